@@ -1,0 +1,1 @@
+"""NMPC as function approximator: parametric OCP, one QP per sample, its sensitivities."""

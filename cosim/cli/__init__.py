@@ -1,0 +1,1 @@
+"""The `cosim` command line: it composes plants, controllers, learning and records."""

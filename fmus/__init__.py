@@ -1,0 +1,1 @@
+"""The evaporator as FMUs: C sources, variable table, build and reference signals."""

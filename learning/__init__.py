@@ -1,0 +1,1 @@
+"""Reinforcement learning rules that tune an NMPC from plant data."""

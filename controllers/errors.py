@@ -1,0 +1,44 @@
+"""Errors of the controllers, each with one message that says what is wrong and how to mend it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from controllers.qp.problem import QuadraticProgram
+
+
+class ControllerError(Exception):
+    """Base of all errors that the package raises."""
+
+
+class ModelError(ControllerError):
+    """The control model or the control problem is malformed."""
+
+
+class ParameterError(ControllerError):
+    """A parameter vector, block or file is malformed."""
+
+
+class OptimumError(ControllerError):
+    """The dynamic-programming policy cannot be computed, stored or read."""
+
+
+class TuningError(ControllerError):
+    """The economic tuning has no solution."""
+
+
+class QpError(ControllerError):
+    """A QP was not solved; it carries the problem for diagnosis.
+
+    `qp` is the `QuadraticProgram` that failed, or None where its data were not finite to begin
+    with; `status` is the backend's own word for the failure. A closed loop recognises the class by
+    `is_solver_failure`, applies its fallback action and counts the failure.
+    """
+
+    is_solver_failure: ClassVar[bool] = True
+
+    def __init__(self, message: str, *, status: str, qp: QuadraticProgram | None = None) -> None:
+        super().__init__(message)
+        self.status = status
+        self.qp = qp

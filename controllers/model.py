@@ -1,0 +1,105 @@
+"""A controller's own model of a plant, as CasADi expressions with named quantities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.errors import ModelError
+
+Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A named quantity with its unit and nominal value."""
+
+    name: str
+    unit: str
+    nominal: float = 0.0
+
+
+@dataclass(frozen=True)
+class Model:
+    """A continuous-time model x' = ode(x, u, d, p) with the economic cost ℓ(x, u, d, p).
+
+    States x, actions u, disturbances d and parameters p are columns in the order of their
+    quantities; `time_unit` is the length in seconds of the unit of time in which `ode` counts.
+    """
+
+    name: str
+    states: tuple[Quantity, ...]
+    actions: tuple[Quantity, ...]
+    disturbances: tuple[Quantity, ...]
+    parameters: tuple[Quantity, ...]
+    ode: Expression = field(repr=False)
+    economic_cost: Expression = field(repr=False)
+    time_unit: float = 1.0
+
+    @property
+    def nominal_disturbance(self) -> NDArray[np.float64]:
+        """Nominal disturbance, shape (n_d,)."""
+        return np.array([quantity.nominal for quantity in self.disturbances])
+
+    @property
+    def nominal_parameters(self) -> NDArray[np.float64]:
+        """Nominal parameter values, shape (n_p,)."""
+        return np.array([quantity.nominal for quantity in self.parameters])
+
+    def parameter_indices(self, names: tuple[str, ...]) -> list[int]:
+        """Positions of the named parameters in p; raises ModelError on a name the model lacks."""
+        known = [quantity.name for quantity in self.parameters]
+        for name in names:
+            if name not in known:
+                raise ModelError(
+                    f"model '{self.name}' has no parameter '{name}'; it has {', '.join(known)}"
+                )
+        return [known.index(name) for name in names]
+
+    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Fresh symbols (x, u, d, p)."""
+        return (
+            ca.SX.sym("x", len(self.states)),
+            ca.SX.sym("u", len(self.actions)),
+            ca.SX.sym("d", len(self.disturbances)),
+            ca.SX.sym("p", len(self.parameters)),
+        )
+
+
+def runge_kutta(  # noqa: PLR0917
+    model: Model, x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX, sampling_time: float, substeps: int
+) -> ca.SX:
+    """State after one sample of `sampling_time` seconds by `substeps` classical RK4 steps."""
+    h = sampling_time / model.time_unit / substeps
+    for _ in range(substeps):
+        k1 = model.ode(x, u, d, p)
+        k2 = model.ode(x + h / 2 * k1, u, d, p)
+        k3 = model.ode(x + h / 2 * k2, u, d, p)
+        k4 = model.ode(x + h * k3, u, d, p)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return x
+
+
+def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function:
+    """Discrete-time model f(x, u, d, p) → x₊ for inputs held over one sample.
+
+    `sampling_time` in seconds. Raises ModelError where it or `substeps` is not positive.
+    """
+    if not sampling_time > 0 or substeps < 1:
+        raise ModelError(
+            f"model '{model.name}': sampling time {sampling_time} s and {substeps} substeps must "
+            "both be positive"
+        )
+    x, u, d, p = model.symbols()
+    x_next = runge_kutta(model, x, u, d, p, sampling_time, substeps)
+    return ca.Function("f", [x, u, d, p], [x_next], ["x", "u", "d", "p"], ["x_next"])
+
+
+def economic_cost(model: Model) -> ca.Function:
+    """Economic cost ℓ(x, u, d, p) as a CasADi function."""
+    x, u, d, p = model.symbols()
+    return ca.Function("l", [x, u, d, p], [model.economic_cost(x, u, d, p)])

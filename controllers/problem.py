@@ -1,0 +1,144 @@
+"""What a controller is told of its task: model, horizon, bounds, penalty and reference."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from controllers.errors import ModelError
+from controllers.model import Model
+
+Vector = NDArray[np.float64]
+
+
+class ScenarioLike(Protocol):
+    """The part of a scenario that a controller reads (`cosim.Scenario` has it)."""
+
+    sampling_time: float
+    discount: float
+    state_lower: Vector
+    state_upper: Vector
+    action_lower: Vector
+    action_upper: Vector
+    penalty_linear: Vector
+    penalty_quadratic: Vector
+    controller: Any
+    hash: str
+
+
+def _frozen(values: ArrayLike) -> Vector:
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A discounted optimal control problem around a reference steady state.
+
+    `sampling_time` [s]; `horizon` N stages; `discount` γ ∈ (0, 1]; bounds and reference in the
+    units of the model's quantities; the penalty of a violation v ≥ 0 is Σ_i linear_i v_i +
+    quadratic_i v_i² (paper.tex, Simulations); `reference_cost` ℓ_s. `substeps` RK4 steps make a
+    sample of the model. Raises ModelError on sizes or values that do not fit.
+    """
+
+    model: Model
+    sampling_time: float
+    horizon: int
+    discount: float
+    state_lower: Vector
+    state_upper: Vector
+    action_lower: Vector
+    action_upper: Vector
+    penalty_linear: Vector
+    penalty_quadratic: Vector
+    reference_state: Vector
+    reference_action: Vector
+    reference_cost: float
+    substeps: int = 2
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays and check every size and sign once."""
+        n, m = self.n_states, self.n_actions
+        for name, size in (
+            ("state_lower", n),
+            ("state_upper", n),
+            ("action_lower", m),
+            ("action_upper", m),
+            ("penalty_linear", n),
+            ("penalty_quadratic", n),
+            ("reference_state", n),
+            ("reference_action", m),
+        ):
+            array = _frozen(getattr(self, name))
+            if array.shape != (size,) or not np.isfinite(array).all():
+                raise ModelError(f"problem: {name} must be {size} finite numbers, not {array}")
+            object.__setattr__(self, name, array)
+        for kind in ("state", "action"):
+            if not (getattr(self, f"{kind}_lower") < getattr(self, f"{kind}_upper")).all():
+                raise ModelError(f"problem: {kind}_lower must be below {kind}_upper everywhere")
+        if (self.penalty_linear <= 0).any() or (self.penalty_quadratic <= 0).any():
+            raise ModelError("problem: penalty_linear and penalty_quadratic must be positive")
+        if self.horizon < 1 or not 0 < self.discount <= 1:
+            raise ModelError(
+                f"problem: horizon {self.horizon} must be at least 1 and discount "
+                f"{self.discount} in (0, 1]"
+            )
+
+    @property
+    def n_states(self) -> int:
+        """Number of states n."""
+        return len(self.model.states)
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actions m."""
+        return len(self.model.actions)
+
+    def penalty(self, s: ArrayLike) -> float:
+        """Penalty of state s by the true bounds, Σ_i linear_i v_i + quadratic_i v_i²."""
+        s = np.asarray(s, dtype=np.float64)
+        violation = np.maximum(np.maximum(self.state_lower - s, s - self.state_upper), 0.0)
+        return float(
+            self.penalty_linear @ violation + self.penalty_quadratic @ (violation * violation)
+        )
+
+    @classmethod
+    def from_scenario(cls, scenario: ScenarioLike) -> Problem:
+        """Build the problem that a scenario describes; its model is named `module:factory`."""
+        settings = scenario.controller
+        return cls(
+            model=load_model(settings.model),
+            sampling_time=scenario.sampling_time,
+            horizon=settings.horizon,
+            discount=scenario.discount,
+            state_lower=scenario.state_lower,
+            state_upper=scenario.state_upper,
+            action_lower=scenario.action_lower,
+            action_upper=scenario.action_upper,
+            penalty_linear=scenario.penalty_linear,
+            penalty_quadratic=scenario.penalty_quadratic,
+            reference_state=settings.reference_state,
+            reference_action=settings.reference_action,
+            reference_cost=settings.reference_cost,
+            substeps=settings.substeps,
+        )
+
+
+def load_model(name: str) -> Model:
+    """Import a model by `module:factory`; raises ModelError where it cannot be had."""
+    module_name, _, factory_name = name.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module_name), factory_name)
+        model = factory()
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise ModelError(
+            f"model '{name}' cannot be loaded ({error}); name it as module:factory"
+        ) from error
+    if not isinstance(model, Model):
+        raise ModelError(f"model '{name}' returned {type(model).__name__}, not a controllers.Model")
+    return model

@@ -1,0 +1,321 @@
+"""The parameters θ of the controller: named blocks of one flat vector."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tomli_w
+from numpy.typing import ArrayLike, NDArray
+
+from controllers.errors import ParameterError
+from controllers.problem import Problem
+from controllers.storage import write_atomically
+
+Vector = NDArray[np.float64]
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Block:
+    """A named part of θ: a scalar, a vector or a symmetric matrix of the given dimension.
+
+    A symmetric matrix is packed as its upper triangle row by row, each entry once. `scale` is the
+    typical size of a change worth making, in the block's own units.
+    """
+
+    name: str
+    kind: Literal["scalar", "vector", "symmetric"]
+    dimension: int
+    scale: tuple[float, ...]
+    meaning: str = ""
+    labels: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of entries in θ."""
+        return self.dimension * (self.dimension + 1) // 2 if self.symmetric else self.dimension
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the block is a symmetric matrix."""
+        return self.kind == "symmetric"
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the unpacked block."""
+        return {
+            "scalar": (),
+            "vector": (self.dimension,),
+            "symmetric": (self.dimension, self.dimension),
+        }[self.kind]
+
+    def pack(self, value: ArrayLike) -> Vector:
+        """Flatten an unpacked value; raises ParameterError on a wrong shape, NaN or asymmetry."""
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ParameterError(f"θ block {self.name} holds no numbers: {value!r}") from error
+        if array.shape != self.shape:
+            raise ParameterError(
+                f"θ block {self.name} has shape {array.shape}; it must have {self.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise ParameterError(f"θ block {self.name} has an entry that is not finite: {array}")
+        if not self.symmetric:
+            return array.reshape(-1)
+        if not np.array_equal(array, array.T):
+            raise ParameterError(f"θ block {self.name} must be symmetric: {array.tolist()}")
+        return array[np.triu_indices(self.dimension)]
+
+    def unpack(self, packed: Vector) -> Vector:
+        """Value of the block in its own shape from its packed entries."""
+        if not self.symmetric:
+            return packed.reshape(self.shape).copy()
+        matrix = np.zeros(self.shape)
+        matrix[np.triu_indices(self.dimension)] = packed
+        return matrix + np.triu(matrix, 1).T
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The blocks of θ, in order."""
+
+    blocks: tuple[Block, ...]
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Slice of each block in θ."""
+        ends = np.cumsum([block.size for block in self.blocks])
+        return {
+            block.name: slice(int(end) - block.size, int(end))
+            for block, end in zip(self.blocks, ends, strict=True)
+        }
+
+    @property
+    def size(self) -> int:
+        """Length of θ."""
+        return sum(block.size for block in self.blocks)
+
+    @cached_property
+    def scale(self) -> Vector:
+        """Learning scale of each entry of θ."""
+        return np.concatenate([np.array(block.scale) for block in self.blocks])
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each entry of θ, such as `B_l[0,2]`."""
+        names: list[str] = []
+        for block in self.blocks:
+            if block.symmetric:
+                rows, columns = np.triu_indices(block.dimension)
+                names += [f"{block.name}[{i},{j}]" for i, j in zip(rows, columns, strict=True)]
+            elif block.kind == "scalar":
+                names.append(block.name)
+            else:
+                names += [
+                    f"{block.name}[{block.labels[i] if block.labels else i}]"
+                    for i in range(block.dimension)
+                ]
+        return tuple(names)
+
+    def __contains__(self, name: str) -> bool:
+        """Whether θ has a block of this name."""
+        return name in self.slices
+
+    def block(self, name: str) -> Block:
+        """Block of this name; raises ParameterError where there is none."""
+        for block in self.blocks:
+            if block.name == name:
+                return block
+        raise ParameterError(f"θ has no block '{name}'; it has {', '.join(self.slices)}")
+
+    @classmethod
+    def of(
+        cls, problem: Problem, *, slack_weights: bool = False, model_parameters: tuple[str, ...] = ()
+    ) -> Layout:
+        """Layout of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
+
+        `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
+        predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
+        Raises ModelError on a parameter that the model lacks.
+        """
+        n, m = problem.n_states, problem.n_actions
+
+        def symmetric(name: str, dimension: int, scale: float, meaning: str) -> Block:
+            size = dimension * (dimension + 1) // 2
+            return Block(name, "symmetric", dimension, (scale,) * size, meaning)
+
+        def vector(name: str, dimension: int, scale: float, meaning: str) -> Block:
+            return Block(name, "vector", dimension, (scale,) * dimension, meaning)
+
+        blocks = [
+            symmetric("B_lambda", n, 1.0, "initial cost, quadratic"),
+            vector("b_lambda", n, 10.0, "initial cost, linear"),
+            Block("c_lambda", "scalar", 1, (1e3,), "initial cost, constant"),
+            symmetric("B_Vf", n, 1.0, "terminal cost, quadratic"),
+            vector("b_Vf", n, 10.0, "terminal cost, linear"),
+            symmetric("B_l", n + m, 1.0, "stage cost, quadratic"),
+            vector("b_l", n + m, 10.0, "stage cost, linear"),
+            vector("c_f", n, 0.1, "model offset"),
+            vector("x_l", n, 1.0, "lower state bound"),
+            vector("x_u", n, 1.0, "upper state bound"),
+        ]
+        if slack_weights:
+            blocks.append(vector("w_sigma", n, 100.0, "slack of stages 1…N, linear weight"))
+            blocks.append(vector("W_sigma", n, 1e3, "slack of stages 1…N, quadratic weight"))
+        if model_parameters:
+            indices = problem.model.parameter_indices(model_parameters)
+            scale = tuple(0.1 * abs(problem.model.parameters[i].nominal) for i in indices)
+            blocks.append(
+                Block(
+                    "p", "vector", len(indices), scale, "model parameters", tuple(model_parameters)
+                )
+            )
+        return cls(tuple(blocks))
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """A value of θ with its layout; `parameters["B_l"]` is the unpacked block.
+
+    Raises ParameterError on a vector of wrong length or with an entry that is not finite.
+    """
+
+    layout: Layout
+    theta: Vector
+
+    def __post_init__(self) -> None:
+        """Keep a read-only copy of a valid vector."""
+        theta = np.array(self.theta, dtype=np.float64)
+        if theta.shape != (self.layout.size,):
+            raise ParameterError(f"θ has shape {theta.shape}; it must have ({self.layout.size},)")
+        if not np.isfinite(theta).all():
+            bad = self.layout.labels[int(np.flatnonzero(~np.isfinite(theta))[0])]
+            raise ParameterError(f"θ is not finite at {bad}")
+        theta.flags.writeable = False
+        object.__setattr__(self, "theta", theta)
+
+    def __getitem__(self, name: str) -> Vector:
+        """Unpacked value of a block."""
+        return self.layout.block(name).unpack(self.theta[self.layout.slices[name]])
+
+    def replace(self, blocks: Mapping[str, ArrayLike]) -> Parameters:
+        """Copy with the named blocks set to new values."""
+        theta = self.theta.copy()
+        for name, value in blocks.items():
+            theta[self.layout.slices[self.layout.block(name).name]] = self.layout.block(name).pack(
+                value
+            )
+        return Parameters(self.layout, theta)
+
+    def with_theta(self, theta: ArrayLike) -> Parameters:
+        """Copy with another flat vector."""
+        return Parameters(self.layout, np.asarray(theta, dtype=np.float64))
+
+    @property
+    def hash(self) -> str:
+        """First 16 hexadecimal digits of the SHA-256 of names and exact values."""
+        content = json.dumps([list(self.layout.labels), [float(v).hex() for v in self.theta]])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def __str__(self) -> str:
+        """One line a block: name, meaning and value to six digits."""
+        lines = [f"θ {self.hash} ({self.layout.size} entries)"]
+        for block in self.layout.blocks:
+            value = np.array2string(
+                self[block.name], precision=6, suppress_small=True, separator=", "
+            )
+            lines.append(f"  {block.name:9s} {block.meaning:34s} {' '.join(value.split())}")
+        return "\n".join(lines)
+
+    @classmethod
+    def naive(
+        cls, problem: Problem, layout: Layout | None = None, *, value_offset: float | None = None
+    ) -> Parameters:
+        """The paper's naive guess: B_l = I, B_Vf = I, c_lambda = ℓ_s, true bounds, else 0.
+
+        `value_offset` is c_lambda where it shall not be ℓ_s, for instance ℓ_s/(1−γ). Slack weights
+        in θ start at the true penalty, model parameters at their nominal values.
+        """
+        layout = layout or Layout.of(problem)
+        values: dict[str, ArrayLike] = {
+            "B_l": np.eye(problem.n_states + problem.n_actions),
+            "B_Vf": np.eye(problem.n_states),
+            "c_lambda": problem.reference_cost if value_offset is None else value_offset,
+            "x_l": problem.state_lower,
+            "x_u": problem.state_upper,
+        }
+        if "w_sigma" in layout:
+            values["w_sigma"] = problem.penalty_linear
+            values["W_sigma"] = problem.penalty_quadratic
+        if "p" in layout:
+            chosen = problem.model.parameter_indices(layout.block("p").labels)
+            values["p"] = problem.model.nominal_parameters[chosen]
+        return cls(layout, np.zeros(layout.size)).replace(values)
+
+    def save(self, path: str | Path) -> Path:
+        """Write θ as TOML with schema version and hash; the file appears whole or not at all."""
+        blocks = {block.name: self[block.name].tolist() for block in self.layout.blocks}
+        document: dict[str, Any] = {"schema": SCHEMA, "hash": self.hash, "theta": blocks}
+        if "p" in self.layout:
+            document["model_parameters"] = list(self.layout.block("p").labels)
+        return write_atomically(path, tomli_w.dumps(document))
+
+    @classmethod
+    def load(cls, path: str | Path, problem: Problem) -> Parameters:
+        """Read θ for a problem; the file says which optional blocks it has.
+
+        Raises ParameterError where the file is missing, is no TOML, has another schema, lacks or
+        adds a block, or where its values do not match its hash.
+        """
+        document = _read_document(Path(path))
+        blocks = document["theta"]
+        layout = Layout.of(
+            problem,
+            slack_weights="w_sigma" in blocks or "W_sigma" in blocks,
+            model_parameters=tuple(document.get("model_parameters", ())),
+        )
+        missing = [name for name in layout.slices if name not in blocks]
+        unknown = [name for name in blocks if name not in layout]
+        if missing or unknown:
+            raise ParameterError(
+                f"{path}: θ blocks missing: {', '.join(missing) or 'none'}; "
+                f"not known: {', '.join(unknown) or 'none'}"
+            )
+        try:
+            parameters = cls(layout, np.zeros(layout.size)).replace(blocks)
+        except ParameterError as error:
+            raise ParameterError(f"{path}: {error}") from error
+        if document.get("hash", parameters.hash) != parameters.hash:
+            raise ParameterError(
+                f"{path}: the values have hash {parameters.hash}, the file says "
+                f"{document['hash']}; delete its line `hash` if the values were edited on purpose"
+            )
+        return parameters
+
+
+def _read_document(path: Path) -> dict[str, Any]:
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ParameterError(f"{path}: there is no such parameters file") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ParameterError(f"{path}: not a readable TOML file ({error})") from error
+    if document.get("schema") != SCHEMA:
+        raise ParameterError(
+            f"{path}: schema is {document.get('schema')!r}; this version reads schema = {SCHEMA}"
+        )
+    if not isinstance(document.get("theta"), dict):
+        raise ParameterError(f"{path}: there is no table [theta]")
+    names = document.get("model_parameters", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ParameterError(f"{path}: model_parameters must be a list of names")
+    return document

@@ -139,7 +139,11 @@ class Layout:
 
     @classmethod
     def of(
-        cls, problem: Problem, *, slack_weights: bool = False, model_parameters: tuple[str, ...] = ()
+        cls,
+        problem: Problem,
+        *,
+        slack_weights: bool = False,
+        model_parameters: tuple[str, ...] = (),
     ) -> Layout:
         """Layout of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
 

@@ -1,1 +1,28 @@
 """Co-simulation of an FMU plant with a controller: scenarios, closed loop, records, results."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cosim.plant import FmuPlant as FmuPlant
+    from cosim.pool import PlantPool as PlantPool
+    from cosim.scenario import Scenario as Scenario
+    from cosim.simulation import simulate as simulate
+    from cosim.trajectory import Trajectory as Trajectory
+
+# Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
+_HOMES = {
+    "FmuPlant": "cosim.plant",
+    "PlantPool": "cosim.pool",
+    "Scenario": "cosim.scenario",
+    "Trajectory": "cosim.trajectory",
+    "simulate": "cosim.simulation",
+}
+
+__all__ = ["FmuPlant", "PlantPool", "Scenario", "Trajectory", "simulate"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'cosim' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,29 @@
+"""Exceptions of the co-simulation, all of them subclasses of `CosimError`."""
+
+
+class CosimError(Exception):
+    """Base of every error that `cosim` raises on bad input or a failed co-simulation."""
+
+
+class ScenarioError(CosimError):
+    """A scenario document that cannot be found, read or validated."""
+
+
+class PlantError(CosimError):
+    """A plant that cannot be loaded, or that refused a call."""
+
+
+class CapabilityError(PlantError):
+    """A capability was asked for that this FMU does not have, e.g. saving its state."""
+
+
+class ControllerLookupError(CosimError):
+    """A controller's name, `module:factory` or parameters file that leads nowhere."""
+
+
+class TrajectoryError(CosimError):
+    """A trajectory file that cannot be read, or signals that do not fit together."""
+
+
+class RecordingError(CosimError):
+    """A recording that cannot be written, read or shown."""

@@ -1,0 +1,50 @@
+"""The known cost of leaving the state bounds, shared by plant, environment and results."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Penalty:
+    """Exact penalty of the state bounds, Σᵢ bᵢ vᵢ + Bᵢ vᵢ² with v = max(x_l − x, x − x_u, 0).
+
+    Source: paper.tex, Simulations (b_σ = 10⁵·1, B_σ = I, at the true bounds).
+
+    Parameters
+    ----------
+    lower, upper : (n,) bounds x_l, x_u in the states' units.
+    linear, quadratic : (n,) weights b (cost per unit) and B (cost per unit²).
+    """
+
+    def __init__(
+        self, lower: ArrayLike, upper: ArrayLike, linear: ArrayLike, quadratic: ArrayLike
+    ) -> None:
+        self.lower = np.asarray(lower, dtype=float)
+        self.upper = np.asarray(upper, dtype=float)
+        self.linear = np.asarray(linear, dtype=float)
+        self.quadratic = np.asarray(quadratic, dtype=float)
+        self._rows = tuple(
+            zip(
+                self.lower.tolist(),
+                self.upper.tolist(),
+                self.linear.tolist(),
+                self.quadratic.tolist(),
+                strict=True,
+            )
+        )
+
+    def __call__(self, state: Sequence[float] | NDArray[np.float64]) -> float:
+        """Penalty of one state (n,); a NaN state gives NaN."""
+        total = 0.0
+        for x, (lower, upper, linear, quadratic) in zip(state, self._rows, strict=True):
+            if lower <= x <= upper:
+                continue
+            v = lower - x if x < lower else x - upper
+            total += linear * v + quadratic * v * v
+        return float(total)
+
+    def violation(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Violation v ≥ 0 of each bound for states (…, n), same shape and units."""
+        outside: NDArray[np.float64] = np.maximum(self.lower - states, states - self.upper)
+        return np.maximum(outside, 0.0)

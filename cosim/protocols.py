@@ -1,0 +1,158 @@
+"""What the closed loop asks of a plant, a controller and a recorder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from cosim.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+
+class Step(NamedTuple):
+    """One sample of the plant: from x_k under u_k and d_k to x_{k+1}.
+
+    `s` (n,) is x_{k+1}; `stage_cost` is ℓ(x_k, u_k, d_k) without penalty; `penalty` is that of
+    x_k at the scenario's true bounds; `disturbance` (p,) is d_k. The cost per sample that
+    J averages is `stage_cost + penalty`.
+    """
+
+    s: Array
+    stage_cost: float
+    penalty: float
+    disturbance: Array
+
+
+class Plant(Protocol):
+    """A sampled plant; `reset` starts an episode at k = 0, `step` advances by one sample."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario that the plant realises."""
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each state, action, disturbance and of the stage cost, by variable name."""
+
+    def reset(self, seed: int | None = None) -> Array:
+        """Start again from the scenario's initial state and return it, (n,)."""
+
+    def step(self, a: Array) -> Step:
+        """Hold the action a (m,) for one sampling time."""
+
+
+class Solution(Protocol):
+    """What a controller returns from `feedback`."""
+
+    @property
+    def action(self) -> Array:
+        """Action, (m,)."""
+
+    @property
+    def value(self) -> float:
+        """V(s), or Q(s, a) when an action was enforced; NaN if the controller has none."""
+
+    @property
+    def status(self) -> str:
+        """`solved`, or the reason why not."""
+
+    @property
+    def residual(self) -> float:
+        """Largest KKT residual of the problem solved; NaN if the controller has none."""
+
+    @property
+    def predicted_states(self) -> Array | None:
+        """Predicted states, (N+1, n), or None."""
+
+    @property
+    def predicted_actions(self) -> Array | None:
+        """Predicted actions, (N, m), or None."""
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """A feedback law in two phases: `prepare` before the state is known, `feedback` after.
+
+    Optional attributes that are used when present: `name` (str) and `parameters` (with `.hash`).
+    An exception whose class has `is_solver_failure = True` makes the loop apply its fallback.
+    """
+
+    def reset(self) -> None:
+        """Forget every earlier sample."""
+
+    def prepare(self) -> None:
+        """Do what needs no measurement, e.g. shift and linearise."""
+
+    def feedback(self, s: Array, a: Array | None = None) -> Solution:
+        """Solve for the measured state s (n,), with the first action fixed to a (m,) if given."""
+
+
+Exploration = Callable[[Array, np.random.Generator], Array]
+"""Maps the policy's action (m,) and a generator to the action to apply.
+
+Return the very same array to leave the sample greedy. The loop saturates the result.
+"""
+
+
+@dataclass(frozen=True)
+class Block:
+    """K consecutive samples of a run, as columns; arrays are views that the loop overwrites later.
+
+    `states` (K, n), `actions` (K, m), `disturbances` (K, p), `time` (K,) in s; `explored` and
+    `failed` (K,) bool; `prepare_time` and `feedback_time` (K,) in s; `status` K strings;
+    `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m), NaN where the controller
+    gave none, or None if it never did in this block.
+    """
+
+    first: int
+    time: Array
+    states: Array
+    actions: Array
+    disturbances: Array
+    stage_cost: Array
+    penalty: Array
+    value: Array
+    residual: Array
+    explored: NDArray[np.bool_]
+    failed: NDArray[np.bool_]
+    status: list[str]
+    prepare_time: Array
+    feedback_time: Array
+    predicted_states: Array | None
+    predicted_actions: Array | None
+
+
+class Recorder(Protocol):
+    """Takes a run block by block; the loop calls start, record…, close in this order."""
+
+    def start(
+        self,
+        scenario: Scenario,
+        controller: Controller,
+        seed: int,
+        steps: int,
+        units: dict[str, str],
+    ) -> None:
+        """Open the record; `units` maps each FMU variable's name to its unit."""
+
+    def record(self, block: Block) -> None:
+        """Append a block; copy what must outlive the call."""
+
+    def close(self) -> None:
+        """Finish the record; also called when the run fails."""
+
+
+def is_solver_failure(error: BaseException) -> bool:
+    """Whether an exception is a controller's declared failure to solve its problem."""
+    return bool(getattr(type(error), "is_solver_failure", False))
+
+
+def controller_name(controller: Any) -> str:
+    """Name of a controller for tables: its `name`, else its class's."""
+    return str(getattr(controller, "name", type(controller).__name__))

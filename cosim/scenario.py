@@ -1,0 +1,362 @@
+"""The scenario: one validated document that says what plant is controlled, and to what end."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cosim.errors import ScenarioError
+from cosim.validation import describe, suggestion
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1)]
+Names = Annotated[tuple[Name, ...], Field(strict=False)]
+Numbers = Annotated[tuple[Number, ...], Field(strict=False)]
+Limits = Annotated[tuple[float, ...], Field(strict=False)]
+NonNegatives = Annotated[tuple[NonNegative, ...], Field(strict=False)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, populate_by_name=True)
+
+
+class MappingTable(_Table):
+    """FMU variables through which a reset writes what the scenario says; each may be left out.
+
+    `initial_state` one start parameter per state; `seed` the variables that take the seed, low 32
+    bits first (a 64-bit variable takes all of it and ends the list); `law` takes the number that
+    `law_codes` gives; `nominal` and `ranges` one variable per disturbance.
+    """
+
+    initial_state: Names = ()
+    seed: Names = ()
+    sampling_time: Name | None = None
+    stochastic: Name | None = None
+    law: Name | None = None
+    law_codes: dict[str, int] = {}
+    nominal: Names = ()
+    ranges: Names = ()
+
+
+class PlantTable(_Table):
+    """The FMU and the map from its variables to states, actions, disturbances and stage cost.
+
+    `fmu` is the name of a shipped one (`evaporator`, `evaporator_fmi3`) or a path, relative to
+    the scenario's file. `parameters` are further start values that each reset writes.
+    """
+
+    fmu: Name
+    states: Annotated[Names, Field(min_length=1)]
+    actions: Annotated[Names, Field(min_length=1)]
+    disturbances: Names = ()
+    stage_cost: Name
+    initial_state: Numbers
+    parameters: dict[str, float | bool] = {}
+    mapping: MappingTable = MappingTable()
+
+
+class DisturbanceTable(_Table):
+    """Law of the disturbances, drawn anew each sample and held.
+
+    `ranges` are half widths for the uniform law and standard deviations for the normal one.
+    """
+
+    law: Literal["uniform", "normal", "none"] = "none"
+    nominal: Numbers = ()
+    ranges: NonNegatives = ()
+
+
+class BoundsTable(_Table):
+    """Bounds of the states (soft: the penalty) and of the actions (hard: the actuators)."""
+
+    state_lower: Limits
+    state_upper: Limits
+    action_lower: Numbers
+    action_upper: Numbers
+
+
+class PenaltyTable(_Table):
+    """Weights b and B of the violation v: Σᵢ bᵢ vᵢ + Bᵢ vᵢ² per sample."""
+
+    linear: NonNegatives
+    quadratic: NonNegatives
+
+
+class ExplorationTable(_Table):
+    """ε-greedy exploration: `additive` a = sat(π(s)+e), `literal` a = sat(e), e ~ N(0, diag σ²)."""
+
+    kind: Literal["additive", "literal", "none"] = "none"
+    probability: Annotated[float, Field(ge=0, le=1)] = 0.0
+    standard_deviation: NonNegatives = ()
+
+
+class ControllerTable(_Table):
+    """What the controller is told; `reference_*` is the operating point x_s, u_s, ℓ_s.
+
+    `value_offset` is c_λ at the start: `stage-cost` ℓ_s (paper) or `discounted` ℓ_s/(1−γ).
+    """
+
+    model: Annotated[str, Field(pattern=r"^[\w.]+:\w+$")] | None = None
+    horizon: Annotated[int, Field(ge=1, le=1000)] = 10
+    substeps: Annotated[int, Field(ge=1, le=1000)] = 2
+    hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
+    backend: Annotated[str, Field(pattern=r"^(daqp|proxqp|qpsolvers:\w+)$")] = "daqp"
+    value_offset: Literal["stage-cost", "discounted"] = "stage-cost"
+    reference_state: Numbers
+    reference_action: Numbers
+    reference_cost: Number
+
+
+class Scenario(_Table):
+    """A benchmark task: plant, sampling, cost, disturbances, bounds and the controller's settings.
+
+    Load one with `Scenario.load`; derive another with `replace`. Times in s, everything else in
+    the FMU's units. Raises ScenarioError with one line that names file, field and allowed values.
+    """
+
+    schema_version: Annotated[Literal[1], Field(alias="schema")]
+    name: Name
+    description: str = ""
+    sampling_time: Positive
+    discount: Annotated[float, Field(gt=0, le=1)]
+    plant: PlantTable
+    disturbance: DisturbanceTable = DisturbanceTable()
+    bounds: BoundsTable
+    penalty: PenaltyTable
+    exploration: ExplorationTable = ExplorationTable()
+    controller: ControllerTable
+
+    @model_validator(mode="after")
+    def _sizes_and_signs_fit(self) -> Self:
+        plant, mapping, law = self.plant, self.plant.mapping, self.disturbance.law
+        n, m, p = len(plant.states), len(plant.actions), len(plant.disturbances)
+        for table, size, of, optional in (
+            ("plant.initial_state", n, "state", False),
+            ("plant.mapping.initial_state", n, "state", True),
+            ("plant.mapping.nominal", p, "disturbance", True),
+            ("plant.mapping.ranges", p, "disturbance", True),
+            ("disturbance.nominal", p, "disturbance", law == "none"),
+            ("disturbance.ranges", p, "disturbance", law == "none"),
+            ("bounds.state_lower", n, "state", False),
+            ("bounds.state_upper", n, "state", False),
+            ("bounds.action_lower", m, "action", False),
+            ("bounds.action_upper", m, "action", False),
+            ("penalty.linear", n, "state", False),
+            ("penalty.quadratic", n, "state", False),
+            ("exploration.standard_deviation", m, "action", self.exploration.kind == "none"),
+            ("controller.reference_state", n, "state", False),
+            ("controller.reference_action", m, "action", False),
+        ):
+            value: Any = self
+            for part in table.split("."):
+                value = getattr(value, part)
+            if len(value) != size and not (optional and not value):
+                raise _misfit(table, f"must have one entry per {of} ({size}), not {len(value)}")
+        for kind in ("state", "action"):
+            lower = getattr(self.bounds, f"{kind}_lower")
+            upper = getattr(self.bounds, f"{kind}_upper")
+            if not all(low < high for low, high in zip(lower, upper, strict=True)):
+                raise _misfit(f"bounds.{kind}_lower", f"must be below {kind}_upper in every entry")
+        names = (*plant.states, *plant.actions, *plant.disturbances)
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise _misfit("plant", f"names '{twice}' twice among states, actions and disturbances")
+        if law != "none" and not (mapping.law and law in mapping.law_codes):
+            raise _misfit("disturbance.law", f"'{law}' needs plant.mapping.law and its law_codes")
+        return self
+
+    @classmethod
+    def load(cls, source: str | Path) -> Scenario:
+        """Load a preset by name or a TOML file by path; raises ScenarioError.
+
+        A document with `extends = NAME_OR_PATH` states only what differs from another one.
+        """
+        document, origin = _read(source)
+        return cls._validated(document, origin)
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any], origin: str = "scenario") -> Scenario:
+        """Validate a document, structured like the TOML file; raises ScenarioError."""
+        return cls._validated(document, origin)
+
+    @classmethod
+    def _validated(cls, document: Mapping[str, Any], origin: str) -> Scenario:
+        try:
+            return cls.model_validate(document)
+        except ValidationError as error:
+            raise ScenarioError(f"{origin}: {describe(error, cls)}") from None
+
+    def replace(self, changes: Mapping[str, Any]) -> Scenario:
+        """Return the scenario with some fields changed, e.g. `{"plant": {"fmu": "my.fmu"}}`.
+
+        Tables are merged, everything else is replaced; the result is validated as a whole.
+        """
+        return self._validated(_merged(self.to_dict(), changes), f"scenario '{self.name}'")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document that this scenario was validated from, every default written out."""
+        document: dict[str, Any] = self.model_dump(mode="json", by_alias=True, exclude_none=True)
+        # JSON has no infinity: bounds are taken as they are.
+        document["bounds"] = {key: list(value) for key, value in self.bounds}
+        return document
+
+    def to_toml(self) -> str:
+        """Return the scenario as TOML text that `load` reads back to an equal scenario."""
+        return tomli_w.dumps(self.to_dict())
+
+    @cached_property
+    def hash(self) -> str:
+        """First 16 hex digits of the SHA-256 of all that bears on results.
+
+        Left out: name, description, and the folder of a foreign FMU (its file name counts).
+        """
+        document = self.to_dict()
+        del document["name"], document["description"]
+        document["plant"]["fmu"] = Path(self.plant.fmu).name
+        canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+    @cached_property
+    def initial_state(self) -> NDArray[np.float64]:
+        """State at k = 0, (n,)."""
+        return _frozen(self.plant.initial_state)
+
+    @cached_property
+    def state_lower(self) -> NDArray[np.float64]:
+        """Lower bounds x_l, (n,)."""
+        return _frozen(self.bounds.state_lower)
+
+    @cached_property
+    def state_upper(self) -> NDArray[np.float64]:
+        """Upper bounds x_u, (n,)."""
+        return _frozen(self.bounds.state_upper)
+
+    @cached_property
+    def action_lower(self) -> NDArray[np.float64]:
+        """Lower bounds u_l, (m,)."""
+        return _frozen(self.bounds.action_lower)
+
+    @cached_property
+    def action_upper(self) -> NDArray[np.float64]:
+        """Upper bounds u_u, (m,)."""
+        return _frozen(self.bounds.action_upper)
+
+    @cached_property
+    def penalty_linear(self) -> NDArray[np.float64]:
+        """Linear weights b of the violation, (n,)."""
+        return _frozen(self.penalty.linear)
+
+    @cached_property
+    def penalty_quadratic(self) -> NDArray[np.float64]:
+        """Quadratic weights B (diagonal) of the violation, (n,)."""
+        return _frozen(self.penalty.quadratic)
+
+    @cached_property
+    def reference_state(self) -> NDArray[np.float64]:
+        """Operating point x_s, (n,)."""
+        return _frozen(self.controller.reference_state)
+
+    @cached_property
+    def reference_action(self) -> NDArray[np.float64]:
+        """Operating point u_s, (m,)."""
+        return _frozen(self.controller.reference_action)
+
+
+def presets() -> list[str]:
+    """Names of the scenarios that the package ships."""
+    folder = files("cosim.presets")
+    return sorted(
+        entry.name.removesuffix(".toml")
+        for entry in folder.iterdir()
+        if entry.name.endswith(".toml")
+    )
+
+
+def _misfit(field: str, message: str) -> ValueError:
+    return ValueError(f"{field}: {message}")
+
+
+def _frozen(values: tuple[float, ...]) -> NDArray[np.float64]:
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        old = merged.get(key)
+        both_tables = isinstance(value, Mapping) and isinstance(old, Mapping)
+        merged[key] = _merged(old, value) if both_tables else value  # type: ignore[arg-type]
+    return merged
+
+
+def _read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any], str]:
+    """Read a preset or file and what it extends; returns the document and its origin's name."""
+    path = Path(source)
+    if str(source) in presets():
+        origin = f"preset '{source}'"
+        text = files("cosim.presets").joinpath(f"{source}.toml").read_text("utf-8")
+        folder = None
+    elif path.suffix == ".toml" or len(path.parts) > 1 or path.is_file():
+        origin = f"scenario file '{source}'"
+        text = _text(path, origin)
+        folder = path.resolve().parent
+    else:
+        raise ScenarioError(
+            f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
+            f"{', '.join(presets())}, or give the path of a TOML file"
+        )
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
+    if folder is not None:
+        _anchor_fmu(document, folder)
+    if (base := document.pop("extends", None)) is not None:
+        document = _merged(_extended(base, origin, folder, (*seen, str(path.resolve()))), document)
+    return document, origin
+
+
+def _text(path: Path, origin: str) -> str:
+    try:
+        return path.read_text("utf-8")
+    except FileNotFoundError:
+        raise ScenarioError(f"{origin} does not exist") from None
+    except UnicodeDecodeError:
+        raise ScenarioError(f"{origin} is not UTF-8 text") from None
+    except OSError as error:
+        raise ScenarioError(f"{origin} cannot be read: {error.strerror}") from None
+
+
+def _extended(
+    base: object, origin: str, folder: Path | None, seen: tuple[str, ...]
+) -> dict[str, Any]:
+    if not isinstance(base, str):
+        raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
+    if folder is not None and base not in presets():
+        base = str(folder / base)
+    if str(Path(base).resolve()) in seen:
+        raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
+    return _read(base, seen)[0]
+
+
+def _anchor_fmu(document: dict[str, Any], folder: Path) -> None:
+    """Make an FMU's relative path absolute, as seen from the scenario's folder."""
+    plant = document.get("plant")
+    if isinstance(plant, dict) and isinstance(plant.get("fmu"), str):
+        fmu = Path(plant["fmu"])
+        if fmu.suffix == ".fmu" or len(fmu.parts) > 1:
+            plant["fmu"] = str(folder / fmu)

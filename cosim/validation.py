@@ -1,0 +1,82 @@
+"""Turns a failed validation into one line: table, field, what is wrong, what is allowed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+_EXPECTED = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text",
+    "tuple_type": "must be a list",
+    "dict_type": "must be a table",
+    "model_type": "must be a table",
+    "model_attributes_type": "must be a table",
+    "finite_number": "must be finite",
+    "string_too_short": "must not be empty",
+    "too_short": "must not be empty",
+}
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """` (did you mean 'x'?)` if a known word is close, else nothing."""
+    close = get_close_matches(word, list(known), n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ""
+
+
+def describe(error: ValidationError, model: type[BaseModel]) -> str:
+    """Return the first complaint of a failed validation, and how many more there are."""
+    details = error.errors(include_url=False)
+    text = _complaint(dict(details[0]), model)
+    more = len(details) - 1
+    return f"{text} ({more} more problem{'s' if more > 1 else ''})" if more else text
+
+
+def _complaint(detail: dict[str, Any], model: type[BaseModel]) -> str:
+    kind, given = detail["type"], detail["input"]
+    if kind == "value_error":
+        return str(detail["ctx"]["error"])
+    path = [part for part in detail["loc"] if not _is_union_branch(part)]
+    field = _dotted(path)
+    if kind == "missing":
+        return f"{field}: is missing"
+    if kind == "extra_forbidden":
+        known = _fields(model, path[:-1])
+        return (
+            f"{field}: unknown field{suggestion(str(path[-1]), known)}; "
+            f"allowed are {', '.join(known)}"
+        )
+    expected = _EXPECTED.get(kind) or str(detail["msg"]).replace("Input should be", "must be", 1)
+    if kind == "string_pattern_mismatch":
+        expected = f"must match {detail['ctx']['pattern']}"
+    shown = repr(given)
+    return f"{field}: {expected}, not {shown if len(shown) <= 60 else shown[:57] + '...'}"
+
+
+def _is_union_branch(part: object) -> bool:
+    return part in ("float", "bool")
+
+
+def _dotted(path: list[Any]) -> str:
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text or "document"
+
+
+def _fields(model: type[BaseModel], path: list[Any]) -> list[str]:
+    """Names that the table at `path` allows."""
+    for part in path:
+        annotation = model.model_fields[str(part)].annotation
+        candidates = (annotation, *get_args(annotation))
+        model = next(
+            option
+            for option in candidates
+            if isinstance(option, type) and issubclass(option, BaseModel)
+        )
+    return [info.alias or name for name, info in model.model_fields.items()]

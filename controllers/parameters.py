@@ -1,4 +1,4 @@
-"""The parameters θ of the controller: named blocks of one flat vector."""
+"""The parameters θ of the controller: a value for each block, its file and its hash."""
 
 from __future__ import annotations
 
@@ -7,183 +7,20 @@ import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import tomli_w
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ParameterError
+from controllers.layout import Layout
 from controllers.problem import Problem
 from controllers.storage import write_atomically
 
 Vector = NDArray[np.float64]
 SCHEMA = 1
-
-
-@dataclass(frozen=True)
-class Block:
-    """A named part of θ: a scalar, a vector or a symmetric matrix of the given dimension.
-
-    A symmetric matrix is packed as its upper triangle row by row, each entry once. `scale` is the
-    typical size of a change worth making, in the block's own units.
-    """
-
-    name: str
-    kind: Literal["scalar", "vector", "symmetric"]
-    dimension: int
-    scale: tuple[float, ...]
-    meaning: str = ""
-    labels: tuple[str, ...] = ()
-
-    @property
-    def size(self) -> int:
-        """Number of entries in θ."""
-        return self.dimension * (self.dimension + 1) // 2 if self.symmetric else self.dimension
-
-    @property
-    def symmetric(self) -> bool:
-        """Whether the block is a symmetric matrix."""
-        return self.kind == "symmetric"
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the unpacked block."""
-        return {
-            "scalar": (),
-            "vector": (self.dimension,),
-            "symmetric": (self.dimension, self.dimension),
-        }[self.kind]
-
-    def pack(self, value: ArrayLike) -> Vector:
-        """Flatten an unpacked value; raises ParameterError on a wrong shape, NaN or asymmetry."""
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ParameterError(f"θ block {self.name} holds no numbers: {value!r}") from error
-        if array.shape != self.shape:
-            raise ParameterError(
-                f"θ block {self.name} has shape {array.shape}; it must have {self.shape}"
-            )
-        if not np.isfinite(array).all():
-            raise ParameterError(f"θ block {self.name} has an entry that is not finite: {array}")
-        if not self.symmetric:
-            return array.reshape(-1)
-        if not np.array_equal(array, array.T):
-            raise ParameterError(f"θ block {self.name} must be symmetric: {array.tolist()}")
-        return array[np.triu_indices(self.dimension)]
-
-    def unpack(self, packed: Vector) -> Vector:
-        """Value of the block in its own shape from its packed entries."""
-        if not self.symmetric:
-            return packed.reshape(self.shape).copy()
-        matrix = np.zeros(self.shape)
-        matrix[np.triu_indices(self.dimension)] = packed
-        return matrix + np.triu(matrix, 1).T
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The blocks of θ, in order."""
-
-    blocks: tuple[Block, ...]
-
-    @cached_property
-    def slices(self) -> dict[str, slice]:
-        """Slice of each block in θ."""
-        ends = np.cumsum([block.size for block in self.blocks])
-        return {
-            block.name: slice(int(end) - block.size, int(end))
-            for block, end in zip(self.blocks, ends, strict=True)
-        }
-
-    @property
-    def size(self) -> int:
-        """Length of θ."""
-        return sum(block.size for block in self.blocks)
-
-    @cached_property
-    def scale(self) -> Vector:
-        """Learning scale of each entry of θ."""
-        return np.concatenate([np.array(block.scale) for block in self.blocks])
-
-    @cached_property
-    def labels(self) -> tuple[str, ...]:
-        """A name for each entry of θ, such as `B_l[0,2]`."""
-        names: list[str] = []
-        for block in self.blocks:
-            if block.symmetric:
-                rows, columns = np.triu_indices(block.dimension)
-                names += [f"{block.name}[{i},{j}]" for i, j in zip(rows, columns, strict=True)]
-            elif block.kind == "scalar":
-                names.append(block.name)
-            else:
-                names += [
-                    f"{block.name}[{block.labels[i] if block.labels else i}]"
-                    for i in range(block.dimension)
-                ]
-        return tuple(names)
-
-    def __contains__(self, name: str) -> bool:
-        """Whether θ has a block of this name."""
-        return name in self.slices
-
-    def block(self, name: str) -> Block:
-        """Block of this name; raises ParameterError where there is none."""
-        for block in self.blocks:
-            if block.name == name:
-                return block
-        raise ParameterError(f"θ has no block '{name}'; it has {', '.join(self.slices)}")
-
-    @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        *,
-        slack_weights: bool = False,
-        model_parameters: tuple[str, ...] = (),
-    ) -> Layout:
-        """Layout of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
-
-        `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
-        predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
-        Raises ModelError on a parameter that the model lacks.
-        """
-        n, m = problem.n_states, problem.n_actions
-
-        def symmetric(name: str, dimension: int, scale: float, meaning: str) -> Block:
-            size = dimension * (dimension + 1) // 2
-            return Block(name, "symmetric", dimension, (scale,) * size, meaning)
-
-        def vector(name: str, dimension: int, scale: float, meaning: str) -> Block:
-            return Block(name, "vector", dimension, (scale,) * dimension, meaning)
-
-        blocks = [
-            symmetric("B_lambda", n, 1.0, "initial cost, quadratic"),
-            vector("b_lambda", n, 10.0, "initial cost, linear"),
-            Block("c_lambda", "scalar", 1, (1e3,), "initial cost, constant"),
-            symmetric("B_Vf", n, 1.0, "terminal cost, quadratic"),
-            vector("b_Vf", n, 10.0, "terminal cost, linear"),
-            symmetric("B_l", n + m, 1.0, "stage cost, quadratic"),
-            vector("b_l", n + m, 10.0, "stage cost, linear"),
-            vector("c_f", n, 0.1, "model offset"),
-            vector("x_l", n, 1.0, "lower state bound"),
-            vector("x_u", n, 1.0, "upper state bound"),
-        ]
-        if slack_weights:
-            blocks.append(vector("w_sigma", n, 100.0, "slack of stages 1…N, linear weight"))
-            blocks.append(vector("W_sigma", n, 1e3, "slack of stages 1…N, quadratic weight"))
-        if model_parameters:
-            indices = problem.model.parameter_indices(model_parameters)
-            scale = tuple(0.1 * abs(problem.model.parameters[i].nominal) for i in indices)
-            blocks.append(
-                Block(
-                    "p", "vector", len(indices), scale, "model parameters", tuple(model_parameters)
-                )
-            )
-        return cls(tuple(blocks))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,93 @@
+"""CasADi functions that read and write preallocated NumPy memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+
+class BufferedFunction:
+    """A CasADi function whose arguments and results live in fixed NumPy arrays.
+
+    `inputs[name]` and `outputs[name]` are flat float64 arrays in CasADi's column-major order:
+    write the inputs, call, read the outputs. A call allocates nothing. `shared` names inputs that
+    are read from somebody else's memory, such as another function's output. Every input and output
+    of the function must be dense. Raises ValueError where a shared array has the wrong size.
+    """
+
+    def __init__(self, function: ca.Function, shared: Mapping[str, Vector] | None = None) -> None:
+        self.function = function
+        self.inputs = {
+            function.name_in(i): np.zeros(function.numel_in(i)) for i in range(function.n_in())
+        }
+        for name, array in (shared or {}).items():
+            if array.shape != self.inputs[name].shape or not array.flags.c_contiguous:
+                raise ValueError(f"{function.name()}: shared input {name} does not fit")
+            self.inputs[name] = array
+        self.outputs = {
+            function.name_out(i): np.zeros(function.numel_out(i)) for i in range(function.n_out())
+        }
+        self._buffer, self._evaluate = function.buffer()
+        for i, array in enumerate(self.inputs.values()):
+            self._buffer.set_arg(i, memoryview(array))
+        for i, array in enumerate(self.outputs.values()):
+            self._buffer.set_res(i, memoryview(array))
+
+    def __call__(self) -> None:
+        """Evaluate with what stands in `inputs`, into `outputs`."""
+        self._evaluate()
+
+
+def stacked(
+    name: str,
+    arguments: Mapping[str, ca.SX],
+    results: Mapping[str, ca.SX],
+    shared: Mapping[str, Vector] | None = None,
+) -> StackedFunction:
+    """Buffered function whose results share one flat array, so that one copy keeps them all."""
+    sizes = [result.numel() for result in results.values()]
+    ends = np.cumsum(sizes)
+    function = ca.Function(
+        name,
+        [ca.densify(argument) for argument in arguments.values()],
+        [ca.densify(ca.veccat(*results.values()))],
+        list(arguments),
+        ["stack"],
+        {"cse": True},
+    )
+    slices = {
+        key: slice(int(end) - size, int(end))
+        for key, size, end in zip(results, sizes, ends, strict=True)
+    }
+    shapes = {key: value.shape for key, value in results.items()}
+    return StackedFunction(function, slices, shapes, shared)
+
+
+class StackedFunction(BufferedFunction):
+    """A buffered function with one output array, cut into named parts."""
+
+    def __init__(
+        self,
+        function: ca.Function,
+        slices: dict[str, slice],
+        shapes: dict[str, tuple[int, int]],
+        shared: Mapping[str, Vector] | None = None,
+    ) -> None:
+        super().__init__(function, shared)
+        self.slices = slices
+        self.shapes = shapes
+        self.stack: Vector = self.outputs["stack"]
+
+    def part(self, name: str, stack: Vector | None = None) -> Vector:
+        """View of a result, transposed to row-major: shape (columns, rows), or flat for a column.
+
+        It looks into the function's own output or into a copy of it.
+        """
+        flat = (self.stack if stack is None else stack)[self.slices[name]]
+        rows, columns = self.shapes[name]
+        return flat if columns == 1 else flat.reshape(columns, rows)

@@ -1,1 +1,21 @@
-"""The evaporator as FMUs: C sources, variable table, build and reference signals."""
+"""The evaporator as an FMU: C sources, table of variables, build and the built files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fmus.errors import BuildError, CheckError, FmuError
+
+__all__ = ["BuildError", "CheckError", "FmuError", "path"]
+
+_NAMES = ("evaporator", "evaporator_fmi3")
+
+
+def path(name: str = "evaporator") -> Path:
+    """The path of a shipped FMU: ``evaporator`` (FMI 2.0) or ``evaporator_fmi3`` (FMI 3.0).
+
+    Raises FmuError for another name.
+    """
+    if name not in _NAMES:
+        raise FmuError(f"there is no FMU {name!r}; shipped are {', '.join(_NAMES)}")
+    return Path(__file__).parent / f"{name}.fmu"

@@ -1,0 +1,262 @@
+"""Generate `modelDescription.xml` for FMI 2.0 and FMI 3.0, and the build description."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal
+from xml.etree import ElementTree
+
+from fmus.dependencies import continuous_dependencies, initial_dependencies
+from fmus.variables import LAWS, UNITS, VARIABLES, Kind, Type, Variable, value_reference
+
+FmiVersion = Literal[2, 3]
+
+MODEL_NAME = "Evaporator"
+MODEL_IDENTIFIER = "evaporator"
+MODEL_VERSION = "1.0.0"
+DESCRIPTION = "Stochastic evaporation process, the plant of the RTI co-simulation benchmark"
+LICENSE = "MIT"
+
+_LOG_CATEGORIES = {
+    "logEvents": "events",
+    "logStatusWarning": "warnings",
+    "logStatusDiscard": "calls that were discarded, and why",
+    "logStatusError": "calls that were refused, and why",
+}
+_CAUSALITY = {
+    Kind.INDEPENDENT: ("independent", "continuous", None),
+    Kind.INPUT: ("input", "continuous", None),
+    Kind.STATE: ("output", "continuous", "calculated"),
+    Kind.DERIVATIVE: ("local", "continuous", "calculated"),
+    Kind.OUTPUT: ("output", "continuous", "calculated"),
+    Kind.FIXED: ("parameter", "fixed", "exact"),
+    Kind.TUNABLE: ("parameter", "tunable", "exact"),
+}
+_INT32 = ("-2147483648", "2147483647")
+_COMMON_CAPABILITIES = {"canBeInstantiatedOnlyOncePerProcess": "false"}
+
+
+def exported(version: FmiVersion) -> list[Variable]:
+    """The variables of the table that FMI `version` shows."""
+    return [v for v in VARIABLES if version == 2 or v.type is not Type.SEED_HIGH]
+
+
+def model_description(version: FmiVersion, token: str) -> str:
+    """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
+    root = _root(version, token)
+    _interfaces(root, version)
+    _units(root, version)
+    _types(root, version)
+    categories = ElementTree.SubElement(root, "LogCategories")
+    for name, text in _LOG_CATEGORIES.items():
+        ElementTree.SubElement(categories, "Category", name=name, description=text)
+    ElementTree.SubElement(
+        root, "DefaultExperiment", startTime="0", stopTime="6000", tolerance="1e-8", stepSize="60"
+    )
+    variables = ElementTree.SubElement(root, "ModelVariables")
+    for variable in exported(version):
+        (_variable2 if version == 2 else _variable3)(variables, variable)
+    (_structure2 if version == 2 else _structure3)(root)
+    return _text(root)
+
+
+def build_description(version: FmiVersion) -> str:
+    """The text of sources/buildDescription.xml: one C99 source file, linked with libm."""
+    root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
+    build = ElementTree.SubElement(
+        root,
+        "BuildConfiguration",
+        modelIdentifier=MODEL_IDENTIFIER,
+        description="Shared library; -ffp-contract=off keeps the results bit-identical",
+    )
+    sources = ElementTree.SubElement(
+        build, "SourceFileSet", language="C99", compilerOptions="-O2 -ffp-contract=off"
+    )
+    ElementTree.SubElement(sources, "SourceFile", name=f"fmi{version}.c")
+    ElementTree.SubElement(build, "Library", name="m")
+    return _text(root)
+
+
+def _text(root: ElementTree.Element) -> str:
+    ElementTree.indent(root, "  ")
+    body = ElementTree.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{body}\n'
+
+
+def _root(version: FmiVersion, token: str) -> ElementTree.Element:
+    key = "guid" if version == 2 else "instantiationToken"
+    attributes = {
+        "fmiVersion": f"{version}.0",
+        "modelName": MODEL_NAME,
+        key: token,
+        "description": DESCRIPTION,
+        "version": MODEL_VERSION,
+        "license": LICENSE,
+        "generationTool": "rti-cosim",
+        "variableNamingConvention": "structured",
+    }
+    if version == 2:
+        attributes["numberOfEventIndicators"] = "0"
+    return ElementTree.Element("fmiModelDescription", attributes)
+
+
+def _interfaces(root: ElementTree.Element, version: FmiVersion) -> None:
+    exchange = {"modelIdentifier": MODEL_IDENTIFIER, **_COMMON_CAPABILITIES}
+    if version == 2:
+        exchange |= {
+            "canNotUseMemoryManagementFunctions": "true",
+            "canGetAndSetFMUstate": "true",
+            "canSerializeFMUstate": "true",
+            "providesDirectionalDerivative": "true",
+        }
+    else:
+        exchange |= {
+            "canGetAndSetFMUState": "true",
+            "canSerializeFMUState": "true",
+            "providesDirectionalDerivatives": "true",
+            "providesAdjointDerivatives": "true",
+        }
+    simulation = {**exchange, "canHandleVariableCommunicationStepSize": "true"}
+    for tag, attributes in (("ModelExchange", exchange), ("CoSimulation", simulation)):
+        element = ElementTree.SubElement(root, tag, attributes)
+        if version == 2:
+            sources = ElementTree.SubElement(element, "SourceFiles")
+            ElementTree.SubElement(sources, "File", name="fmi2.c")
+
+
+def _units(root: ElementTree.Element, version: FmiVersion) -> None:
+    units = ElementTree.SubElement(root, "UnitDefinitions")
+    for unit in UNITS:
+        element = ElementTree.SubElement(units, "Unit", name=unit.name)
+        base = {name: str(exponent) for name, exponent in unit.exponents}
+        if unit.factor != 1.0:
+            base["factor"] = repr(unit.factor)
+        if unit.offset != 0.0:
+            base["offset"] = repr(unit.offset)
+        ElementTree.SubElement(element, "BaseUnit", base)
+
+
+def _types(root: ElementTree.Element, version: FmiVersion) -> None:
+    types = ElementTree.SubElement(root, "TypeDefinitions")
+    if version == 2:
+        simple = ElementTree.SubElement(types, "SimpleType", name="Law")
+        enumeration = ElementTree.SubElement(simple, "Enumeration")
+    else:
+        enumeration = ElementTree.SubElement(types, "EnumerationType", name="Law")
+    for name, value, text in LAWS:
+        ElementTree.SubElement(enumeration, "Item", name=name, value=str(value), description=text)
+
+
+def _common(variable: Variable) -> dict[str, str]:
+    causality, variability, initial = _CAUSALITY[variable.kind]
+    attributes = {
+        "name": variable.name,
+        "valueReference": str(value_reference(variable.name)),
+        "description": variable.description,
+        "causality": causality,
+        "variability": variability,
+    }
+    if initial is not None:
+        attributes["initial"] = initial
+    return attributes
+
+
+def _real(variable: Variable) -> dict[str, str]:
+    attributes = {"unit": variable.unit}
+    for key in ("min", "max", "nominal", "start"):
+        value = getattr(variable, key)
+        if value is not None and not (key == "nominal" and value == 0.0):
+            attributes[key] = repr(float(value))
+    return attributes
+
+
+def _boolean(variable: Variable) -> dict[str, str]:
+    return {"start": "true" if variable.start else "false"}
+
+
+def _state_of(variable: Variable) -> str:
+    return variable.name.removeprefix("der(").removesuffix(")")
+
+
+def _index2(name: str) -> int:
+    return [v.name for v in exported(2)].index(name) + 1
+
+
+def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
+    scalar = ElementTree.SubElement(parent, "ScalarVariable", _common(variable))
+    if variable.type is Type.BOOLEAN:
+        ElementTree.SubElement(scalar, "Boolean", _boolean(variable))
+    elif variable.type is Type.LAW:
+        ElementTree.SubElement(scalar, "Enumeration", declaredType="Law", min="1", max="2", start="1")
+    elif variable.type in (Type.SEED, Type.SEED_HIGH):
+        ElementTree.SubElement(scalar, "Integer", min=_INT32[0], max=_INT32[1], start="0")
+    else:
+        attributes = _real(variable)
+        if variable.kind is Kind.DERIVATIVE:
+            attributes["derivative"] = str(_index2(_state_of(variable)))
+        ElementTree.SubElement(scalar, "Real", attributes)
+
+
+def _variable3(parent: ElementTree.Element, variable: Variable) -> None:
+    attributes = _common(variable)
+    if variable.type is Type.BOOLEAN:
+        ElementTree.SubElement(parent, "Boolean", attributes | _boolean(variable))
+    elif variable.type is Type.LAW:
+        law = {"declaredType": "Law", "min": "1", "max": "2", "start": "1"}
+        ElementTree.SubElement(parent, "Enumeration", attributes | law)
+    elif variable.type is Type.SEED:
+        seed = {"min": "0", "max": str(2**64 - 1), "start": "0"}
+        ElementTree.SubElement(parent, "UInt64", attributes | seed)
+    else:
+        attributes |= _real(variable)
+        if variable.kind is Kind.DERIVATIVE:
+            attributes["derivative"] = str(value_reference(_state_of(variable)))
+        ElementTree.SubElement(parent, "Float64", attributes)
+
+
+def _names(*kinds: Kind) -> list[str]:
+    return [v.name for v in VARIABLES if v.kind in kinds]
+
+
+_UNKNOWNS = (
+    ("Output", "Outputs", (Kind.STATE, Kind.OUTPUT), False),
+    ("ContinuousStateDerivative", "Derivatives", (Kind.DERIVATIVE,), False),
+    ("InitialUnknown", "InitialUnknowns", (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT), True),
+)
+
+
+def _kinds_text(name: str, dependencies: Iterable[str]) -> str:
+    """The states depend on themselves or on their start with constant factor 1."""
+    is_state = name in _names(Kind.STATE)
+    return " ".join("constant" if is_state else "dependent" for _ in dependencies)
+
+
+def _structure2(root: ElementTree.Element) -> None:
+    structure = ElementTree.SubElement(root, "ModelStructure")
+    for _, tag, kinds, initial in _UNKNOWNS:
+        group = ElementTree.SubElement(structure, tag)
+        for name in _names(*kinds):
+            names = initial_dependencies(name) if initial else continuous_dependencies(name)
+            ElementTree.SubElement(
+                group,
+                "Unknown",
+                index=str(_index2(name)),
+                dependencies=" ".join(str(_index2(n)) for n in names),
+                dependenciesKind=_kinds_text(name, names),
+            )
+
+
+def _structure3(root: ElementTree.Element) -> None:
+    structure = ElementTree.SubElement(root, "ModelStructure")
+    shown = {v.name for v in exported(3)}
+    for tag, _, kinds, initial in _UNKNOWNS:
+        for name in _names(*kinds):
+            names = initial_dependencies(name) if initial else continuous_dependencies(name)
+            names = tuple(n for n in names if n in shown)
+            ElementTree.SubElement(
+                structure,
+                tag,
+                valueReference=str(value_reference(name)),
+                dependencies=" ".join(str(value_reference(n)) for n in names),
+                dependenciesKind=_kinds_text(name, names),
+            )

@@ -1,0 +1,70 @@
+"""Generate the C header `sources/variables.h` from the table of variables."""
+
+from __future__ import annotations
+
+from fmus.variables import VARIABLES, Kind, Type, Variable
+
+_TYPES = {
+    Type.REAL: "REAL",
+    Type.BOOLEAN: "BOOLEAN",
+    Type.LAW: "LAW",
+    Type.SEED: "SEED",
+    Type.SEED_HIGH: "SEED_HIGH",
+}
+_KINDS = {
+    Kind.INDEPENDENT: "INDEPENDENT",
+    Kind.INPUT: "INPUT",
+    Kind.STATE: "STATE",
+    Kind.DERIVATIVE: "DERIVATIVE",
+    Kind.OUTPUT: "OUTPUT",
+    Kind.FIXED: "FIXED",
+    Kind.TUNABLE: "TUNABLE",
+}
+_SEED_MAX = 4294967295.0
+
+
+def c_header(token: str) -> str:
+    """The header's text: value references, types, starts and ranges, and the model's `token`."""
+    references = "\n".join(f"    VR_{v.identifier} = {i}," for i, v in enumerate(VARIABLES))
+    rows = "\n".join(f"    {_row(variable)}," for variable in VARIABLES)
+    return f"""\
+/* Generated from fmus/variables.py by `cosim fmu build --in-place`; do not edit. */
+#ifndef VARIABLES_H
+#define VARIABLES_H
+
+#define MODEL_TOKEN "{token}"
+
+enum {{
+{references}
+    N_VARIABLES = {len(VARIABLES)}
+}};
+
+typedef enum {{ {", ".join(_TYPES.values())} }} VariableType;
+
+typedef enum {{ {", ".join(_KINDS.values())} }} VariableKind;
+
+typedef struct {{
+    const char *name;
+    VariableType type;
+    VariableKind kind;
+    double start, min, max, nominal;
+}} VariableInfo;
+
+static const VariableInfo VARIABLES[N_VARIABLES] = {{
+{rows}
+}};
+
+#endif
+"""
+
+
+def _row(variable: Variable) -> str:
+    seed = variable.type in (Type.SEED, Type.SEED_HIGH)
+    numbers = (
+        variable.start,
+        0.0 if seed else variable.min,
+        _SEED_MAX if seed else variable.max,
+        1.0 if variable.nominal is None else variable.nominal,
+    )
+    values = ", ".join(repr(float(number or 0.0)) for number in numbers)
+    return f'{{"{variable.name}", {_TYPES[variable.type]}, {_KINDS[variable.kind]}, {values}}}'

@@ -1,0 +1,95 @@
+/* The experiment: initialisation and the co-simulation step. */
+#ifndef SIMULATION_H
+#define SIMULATION_H
+
+#include "instance.h"
+
+/* A step that would take longer than about a second is refused. */
+#define MAX_STEPS_PER_CALL 4194304
+
+static double time_tolerance(double time) { return 1e-9 * fmax(1.0, fabs(time)); }
+
+static Status set_experiment(Instance *instance, const char *function, double start_time,
+                             int stop_defined, double stop_time) {
+    const Grid finest = make_grid(VARIABLES[VR_sampling_time].min);
+    if (!isfinite(start_time) || !on_grid_range(finest, start_time))
+        return report(instance, ERROR, "%s: start time %g is not usable.", function, start_time);
+    if (stop_defined && !(isfinite(stop_time) && stop_time >= start_time))
+        return report(instance, ERROR, "%s: stop time %g is before the start time %g.", function,
+                      stop_time, start_time);
+    instance->state.experiment_defined = 1;
+    instance->state.start_time = start_time;
+    instance->state.stop_time = stop_defined ? stop_time : INFINITY;
+    instance->state.v[VR_time] = start_time;
+    instance->state.outputs_current = 0;
+    return OK;
+}
+
+static Status check_time(const Instance *instance, const char *function, double time) {
+    if (!isfinite(time)) return report(instance, ERROR, "%s: the time is not finite.", function);
+    if (!on_grid_range(make_grid(instance->state.v[VR_sampling_time]), time))
+        return report(instance, ERROR, "%s: time %g is out of range.", function, time);
+    return OK;
+}
+
+static Status check_stop_time(const Instance *instance, const char *function, double time) {
+    const double stop_time = instance->state.stop_time;
+    if (time <= stop_time + time_tolerance(stop_time)) return OK;
+    return report(instance, ERROR, "%s: time %.17g is past the stop time %.17g.", function, time,
+                  stop_time);
+}
+
+static void leave_initialization(Instance *instance) {
+    State *state = &instance->state;
+    refresh(state);
+    state->mode = state->interface == CO_SIMULATION ? STEP : EVENT;
+}
+
+/* Integrate within one integration step, in which input and disturbance are constant. */
+static void integrate(State *state, int64_t sample, double h) {
+    move_to_sample(state, sample);
+    realise_disturbances(state);
+    runge_kutta(state->v, h);
+}
+
+static Status do_step(Instance *instance, const char *function, double time, double h) {
+    State *state = &instance->state;
+    const Grid grid = make_grid(state->v[VR_sampling_time]);
+    const double end = time + h;
+    State before;
+    Status status;
+    if (!isfinite(time) || !isfinite(h) || !(h > 0.0))
+        return report(instance, ERROR, "%s: communication point %g with step size %g.", function,
+                      time, h);
+    if (fabs(time - state->v[VR_time]) > time_tolerance(time))
+        return report(instance, ERROR,
+                      "%s: the communication point is %.17g but the instance is at %.17g.",
+                      function, time, state->v[VR_time]);
+    status = check_time(instance, function, end);
+    if (status == OK) status = check_stop_time(instance, function, end);
+    if (status != OK) return status;
+    const GridPosition from = locate(grid, time), to = locate(grid, end);
+    if (to.point - from.point > MAX_STEPS_PER_CALL)
+        return report(instance, DISCARD, "%s: step size %g s needs more than %d integration steps.",
+                      function, h, MAX_STEPS_PER_CALL);
+    before = *state;
+    if (from.point == to.point) {
+        integrate(state, sample_of(grid, from.point), (to.fraction - from.fraction) * grid.step);
+    } else {
+        int64_t point = from.point;
+        integrate(state, sample_of(grid, point), (1.0 - from.fraction) * grid.step);
+        while (++point < to.point) integrate(state, sample_of(grid, point), grid.step);
+        if (to.fraction > 0.0)
+            integrate(state, sample_of(grid, to.point), to.fraction * grid.step);
+    }
+    if (!isfinite(state->v[VR_X2]) || !isfinite(state->v[VR_P2])) {
+        *state = before;
+        return report(instance, ERROR, "%s: the states left the finite numbers.", function);
+    }
+    move_to_sample(state, sample_of(grid, to.point));
+    state->v[VR_time] = end;
+    state->outputs_current = 0;
+    return OK;
+}
+
+#endif

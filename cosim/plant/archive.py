@@ -1,0 +1,126 @@
+"""FMU archives: found by name or path, checked, unpacked once per process and shared."""
+
+from __future__ import annotations
+
+import hashlib
+import stat
+import tempfile
+import threading
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import fmpy
+from fmpy.model_description import ValidationError, read_model_description
+
+import fmus
+from cosim.errors import PlantError
+
+SHIPPED = ("evaporator", "evaporator_fmi3")
+MAX_ENTRIES = 20_000
+MAX_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class UnpackedFmu:
+    """An FMU on disk: the archive's path and SHA-256, the folder that holds its content."""
+
+    path: Path
+    sha256: str
+    folder: Path
+    description: Any
+
+
+_unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
+_folders: list[tempfile.TemporaryDirectory[str]] = []
+_lock = threading.Lock()
+
+
+def unpack(fmu: str | Path) -> UnpackedFmu:
+    """Unpack an FMU, shipped (by name) or foreign (by path), and read its model description.
+
+    An FMU is native code that runs with the caller's rights, so a foreign one is taken only from
+    the very path given. Raises PlantError on a missing, corrupt or suspicious archive.
+    """
+    path = _locate(fmu).resolve()
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise PlantError(f"FMU '{path}' cannot be read: {error.strerror}") from None
+    key = (path, status.st_mtime_ns, status.st_size)
+    with _lock:
+        if key not in _unpacked:
+            _unpacked[key] = _unpack(path)
+        return _unpacked[key]
+
+
+def _locate(fmu: str | Path) -> Path:
+    if str(fmu) in SHIPPED:
+        return Path(fmus.path(str(fmu)))
+    path = Path(fmu)
+    if path.suffix != ".fmu" and len(path.parts) == 1:
+        raise PlantError(
+            f"unknown FMU '{fmu}'; shipped are {', '.join(SHIPPED)}, or give the path of an .fmu"
+        )
+    if not path.is_file():
+        raise PlantError(f"FMU '{path}' does not exist or is not a file")
+    return path
+
+
+def _unpack(path: Path) -> UnpackedFmu:
+    folder = tempfile.TemporaryDirectory(prefix="cosim-fmu-")
+    try:
+        with path.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        with zipfile.ZipFile(path) as archive:
+            _check_entries(path, archive.infolist())
+            archive.extractall(folder.name)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise PlantError(
+            f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
+        ) from None
+    except OSError as error:
+        raise PlantError(f"FMU '{path}' cannot be unpacked: {error}") from None
+    description = _describe(path, Path(folder.name))
+    _folders.append(folder)
+    return UnpackedFmu(path, digest, Path(folder.name), description)
+
+
+def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse what no honest FMU contains: paths that lead outside, links, absurd size."""
+    if len(entries) > MAX_ENTRIES:
+        raise PlantError(f"FMU '{path}' is refused: more than {MAX_ENTRIES} entries")
+    if sum(entry.file_size for entry in entries) > MAX_BYTES:
+        raise PlantError(f"FMU '{path}' is refused: unpacks to more than {MAX_BYTES >> 20} MiB")
+    for entry in entries:
+        name = PurePosixPath(entry.orig_filename)
+        illegal = "\\" in entry.orig_filename or ":" in entry.orig_filename
+        if illegal or name.is_absolute() or ".." in name.parts or "\0" in entry.orig_filename:
+            raise PlantError(
+                f"FMU '{path}' is refused: entry {entry.orig_filename!r} leads outside its folder"
+            )
+        if stat.S_ISLNK(entry.external_attr >> 16):
+            raise PlantError(f"FMU '{path}' is refused: entry '{name}' is a link")
+
+
+def _describe(path: Path, folder: Path) -> Any:
+    if not (folder / "modelDescription.xml").is_file():
+        raise PlantError(f"'{path}' is not an FMU: it has no modelDescription.xml")
+    try:
+        return read_model_description(str(folder))
+    except ValidationError as error:
+        problems = error.problems
+        raise PlantError(
+            f"FMU '{path}' has an invalid model description: {problems[0]}"
+            + (f" ({len(problems) - 1} more)" if len(problems) > 1 else "")
+        ) from None
+    # fmpy raises bare Exception and whatever lxml does on text that is not XML.
+    except Exception as error:
+        raise PlantError(f"FMU '{path}' has an unreadable model description: {error}") from None
+
+
+def binary_folder(version: str) -> str:
+    """Name of this platform's folder under `binaries/` in FMI 2 or FMI 3."""
+    return str(fmpy.platform if version.startswith("2") else fmpy.platform_tuple)

@@ -1,0 +1,268 @@
+"""The plant as the closed loop sees it: reset, step, snapshot, restore."""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from collections.abc import Sequence
+from math import isfinite
+from pathlib import Path
+from types import TracebackType
+from typing import NoReturn, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import PlantError
+from cosim.penalty import Penalty
+from cosim.plant.archive import unpack
+from cosim.plant.fmi2 import Fmi2Instance
+from cosim.plant.fmi3 import Fmi3Instance
+from cosim.plant.instance import Instance
+from cosim.plant.wiring import Wirer
+from cosim.protocols import Step
+from cosim.scenario import Scenario
+
+Array = NDArray[np.float64]
+_HEADER = struct.Struct("<8sq32s")
+_MAGIC = b"cosimfs1"
+_NOT_STARTED = -1
+
+
+class Snapshot:
+    """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
+
+    Its memory belongs to the FMU and is handed to a later snapshot when this one is dropped.
+    """
+
+    __slots__ = ("_plant", "handle", "k")
+
+    def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
+        self._plant = plant
+        self.handle = handle
+        self.k = k
+
+    def belongs_to(self, plant: FmuPlant) -> bool:
+        """Whether the plant made this snapshot."""
+        return self._plant is plant
+
+    def __del__(self) -> None:
+        """Give the memory back to the plant."""
+        self._plant.recycle(self.handle)
+
+
+class FmuPlant:
+    """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
+
+    At sample k, time k·h: the action is written, ℓ(x_k, u_k, d_k) and d_k are read, the FMU steps
+    by the sampling time h, and x_{k+1} is read. Use it as a context manager, or call `close`.
+    An FMU is native code: name only files that you trust.
+
+    Parameters
+    ----------
+    scenario : a `Scenario`, or what `Scenario.load` takes.
+    fmu : FMU to use in place of the scenario's, a shipped one's name or a path.
+
+    Raises PlantError if the FMU is missing, corrupt, has no co-simulation binary for this
+    platform or lacks a variable that the scenario names; CapabilityError when a capability that
+    the FMU lacks is asked for, not before.
+    """
+
+    def __init__(self, scenario: Scenario | str | Path, fmu: str | Path | None = None) -> None:
+        self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+        self._fmi: Instance | None = None
+        self._handles: list[ctypes.c_void_p] = []
+        self._free_handles: list[ctypes.c_void_p] = []
+        unpacked = unpack(self.scenario.plant.fmu if fmu is None else fmu)
+        version = str(unpacked.description.fmiVersion)
+        if unpacked.description.coSimulation is None:
+            raise PlantError(f"FMU '{unpacked.path}' has no co-simulation interface")
+        if version[0] not in "23":
+            raise PlantError(f"FMU '{unpacked.path}' is FMI {version}; 2.0 and 3.0 are supported")
+        interface = Fmi2Instance if version[0] == "2" else Fmi3Instance
+        wirer = Wirer(self.scenario, unpacked, interface)
+        self.fmi_version = version
+        self.fmu_path = unpacked.path
+        self.fmu_sha256 = unpacked.sha256
+        self.units = wirer.units()
+        self.penalty = Penalty(
+            self.scenario.state_lower,
+            self.scenario.state_upper,
+            self.scenario.penalty_linear,
+            self.scenario.penalty_quadratic,
+        )
+        self._seeds = wirer.seeds()
+        self._h = self.scenario.sampling_time
+        self._m = len(self.scenario.plant.actions)
+        self._k = _NOT_STARTED
+        self._started = False
+        self._penalty_now = 0.0
+        self._fmi = interface(unpacked, wirer.wiring(), self._h)
+        self._advance = self._fmi.advance
+        self._inputs = self._fmi.inputs
+        self._outputs = self._fmi.outputs
+        self._states = self._fmi.states
+        self._copy_states = self._fmi.states_view.copy
+        self._copy_disturbances = self._fmi.outputs_view[1:].copy
+
+    @property
+    def k(self) -> int:
+        """Number of steps since the reset."""
+        return self._k
+
+    @property
+    def time(self) -> float:
+        """Time k·h in s, not accumulated."""
+        return self._k * self._h
+
+    @property
+    def state(self) -> Array:
+        """Present state, (n,), a copy."""
+        return self._copy_states()
+
+    def reset(self, seed: int) -> Array:
+        """Start again at k = 0 with the disturbances of a seed in [0, 2⁶⁴); return the state (n,).
+
+        Every start value is written anew, so that nothing of an earlier episode remains.
+        """
+        fmi = self._instance
+        if not 0 <= seed < 1 << 64:
+            raise PlantError(f"seed {seed} is not in [0, 2^64)")
+        word = int(seed)
+        for reference, width in self._seeds:
+            fmi.change_start(reference, word if width == 64 else word & 0xFFFFFFFF)
+            word >>= 32
+        self._k = _NOT_STARTED
+        fmi.initialise(self._started)
+        self._started = True
+        self._k = 0
+        self._penalty_now = self.penalty(self._states)
+        return self._copy_states()
+
+    def step(self, a: Sequence[float] | Array) -> Step:
+        """Hold the action a (m,) for one sampling time; raises PlantError, then needs a reset."""
+        try:
+            values = a.tolist() if isinstance(a, np.ndarray) else list(a)
+            acceptable = len(values) == self._m and isfinite(sum(values))
+        except TypeError:
+            acceptable = False
+        if not acceptable:
+            self._refuse(a)
+        if self._k < 0:
+            self._refuse_unstarted()
+        self._inputs[:] = values
+        penalty, k = self._penalty_now, self._k
+        self._k = _NOT_STARTED
+        self._advance(k * self._h)
+        states, cost = self._states, self._outputs[0]
+        if not isfinite(cost + sum(states)):
+            self._refuse_output(k)
+        self._k = k + 1
+        self._penalty_now = self.penalty(states)
+        return Step(self._copy_states(), cost, penalty, self._copy_disturbances())
+
+    def snapshot(self) -> Snapshot:
+        """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""
+        fmi = self._instance
+        if self._k < 0:
+            self._refuse_unstarted()
+        handle = self._handle()
+        fmi.save(handle)
+        return Snapshot(self, handle, self._k)
+
+    def restore(self, snapshot: Snapshot) -> Array:
+        """Go back to a snapshot of this very plant; return its state (n,)."""
+        fmi = self._instance
+        if not snapshot.belongs_to(self):
+            raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
+        fmi.load(snapshot.handle)
+        self._k = snapshot.k
+        self._penalty_now = self.penalty(self._states)
+        return self._copy_states()
+
+    def serialise(self, snapshot: Snapshot) -> bytes:
+        """Return a snapshot as bytes for `deserialise`, also in another process."""
+        fmi = self._instance
+        if not snapshot.belongs_to(self):
+            raise PlantError("this snapshot was taken from another plant")
+        digest = bytes.fromhex(self.fmu_sha256)
+        return _HEADER.pack(_MAGIC, snapshot.k, digest) + fmi.serialise(snapshot.handle)
+
+    def deserialise(self, data: bytes) -> Snapshot:
+        """Return the snapshot that `serialise` wrote, of any plant with the very same FMU file."""
+        fmi = self._instance
+        if len(data) < _HEADER.size or data[:8] != _MAGIC:
+            raise PlantError("these bytes are not a serialised plant state")
+        _, k, digest = _HEADER.unpack_from(data)
+        if digest.hex() != self.fmu_sha256:
+            raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
+        if k < 0:
+            raise PlantError("these bytes are not a serialised plant state")
+        if not self._started:
+            self.reset(0)
+        handle = self._handle()
+        fmi.deserialise(data[_HEADER.size :], handle)
+        return Snapshot(self, handle, k)
+
+    def recycle(self, handle: ctypes.c_void_p) -> None:
+        """Keep a dropped snapshot's memory for the next one."""
+        if self._fmi is not None:
+            self._free_handles.append(handle)
+
+    def close(self) -> None:
+        """Free the FMU instance and every snapshot; a closed plant refuses all calls."""
+        if self._fmi is None:
+            return
+        fmi, self._fmi = self._fmi, None
+        self._k = _NOT_STARTED
+        for handle in self._handles:
+            fmi.free(handle)
+        fmi.close()
+
+    def __enter__(self) -> Self:
+        """Return the plant itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the plant."""
+        self.close()
+
+    def __del__(self) -> None:
+        """Free the instance of a plant that nobody closed."""
+        if getattr(self, "_fmi", None) is not None:
+            self.close()
+
+    def _handle(self) -> ctypes.c_void_p:
+        """A dropped snapshot's memory, or none yet: the FMU allocates what it needs."""
+        if self._free_handles:
+            return self._free_handles.pop()
+        handle = ctypes.c_void_p()
+        self._handles.append(handle)
+        return handle
+
+    @property
+    def _instance(self) -> Instance:
+        if self._fmi is None:
+            raise PlantError("the plant is closed")
+        return self._fmi
+
+    def _refuse(self, a: object) -> NoReturn:
+        names = ", ".join(self.scenario.plant.actions)
+        raise PlantError(f"action must be {self._m} finite numbers ({names}), not {a}")
+
+    def _refuse_unstarted(self) -> NoReturn:
+        if self._fmi is None:
+            raise PlantError("the plant is closed")
+        raise PlantError("call reset first: no episode has begun, or an error ended it")
+
+    def _refuse_output(self, k: int) -> NoReturn:
+        table = self.scenario.plant
+        values = {table.stage_cost: self._outputs[0]}
+        values |= dict(zip(table.states, self._states, strict=True))
+        bad = ", ".join(f"{name} = {value}" for name, value in values.items() if value - value != 0)
+        raise PlantError(f"FMU '{self.fmu_path.name}' returned {bad} at step {k}")

@@ -1,0 +1,133 @@
+"""Finds a scenario's variables in an FMU and turns them into value references."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from cosim.errors import PlantError
+from cosim.plant.archive import UnpackedFmu
+from cosim.plant.instance import Instance, StartValue, Wiring
+from cosim.scenario import Scenario
+from cosim.validation import suggestion
+
+_WIDE = ("Int64", "UInt64")
+
+
+class Wirer:
+    """Looks up the variables of one FMU for one scenario; raises PlantError on any misfit."""
+
+    def __init__(self, scenario: Scenario, fmu: UnpackedFmu, interface: type[Instance]) -> None:
+        self._scenario = scenario
+        self._fmu = fmu
+        self._interface = interface
+        self._variables = {variable.name: variable for variable in fmu.description.modelVariables}
+
+    def wiring(self) -> Wiring:
+        """Value references of inputs, outputs (stage cost first), states and start values."""
+        plant = self._scenario.plant
+        outputs = (plant.stage_cost, *plant.disturbances)
+        return Wiring(
+            inputs=[self._input(name) for name in plant.actions],
+            outputs=[self._real(name, "plant") for name in outputs],
+            states=[self._real(name, "plant.states") for name in plant.states],
+            starts=self._starts(),
+        )
+
+    def seeds(self) -> list[tuple[int, int]]:
+        """Value reference and width in bits of the variables that take the seed, low word first."""
+        words = []
+        for name in self._scenario.plant.mapping.seed:
+            variable = self._find(name, "plant.mapping.seed")
+            wide = variable.type in _WIDE
+            words.append((int(variable.valueReference), 64 if wide else 32))
+            if wide:
+                break
+        return words
+
+    def units(self) -> dict[str, str]:
+        """Unit of each exchanged variable by name, empty where the FMU states none."""
+        plant = self._scenario.plant
+        names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
+        return {name: _unit(self._find(name, "plant")) for name in names}
+
+    def _starts(self) -> list[StartValue]:
+        scenario, mapping = self._scenario, self._scenario.plant.mapping
+        law = scenario.disturbance
+        starts = [
+            *self._start("initial_state", mapping.initial_state, scenario.plant.initial_state),
+            *self._start("sampling_time", mapping.sampling_time, [scenario.sampling_time]),
+            *self._start("stochastic", mapping.stochastic, [float(law.law != "none")]),
+        ]
+        if law.law in mapping.law_codes:
+            starts += self._start("law", mapping.law, [float(mapping.law_codes[law.law])])
+        if law.nominal:
+            starts += self._start("nominal", mapping.nominal, law.nominal)
+        if law.ranges:
+            starts += self._start("ranges", mapping.ranges, law.ranges)
+        for name, value in scenario.plant.parameters.items():
+            starts.append(self._start_value(name, float(value), "plant.parameters"))
+        for reference, width in self.seeds():
+            starts.append(StartValue(reference, self._seed_type(width, reference), 0.0))
+        return starts
+
+    def _start(
+        self, field: str, names: str | Iterable[str] | None, values: Iterable[float]
+    ) -> list[StartValue]:
+        names = [names] if isinstance(names, str) else list(names or ())
+        table = f"plant.mapping.{field}"
+        pairs = zip(names, values, strict=True) if names else ()
+        return [self._start_value(name, value, table) for name, value in pairs]
+
+    def _start_value(self, name: str, value: float, table: str) -> StartValue:
+        variable = self._find(name, table)
+        if variable.type not in self._interface.setters:
+            raise self._misfit(name, table, f"is a {variable.type}, which cannot be set here")
+        if variable.type not in ("Real", "Float64", "Float32") and value != int(value):
+            raise self._misfit(name, table, f"is a {variable.type} and cannot take {value}")
+        if variable.causality in ("output", "calculatedParameter", "independent"):
+            raise self._misfit(name, table, f"is a {variable.causality}: it has no start to set")
+        if variable.variability == "constant":
+            raise self._misfit(name, table, "is a constant")
+        return StartValue(int(variable.valueReference), variable.type, value)
+
+    def _seed_type(self, width: int, reference: int) -> str:
+        variables = self._fmu.description.modelVariables
+        variable = next(v for v in variables if v.valueReference == reference)
+        if width == 32 and variable.type not in ("Integer", "Int32", "UInt32"):
+            raise self._misfit(variable.name, "plant.mapping.seed", f"is a {variable.type}")
+        return str(variable.type)
+
+    def _input(self, name: str) -> int:
+        reference = self._real(name, "plant.actions")
+        variable = self._variables[name]
+        if variable.causality != "input" and variable.variability != "tunable":
+            raise self._misfit(name, "plant.actions", f"is a {variable.causality}, not an input")
+        return reference
+
+    def _real(self, name: str, table: str) -> int:
+        variable = self._find(name, table)
+        if variable.type != self._interface.real or variable.shape:
+            kind = f"{variable.type} array" if variable.shape else variable.type
+            raise self._misfit(name, table, f"is a {kind}, not a scalar {self._interface.real}")
+        return int(variable.valueReference)
+
+    def _find(self, name: str, table: str) -> Any:
+        if name not in self._variables:
+            raise PlantError(
+                f"FMU '{self._fmu.path.name}' has no variable '{name}'"
+                f"{suggestion(name, self._variables)}, which {table} of scenario "
+                f"'{self._scenario.name}' names"
+            )
+        return self._variables[name]
+
+    def _misfit(self, name: str, table: str, what: str) -> PlantError:
+        return PlantError(
+            f"variable '{name}' of FMU '{self._fmu.path.name}' {what}; {table} of scenario "
+            f"'{self._scenario.name}' names it"
+        )
+
+
+def _unit(variable: Any) -> str:
+    declared = variable.declaredType.unit if variable.declaredType is not None else None
+    return str(variable.unit or declared or "")

@@ -1,0 +1,206 @@
+"""A run's record: named, unit-bearing signals, with the clock's readings kept apart."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.storage import write_atomically
+from cosim.errors import TrajectoryError
+from cosim.scenario import Scenario
+
+Array = NDArray[np.float64]
+STATUS = "status"
+SOLVED = "solved"
+FALLBACK = "fallback"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A sampled quantity: its name, its unit ("" if it has none) and one value per sample."""
+
+    name: str
+    unit: str
+    values: Array
+
+    @property
+    def header(self) -> str:
+        """Column title in CSV, `name [unit]`."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The K samples of a closed-loop run on a scenario.
+
+    Signals, each (K,): `time` [s]; the scenario's states, actions and disturbances under their
+    FMU names; `stage_cost` ℓ(x_k, u_k, d_k) without penalty; `penalty` and `violation` Σᵢ vᵢ of
+    x_k at the true bounds; the controller's `value` and `residual` (NaN if it has none);
+    `explored` and `failed` (0 or 1). `status` has one word per sample, `fallback` where the
+    controller failed. `timing` holds wall-clock times [s] by name, (K,); `final_state` is x_K.
+    """
+
+    scenario: Scenario
+    signals: Mapping[str, Signal]
+    status: Sequence[str]
+    timing: Mapping[str, Array] = field(default_factory=dict)
+    final_state: Array | None = None
+    seed: int | None = None
+    controller: str = ""
+
+    def __post_init__(self) -> None:
+        """Check that every signal is there and has one value per sample."""
+        expected = signal_names(self.scenario)
+        if missing := [name for name in expected if name not in self.signals]:
+            raise TrajectoryError(f"the trajectory lacks the signal {', '.join(missing)}")
+        samples = len(self.status)
+        for signal in self.signals.values():
+            if signal.values.shape != (samples,):
+                raise TrajectoryError(
+                    f"signal '{signal.name}' has shape {signal.values.shape}, not ({samples},)"
+                )
+
+    def __len__(self) -> int:
+        """Return the number of samples K."""
+        return len(self.status)
+
+    def __getitem__(self, name: str) -> Array:
+        """Values of a signal by name, (K,)."""
+        if name not in self.signals:
+            raise TrajectoryError(f"no signal '{name}'; there are {', '.join(self.signals)}")
+        return self.signals[name].values
+
+    def _columns(self, names: Sequence[str]) -> Array:
+        return (
+            np.stack([self[name] for name in names], axis=1) if names else np.empty((len(self), 0))
+        )
+
+    @property
+    def time(self) -> Array:
+        """Sample instants k·h in s, (K,)."""
+        return self["time"]
+
+    @property
+    def states(self) -> Array:
+        """States x_k, (K, n)."""
+        return self._columns(self.scenario.plant.states)
+
+    @property
+    def actions(self) -> Array:
+        """Applied actions u_k, (K, m)."""
+        return self._columns(self.scenario.plant.actions)
+
+    @property
+    def disturbances(self) -> Array:
+        """Realised disturbances d_k, (K, p)."""
+        return self._columns(self.scenario.plant.disturbances)
+
+    def summary(self) -> dict[str, Any]:
+        """Per-sample means of the run and its counts; the same for the same signals.
+
+        `economic_cost` mean of ℓ; `mean_violation` mean of Σᵢ vᵢ; `violating_share` share of
+        samples with any vᵢ > 0; `J` mean of ℓ + penalty; `failures` samples under the fallback
+        action; `explored` samples that the exploration changed; `statuses` samples by status.
+        """
+        return {
+            "samples": len(self),
+            "economic_cost": float(np.mean(self["stage_cost"])),
+            "mean_violation": float(np.mean(self["violation"])),
+            "violating_share": float(np.mean(self["violation"] > 0)),
+            "J": float(np.mean(self["stage_cost"] + self["penalty"])),
+            "failures": int(np.sum(self["failed"])),
+            "explored": int(np.sum(self["explored"])),
+            "statuses": dict(sorted(Counter(self.status).items())),
+            "final_state": None if self.final_state is None else self.final_state.tolist(),
+        }
+
+    def timing_summary(self) -> dict[str, dict[str, float]]:
+        """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
+        return {
+            name: {
+                "median_us": float(np.median(values)) * 1e6,
+                "p95_us": float(np.quantile(values, 0.95)) * 1e6,
+                "p99_us": float(np.quantile(values, 0.99)) * 1e6,
+                "max_us": float(np.max(values)) * 1e6,
+            }
+            for name, values in self.timing.items()
+        }
+
+    def to_csv(self) -> str:
+        """Return the signals and the status as CSV text; floats read back to the same bits."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        signals = list(self.signals.values())
+        writer.writerow([*(signal.header for signal in signals), STATUS])
+        columns = [
+            (signal.values.astype(int) if signal.name in ("explored", "failed") else signal.values)
+            for signal in signals
+        ]
+        writer.writerows(
+            zip(*(map(repr, column.tolist()) for column in columns), self.status, strict=True)
+        )
+        return text.getvalue()
+
+    def write_csv(self, path: str | Path) -> Path:
+        """Write `to_csv` to a file, whole or not at all."""
+        write_atomically(path, self.to_csv())
+        return Path(path)
+
+    def write_timing_csv(self, path: str | Path) -> Path:
+        """Write the wall-clock times in µs to a file of their own, one row per sample."""
+        header = ",".join(f"{name} [us]" for name in self.timing)
+        rows = zip(*(values.tolist() for values in self.timing.values()), strict=True)
+        lines = (",".join(f"{1e6 * value:.3f}" for value in row) for row in rows)
+        write_atomically(path, "\n".join([header, *lines, ""]))
+        return Path(path)
+
+
+def signal_names(scenario: Scenario) -> list[str]:
+    """Names of a run's signals, in the order of the CSV's columns."""
+    plant = scenario.plant
+    return [
+        "time",
+        *plant.states,
+        *plant.actions,
+        *plant.disturbances,
+        "stage_cost",
+        "penalty",
+        "violation",
+        "value",
+        "residual",
+        "explored",
+        "failed",
+    ]
+
+
+def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:
+    """Read what `Trajectory.write_csv` wrote; raises TrajectoryError with file and line."""
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.reader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise TrajectoryError(f"trajectory '{path}' cannot be read: {error}") from None
+    if len(rows) < 2 or rows[0][-1] != STATUS:
+        raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
+    header, body = rows[0], rows[1:]
+    values = np.empty((len(body), len(header) - 1))
+    for number, row in enumerate(body, start=2):
+        if len(row) != len(header):
+            raise TrajectoryError(f"'{path}', line {number}: {len(row)} fields, not {len(header)}")
+        try:
+            values[number - 2] = [float(cell) for cell in row[:-1]]
+        except ValueError as error:
+            raise TrajectoryError(f"'{path}', line {number}: {error}") from None
+    signals = {}
+    for title, column in zip(header, values.T, strict=False):
+        name, _, unit = title.partition(" [")
+        signals[name] = Signal(name, unit.removesuffix("]"), column.copy())
+    return Trajectory(scenario, signals, [row[-1] for row in body])

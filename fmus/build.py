@@ -113,8 +113,6 @@ def build(folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     built = []
     for version, name in FILE_NAMES.items():
-        if not (SOURCES / f"fmi{version}.c").exists():
-            continue
         partial = folder / f".{name}.partial"
         archive(contents(version), partial)
         partial.replace(folder / name)

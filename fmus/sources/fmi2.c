@@ -89,6 +89,17 @@ fmi2Status fmi2Reset(fmi2Component c) {
 
 /* Getting and setting variable values */
 
+/* Integers: the enumeration and the halves of the seed, whose bits are kept. */
+static Status check_integer(const Instance *instance, const char *function, unsigned vr) {
+    if (vr < N_VARIABLES && (VARIABLES[vr].type == SEED || VARIABLES[vr].type == SEED_HIGH))
+        return OK;
+    return check_reference(instance, function, vr, LAW);
+}
+
+static double integer_value(unsigned vr, int32_t value) {
+    return VARIABLES[vr].type == LAW ? (double)value : (double)(uint32_t)value;
+}
+
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,
                        fmi2Real value[]) {
     ENTER(READABLE);

@@ -295,17 +295,6 @@ static Status set_values(Instance *instance, const char *function, VariableType 
     return OK;
 }
 
-/* FMI 2.0 Integers: the enumeration and the halves of the seed, whose bits are kept. */
-static Status check_integer(const Instance *instance, const char *function, unsigned vr) {
-    if (vr < N_VARIABLES && (VARIABLES[vr].type == SEED || VARIABLES[vr].type == SEED_HIGH))
-        return OK;
-    return check_reference(instance, function, vr, LAW);
-}
-
-static double integer_value(unsigned vr, int32_t value) {
-    return VARIABLES[vr].type == LAW ? (double)value : (double)(uint32_t)value;
-}
-
 static Status no_such_type(const Instance *instance, const char *function, const void *vr,
                            size_t n, const void *value) {
     const Status status = check_arrays(instance, function, vr, n, value, n);

@@ -2,7 +2,7 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{058013b1-8ecc-5e32-b070-a1fca00320fb}"
+#define MODEL_TOKEN "{187d7793-4a60-5caf-a623-65c7e33eff2b}"
 
 enum {
     VR_time = 0,

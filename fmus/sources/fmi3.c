@@ -1,0 +1,528 @@
+/* The FMI 3.0 face of the evaporator: co-simulation and model exchange. */
+#include "fmi3Functions.h"
+
+#include "adjoint.h"
+#include "derivatives.h"
+#include "events.h"
+#include "simulation.h"
+#include "snapshot.h"
+
+#define ENTER(modes)                                                        \
+    Instance *const self = (Instance *)instance;                            \
+    if (!allowed(self, (modes), __func__)) return fmi3Error
+
+#define ENTER_AS(required, modes)                                           \
+    ENTER(modes);                                                           \
+    if (!offers(self, (required), __func__)) return fmi3Error
+
+#define TRY(call)                                                           \
+    do {                                                                    \
+        const Status status_ = (call);                                      \
+        if (status_ != OK) return (fmi3Status)status_;                      \
+    } while (0)
+
+#define REFUSE(...) return (fmi3Status)report(self, ERROR, __VA_ARGS__)
+
+static void log_fmi3(const Instance *instance, Status status, const char *category,
+                     const char *message) {
+    ((fmi3LogMessageCallback)instance->logger)(instance->environment, (fmi3Status)status, category,
+                                               message);
+}
+
+const char *fmi3GetVersion(void) { return fmi3Version; }
+
+fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories,
+                               const fmi3String categories[]) {
+    ENTER(ANY_MODE);
+    return (fmi3Status)set_logging(self, __func__, loggingOn, nCategories, categories);
+}
+
+fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String instantiationToken,
+                                          fmi3String resourcePath, fmi3Boolean visible,
+                                          fmi3Boolean loggingOn,
+                                          fmi3InstanceEnvironment instanceEnvironment,
+                                          fmi3LogMessageCallback logMessage) {
+    (void)resourcePath, (void)visible;
+    return open_instance(instanceName, MODEL_EXCHANGE, instantiationToken, instanceEnvironment,
+                         (void (*)(void))logMessage, log_fmi3, loggingOn);
+}
+
+fmi3Instance fmi3InstantiateCoSimulation(
+    fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
+    fmi3Boolean visible, fmi3Boolean loggingOn, fmi3Boolean eventModeUsed,
+    fmi3Boolean earlyReturnAllowed, const fmi3ValueReference requiredIntermediateVariables[],
+    size_t nRequiredIntermediateVariables, fmi3InstanceEnvironment instanceEnvironment,
+    fmi3LogMessageCallback logMessage, fmi3IntermediateUpdateCallback intermediateUpdate) {
+    (void)resourcePath, (void)visible, (void)earlyReturnAllowed;
+    (void)requiredIntermediateVariables, (void)intermediateUpdate;
+    Instance *self =
+        open_instance(instanceName, CO_SIMULATION, instantiationToken, instanceEnvironment,
+                      (void (*)(void))logMessage, log_fmi3, loggingOn);
+    if (!self || (!eventModeUsed && nRequiredIntermediateVariables == 0)) return self;
+    report(self, ERROR, "%s: event mode and intermediate update are not offered.", __func__);
+    free_instance(self);
+    return NULL;
+}
+
+fmi3Instance fmi3InstantiateScheduledExecution(
+    fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
+    fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
+    fmi3LogMessageCallback logMessage, fmi3ClockUpdateCallback clockUpdate,
+    fmi3LockPreemptionCallback lockPreemption, fmi3UnlockPreemptionCallback unlockPreemption) {
+    (void)instanceName, (void)instantiationToken, (void)resourcePath, (void)visible;
+    (void)loggingOn, (void)clockUpdate, (void)lockPreemption, (void)unlockPreemption;
+    if (logMessage)
+        logMessage(instanceEnvironment, fmi3Error, CATEGORY_NAMES[LOG_ERROR],
+                   "fmi3InstantiateScheduledExecution: scheduled execution is not offered.");
+    return NULL;
+}
+
+void fmi3FreeInstance(fmi3Instance instance) { free_instance((Instance *)instance); }
+
+fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean toleranceDefined,
+                                       fmi3Float64 tolerance, fmi3Float64 startTime,
+                                       fmi3Boolean stopTimeDefined, fmi3Float64 stopTime) {
+    (void)toleranceDefined, (void)tolerance;
+    ENTER(INSTANTIATED);
+    TRY(set_experiment(self, __func__, startTime, stopTimeDefined, stopTime));
+    self->state.mode = INITIALIZATION;
+    return fmi3OK;
+}
+
+fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
+    ENTER(INITIALIZATION);
+    leave_initialization(self);
+    return fmi3OK;
+}
+
+fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
+    ENTER_AS(MODEL_EXCHANGE, CONTINUOUS_TIME);
+    self->state.mode = EVENT;
+    return fmi3OK;
+}
+
+fmi3Status fmi3Terminate(fmi3Instance instance) {
+    ENTER(EVENT | CONTINUOUS_TIME | STEP);
+    refresh(&self->state);
+    self->state.mode = TERMINATED;
+    return fmi3OK;
+}
+
+fmi3Status fmi3Reset(fmi3Instance instance) {
+    ENTER(ANY_MODE);
+    reset_state(&self->state, (Interface)self->state.interface);
+    return fmi3OK;
+}
+
+/* Getting and setting variable values */
+
+#define GETTER_ARGUMENTS(Type)                                                     \
+    fmi3Instance instance, const fmi3ValueReference valueReferences[],             \
+        size_t nValueReferences, fmi3##Type values[], size_t nValues
+
+#define SETTER_ARGUMENTS(Type)                                                     \
+    fmi3Instance instance, const fmi3ValueReference valueReferences[],             \
+        size_t nValueReferences, const fmi3##Type values[], size_t nValues
+
+#define CHECK_ARRAYS \
+    TRY(check_arrays(self, __func__, valueReferences, nValueReferences, values, nValues))
+
+fmi3Status fmi3GetFloat64(GETTER_ARGUMENTS(Float64)) {
+    ENTER(READABLE);
+    CHECK_ARRAYS;
+    return (fmi3Status)get_values(self, __func__, REAL, valueReferences, nValues, values);
+}
+
+fmi3Status fmi3SetFloat64(SETTER_ARGUMENTS(Float64)) {
+    ENTER(SETTABLE);
+    CHECK_ARRAYS;
+    return (fmi3Status)set_values(self, __func__, REAL, valueReferences, nValues, values);
+}
+
+fmi3Status fmi3GetUInt64(GETTER_ARGUMENTS(UInt64)) {
+    ENTER(READABLE);
+    CHECK_ARRAYS;
+    for (size_t i = 0; i < nValues; i++)
+        TRY(check_reference(self, __func__, valueReferences[i], SEED));
+    for (size_t i = 0; i < nValues; i++)
+        values[i] = ((uint64_t)self->state.v[VR_seedHigh] << 32) | (uint64_t)self->state.v[VR_seed];
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetUInt64(SETTER_ARGUMENTS(UInt64)) {
+    ENTER(SETTABLE);
+    CHECK_ARRAYS;
+    for (size_t i = 0; i < nValues; i++) {
+        TRY(check_reference(self, __func__, valueReferences[i], SEED));
+        TRY(check_value(self, __func__, valueReferences[i], 0.0));
+    }
+    for (size_t i = 0; i < nValues; i++) {
+        set_value(&self->state, VR_seed, (double)(values[i] & UINT32_MAX));
+        set_value(&self->state, VR_seedHigh, (double)(values[i] >> 32));
+    }
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetInt64(GETTER_ARGUMENTS(Int64)) {
+    ENTER(READABLE);
+    CHECK_ARRAYS;
+    for (size_t i = 0; i < nValues; i++)
+        TRY(check_reference(self, __func__, valueReferences[i], LAW));
+    for (size_t i = 0; i < nValues; i++) values[i] = (int64_t)self->state.v[valueReferences[i]];
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetInt64(SETTER_ARGUMENTS(Int64)) {
+    ENTER(SETTABLE);
+    CHECK_ARRAYS;
+    for (size_t i = 0; i < nValues; i++) {
+        TRY(check_reference(self, __func__, valueReferences[i], LAW));
+        TRY(check_value(self, __func__, valueReferences[i], (double)values[i]));
+    }
+    for (size_t i = 0; i < nValues; i++)
+        set_value(&self->state, valueReferences[i], (double)values[i]);
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetBoolean(GETTER_ARGUMENTS(Boolean)) {
+    ENTER(READABLE);
+    CHECK_ARRAYS;
+    for (size_t i = 0; i < nValues; i++)
+        TRY(check_reference(self, __func__, valueReferences[i], BOOLEAN));
+    for (size_t i = 0; i < nValues; i++) values[i] = self->state.v[valueReferences[i]] != 0.0;
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetBoolean(SETTER_ARGUMENTS(Boolean)) {
+    ENTER(SETTABLE);
+    CHECK_ARRAYS;
+    for (size_t i = 0; i < nValues; i++) {
+        TRY(check_reference(self, __func__, valueReferences[i], BOOLEAN));
+        TRY(check_value(self, __func__, valueReferences[i], values[i] ? 1.0 : 0.0));
+    }
+    for (size_t i = 0; i < nValues; i++)
+        set_value(&self->state, valueReferences[i], values[i] ? 1.0 : 0.0);
+    return fmi3OK;
+}
+
+#define NO_SUCH_TYPE(Type)                                                                   \
+    fmi3Status fmi3Get##Type(GETTER_ARGUMENTS(Type)) {                                       \
+        ENTER(READABLE);                                                                     \
+        CHECK_ARRAYS;                                                                        \
+        return (fmi3Status)no_such_type(self, __func__, valueReferences, nValues, values);   \
+    }                                                                                        \
+    fmi3Status fmi3Set##Type(SETTER_ARGUMENTS(Type)) {                                       \
+        ENTER(SETTABLE);                                                                     \
+        CHECK_ARRAYS;                                                                        \
+        return (fmi3Status)no_such_type(self, __func__, valueReferences, nValues, values);   \
+    }
+
+NO_SUCH_TYPE(Float32)
+NO_SUCH_TYPE(Int8)
+NO_SUCH_TYPE(UInt8)
+NO_SUCH_TYPE(Int16)
+NO_SUCH_TYPE(UInt16)
+NO_SUCH_TYPE(Int32)
+NO_SUCH_TYPE(UInt32)
+NO_SUCH_TYPE(String)
+
+fmi3Status fmi3GetBinary(fmi3Instance instance, const fmi3ValueReference valueReferences[],
+                         size_t nValueReferences, size_t valueSizes[], fmi3Binary values[],
+                         size_t nValues) {
+    (void)valueSizes;
+    ENTER(READABLE);
+    CHECK_ARRAYS;
+    return (fmi3Status)no_such_type(self, __func__, valueReferences, nValues, values);
+}
+
+fmi3Status fmi3SetBinary(fmi3Instance instance, const fmi3ValueReference valueReferences[],
+                         size_t nValueReferences, const size_t valueSizes[],
+                         const fmi3Binary values[], size_t nValues) {
+    (void)valueSizes;
+    ENTER(SETTABLE);
+    CHECK_ARRAYS;
+    return (fmi3Status)no_such_type(self, __func__, valueReferences, nValues, values);
+}
+
+fmi3Status fmi3GetClock(fmi3Instance instance, const fmi3ValueReference valueReferences[],
+                        size_t nValueReferences, fmi3Clock values[]) {
+    ENTER(READABLE);
+    return (fmi3Status)no_such_type(self, __func__, valueReferences, nValueReferences, values);
+}
+
+fmi3Status fmi3SetClock(fmi3Instance instance, const fmi3ValueReference valueReferences[],
+                        size_t nValueReferences, const fmi3Clock values[]) {
+    ENTER(SETTABLE);
+    return (fmi3Status)no_such_type(self, __func__, valueReferences, nValueReferences, values);
+}
+
+/* Getting and setting the internal state */
+
+fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
+    ENTER(ANY_MODE);
+    return (fmi3Status)take_snapshot(self, __func__, FMUState);
+}
+
+fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState FMUState) {
+    ENTER(ANY_MODE);
+    return (fmi3Status)restore_snapshot(self, __func__, FMUState);
+}
+
+fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
+    ENTER(ANY_MODE);
+    return (fmi3Status)free_snapshot(self, __func__, FMUState);
+}
+
+fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState FMUState, size_t *size) {
+    ENTER(ANY_MODE);
+    return (fmi3Status)serialised_size(self, __func__, FMUState, size);
+}
+
+fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState FMUState,
+                                 fmi3Byte serializedState[], size_t size) {
+    ENTER(ANY_MODE);
+    return (fmi3Status)serialise(self, __func__, FMUState, serializedState, size);
+}
+
+fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte serializedState[],
+                                   size_t size, fmi3FMUState *FMUState) {
+    ENTER(ANY_MODE);
+    return (fmi3Status)deserialise(self, __func__, serializedState, size, FMUState);
+}
+
+/* Partial derivatives */
+
+fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[],
+                                        size_t nUnknowns, const fmi3ValueReference knowns[],
+                                        size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+                                        fmi3Float64 sensitivity[], size_t nSensitivity) {
+    ENTER(READABLE);
+    TRY(check_arrays(self, __func__, unknowns, nUnknowns, sensitivity, nSensitivity));
+    TRY(check_arrays(self, __func__, knowns, nKnowns, seed, nSeed));
+    return (fmi3Status)directional_derivative(self, __func__, unknowns, nUnknowns, knowns, nKnowns,
+                                              seed, sensitivity);
+}
+
+fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[],
+                                    size_t nUnknowns, const fmi3ValueReference knowns[],
+                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+                                    fmi3Float64 sensitivity[], size_t nSensitivity) {
+    ENTER(READABLE);
+    TRY(check_arrays(self, __func__, unknowns, nUnknowns, seed, nSeed));
+    TRY(check_arrays(self, __func__, knowns, nKnowns, sensitivity, nSensitivity));
+    return (fmi3Status)adjoint_derivative(self, __func__, unknowns, nUnknowns, knowns, nKnowns,
+                                          seed, sensitivity);
+}
+
+/* Discrete states and model exchange */
+
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
+                                    fmi3Boolean *terminateSimulation,
+                                    fmi3Boolean *nominalsOfContinuousStatesChanged,
+                                    fmi3Boolean *valuesOfContinuousStatesChanged,
+                                    fmi3Boolean *nextEventTimeDefined,
+                                    fmi3Float64 *nextEventTime) {
+    ENTER(EVENT);
+    if (!discreteStatesNeedUpdate || !terminateSimulation || !nominalsOfContinuousStatesChanged ||
+        !valuesOfContinuousStatesChanged || !nextEventTimeDefined || !nextEventTime)
+        REFUSE("%s: null argument.", __func__);
+    TRY(update_discrete_state(self, __func__));
+    *discreteStatesNeedUpdate = false;
+    *terminateSimulation = false;
+    *nominalsOfContinuousStatesChanged = false;
+    *valuesOfContinuousStatesChanged = false;
+    *nextEventTimeDefined = has_time_events(&self->state);
+    *nextEventTime = next_event_time(&self->state);
+    return fmi3OK;
+}
+
+fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance instance) {
+    ENTER(INITIALIZATION | EVENT);
+    return fmi3OK;
+}
+
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
+    ENTER_AS(MODEL_EXCHANGE, EVENT);
+    self->state.mode = CONTINUOUS_TIME;
+    return fmi3OK;
+}
+
+fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance,
+                                       fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+                                       fmi3Boolean *enterEventMode,
+                                       fmi3Boolean *terminateSimulation) {
+    (void)noSetFMUStatePriorToCurrentPoint;
+    ENTER_AS(MODEL_EXCHANGE, CONTINUOUS_TIME);
+    if (!enterEventMode || !terminateSimulation) REFUSE("%s: null argument.", __func__);
+    TRY(complete_step(self, __func__));
+    *enterEventMode = false;
+    *terminateSimulation = false;
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
+    ENTER_AS(MODEL_EXCHANGE, EVENT | CONTINUOUS_TIME);
+    return (fmi3Status)set_time(self, __func__, time);
+}
+
+fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 continuousStates[],
+                                   size_t nContinuousStates) {
+    ENTER_AS(MODEL_EXCHANGE, CONTINUOUS_TIME);
+    return (fmi3Status)set_continuous_states(self, __func__, continuousStates, nContinuousStates);
+}
+
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[],
+                                             size_t nContinuousStates) {
+    ENTER_AS(MODEL_EXCHANGE, READABLE);
+    return (fmi3Status)get_vector(self, __func__, DERIVATIVE_REFERENCES, derivatives,
+                                  nContinuousStates);
+}
+
+fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 eventIndicators[],
+                                  size_t nEventIndicators) {
+    (void)eventIndicators;
+    ENTER_AS(MODEL_EXCHANGE, READABLE);
+    if (nEventIndicators == 0) return fmi3OK;
+    REFUSE("%s: there are no event indicators.", __func__);
+}
+
+fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 continuousStates[],
+                                   size_t nContinuousStates) {
+    ENTER_AS(MODEL_EXCHANGE, READABLE);
+    return (fmi3Status)get_vector(self, __func__, STATE_REFERENCES, continuousStates,
+                                  nContinuousStates);
+}
+
+fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[],
+                                             size_t nContinuousStates) {
+    ENTER_AS(MODEL_EXCHANGE, ANY_MODE);
+    return (fmi3Status)get_nominals(self, __func__, nominals, nContinuousStates);
+}
+
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *nEventIndicators) {
+    ENTER_AS(MODEL_EXCHANGE, ANY_MODE);
+    if (!nEventIndicators) REFUSE("%s: null argument.", __func__);
+    *nEventIndicators = 0;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *nContinuousStates) {
+    ENTER_AS(MODEL_EXCHANGE, ANY_MODE);
+    if (!nContinuousStates) REFUSE("%s: null argument.", __func__);
+    *nContinuousStates = N_STATES;
+    return fmi3OK;
+}
+
+/* Co-simulation */
+
+fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoint,
+                      fmi3Float64 communicationStepSize,
+                      fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+                      fmi3Boolean *eventHandlingNeeded, fmi3Boolean *terminateSimulation,
+                      fmi3Boolean *earlyReturn, fmi3Float64 *lastSuccessfulTime) {
+    (void)noSetFMUStatePriorToCurrentPoint;
+    ENTER_AS(CO_SIMULATION, STEP);
+    if (!eventHandlingNeeded || !terminateSimulation || !earlyReturn || !lastSuccessfulTime)
+        REFUSE("%s: null argument.", __func__);
+    *eventHandlingNeeded = false;
+    *terminateSimulation = false;
+    *earlyReturn = false;
+    *lastSuccessfulTime = self->state.v[VR_time];
+    TRY(do_step(self, __func__, currentCommunicationPoint, communicationStepSize));
+    *lastSuccessfulTime = self->state.v[VR_time];
+    return fmi3OK;
+}
+
+/* Not offered: each is refused with a message */
+
+static fmi3Status refuse(fmi3Instance instance, const char *function) {
+    const Instance *const self = (const Instance *)instance;
+    if (!self) return fmi3Error;
+    REFUSE("%s: not offered by this FMU.", function);
+}
+
+fmi3Status fmi3EnterConfigurationMode(fmi3Instance instance) { return refuse(instance, __func__); }
+
+fmi3Status fmi3ExitConfigurationMode(fmi3Instance instance) { return refuse(instance, __func__); }
+
+fmi3Status fmi3EnterStepMode(fmi3Instance instance) { return refuse(instance, __func__); }
+
+fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance instance,
+                                               fmi3ValueReference valueReference,
+                                               size_t *nDependencies) {
+    (void)valueReference, (void)nDependencies;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3GetVariableDependencies(fmi3Instance instance, fmi3ValueReference dependent,
+                                       size_t elementIndicesOfDependent[],
+                                       fmi3ValueReference independents[],
+                                       size_t elementIndicesOfIndependents[],
+                                       fmi3DependencyKind dependencyKinds[],
+                                       size_t nDependencies) {
+    (void)dependent, (void)elementIndicesOfDependent, (void)independents;
+    (void)elementIndicesOfIndependents, (void)dependencyKinds, (void)nDependencies;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3GetOutputDerivatives(fmi3Instance instance,
+                                    const fmi3ValueReference valueReferences[],
+                                    size_t nValueReferences, const fmi3Int32 orders[],
+                                    fmi3Float64 values[], size_t nValues) {
+    (void)valueReferences, (void)nValueReferences, (void)orders, (void)values, (void)nValues;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3ActivateModelPartition(fmi3Instance instance, fmi3ValueReference clockReference,
+                                      fmi3Float64 activationTime) {
+    (void)clockReference, (void)activationTime;
+    return refuse(instance, __func__);
+}
+
+#define CLOCK_ARGUMENTS                                                                       \
+    fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences
+
+fmi3Status fmi3GetIntervalDecimal(CLOCK_ARGUMENTS, fmi3Float64 intervals[],
+                                  fmi3IntervalQualifier qualifiers[]) {
+    (void)valueReferences, (void)nValueReferences, (void)intervals, (void)qualifiers;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3GetIntervalFraction(CLOCK_ARGUMENTS, fmi3UInt64 counters[],
+                                   fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[]) {
+    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
+    (void)qualifiers;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3GetShiftDecimal(CLOCK_ARGUMENTS, fmi3Float64 shifts[]) {
+    (void)valueReferences, (void)nValueReferences, (void)shifts;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3GetShiftFraction(CLOCK_ARGUMENTS, fmi3UInt64 counters[], fmi3UInt64 resolutions[]) {
+    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3SetIntervalDecimal(CLOCK_ARGUMENTS, const fmi3Float64 intervals[]) {
+    (void)valueReferences, (void)nValueReferences, (void)intervals;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3SetIntervalFraction(CLOCK_ARGUMENTS, const fmi3UInt64 counters[],
+                                   const fmi3UInt64 resolutions[]) {
+    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3SetShiftDecimal(CLOCK_ARGUMENTS, const fmi3Float64 shifts[]) {
+    (void)valueReferences, (void)nValueReferences, (void)shifts;
+    return refuse(instance, __func__);
+}
+
+fmi3Status fmi3SetShiftFraction(CLOCK_ARGUMENTS, const fmi3UInt64 counters[],
+                                const fmi3UInt64 resolutions[]) {
+    (void)valueReferences, (void)nValueReferences, (void)counters, (void)resolutions;
+    return refuse(instance, __func__);
+}

@@ -1,0 +1,14 @@
+"""Rerun recordings: of runs, of training and of comparisons; the only importer of rerun."""
+
+from cosim.recording.reading import Recording, read_recording, read_signals
+from cosim.recording.run import RunRecorder
+from cosim.recording.viewer import open_viewer, render
+
+__all__ = [
+    "Recording",
+    "RunRecorder",
+    "open_viewer",
+    "read_recording",
+    "read_signals",
+    "render",
+]

@@ -1,0 +1,133 @@
+"""Reads a recording back: signals with every bit, units, and the run's properties."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import Chunk, RrdReader
+
+from cosim.errors import RecordingError
+from cosim.recording.stream import SAMPLE, SIGNAL, TIME
+
+_SCALARS = rr.Scalars.descriptor_scalars().component
+_STATUS = rr.StateChange.descriptor_state().component
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Content of a recording.
+
+    `signals` maps a signal's name to its values, (K,) float64, or (K, N) for a prediction
+    (`prediction/<name>`); `samples` (K,) are the numbers of their rows and `time` (K,) the plant's
+    time in s (NaN where there is none); `units` and `properties` are text; `status` (K,) is the
+    solver's status of each sample, empty if it was not recorded.
+    """
+
+    signals: dict[str, NDArray[np.float64]]
+    samples: NDArray[np.int64]
+    time: NDArray[np.float64]
+    units: dict[str, str]
+    properties: dict[str, str]
+    status: list[str]
+
+
+def read_signals(path: str | Path) -> dict[str, NDArray[np.float64]]:
+    """Signals of a recording by name; raises RecordingError as `read_recording` does."""
+    return read_recording(path).signals
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Read a `.rrd` file that this package wrote.
+
+    Raises
+    ------
+    RecordingError : no such file, not a recording, or not one of this package.
+    """
+    static: dict[str, dict[str, str]] = {}
+    rows: dict[str, list[pa.RecordBatch]] = defaultdict(list)
+    for chunk in _chunks(Path(path)):
+        batch = chunk.to_record_batch()
+        if chunk.is_static:
+            texts = {name: _text(batch.column(name)) for name in batch.schema.names}
+            static.setdefault(chunk.entity_path, {}).update(texts)
+        elif SAMPLE in batch.schema.names:
+            rows[chunk.entity_path].append(batch)
+    marks = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
+    if not marks:
+        raise RecordingError(f"{path} holds no signals of rti-cosim")
+    signals, units = {}, {}
+    samples, time = np.empty(0, np.int64), np.empty(0)
+    for entity, texts in marks.items():
+        name = texts[f"{SIGNAL}:name"]
+        units[name] = texts[f"{SIGNAL}:unit"]
+        found, values = _column(rows[entity])
+        signals[name] = values
+        if len(found) > len(samples):
+            samples, time = found, _time(rows[entity])
+    properties = next((dict(t) for e, t in static.items() if e.endswith("/run")), {})
+    properties.pop("rerun.controls.RowId", None)
+    status = _status(rows.get("/solver/status", []), samples)
+    return Recording(dict(sorted(signals.items())), samples, time, units, properties, status)
+
+
+def _chunks(path: Path) -> list[Chunk]:
+    if not path.is_file():
+        raise RecordingError(f"there is no recording {path}")
+    try:
+        return RrdReader(path).stream().to_chunks()
+    except (ValueError, RuntimeError, OSError) as error:
+        raise RecordingError(
+            f"{path} is not a readable recording ({str(error).splitlines()[0]}); if its process "
+            "was killed, repair it with: rerun rrd optimize FILE -o REPAIRED"
+        ) from None
+
+
+def _text(column: pa.Array) -> str:
+    """First value of a static column, as text."""
+    value: Any = column[0].as_py()
+    while isinstance(value, list):
+        value = value[0] if value else ""
+    return str(value)
+
+
+def _order(batches: list[pa.RecordBatch]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    samples = np.concatenate([np.asarray(batch.column(SAMPLE)) for batch in batches])
+    order = np.argsort(samples, kind="stable")
+    return samples[order], order
+
+
+def _column(
+    batches: list[pa.RecordBatch],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    if not batches:
+        return np.empty(0, np.int64), np.empty(0)
+    samples, order = _order(batches)
+    lists = [batch.column(_SCALARS) for batch in batches]
+    flat = np.concatenate([column.flatten().to_numpy() for column in lists])
+    values = flat.reshape(len(samples), -1)[order]
+    return samples, values[:, 0] if values.shape[1] == 1 else values
+
+
+def _time(batches: list[pa.RecordBatch]) -> NDArray[np.float64]:
+    _, order = _order(batches)
+    if any(TIME not in batch.schema.names for batch in batches):
+        return np.full(len(order), np.nan)
+    columns = [np.asarray(batch.column(TIME).cast(pa.int64())) for batch in batches]
+    return np.concatenate(columns)[order] / 1e9
+
+
+def _status(batches: list[pa.RecordBatch], samples: NDArray[np.int64]) -> list[str]:
+    """Every sample's status from the changes that were recorded."""
+    if not batches:
+        return []
+    at, order = _order(batches)
+    texts = [text[0] for batch in batches for text in batch.column(_STATUS).to_pylist()]
+    last = np.searchsorted(at, samples, side="right") - 1
+    return [texts[order[i]] for i in last]

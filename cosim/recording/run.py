@@ -1,0 +1,169 @@
+"""Records a closed-loop run; the loop hands it blocks of samples."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from rerun.blueprint import Blueprint
+
+from cosim.penalty import Penalty
+from cosim.protocols import Block, Controller, controller_name
+from cosim.recording import diagram
+from cosim.recording.about import describe
+from cosim.recording.blocks import joined
+from cosim.recording.channels import Channel, escaped, run_channels, run_columns
+from cosim.recording.horizon import Horizon, Strip
+from cosim.recording.layout import run_blueprint
+from cosim.recording.palette import BOUND, GOOD, SERIES, packed
+from cosim.recording.stream import Stream, line, mark, sample_times
+from cosim.recording.text import drawable
+from cosim.scenario import Scenario
+
+ROWS = 2000
+
+
+class RunRecorder:
+    """Recorder of `simulate`: a `.rrd` file with layout, signals, predictions and run properties.
+
+    Every signal keeps its name and float64 bits; `read_signals` gives them back.
+
+    Raises
+    ------
+    RecordingError : the file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._stream: Stream | None = None
+        self._pending: list[Block] = []
+
+    def start(
+        self,
+        scenario: Scenario,
+        controller: Controller,
+        seed: int,
+        steps: int,
+        units: dict[str, str],
+    ) -> None:
+        """Open the file and send what is known before the first sample."""
+        name = controller_name(controller)
+        theta = str(getattr(getattr(controller, "parameters", None), "hash", "none"))
+        self._duration = steps * scenario.sampling_time
+        self._channels = run_channels(scenario, units)
+        self._violation = Penalty(
+            scenario.state_lower,
+            scenario.state_upper,
+            scenario.penalty_linear,
+            scenario.penalty_quadratic,
+        ).violation
+        self._horizon: Horizon | None = None
+        self._status: str | None = None
+        stream = Stream(self.path, self._blueprint(), f"{name} on {scenario.name}, seed {seed}")
+        properties = {
+            "scenario": scenario.name,
+            "scenario_hash": scenario.hash,
+            "controller": name,
+            "theta_hash": theta,
+            "seed": seed,
+            "steps": steps,
+            "sampling_time": f"{scenario.sampling_time:g} s",
+            "fmu": Path(scenario.plant.fmu).name,
+            "package": f"rti-cosim {version('rti-cosim')}",
+        }
+        stream.properties("run", properties)
+        text = describe(scenario, properties, self._channels)
+        stream.static("about", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        diagram.draw(stream, scenario, name, theta)
+        self._declare(stream)
+        self._stream = stream
+
+    def record(self, block: Block) -> None:
+        """Append K samples; they reach the file when `ROWS` have come together."""
+        self._pending.append(deepcopy(block))
+        if sum(len(pending.time) for pending in self._pending) >= ROWS:
+            self._send()
+
+    def close(self) -> None:
+        """Send the layout again with the ranges that the run needed, and give the file its name."""
+        if self._stream is not None:
+            self._send()
+            self._stream.blueprint(self._blueprint())
+            self._stream.close()
+            self._stream = None
+
+    def _send(self) -> None:
+        """Send what is pending: one column of K rows for each signal."""
+        if self._stream is None or not self._pending:
+            return
+        stream, block = self._stream, joined(self._pending)
+        self._pending.clear()
+        samples = np.arange(block.first, block.first + len(block.time))
+        times = sample_times(samples, block.time)
+        ends = sample_times(samples[[0, -1]], block.time[[0, -1]])
+        for i, (channel, values) in enumerate(
+            zip(self._channels, run_columns(block, self._violation), strict=True)
+        ):
+            stream.scalars(channel.entity, times, values)
+            self._channels[i] = channel.with_values(values)
+            for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
+                # Two rows a block are enough to draw a constant line.
+                if np.isfinite(bound):
+                    stream.scalars(f"{channel.bound_entity}/{side}", ends, np.full(2, bound))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stream.scalars("display/log_residual", times, np.log10(block.residual))
+        self._changes_of_status(stream, samples, block)
+        self._predictions(stream, times, block)
+
+    def _blueprint(self) -> Blueprint:
+        return run_blueprint(self._duration, self._channels, predicts=self._horizon is not None)
+
+    def _declare(self, stream: Stream) -> None:
+        for channel in self._channels:
+            stream.static(
+                channel.entity,
+                mark(channel.name, channel.unit),
+                line(channel.label, channel.color, step=channel.step),
+            )
+            for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
+                if np.isfinite(bound):
+                    style = line(f"{side} bound", BOUND, width=2.0)
+                    stream.static(f"{channel.bound_entity}/{side}", style)
+        stream.static("display/log_residual", line("log10 residual", SERIES[2]))
+        stream.static(
+            "solver/status", rr.StateConfiguration(values=["solved"], colors=[packed(GOOD)])
+        )
+
+    def _changes_of_status(self, stream: Stream, samples: np.ndarray, block: Block) -> None:
+        before = [self._status, *block.status[:-1]]
+        rows = [i for i, status in enumerate(block.status) if status != before[i]]
+        self._status = block.status[-1]
+        if rows:
+            states = rr.StateChange.columns(state=[drawable(block.status[i]) for i in rows])
+            stream.columns("solver/status", sample_times(samples[rows], block.time[rows]), states)
+
+    def _predictions(self, stream: Stream, times: list[rr.TimeColumn], block: Block) -> None:
+        states, actions = block.predicted_states, block.predicted_actions
+        if states is None or actions is None:
+            return
+        strips: dict[str, list[Strip]] = {"states": [], "actions": []}
+        for group, values in (("states", states), ("actions", actions)):
+            channels = [channel for channel in self._channels if channel.group == group]
+            for i, channel in enumerate(channels):
+                entity = f"prediction/{escaped(channel.name)}"
+                if self._horizon is None:
+                    stream.static(entity, mark(f"prediction/{channel.name}", channel.unit))
+                    strips[group].append(_strip(channel.with_values(values[:, :, i])))
+                stream.scalars(entity, times, values[:, :, i])
+        if self._horizon is None:
+            stages = actions.shape[1]
+            self._horizon = Horizon(stream, strips["states"], strips["actions"], stages)
+        self._horizon.send(times, states, actions)
+
+
+def _strip(channel: Channel) -> Strip:
+    reference = np.nan if channel.reference is None else channel.reference
+    return Strip(channel.label, channel.color, channel.window(), channel.bounds, reference)

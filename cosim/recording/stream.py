@@ -1,0 +1,107 @@
+"""A Rerun file that is written in blocks of columns and appears only when it is whole."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from cosim.errors import RecordingError
+from cosim.recording.palette import packed
+from cosim.recording.text import drawable
+
+APPLICATION = "rti-cosim"
+SIGNAL = "cosim.Signal"
+"""Archetype of the static mark (name, unit) on every entity that holds a signal."""
+
+TIME = "time"
+SAMPLE = "sample"
+
+
+class Stream:
+    """An open recording; use `static`, `scalars` and `columns`, then `close`.
+
+    The file is written beside `path` under a hidden name and renamed by `close`, so that `path`
+    never holds half a recording. What a killed process leaves there is repaired by
+    `rerun rrd optimize`.
+
+    Raises
+    ------
+    RecordingError : the folder does not exist or cannot be written.
+    """
+
+    def __init__(self, path: str | Path, blueprint: rrb.Blueprint, name: str) -> None:
+        self.path = Path(path)
+        self._partial = self.path.with_name(f".{self.path.stem}.partial.rrd")
+        try:
+            self._partial.open("wb").close()
+        except OSError as error:
+            raise RecordingError(
+                f"cannot write the recording {self.path}: {error.strerror}"
+            ) from None
+        # Without it a column of the wrong shape is dropped with no more than a warning.
+        rr.set_strict_mode(True)
+        self._stream = rr.RecordingStream(APPLICATION)
+        self._stream.save(self._partial, default_blueprint=blueprint)
+        self._stream.send_recording_name(drawable(name))
+
+    def properties(self, group: str, values: Mapping[str, object]) -> None:
+        """Describe the run as a whole; shown in the viewer when the recording is selected."""
+        described = rr.AnyValues()
+        for key, value in values.items():
+            described.with_component_from_data(key, drawable(str(value)))
+        self._stream.send_property(group, described)
+
+    def static(self, entity: str, *archetypes: rr.AsComponents) -> None:
+        """Log what does not change over time."""
+        self._stream.log(entity, *archetypes, static=True)
+
+    def columns(
+        self, entity: str, times: list[rr.TimeColumn], columns: rr.ComponentColumnList
+    ) -> None:
+        """Send a block of rows."""
+        self._stream.send_columns(entity, times, columns)
+
+    def scalars(self, entity: str, times: list[rr.TimeColumn], values: NDArray[np.float64]) -> None:
+        """Send a block of one signal, (K,), or of K vectors, (K, m)."""
+        self.columns(entity, times, rr.Scalars.columns(scalars=values))
+
+    def blueprint(self, blueprint: rrb.Blueprint) -> None:
+        """Replace the layout that was sent first."""
+        self._stream.send_blueprint(blueprint)
+
+    def close(self) -> None:
+        """Finish the file and give it its name; later calls do nothing."""
+        if self._partial.exists():
+            self._stream.disconnect()
+            self._partial.replace(self.path)
+
+
+def line(label: str, color: str, *, step: bool = False, width: float = 1.5) -> rr.SeriesLines:
+    """Style of a line; `step` holds each value until the next one (inputs, disturbances)."""
+    mode, policy = rr.components.InterpolationMode, rr.components.AggregationPolicy
+    return rr.SeriesLines(
+        names=drawable(label),
+        colors=packed(color),
+        widths=width,
+        # The default average would hide the violations of a run that is wider than the screen.
+        aggregation_policy=policy.MinMax,
+        interpolation_mode=mode.StepAfter if step else mode.Linear,
+    )
+
+
+def mark(name: str, unit: str) -> rr.DynamicArchetype:
+    """Static mark of an entity that holds the signal `name`, by which `read_signals` finds it."""
+    return rr.DynamicArchetype(SIGNAL, components={"name": name, "unit": unit})
+
+
+def sample_times(samples: NDArray[np.int64], time: NDArray[np.float64]) -> list[rr.TimeColumn]:
+    """Index columns of K rows: the sample numbers and the time in s, rounded to 1 ns."""
+    return [
+        rr.TimeColumn(TIME, duration=np.rint(time * 1e9).astype("timedelta64[ns]")),
+        rr.TimeColumn(SAMPLE, sequence=samples),
+    ]

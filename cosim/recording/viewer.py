@@ -1,0 +1,149 @@
+"""Shows a recording: in the viewer's window, or as a PNG on a machine without a screen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rerun.experimental import ViewerClient
+
+from controllers.storage import write_atomically
+from cosim.errors import RecordingError
+from cosim.recording.stream import TIME
+
+LOOPBACK = "127.0.0.1"
+_NO_DRIVER = ("No graphics adapter", "Failed to get render context")
+
+
+def open_viewer(path: str | Path) -> None:
+    """Open a recording in a window and wait until it is closed; the viewer binds 127.0.0.1 only.
+
+    Raises
+    ------
+    RecordingError : no such file, or the viewer failed (no display, no graphics driver).
+    """
+    command = [*_viewer(), "--port", "auto", str(_existing(path))]
+    if subprocess.run(command, check=False).returncode not in (0, 130):
+        raise RecordingError(
+            f"the viewer could not show {path}; on a machine without a screen use --png FILE"
+        )
+
+
+def render(
+    path: str | Path,
+    png: str | Path,
+    *,
+    at: float | None = None,
+    size: tuple[int, int] = (1920, 1080),
+    timeout: float = 60.0,
+) -> None:
+    """Draw a recording to a PNG without a screen, with the time cursor at `at` seconds.
+
+    Raises
+    ------
+    RecordingError : no such file, no graphics driver, a view that failed, or `timeout` s passed.
+    """
+    path = _existing(path)
+    deadline = time.monotonic() + timeout
+    with _headless(size, deadline) as client:
+        client.open(str(path.resolve()))
+        _wait(lambda: not client.get_state().loading, deadline, f"loading {path}")
+        if at is not None:
+            client.set_time(TIME, duration=at, play_state="paused")
+        image = _settled(client, deadline)
+        for view in client.get_state().views:
+            for report in view.reports:
+                raise RecordingError(f"view '{view.name}' of {path}: {report.summary}")
+    write_atomically(png, image)
+
+
+def _existing(path: str | Path) -> Path:
+    path = Path(path)
+    if not path.is_file():
+        raise RecordingError(f"there is no recording {path}")
+    return path
+
+
+def _viewer() -> list[str]:
+    return [sys.executable, "-m", "rerun", "--bind", LOOPBACK]
+
+
+@contextmanager
+def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
+    """A viewer process without a window, ended on exit."""
+    port = _free_port()
+    options = ["--headless", "--hide-welcome-screen", "--port", str(port)]
+    window = ["--window-size", f"{size[0]}x{size[1]}"]
+    with tempfile.TemporaryFile() as log:
+        # A session of its own: the command is a shim, and ending it alone would leave the viewer.
+        process = subprocess.Popen(
+            [*_viewer(), *options, *window],
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            # Messages below an error would be drawn over the views.
+            env=os.environ | {"RUST_LOG": "error"},
+        )
+
+        def answers() -> bool:
+            if process.poll() is not None:
+                raise RecordingError(_complaint(log.fileno()))
+            with socket.socket() as probe:
+                return probe.connect_ex((LOOPBACK, port)) == 0
+
+        try:
+            _wait(answers, deadline, "starting the viewer")
+            client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            try:
+                yield client
+            except (ConnectionError, RuntimeError) as error:
+                raise RecordingError(_complaint(log.fileno())) from error
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGTERM)
+            process.wait()
+
+
+def _settled(client: ViewerClient, deadline: float) -> bytes:
+    """Screenshot taken when two in a row are equal: chunks are fetched after loading has ended."""
+    shots = [b"", client.take_screenshot()]
+
+    def unchanged() -> bool:
+        shots[:] = [shots[1], client.take_screenshot()]
+        return shots[0] == shots[1]
+
+    _wait(unchanged, deadline, "drawing")
+    return shots[1]
+
+
+def _wait(done: Callable[[], bool], deadline: float, task: str) -> None:
+    while not done():
+        if time.monotonic() > deadline:
+            raise RecordingError(f"{task} took too long")
+        time.sleep(0.1)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def _complaint(log: int) -> str:
+    """What the viewer's log says about its end."""
+    text = os.pread(log, 1 << 20, 0).decode(errors="replace")
+    if any(sign in text for sign in _NO_DRIVER):
+        return (
+            "no graphics driver for drawing without a screen; install a software one, on Debian: "
+            "apt-get install libvulkan1 mesa-vulkan-drivers"
+        )
+    panics = [line.strip() for line in text.splitlines() if "panicked" in line or "rror" in line]
+    return panics[-1] if panics else "the viewer ended without a message"

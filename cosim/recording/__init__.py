@@ -1,14 +1,15 @@
 """Rerun recordings: of runs, of training and of comparisons; the only importer of rerun."""
 
-from cosim.recording.reading import Recording, read_recording, read_signals
-from cosim.recording.run import RunRecorder
+from cosim.recording.reading import Recording, read_recording, read_signals, summarise
+from cosim.recording.run import RerunRecorder
 from cosim.recording.viewer import open_viewer, render
 
 __all__ = [
     "Recording",
-    "RunRecorder",
+    "RerunRecorder",
     "open_viewer",
     "read_recording",
     "read_signals",
     "render",
+    "summarise",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,25 @@ def read_recording(path: str | Path) -> Recording:
     properties.pop("rerun.controls.RowId", None)
     status = _status(rows.get("/solver/status", []), samples)
     return Recording(dict(sorted(signals.items())), samples, time, units, properties, status)
+
+
+def summarise(path: str | Path) -> dict[str, Any]:
+    """Return what a recording holds, ready for JSON: properties, and each signal's unit and range.
+
+    Raises RecordingError as `read_recording` does.
+    """
+    recording = read_recording(path)
+    signals = {}
+    for name, values in recording.signals.items():
+        finite = values[np.isfinite(values)]
+        low, high = (float(finite.min()), float(finite.max())) if finite.size else (None, None)
+        signals[name] = {"unit": recording.units[name], "minimum": low, "maximum": high}
+    return {
+        "properties": recording.properties,
+        "samples": len(recording.samples),
+        "signals": signals,
+        "statuses": dict(sorted(Counter(recording.status).items())),
+    }
 
 
 def _chunks(path: Path) -> list[Chunk]:

@@ -26,7 +26,7 @@ from cosim.scenario import Scenario
 ROWS = 2000
 
 
-class RunRecorder:
+class RerunRecorder:
     """Recorder of `simulate`: a `.rrd` file with layout, signals, predictions and run properties.
 
     Every signal keeps its name and float64 bits; `read_signals` gives them back.

@@ -9,7 +9,8 @@
 #include <math.h>
 #include <stdint.h>
 
-#define MAX_INTEGRATION_STEP 10.0 /* s */
+/* s; the error of a 60 s sample is then below 3e-10 relative, for X2 up to 100 and any input. */
+#define MAX_INTEGRATION_STEP 1.0
 
 typedef struct {
     double step;           /* length of an integration step, s */
@@ -38,7 +39,7 @@ static int on_grid_range(Grid grid, double time) {
 
 static GridPosition locate(Grid grid, double time) {
     const double s = time / grid.step;
-    const double nearest = nearbyint(s);
+    const double nearest = floor(s + 0.5);
     const double tolerance = fmin(1e-3, 1e-9 * fmax(1.0, fabs(s)));
     GridPosition position;
     if (fabs(s - nearest) <= tolerance) {

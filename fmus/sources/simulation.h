@@ -4,8 +4,8 @@
 
 #include "instance.h"
 
-/* A step that would take longer than about a second is refused. */
-#define MAX_STEPS_PER_CALL 4194304
+/* Integration steps in one call: half a year of seconds, at most about two seconds of computing. */
+#define MAX_STEPS_PER_CALL 16777216
 
 static double time_tolerance(double time) { return 1e-9 * fmax(1.0, fabs(time)); }
 
@@ -45,11 +45,36 @@ static void leave_initialization(Instance *instance) {
     state->mode = state->interface == CO_SIMULATION ? STEP : EVENT;
 }
 
-/* Integrate within one integration step, in which input and disturbance are constant. */
-static void integrate(State *state, int64_t sample, double h) {
-    move_to_sample(state, sample);
-    realise_disturbances(state);
-    runge_kutta(state->v, h);
+/* Integrate between two positions of one sample, in which input and disturbance are constant. */
+static void integrate(double v[N_VARIABLES], Grid grid, GridPosition from, GridPosition to) {
+    const Rates rates = held_rates(v);
+    int64_t whole = to.point - from.point;
+    if (whole == 0) {
+        runge_kutta(v, rates, (to.fraction - from.fraction) * grid.step, 1);
+        return;
+    }
+    if (from.fraction > 0.0) {
+        runge_kutta(v, rates, (1.0 - from.fraction) * grid.step, 1);
+        whole--;
+    }
+    runge_kutta(v, rates, grid.step, whole);
+    if (to.fraction > 0.0) runge_kutta(v, rates, to.fraction * grid.step, 1);
+}
+
+/* Go through the samples between two positions. */
+static void advance(State *state, Grid grid, GridPosition from, GridPosition to) {
+    int64_t sample = sample_of(grid, from.point);
+    for (;;) {
+        const GridPosition next = {(sample + 1) * grid.steps, 0.0};
+        const int last = to.point < next.point;
+        move_to_sample(state, sample);
+        if (to.point == from.point && to.fraction == from.fraction) return;
+        realise_disturbances(state);
+        integrate(state->v, grid, from, last ? to : next);
+        if (last) return;
+        from = next;
+        sample++;
+    }
 }
 
 static Status do_step(Instance *instance, const char *function, double time, double h) {
@@ -73,20 +98,11 @@ static Status do_step(Instance *instance, const char *function, double time, dou
         return report(instance, DISCARD, "%s: step size %g s needs more than %d integration steps.",
                       function, h, MAX_STEPS_PER_CALL);
     before = *state;
-    if (from.point == to.point) {
-        integrate(state, sample_of(grid, from.point), (to.fraction - from.fraction) * grid.step);
-    } else {
-        int64_t point = from.point;
-        integrate(state, sample_of(grid, point), (1.0 - from.fraction) * grid.step);
-        while (++point < to.point) integrate(state, sample_of(grid, point), grid.step);
-        if (to.fraction > 0.0)
-            integrate(state, sample_of(grid, to.point), to.fraction * grid.step);
-    }
+    advance(state, grid, from, to);
     if (!isfinite(state->v[VR_X2]) || !isfinite(state->v[VR_P2])) {
         *state = before;
         return report(instance, ERROR, "%s: the states left the finite numbers.", function);
     }
-    move_to_sample(state, sample_of(grid, to.point));
     state->v[VR_time] = end;
     state->outputs_current = 0;
     return OK;

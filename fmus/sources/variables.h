@@ -2,7 +2,7 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{187d7793-4a60-5caf-a623-65c7e33eff2b}"
+#define MODEL_TOKEN "{f163e074-cf66-5872-8543-17398b74ec70}"
 
 enum {
     VR_time = 0,

@@ -40,7 +40,7 @@ class Plant(Protocol):
     def units(self) -> dict[str, str]:
         """Unit of each state, action, disturbance and of the stage cost, by variable name."""
 
-    def reset(self, seed: int | None = None) -> Array:
+    def reset(self, seed: int) -> Array:
         """Start again from the scenario's initial state and return it, (n,)."""
 
     def step(self, a: Array) -> Step:

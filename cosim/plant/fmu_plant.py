@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cosim.errors import PlantError
 from cosim.penalty import Penalty
-from cosim.plant.archive import unpack
+from cosim.plant.archive import SHIPPED, unpack
 from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
@@ -81,6 +81,7 @@ class FmuPlant:
             raise PlantError(f"FMU '{unpacked.path}' is FMI {version}; 2.0 and 3.0 are supported")
         interface = Fmi2Instance if version[0] == "2" else Fmi3Instance
         wirer = Wirer(self.scenario, unpacked, interface)
+        self.unpacked = unpacked
         self.fmi_version = version
         self.fmu_path = unpacked.path
         self.fmu_sha256 = unpacked.sha256
@@ -97,6 +98,7 @@ class FmuPlant:
         self._k = _NOT_STARTED
         self._started = False
         self._penalty_now = 0.0
+        self.is_shipped = str(self.scenario.plant.fmu if fmu is None else fmu) in SHIPPED
         self._fmi = interface(unpacked, wirer.wiring(), self._h)
         self._advance = self._fmi.advance
         self._inputs = self._fmi.inputs

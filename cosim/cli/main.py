@@ -1,0 +1,90 @@
+"""The application, its commands, and what becomes of an error."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from cosim.cli import benchmark, demo, scenario, simulate, view
+
+app = typer.Typer(
+    name="cosim",
+    help="Co-simulate an FMU plant with learning-based MPC, and benchmark what it learns.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("demo")(demo.demo)
+app.command("simulate")(simulate.simulate)
+app.command("view")(view.view)
+app.command("scenario")(scenario.scenario)
+app.add_typer(benchmark.app, name="benchmark")
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+# Looked up only among modules that are loaded: an error's class cannot come from another one.
+_ERRORS = (
+    ("fmus.errors", "FmuError"),
+    ("cosim.errors", "CosimError"),
+    ("controllers.errors", "ControllerError"),
+    ("learning.errors", "LearningError"),
+)
+
+
+def _version(wanted: bool) -> None:
+    if not wanted:
+        return
+    import hashlib
+    from importlib.metadata import version
+
+    import fmus
+
+    print(f"cosim {version('rti-cosim')}")
+    for name in ("evaporator", "evaporator_fmi3"):
+        digest = hashlib.sha256(fmus.path(name).read_bytes()).hexdigest()
+        print(f"{name}.fmu sha256 {digest}")
+    raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            callback=_version,
+            is_eager=True,
+            help="Print the version and the shipped FMUs' hashes.",
+        ),
+    ] = False,
+) -> None:
+    """Co-simulate an FMU plant with learning-based MPC, and benchmark what it learns."""
+
+
+def main() -> None:
+    """Run the command line; bad input ends in one line on standard error and exit code 2."""
+    try:
+        app()
+    except tuple(_known_errors()) as error:
+        _fail(str(error))
+    except BrokenPipeError:
+        sys.exit(1)
+    except OSError as error:
+        name = f"'{error.filename}': " if error.filename else ""
+        _fail(f"{name}{error.strerror or error}")
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _known_errors() -> list[type[Exception]]:
+    return [getattr(sys.modules[module], name) for module, name in _ERRORS if module in sys.modules]
+
+
+def _fail(message: str) -> None:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(EXIT_BAD_INPUT)

@@ -1,0 +1,142 @@
+"""What a command prints and writes: tables, progress, JSON, files."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cosim.errors import CosimError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print a JSON summary on standard output, nothing else.")
+]
+
+
+class Output:
+    """Tables go to standard output, progress to standard error; with JSON, only JSON goes out."""
+
+    def __init__(self, as_json: bool) -> None:
+        self.as_json = as_json
+        self._stdout = -1
+
+    def console(self) -> Console:
+        """Console of standard error, for progress and notes."""
+        from rich.console import Console
+
+        return Console(stderr=True)
+
+    def note(self, text: str) -> None:
+        """Print a line on standard error, unless JSON was asked for."""
+        if not self.as_json:
+            self.console().print(text, highlight=False, soft_wrap=True)
+
+    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """Print a table, its first column left and the others right justified."""
+        if self.as_json:
+            return
+        from rich.console import Console
+        from rich.table import Table
+
+        table = Table(title=title, title_justify="left")
+        for number, column in enumerate(header):
+            table.add_column(column, justify="right" if number else "left")
+        for row in rows:
+            table.add_row(*row)
+        Console().print(table)
+
+    def json(self, document: Mapping[str, Any]) -> None:
+        """Print the document if JSON was asked for."""
+        if self.as_json:
+            text = dump(document)
+            if self._stdout >= 0:
+                os.write(self._stdout, text.encode())
+            else:
+                sys.stdout.write(text)
+
+    @contextmanager
+    def progress(self, label: str, total: int) -> Iterator[Any]:
+        """Progress bar on standard error; yields a function that takes the number done."""
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        console = self.console()
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        hidden = self.as_json or not console.is_terminal
+        with Progress(*columns, TimeRemainingColumn(), console=console, disable=hidden) as bar:
+            task = bar.add_task(label, total=total)
+
+            def update(done: int) -> None:
+                bar.update(task, completed=done)
+
+            yield update
+
+
+@contextmanager
+def output(as_json: bool) -> Iterator[Output]:
+    """Open a command's output.
+
+    With JSON, file descriptor 1 is turned to standard error meanwhile, since an FMU or a solver
+    is native code that may print.
+    """
+    result = Output(as_json)
+    if not as_json or not _has_descriptor():
+        yield result
+        return
+    sys.stdout.flush()
+    result._stdout = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield result
+    finally:
+        sys.stdout.flush()
+        os.dup2(result._stdout, 1)
+        os.close(result._stdout)
+        result._stdout = -1
+
+
+def _has_descriptor() -> bool:
+    """Whether standard output is the process's own (a test runner may have replaced it)."""
+    try:
+        return sys.stdout.fileno() == 1
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def dump(document: Mapping[str, Any]) -> str:
+    """JSON text with sorted keys; a number that is not finite becomes null."""
+    return json.dumps(_finite(document), indent=2, sort_keys=True, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and value - value != 0.0 else value
+
+
+def open_folder(folder: Path) -> Path:
+    """Create an output folder and make sure, before the work, that it can be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".cosim-"):
+            pass
+    except OSError as error:
+        raise CosimError(f"cannot write to folder '{folder}': {error.strerror}") from None
+    return folder

@@ -1,0 +1,94 @@
+"""One closed-loop run from names to files, shared by `demo` and `simulate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cosim.cli.output import Output, dump, open_folder
+
+if TYPE_CHECKING:
+    from cosim.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run is made of, by name."""
+
+    scenario: str
+    controller: str
+    steps: int
+    seed: int
+    out: Path
+    record: bool
+
+
+def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
+    """Simulate, write trajectory.csv, timing.csv, summary.json, scenario.toml and run.rrd.
+
+    Returns the trajectory and the summary. Everything that a clock measured is in timing.csv and
+    the summary's `timing`; all other bytes are the same for the same command and seed.
+    """
+    from controllers.storage import write_atomically
+    from cosim.cli.compose import build_controller, build_plant
+    from cosim.scenario import Scenario
+    from cosim.simulation import simulate
+
+    scenario = Scenario.load(run.scenario)
+    folder = open_folder(run.out)
+    with build_plant(scenario) as plant:
+        if not plant.is_shipped:
+            output.note(f"native code of {plant.fmu_path}, sha256 {plant.fmu_sha256}")
+        controller = build_controller(run.controller, scenario)
+        recorder = None
+        if run.record:
+            from cosim.recording import RerunRecorder
+
+            recorder = RerunRecorder(folder / "run.rrd")
+        label = f"{run.controller} on {scenario.name}"
+        with output.progress(label, run.steps) as progress:
+            trajectory = simulate(
+                plant, controller, run.steps, run.seed, recorder=recorder, progress=progress
+            )
+        summary = _summary(run, trajectory, controller, plant)
+    trajectory.write_csv(folder / "trajectory.csv")
+    trajectory.write_timing_csv(folder / "timing.csv")
+    write_atomically(folder / "scenario.toml", scenario.to_toml())
+    write_atomically(folder / "summary.json", dump(summary))
+    return trajectory, summary
+
+
+def _summary(run: Run, trajectory: Trajectory, controller: Any, plant: Any) -> dict[str, Any]:
+    from importlib.metadata import version
+
+    parameters = getattr(controller, "parameters", None)
+    return {
+        "version": version("rti-cosim"),
+        "scenario": trajectory.scenario.name,
+        "scenario_hash": trajectory.scenario.hash,
+        "fmu": plant.fmu_path.name,
+        "fmu_sha256": plant.fmu_sha256,
+        "controller": run.controller,
+        "parameters_hash": getattr(parameters, "hash", None),
+        "seed": run.seed,
+        **trajectory.summary(),
+        "timing": trajectory.timing_summary(),
+    }
+
+
+def show(summary: dict[str, Any], output: Output) -> None:
+    """Print a run's table: costs, violations, failures and step times."""
+    title = "{controller} on {scenario}, {samples} samples, seed {seed}".format(**summary)
+    rows = [
+        ("economic cost", f"{summary['economic_cost']:.3f}"),
+        ("mean violation", f"{summary['mean_violation']:.5f}"),
+        ("violating share", f"{100 * summary['violating_share']:.2f} %"),
+        ("J = mean(economic cost + penalty)", f"{summary['J']:.3f}"),
+        ("failures", str(summary["failures"])),
+    ]
+    rows += [
+        (f"{name} time, median / 99 %", f"{t['median_us']:.1f} / {t['p99_us']:.1f} µs")
+        for name, t in summary["timing"].items()
+    ]
+    output.table(title, ("per sample", "value"), rows)

@@ -1,0 +1,47 @@
+"""`cosim simulate`: one closed-loop run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosim.cli.output import JsonOption, output
+from cosim.cli.run import Run, execute, show
+
+ScenarioOption = Annotated[
+    str,
+    typer.Option("--scenario", "-s", help="Preset (paper, nominal, fast-sampling) or TOML file."),
+]
+StepsOption = Annotated[int, typer.Option("--steps", "-n", min=1, help="Number of samples.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the disturbances.")]
+
+
+def simulate(
+    scenario: ScenarioOption = "paper",
+    controller: Annotated[
+        str,
+        typer.Option(
+            "--controller",
+            "-c",
+            help="naive, tuned, converged, optimal, a parameters file, or module:factory.",
+        ),
+    ] = "naive",
+    steps: StepsOption = 1000,
+    seed: SeedOption = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
+        "cosim-run"
+    ),
+    record: Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Run a controller on a scenario's plant.
+
+    Writes trajectory.csv, timing.csv, summary.json, scenario.toml and, with --record, run.rrd.
+    """
+    with output(json) as out_:
+        _, summary = execute(Run(scenario, controller, steps, seed, out, record), out_)
+        show(summary, out_)
+        out_.note(f"files are in {out.resolve()}")
+        out_.json(summary)

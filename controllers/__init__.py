@@ -5,5 +5,18 @@ from controllers.layout import Layout
 from controllers.model import Model, Quantity
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.rti import RtiNmpc
+from controllers.solution import LinearisationPoint, RtiSolution
 
-__all__ = ["ControllerError", "Layout", "Model", "Parameters", "Problem", "QpError", "Quantity"]
+__all__ = [
+    "ControllerError",
+    "Layout",
+    "LinearisationPoint",
+    "Model",
+    "Parameters",
+    "Problem",
+    "QpError",
+    "Quantity",
+    "RtiNmpc",
+    "RtiSolution",
+]

@@ -34,9 +34,9 @@ class BufferedFunction:
         }
         self._buffer, self._evaluate = function.buffer()
         for i, array in enumerate(self.inputs.values()):
-            self._buffer.set_arg(i, memoryview(array))
+            self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]
         for i, array in enumerate(self.outputs.values()):
-            self._buffer.set_res(i, memoryview(array))
+            self._buffer.set_res(i, memoryview(array))  # type: ignore[arg-type,call-arg]
 
     def __call__(self) -> None:
         """Evaluate with what stands in `inputs`, into `outputs`."""

@@ -70,7 +70,7 @@ class Model:
         )
 
 
-def runge_kutta(  # noqa: PLR0917
+def runge_kutta(
     model: Model, x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX, sampling_time: float, substeps: int
 ) -> ca.SX:
     """State after one sample of `sampling_time` seconds by `substeps` classical RK4 steps."""

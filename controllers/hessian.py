@@ -1,0 +1,147 @@
+"""The second-order term of the QP: Gauss–Newton, or exact with a stated convexification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.buffered import BufferedFunction, stacked
+from controllers.errors import ControllerError
+from controllers.lagrangian import sampled_curvature
+from controllers.layout import Layout
+from controllers.ocp import SymbolicParameters
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+
+Vector = NDArray[np.float64]
+RULES = ("gauss-newton", "exact")
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigenvalues (N, s) and eigenvectors (N, s, s) of the blocks before they were lifted."""
+
+    values: Vector
+    vectors: Vector
+    floor: Vector
+
+    def contract(self, seed: Vector) -> Vector:
+        """Adjoint of the derivative of L = P(·): M with ⟨seed, dL⟩ = ⟨M, dX⟩, shapes (N, s, s).
+
+        The derivative of a spectral function is a Schur product with its divided differences in
+        the eigenbasis (Daleckii and Krein).
+        """
+        lifted = np.maximum(self.values, self.floor)
+        gap = self.values[:, :, None] - self.values[:, None, :]
+        rise = lifted[:, :, None] - lifted[:, None, :]
+        kept = (self.values > self.floor).astype(float)
+        same = np.abs(gap) < 1e-12 * np.maximum(1.0, np.abs(self.values).max())
+        divided = np.where(same, kept[:, :, None] * kept[:, None, :], rise / np.where(same, 1, gap))
+        transposed = self.vectors.transpose(0, 2, 1)
+        return self.vectors @ (divided * (transposed @ seed @ self.vectors)) @ transposed
+
+
+class HessianRule(Protocol):
+    """Fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation."""
+
+    spectrum: Spectrum | None
+
+    def set_parameters(self, parameters: Parameters) -> None:
+        """Take over a new θ."""
+
+    def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
+        """Write L and q for the linearisation points (N, n), (N, m); return the constant."""
+
+
+class GaussNewton:
+    """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is."""
+
+    spectrum: Spectrum | None = None
+
+    def __init__(self, problem: Problem, prepared: BufferedFunction) -> None:
+        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        self._discounts = problem.discount ** np.arange(horizon)
+        self._end = problem.discount**horizon
+        self._L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
+        self._q = prepared.inputs["q"].reshape(horizon, n + m)
+        self._L_N, self._q_N = prepared.inputs["L_N"], prepared.inputs["q_N"]
+
+    def set_parameters(self, parameters: Parameters) -> None:
+        """Write the costs of θ, which no linearisation point changes."""
+        self._L[:] = 2 * self._discounts[:, None, None] * parameters["B_l"]
+        self._q[:] = self._discounts[:, None] * parameters["b_l"]
+        self._L_N[:] = 2 * self._end * parameters["B_Vf"].reshape(-1)
+        self._q_N[:] = self._end * parameters["b_Vf"]
+
+    def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
+        """Leave all as it is."""
+        return 0.0
+
+
+class Exact:
+    """L_k = P(2γᵏB_l + D_k), D_k the curvature of χ̄_{k+1}ᵀf at the linearisation point.
+
+    P lifts the eigenvalues of each stage's block to at least γᵏ·`FLOOR`, so that the QP keeps its
+    stage structure and is strictly convex. The floor does not depend on θ, so that P can be
+    differentiated. The terminal cost has no curvature of the model and stays as it is.
+    """
+
+    FLOOR = 1e-3
+    spectrum: Spectrum | None = None
+
+    def __init__(self, problem: Problem, layout: Layout, prepared: BufferedFunction) -> None:
+        self._cost = GaussNewton(problem, prepared)
+        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        self._reference = np.concatenate([problem.reference_state, problem.reference_action])
+        self._discounts = problem.discount ** np.arange(horizon)
+        self._L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
+        self._q = prepared.inputs["q"].reshape(horizon, n + m)
+        symbols = SymbolicParameters.of(problem, layout)
+        x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
+        guess = ca.SX.sym("guess", n, horizon)
+        self._curvature = stacked(
+            "curvature",
+            {"x": x, "u": u, "guess": guess, "theta": symbols.theta},
+            {"D": ca.horzcat(*sampled_curvature(problem, symbols, x, u, guess))},
+        )
+
+    def set_parameters(self, parameters: Parameters) -> None:
+        """Take over the costs of θ."""
+        self._cost.set_parameters(parameters)
+        self._B, self._b = parameters["B_l"], parameters["b_l"]
+        self._curvature.inputs["theta"][:] = parameters.theta
+
+    def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
+        """Write the convexified blocks and the gradients that go with them."""
+        call = self._curvature
+        for name, value in (("x", x), ("u", u), ("guess", costates)):
+            call.inputs[name][:] = value.reshape(-1)
+        call()
+        size = self._reference.size
+        cost = 2 * self._discounts[:, None, None] * self._B
+        raw = cost + call.part("D").reshape(-1, size, size)
+        values, vectors = np.linalg.eigh(raw)
+        floor: Vector = self.FLOOR * self._discounts[:, None]
+        self.spectrum = Spectrum(values, vectors, floor)
+        lifted = np.maximum(values, floor)
+        self._L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
+        at = np.concatenate([x, u], axis=1) - self._reference
+        curved = np.einsum("kij,kj->ki", self._L, at)
+        flat = 2 * self._discounts[:, None] * (at @ self._B)
+        self._q[:] = flat + self._discounts[:, None] * self._b - curved
+        return float((at * (curved - flat)).sum() / 2)
+
+
+def make_hessian(
+    name: str, problem: Problem, layout: Layout, prepared: BufferedFunction
+) -> HessianRule:
+    """Rule by name, `gauss-newton` or `exact`; raises ControllerError on another."""
+    if name == "gauss-newton":
+        return GaussNewton(problem, prepared)
+    if name == "exact":
+        return Exact(problem, layout, prepared)
+    raise ControllerError(f"there is no Hessian '{name}'; choose {' or '.join(RULES)}")

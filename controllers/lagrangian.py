@@ -1,0 +1,246 @@
+"""The Lagrangian of the QP in CasADi: read-outs of a solution and their derivatives.
+
+The QP's value has the gradient ∇θ of the QP's Lagrangian at the primal-dual solution y, and the
+derivative of y is minus the inverse KKT matrix times ∇θ∇_y of that Lagrangian (paper.tex, RTI
+Sensitivities). Both need one expression only: the part of the Lagrangian that contains θ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from controllers.buffered import StackedFunction, stacked
+from controllers.layout import Layout
+from controllers.ocp import SymbolicParameters, linearisation, sampled_jacobian
+from controllers.problem import Problem
+
+
+@dataclass(frozen=True)
+class PrimalDual:
+    """Symbols of a solution: ξ (n, N+1), v (m, N), slack t and λ (n, N), χ (n, N+1)."""
+
+    xi: ca.SX
+    v: ca.SX
+    t: ca.SX
+    lam: ca.SX
+    chi: ca.SX
+
+    @classmethod
+    def symbols(cls, problem: Problem, prefix: str = "") -> PrimalDual:
+        """Fresh symbols, their names prefixed."""
+        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        shapes = {
+            "xi": (n, horizon + 1),
+            "v": (m, horizon),
+            "t": (n, horizon),
+            "lam": (n, horizon),
+            "chi": (n, horizon + 1),
+        }
+        return cls(**{name: ca.SX.sym(prefix + name, *shape) for name, shape in shapes.items()})
+
+    def named(self, prefix: str = "") -> dict[str, ca.SX]:
+        """The symbols by name."""
+        return {prefix + name: getattr(self, name) for name in ("xi", "v", "t", "lam", "chi")}
+
+
+def sampled_curvature(
+    problem: Problem, symbols: SymbolicParameters, x: ca.SX, u: ca.SX, chi: ca.SX
+) -> list[ca.SX]:
+    """Second derivatives D_k of χ_{k+1}ᵀ f(x_k, u_k) with respect to (x, u), stage by stage."""
+    curvature = []
+    for k in range(problem.horizon):
+        point = ca.SX.sym("point", problem.n_states + problem.n_actions)
+        x_k, u_k = point[: problem.n_states], point[problem.n_states :]
+        x_next, _ = sampled_jacobian(problem, x_k, u_k, symbols.model_parameters)
+        costate = ca.SX.sym("costate", problem.n_states)
+        hessian, _ = ca.hessian(ca.dot(costate, x_next), point)
+        curvature.append(
+            ca.substitute(
+                hessian,
+                ca.vertcat(point, costate),
+                ca.vertcat(x[:, k], u[:, k], chi[:, k]),
+            )
+        )
+    return curvature
+
+
+def readout(problem: Problem, layout: Layout, prepared: StackedFunction) -> StackedFunction:
+    """States, slack, costates and value that belong to a solution (v, λ) of the condensed QP.
+
+    Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta; the QP's
+    A, B, r, L, q, L_N, q_N are read from the preparation's memory. Results: xi (n, N+1), t (n, N),
+    chi (n, N+1), value.
+    The costates χ solve the adjoint recursion, so χ_0 is the gradient of the value in s.
+    """
+    n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
+    symbols = SymbolicParameters.of(problem, layout)
+    blocks = symbols.blocks
+    x_s = ca.DM(problem.reference_state)
+    s, v, lam = ca.SX.sym("s", n), ca.SX.sym("v", m, horizon), ca.SX.sym("lam", n, horizon)
+    A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
+    r = ca.SX.sym("r", n, horizon)
+    L, q = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("q", n + m, horizon)
+    L_N, q_N, constant = ca.SX.sym("L_N", n, n), ca.SX.sym("q_N", n), ca.SX.sym("constant")
+
+    violation = ca.fmax(ca.fmax(problem.state_lower - s, s - problem.state_upper), 0)
+    known = ca.dot(problem.penalty_linear, violation) + ca.dot(
+        problem.penalty_quadratic, violation**2
+    )
+    xi = [s - x_s]
+    value = constant + known + blocks["c_lambda"]
+    value += ca.bilin(blocks["B_lambda"], xi[0]) + ca.dot(blocks["b_lambda"], xi[0])
+    t, weights = [], []
+    for k in range(horizon):
+        w = ca.vertcat(xi[k], v[:, k])
+        weights.append(L[:, k * (n + m) : (k + 1) * (n + m)])
+        value += ca.bilin(weights[k], w) / 2 + ca.dot(q[:, k], w)
+        columns = slice(k * n, (k + 1) * n)
+        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ v[:, k] + r[:, k])
+        outside = ca.fmax(blocks["x_l"] - x_s - xi[k + 1], xi[k + 1] - blocks["x_u"] + x_s)
+        t.append(ca.fmax(outside, 0))
+        value += gamma ** (k + 1) * (
+            ca.dot(blocks["w_sigma"], t[k]) + ca.dot(blocks["W_sigma"], t[k] ** 2)
+        )
+    value += ca.bilin(L_N, xi[horizon]) / 2 + ca.dot(q_N, xi[horizon])
+
+    chi = [L_N @ xi[horizon] + q_N + lam[:, horizon - 1]]
+    for k in reversed(range(horizon)):
+        w = ca.vertcat(xi[k], v[:, k])
+        costate = weights[k][:n, :] @ w + q[:n, k] + A[:, k * n : (k + 1) * n] @ chi[0]
+        if k == 0:
+            costate += 2 * blocks["B_lambda"] @ xi[0] + blocks["b_lambda"]
+            costate += ca.gradient(known, s)
+        else:
+            costate += lam[:, k - 1]
+        chi.insert(0, costate)
+    return stacked(
+        "readout",
+        {
+            "s": s,
+            "v": v,
+            "lam": lam,
+            "A": A,
+            "B": B,
+            "r": r,
+            "L": L,
+            "q": q,
+            "L_N": L_N,
+            "q_N": q_N,
+            "constant": constant,
+            "theta": symbols.theta,
+        },
+        {
+            "xi": ca.horzcat(*xi),
+            "t": ca.horzcat(*t),
+            "chi": ca.horzcat(*chi),
+            "value": value,
+        },
+        {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
+        | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N")},
+    )
+
+
+def _theta_part(
+    problem: Problem,
+    symbols: SymbolicParameters,
+    y: PrimalDual,
+    x: ca.SX,
+    u: ca.SX,
+    exact: tuple[ca.SX, ca.SX] | None,
+) -> ca.SX:
+    """All terms of the QP's Lagrangian in which θ appears.
+
+    `exact` is (M, χ̄) where the QP has the exact Hessian: M_k stands for the derivative of the
+    stage's second-order term with respect to L_k, and χ̄ are the costates at which D_k was taken.
+    """
+    n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
+    blocks = symbols.blocks
+    x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
+    part = ca.bilin(blocks["B_lambda"], y.xi[:, 0]) + ca.dot(blocks["b_lambda"], y.xi[:, 0])
+    part += blocks["c_lambda"]
+    by_state, by_action, offset = linearisation(problem, symbols, x, u)
+    curvature = sampled_curvature(problem, symbols, x, u, exact[1]) if exact else []
+    for k in range(horizon):
+        w = ca.vertcat(y.xi[:, k], y.v[:, k])
+        stage = ca.dot(blocks["b_l"], w)
+        if exact is None:
+            stage += ca.bilin(blocks["B_l"], w)
+        else:
+            at = ca.vertcat(x[:, k] - x_s, u[:, k] - u_s)
+            columns = slice(k * (n + m), (k + 1) * (n + m))
+            M = exact[0][:, columns]
+            stage += ca.bilin(blocks["B_l"], at, 2 * w - at) + 2 * ca.dot(M, blocks["B_l"])
+            part += ca.dot(M, curvature[k])
+        predicted = by_state[k] @ y.xi[:, k] + by_action[k] @ y.v[:, k] + offset[k]
+        part += gamma**k * stage + ca.dot(y.chi[:, k + 1], predicted)
+        part += gamma ** (k + 1) * ca.dot(blocks["w_sigma"], y.t[:, k])
+        part += gamma ** (k + 1) * ca.dot(blocks["W_sigma"], y.t[:, k] ** 2)
+        part += ca.dot(ca.fmax(-y.lam[:, k], 0), blocks["x_l"])
+        part -= ca.dot(ca.fmax(y.lam[:, k], 0), blocks["x_u"])
+    end = y.xi[:, horizon]
+    return part + gamma**horizon * (ca.bilin(blocks["B_Vf"], end) + ca.dot(blocks["b_Vf"], end))
+
+
+def sensitivities(
+    problem: Problem, layout: Layout, *, exact: bool
+) -> tuple[StackedFunction, StackedFunction]:
+    """Gradient of the value in θ, and its directional derivatives along the KKT adjoints.
+
+    The first maps a solution (xi, v, t, lam, chi), the linearisation points x, u and theta to
+    `gradient` (n_θ). The second maps that, the QP's A, B, L, L_N and the columns of m adjoint
+    directions dv (mN, m), dt and dlam (nN, m) to `policy` (n_θ, m), which is dπ/dθ transposed, and
+    `state` (n, m), dπ/ds transposed. With `exact` both need M and χ̄ (see `_theta_part`), the
+    second also dM, the directional derivative of M.
+    """
+    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+    symbols = SymbolicParameters.of(problem, layout)
+    y = PrimalDual.symbols(problem)
+    x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
+    M = ca.SX.sym("M", n + m, horizon * (n + m))
+    guess = ca.SX.sym("guess", n, horizon)
+    extra = {"M": M, "guess": guess} if exact else {}
+    part = _theta_part(problem, symbols, y, x, u, (M, guess) if exact else None)
+    gradient = ca.gradient(part, symbols.theta)
+    inputs = {**y.named(), "x": x, "u": u, "theta": symbols.theta, **extra}
+    value = stacked("value_gradient", inputs, {"gradient": gradient})
+
+    A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
+    L, L_N = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("L_N", n, n)
+    dv, dt, dlam = (
+        ca.SX.sym(name, rows * horizon, m) for name, rows in (("dv", m), ("dt", n), ("dlam", n))
+    )
+    dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
+    symbol = ca.veccat(*y.named().values(), *([M] if exact else []))
+    policy, state = [], []
+    for i in range(m):
+        v_i = ca.reshape(dv[:, i], m, horizon)
+        lam_i = ca.reshape(dlam[:, i], n, horizon)
+        xi_i, chi_i = _direction(problem, A, B, L, L_N, v_i, lam_i)
+        direction = ca.veccat(xi_i, v_i, dt[:, i], lam_i, chi_i, *([dM[:, i]] if exact else []))
+        policy.append(-ca.jtimes(gradient, symbol, direction))
+        state.append(-chi_i[:, 0])
+    moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
+    return value, stacked(
+        "policy_jacobian",
+        {**inputs, **moved, **({"dM": dM} if exact else {})},
+        {"policy": ca.horzcat(*policy), "state": ca.horzcat(*state)},
+    )
+
+
+def _direction(
+    problem: Problem, A: ca.SX, B: ca.SX, L: ca.SX, L_N: ca.SX, dv: ca.SX, dlam: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Directions of the states and costates that go with those of the controls and rows."""
+    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+    xi = [ca.SX(n, 1)]
+    for k in range(horizon):
+        columns = slice(k * n, (k + 1) * n)
+        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ dv[:, k])
+    chi = [L_N @ xi[horizon] + dlam[:, horizon - 1]]
+    for k in reversed(range(horizon)):
+        weight = L[:, k * (n + m) : (k + 1) * (n + m)]
+        costate = weight[:n, :] @ ca.vertcat(xi[k], dv[:, k]) + A[:, k * n : (k + 1) * n] @ chi[0]
+        chi.insert(0, costate + (dlam[:, k - 1] if k else 0))
+    return ca.horzcat(*xi), ca.horzcat(*chi)

@@ -1,0 +1,84 @@
+"""DAQP with a persistent workspace: a dual active-set method with native soft constraints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import daqp
+import numpy as np
+
+from controllers.errors import QpError
+from controllers.qp.problem import QpSolution, SoftQp
+
+SOFT, FIXED = 8, 5
+SETTINGS = {"primal_tol": 1e-10, "dual_tol": 1e-12}
+MEANING = {
+    -1: "infeasible",
+    -2: "cycling",
+    -3: "unbounded",
+    -4: "iteration limit",
+    -5: "not convex",
+    -6: "overdetermined start",
+    -7: "time limit",
+}
+
+
+class DaqpBackend:
+    """Solves the condensed QP; the slack never becomes a variable.
+
+    Every solve starts from the same empty working set, so its result depends on the QP alone and
+    not on what was solved before: runs can be repeated and resumed bit by bit.
+    """
+
+    def __init__(self) -> None:
+        self._model: Any = None
+        self._factorised = 0
+
+    def load(self, qp: SoftQp) -> None:
+        """Factorise H and transform the rows; the first call allocates the workspace."""
+        n, rows = qp.f.size, qp.w.size
+        if self._model is None:
+            self._lower, self._upper = np.zeros(n + rows), np.zeros(n + rows)
+            self._free = np.repeat(np.array([0, SOFT], dtype=np.int32), [n, rows])
+            self._sense = self._free.copy()
+            self._model = daqp.Model()
+            self._model.settings = SETTINGS
+            self._write_limits(qp)
+            self._factorised, _ = self._model.setup(
+                qp.H, qp.f, qp.rows, self._upper, self._lower, self._sense
+            )
+            self._weights(qp)
+        else:
+            if not (np.array_equal(qp.w, self._w) and np.array_equal(qp.W, self._W)):
+                self._weights(qp)
+            self._factorised = self._model.update(H=qp.H, A=qp.rows, sense=self._free)
+
+    def _weights(self, qp: SoftQp) -> None:
+        self._w, self._W = qp.w.copy(), qp.W.copy()
+        unused = np.ones(qp.f.size)
+        linear, compliance = np.r_[unused, self._w], np.r_[unused, 0.5 / self._W]
+        self._model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
+
+    def _write_limits(self, qp: SoftQp) -> None:
+        n = qp.f.size
+        self._lower[:n], self._upper[:n] = qp.lower, qp.upper
+        self._lower[n:], self._upper[n:] = qp.row_lower, qp.row_upper
+
+    def solve(self, qp: SoftQp) -> QpSolution:
+        """Solve with the vectors of `qp`; raises QpError where DAQP does not."""
+        n = qp.f.size
+        self._write_limits(qp)
+        self._sense[:] = self._free
+        self._sense[:n][qp.lower >= qp.upper] = FIXED
+        flag = self._factorised
+        if flag >= 0:
+            flag = self._model.update(
+                f=qp.f, bupper=self._upper, blower=self._lower, sense=self._sense
+            )
+        if flag >= 0:
+            v, _, flag, info = self._model.solve()
+        if flag <= 0:
+            status = MEANING.get(flag, f"exit flag {flag}")
+            raise QpError(f"DAQP did not solve the QP: {status}", status=status, qp=qp.copy())
+        multipliers = info["lam"]
+        return QpSolution(v, multipliers[:n], multipliers[n:])

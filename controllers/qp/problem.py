@@ -1,0 +1,199 @@
+"""The QP of one sample as mathematics, and the measures of a solution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+@dataclass
+class Stages:
+    """The same QP stage by stage, before the states are eliminated.
+
+    ξ_{k+1} = A_k ξ_k + B_k v_k + r_k from ξ_0; stage costs ½wᵀL_k w + q_kᵀw with w = (ξ, v),
+    terminal ½ξᵀL_N ξ + q_Nᵀξ. Shapes: A (N, n, n), B (N, n, m), r (N, n), L (N, n+m, n+m),
+    q (N, n+m), L_N (n, n), q_N (n,), state_lower and state_upper (n,), the limits on ξ_1…ξ_N.
+    """
+
+    A: Matrix
+    B: Matrix
+    r: Matrix
+    L: Matrix
+    q: Matrix
+    L_N: Matrix
+    q_N: Vector
+    initial: Vector
+    state_lower: Vector
+    state_upper: Vector
+
+
+@dataclass
+class SoftQp:
+    """A strictly convex QP with hard bounds on its variables and soft bounds on its rows.
+
+        min_v  ½ vᵀH v + fᵀv + Σ_i w_i t_i + W_i t_i²
+        s.t.   lower ≤ v ≤ upper,   row_lower − t ≤ Γ v ≤ row_upper + t,   t ≥ 0
+
+    The stacked controls V = (v_0, …, v_{N−1}) are the variables, the predicted states Γ V the
+    rows; paper.tex eq. param_nlp_qp with the dynamics eliminated. `lower = upper` fixes a variable,
+    which is how u_0 = a is enforced. `stages`, where given, holds the QP with the dynamics.
+    """
+
+    H: Matrix
+    f: Vector
+    lower: Vector
+    upper: Vector
+    rows: Matrix
+    row_lower: Vector
+    row_upper: Vector
+    w: Vector
+    W: Vector
+    stages: Stages | None = None
+
+    def copy(self) -> SoftQp:
+        """Deep copy, for a QP that is kept beyond the next sample."""
+        copied: SoftQp = _copied(self)
+        return copied
+
+    def slack(self, v: Vector) -> Vector:
+        """Least slack t ≥ 0 of each row at v."""
+        y = self.rows @ v
+        return np.maximum(np.maximum(self.row_lower - y, y - self.row_upper), 0.0)
+
+    def objective(self, v: Vector) -> float:
+        """Objective at v with the least slack."""
+        t = self.slack(v)
+        return float(0.5 * v @ self.H @ v + self.f @ v + self.w @ t + self.W @ (t * t))
+
+
+def _copied(data: Any) -> Any:
+    values = {}
+    for entry in fields(data):
+        value = getattr(data, entry.name)
+        values[entry.name] = (
+            value.copy()
+            if isinstance(value, np.ndarray)
+            else _copied(value)
+            if is_dataclass(value)
+            else value
+        )
+    return type(data)(**values)
+
+
+class Residuals(NamedTuple):
+    """Distances from optimality, each zero exactly at the primal-dual solution.
+
+    `stationarity` ‖Hv + f + ν + Γᵀλ‖∞ divided by max(1, ‖f‖∞, ‖Hv‖∞, ‖Γᵀλ‖∞); `bounds`
+    ‖v − clip(v + ν)‖∞ and `rows` ‖y − prox_φ(y + λ)‖∞ in the units of v and y = Γv, where φ is the
+    soft bound: they measure feasibility, sign and complementarity at once. `gap` is the duality
+    gap relative to max(1, |objective|).
+    """
+
+    stationarity: float
+    bounds: float
+    rows: float
+    gap: float
+
+    @property
+    def largest(self) -> float:
+        """Largest of the three KKT residuals."""
+        return max(self.stationarity, self.bounds, self.rows)
+
+
+class QpSolution(NamedTuple):
+    """Primal-dual solution: Hv + f + ν + Γᵀλ = 0.
+
+    A multiplier is positive where an upper limit pushes and negative where a lower one does; ν
+    belongs to the bounds (for fixed variables it is the multiplier of that equation), λ to the
+    rows, with |λ_i| ≤ w_i unless row i is violated, and then |λ_i| = w_i + 2 W_i t_i.
+    """
+
+    v: Vector
+    nu: Vector
+    lam: Vector
+
+    def residuals(self, qp: SoftQp) -> Residuals:
+        """Measure the solution against the QP that it is meant to solve."""
+        v, nu, lam = self
+        curvature, pull, y = qp.H @ v, lam @ qp.rows, qp.rows @ v
+        scale = max(1.0, *(float(np.abs(part).max()) for part in (qp.f, curvature, pull)))
+        stationarity = float(np.abs(curvature + qp.f + nu + pull).max()) / scale
+        bounds = float(np.abs(v - np.minimum(np.maximum(v + nu, qp.lower), qp.upper)).max())
+        rows = float(np.abs(y - _proximal(y + lam, qp)).max())
+        return Residuals(stationarity, bounds, rows, self._gap(qp, curvature))
+
+    def _gap(self, qp: SoftQp, curvature: Vector) -> float:
+        v, nu, lam = self
+        # The dual function at (ν, λ): minus the conjugates of the bounds and of the soft rows.
+        bound = np.where(nu > 0, nu * qp.upper, nu * qp.lower).sum()
+        over = np.maximum(np.abs(lam) - qp.w, 0.0)
+        soft = np.where(lam > 0, lam * qp.row_upper, lam * qp.row_lower).sum()
+        dual = -0.5 * float(v @ curvature) - bound - soft - float((over**2 / (4 * qp.W)).sum())
+        primal = qp.objective(v)
+        return abs(primal - float(dual)) / max(1.0, abs(primal))
+
+    def weakly_active(self, qp: SoftQp, tolerance: float = 1e-6) -> bool:
+        """Whether some bound or row is about to change its activity.
+
+        It is where a limit is reached (within `tolerance`, relative to 1 + |limit|) with a
+        multiplier below `tolerance`·max(1, ‖multipliers‖∞), or a row sits at its limit with a
+        multiplier as close to w. Derivatives of the solution are then one-sided.
+        """
+        v, nu, lam = self
+        small = tolerance * max(1.0, float(np.abs(nu).max()))
+        free = qp.lower < qp.upper
+        at_bound = np.minimum(v - qp.lower, qp.upper - v) < tolerance * (1 + np.abs(v))
+        if (free & at_bound & (np.abs(nu) < small)).any():
+            return True
+        y = qp.rows @ v
+        at_limit = np.minimum(np.abs(y - qp.row_lower), np.abs(y - qp.row_upper)) < tolerance * (
+            1 + np.abs(y)
+        )
+        size = np.abs(lam)
+        undecided = (size < tolerance * np.maximum(1.0, size.max())) | (
+            np.abs(size - qp.w) < tolerance * qp.w
+        )
+        return bool((at_limit & undecided).any())
+
+    def active(self, qp: SoftQp) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Masks: variables held by a bound, rows held at a limit, rows violated.
+
+        By the multipliers, which are exactly zero for inactive limits of an active-set solver and
+        nearly so for an interior one; `weakly_active` says where that is not safe.
+        """
+        v, nu, lam = self
+        at_bound = np.minimum(v - qp.lower, qp.upper - v) < np.abs(nu)
+        held = (qp.lower >= qp.upper) | at_bound
+        y = qp.rows @ v
+        outside = np.maximum(np.maximum(qp.row_lower - y, y - qp.row_upper), 0.0)
+        violated = np.abs(lam) - qp.w > outside
+        inside = np.minimum(y - qp.row_lower, qp.row_upper - y)
+        return held, ~violated & (np.abs(lam) > inside), violated
+
+    def licq_margin(self, qp: SoftQp) -> float:
+        """Least singular value of the active constraints' normalised gradients; ∞ without any.
+
+        Zero means that the linear independence constraint qualification fails.
+        """
+        held, at_limit, _ = self.active(qp)
+        gradients = qp.rows[np.ix_(at_limit, ~held)]
+        if gradients.shape[0] == 0:
+            return np.inf
+        if gradients.shape[0] > gradients.shape[1]:
+            return 0.0
+        norms = np.maximum(np.linalg.norm(gradients, axis=1, keepdims=True), 1e-300)
+        return float(np.linalg.svd(gradients / norms, compute_uv=False)[-1])
+
+
+def _proximal(z: Vector, qp: SoftQp) -> Vector:
+    """prox_φ(z) of φ(y) = Σ w t + W t², t the violation of the row limits."""
+    result = np.minimum(np.maximum(z, qp.row_lower), qp.row_upper)
+    above, below = z - qp.row_upper - qp.w, qp.row_lower - z - qp.w
+    result = np.where(above > 0, qp.row_upper + above / (1 + 2 * qp.W), result)
+    return np.where(below > 0, qp.row_lower - below / (1 + 2 * qp.W), result)

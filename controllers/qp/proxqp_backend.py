@@ -1,0 +1,97 @@
+"""ProxQP with a persistent workspace and warm start: a proximal augmented Lagrangian method."""
+
+from __future__ import annotations
+
+import numpy as np
+from proxsuite import proxqp
+
+from controllers.errors import QpError
+from controllers.qp.problem import QpSolution, SoftQp
+
+TOLERANCE = 1e-9
+INFINITE = 1e20
+
+
+class ProxQpBackend:
+    """Solves the condensed QP with one explicit slack a row and box constraints.
+
+    Each solve starts from the previous solution, so it is reproducible to the tolerance only. The
+    preconditioner is that of the first QP: computing it anew costs more than it saves.
+    """
+
+    def __init__(self) -> None:
+        self._qp: proxqp.dense.QP | None = None
+
+    def load(self, qp: SoftQp) -> None:
+        """Hand over the matrices; the first call allocates the workspace."""
+        n, rows = qp.f.size, qp.w.size
+        if self._qp is None:
+            self._hessian = np.zeros((n + rows, n + rows))
+            self._gradient = np.zeros(n + rows)
+            self._rows = np.zeros((2 * rows, n + rows))
+            self._rows[:rows, n:], self._rows[rows:, n:] = np.eye(rows), -np.eye(rows)
+            self._row_lower, self._row_upper = np.full((2, 2 * rows), INFINITE)
+            self._row_lower *= -1
+            self._lower, self._upper = np.zeros(n + rows), np.full(n + rows, INFINITE)
+        self._hessian[:n, :n] = qp.H
+        np.fill_diagonal(self._hessian[n:, n:], 2 * qp.W)
+        self._rows[:rows, :n] = self._rows[rows:, :n] = qp.rows
+        self._write_vectors(qp)
+        if self._qp is None:
+            self._qp = proxqp.dense.QP(n + rows, 0, 2 * rows, True)
+            settings = self._qp.settings
+            settings.eps_abs, settings.eps_rel = TOLERANCE, 0.0
+            settings.max_iter = 1000
+            settings.initial_guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
+            self._qp.init(
+                self._hessian,
+                self._gradient,
+                None,
+                None,
+                self._rows,
+                self._row_lower,
+                self._row_upper,
+                self._lower,
+                self._upper,
+            )
+            # An update before the first solve crashes the process (proxsuite 0.8.0).
+            self._qp.solve()
+        else:
+            self._qp.update(
+                H=self._hessian,
+                C=self._rows,
+                l_box=self._lower,
+                u_box=self._upper,
+                update_preconditioner=False,
+            )
+
+    def _write_vectors(self, qp: SoftQp) -> None:
+        n, rows = qp.f.size, qp.w.size
+        self._gradient[:n], self._gradient[n:] = qp.f, qp.w
+        self._lower[:n], self._upper[:n] = qp.lower, qp.upper
+        self._row_lower[:rows], self._row_upper[rows:] = qp.row_lower, qp.row_upper
+
+    def solve(self, qp: SoftQp) -> QpSolution:
+        """Solve with the vectors of `qp`; raises QpError where ProxQP does not."""
+        n, rows = qp.f.size, qp.w.size
+        self._write_vectors(qp)
+        assert self._qp is not None, "load comes before solve"
+        self._qp.update(
+            g=self._gradient,
+            l=self._row_lower,
+            u=self._row_upper,
+            l_box=self._lower,
+            u_box=self._upper,
+            update_preconditioner=False,
+        )
+        self._qp.solve()
+        results = self._qp.results
+        if results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
+            status = results.info.status.name.removeprefix("PROXQP_").lower().replace("_", " ")
+            raise QpError(f"ProxQP did not solve the QP: {status}", status=status, qp=qp.copy())
+        z = results.z
+        return QpSolution(
+            results.x[:n].copy(),
+            z[2 * rows : 2 * rows + n].copy(),
+            z[:rows] + z[rows : 2 * rows],
+        )

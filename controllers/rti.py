@@ -1,0 +1,281 @@
+"""Real-time-iteration NMPC: one QP a sample, prepared before the state is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from controllers.errors import ControllerError, ParameterError, QpError
+from controllers.hessian import make_hessian
+from controllers.lagrangian import readout, sensitivities
+from controllers.ocp import embedding, preparation
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.qp import SoftQp, Stages, make_backend
+from controllers.solution import Functions, LinearisationPoint, Prepared, RtiSolution
+
+Vector = NDArray[np.float64]
+
+
+class RtiNmpc:
+    """NMPC by the real-time iteration scheme, as action value Q, value V and policy π of θ.
+
+        V(s) = λ_θ(s) + p(s) + Σ_{k<N} γᵏ ℓ_θ(x_k, u_k) + γᴺ V^f_θ(x_N) + Σ_{1≤k≤N} γᵏ p_θ(σ_k)
+
+    minimised over the QP of the linearised dynamics (paper.tex eq. param_nmpc, param_nlp_qp), where
+    p is the penalty of the true bounds at the known state s, p_θ(σ) = w_sigmaᵀσ + σᵀW_sigma σ that
+    of the predicted slack, and Q(s, a) enforces u_0 = a.
+
+    A sample is `prepare()`, which shifts the solution of the last `feedback` and linearises along
+    it, then `feedback(s)`. A second `prepare()` without a feedback in between changes nothing, and
+    `feedback(s, a)` after `feedback(s)` uses the same QP data.
+
+    `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp` or `qpsolvers:SOLVER`.
+    Raises ControllerError on another choice.
+    """
+
+    name = "rti"
+
+    def __init__(
+        self,
+        problem: Problem,
+        parameters: Parameters,
+        *,
+        hessian: str = "gauss-newton",
+        backend: str = "daqp",
+    ) -> None:
+        """Build the CasADi functions and the workspace of the backend; see the class."""
+        self.problem = problem
+        layout = parameters.layout
+        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        self._backend_name, self._backend = backend, make_backend(backend)
+        self._prepare = preparation(problem, layout)
+        self._embed = embedding(problem, layout, self._prepare)
+        self._hessian = make_hessian(hessian, problem, layout, self._prepare)
+        gradient, policy = sensitivities(problem, layout, exact=hessian == "exact")
+        self._readout = readout(problem, layout, self._prepare)
+        self._functions = Functions(
+            problem, self._prepare, self._embed, self._readout, gradient, policy
+        )
+        self._stages = Stages(
+            A=self._prepare.part("A").reshape(horizon, n, n),
+            B=self._prepare.part("B").reshape(horizon, n, m),
+            r=self._prepare.part("r"),
+            L=self._prepare.inputs["L"].reshape(horizon, n + m, n + m),
+            q=self._prepare.inputs["q"].reshape(horizon, n + m),
+            L_N=self._prepare.inputs["L_N"].reshape(n, n),
+            q_N=self._prepare.inputs["q_N"],
+            initial=np.zeros(n),
+            state_lower=np.zeros(n),
+            state_upper=np.zeros(n),
+        )
+        self._action_lower = np.tile(problem.action_lower - problem.reference_action, horizon)
+        self._action_upper = np.tile(problem.action_upper - problem.reference_action, horizon)
+        self._qp = SoftQp(
+            H=self._prepare.part("H"),
+            f=self._embed.part("f"),
+            lower=self._action_lower.copy(),
+            upper=self._action_upper.copy(),
+            rows=self._prepare.part("Gamma"),
+            row_lower=self._embed.part("lower"),
+            row_upper=self._embed.part("upper"),
+            w=np.zeros(n * horizon),
+            W=np.zeros(n * horizon),
+            stages=self._stages,
+        )
+        self._x = self._prepare.inputs["x"].reshape(horizon, n)
+        self._u = self._prepare.inputs["u"].reshape(horizon, m)
+        self._costates = np.zeros((horizon, n))
+        self._constant = 0.0
+        self.parameters = parameters
+        self.reset()
+
+    # θ ------------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> Parameters:
+        """Parameters θ; setting them keeps the guess and makes the next feedback prepare anew.
+
+        Raises ParameterError where the layout differs, a learned lower bound is not below the
+        upper one or a slack weight is not positive.
+        """
+        return self._parameters
+
+    @parameters.setter
+    def parameters(self, parameters: Parameters) -> None:
+        self._check(parameters)
+        problem, horizon = self.problem, self.problem.horizon
+        self._parameters = parameters
+        self._hessian.set_parameters(parameters)
+        for function in (self._prepare, self._embed, self._readout):
+            function.inputs["theta"][:] = parameters.theta
+        discounts = np.repeat(problem.discount ** np.arange(1, horizon + 1), problem.n_states)
+        learned = "w_sigma" in parameters.layout
+        w = parameters["w_sigma"] if learned else problem.penalty_linear
+        W = parameters["W_sigma"] if learned else problem.penalty_quadratic
+        self._qp.w = discounts * np.tile(w, horizon)
+        self._qp.W = discounts * np.tile(W, horizon)
+        self._stages.state_lower[:] = parameters["x_l"] - problem.reference_state
+        self._stages.state_upper[:] = parameters["x_u"] - problem.reference_state
+        self._prepared: Prepared | None = None
+
+    def _check(self, parameters: Parameters) -> None:
+        current = getattr(self, "_parameters", parameters)
+        if parameters.layout != current.layout:
+            raise ParameterError(
+                "θ has another layout than the controller was built with: "
+                f"{', '.join(parameters.layout.slices)}; build a new controller for it"
+            )
+        if not (parameters["x_l"] < parameters["x_u"]).all():
+            raise ParameterError(
+                f"θ: x_l = {parameters['x_l']} must stay below x_u = {parameters['x_u']}"
+            )
+        if "w_sigma" in parameters.layout:
+            for name in ("w_sigma", "W_sigma"):
+                if not (parameters[name] > 0).all():
+                    raise ParameterError(f"θ: {name} = {parameters[name]} must be positive")
+
+    @property
+    def theta(self) -> Vector:
+        """θ as a flat read-only vector, (n_θ,); set it like `parameters`."""
+        return self._parameters.theta
+
+    @theta.setter
+    def theta(self, theta: ArrayLike) -> None:
+        self.parameters = self._parameters.with_theta(theta)
+
+    # the two phases -----------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget all earlier samples: the next QP is linearised at the reference steady state."""
+        self._x[:] = self.problem.reference_state
+        self._u[:] = self.problem.reference_action
+        self._costates[:] = 0.0
+        self._pending: RtiSolution | None = None
+        self._prepared = None
+        self._backend = make_backend(self._backend_name)
+
+    def prepare(self) -> None:
+        """Preparation phase: shift the last solution, linearise along it, condense, factorise.
+
+        The shift drops the first stage, repeats the last control and, since stage N is not
+        linearised, needs no state beyond the predicted x_N.
+        """
+        if self._pending is not None:
+            last, self._pending = self._pending, None
+            self._x[:] = last.predicted_states[1:]
+            self._u[:-1] = last.predicted_actions[1:]
+            self._u[-1] = last.predicted_actions[-1]
+            # Stage k + 1 becomes stage k, whose costs weigh 1/γ as much.
+            self._costates[:-1] = last.costates[2:] / self.problem.discount
+            self._costates[-1] = last.costates[-1]
+            self._prepared = None
+        if self._prepared is None:
+            self._linearise()
+
+    def prepare_at(self, point: LinearisationPoint) -> None:
+        """Prepare at a given point without shifting, as replay does.
+
+        Raises ControllerError where an array has a wrong shape or is not finite.
+        """
+        targets = {"x": self._x, "u": self._u, "costates": self._costates}
+        for name, target in targets.items():
+            array = np.asarray(getattr(point, name), dtype=np.float64)
+            if array.shape != target.shape or not np.isfinite(array).all():
+                raise ControllerError(
+                    f"linearisation point: {name} must be finite with shape {target.shape}, "
+                    f"not {array.shape}"
+                )
+            target[:] = array
+        self._pending = None
+        self._linearise()
+
+    def _linearise(self) -> None:
+        prepare = self._prepare
+        self._constant = self._hessian.fill(self._x, self._u, self._costates)
+        prepare()
+        self._backend.load(self._qp)
+        self._prepared = Prepared(
+            point=LinearisationPoint(self._x.copy(), self._u.copy(), self._costates.copy()),
+            parameters=self._parameters,
+            stack=prepare.stack.copy(),
+            L=prepare.inputs["L"].copy(),
+            L_N=prepare.inputs["L_N"].copy(),
+            w=self._qp.w,
+            W=self._qp.W,
+            spectrum=self._hessian.spectrum,
+            functions=self._functions,
+        )
+
+    @property
+    def linearisation_point(self) -> LinearisationPoint:
+        """Point at which the QP is prepared, for replay by `prepare_at`."""
+        if self._prepared is None:
+            self.prepare()
+        assert self._prepared is not None
+        return self._prepared.point
+
+    def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> RtiSolution:
+        """Feedback phase: V(s) and π(s), or Q(s, a) where `a` is given.
+
+        s (n,) and a (m,) in the units of the model; an enforced action replaces the bounds of the
+        first control. The solution becomes what the next `prepare` shifts. Raises QpError where s
+        is not finite or the QP is not solved; ControllerError on wrong shapes.
+        """
+        solution = self._solve(s, a)
+        self._pending = solution
+        return solution
+
+    def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
+        s = _finite_vector("state", s, self.problem.n_states)
+        if self._prepared is None:
+            self.prepare()
+        prepared, qp, m = self._prepared, self._qp, self.problem.n_actions
+        assert prepared is not None
+        self._stages.initial[:] = s - self.problem.reference_state
+        self._embed.inputs["s"][:] = s
+        self._embed()
+        if a is None:
+            qp.lower[:m], qp.upper[:m] = self._action_lower[:m], self._action_upper[:m]
+        else:
+            qp.lower[:m] = _finite_vector("action", a, m) - self.problem.reference_action
+            qp.upper[:m] = qp.lower[:m]
+        multipliers = self._backend.solve(qp)
+        inputs = self._readout.inputs
+        inputs["s"][:], inputs["constant"][0] = s, self._constant
+        inputs["v"][:], inputs["lam"][:] = multipliers.v, multipliers.lam
+        self._readout()
+        stack = self._readout.stack.copy()
+        return RtiSolution(
+            action=multipliers.v[:m] + self.problem.reference_action,
+            value=float(stack[-1]),
+            multipliers=multipliers,
+            prepared=prepared,
+            stack=stack,
+            embedded=self._embed.stack.copy(),
+            limits=(qp.lower.copy(), qp.upper.copy()),
+            enforced=a is not None,
+        )
+
+    # read-outs that leave the guess alone -------------------------------------------------------
+
+    def value(self, s: ArrayLike) -> float:
+        """V(s) of the prepared QP."""
+        return self._solve(s, None).value
+
+    def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
+        """Q(s, a) of the prepared QP."""
+        return self._solve(s, a).value
+
+    def policy(self, s: ArrayLike) -> Vector:
+        """π(s) of the prepared QP, (m,)."""
+        return self._solve(s, None).action
+
+
+def _finite_vector(kind: str, values: ArrayLike, size: int) -> Vector:
+    vector = np.asarray(values, dtype=np.float64)
+    if vector.shape != (size,):
+        raise ControllerError(f"the {kind} must have {size} entries, not shape {vector.shape}")
+    if not np.isfinite(vector).all():
+        raise QpError(f"the {kind} is not finite: {vector}", status=f"{kind} not finite")
+    return vector

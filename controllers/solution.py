@@ -1,0 +1,255 @@
+"""What one feedback of the RTI-NMPC returns: action, value, and sensitivities on demand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.buffered import StackedFunction
+from controllers.errors import ControllerError
+from controllers.hessian import Spectrum
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.qp.problem import QpSolution, Residuals, SoftQp
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+class LinearisationPoint(NamedTuple):
+    """Where a QP is linearised: states x (N, n), actions u (N, m), costates (N, n).
+
+    The state at stage N is not needed since the terminal cost is quadratic; the costates χ_1 … χ_N
+    matter for the exact Hessian only.
+    """
+
+    x: Matrix
+    u: Matrix
+    costates: Matrix
+
+
+@dataclass(frozen=True)
+class Functions:
+    """The CasADi functions of a controller (`controllers.ocp`, `controllers.lagrangian`)."""
+
+    problem: Problem
+    preparation: StackedFunction
+    embedding: StackedFunction
+    readout: StackedFunction
+    gradient: StackedFunction
+    policy: StackedFunction
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What the preparation phase fixed, kept for read-outs after the next one has begun."""
+
+    point: LinearisationPoint
+    parameters: Parameters
+    stack: Vector
+    L: Vector
+    L_N: Vector
+    w: Vector
+    W: Vector
+    spectrum: Spectrum | None
+    functions: Functions
+
+
+@dataclass(eq=False)
+class RtiSolution:
+    """The solution of one QP, read as V(s) and π(s), or as Q(s, a) where u_0 = a was enforced.
+
+    `action` (m,) is u_0; `value` is V or Q; `multipliers` is the primal-dual solution of
+    the condensed QP `qp`. All derivatives are those of the QP that was solved, at the point where
+    it was linearised (paper.tex, RTI Sensitivities); they are one-sided where `weakly_active`.
+    """
+
+    action: Vector
+    value: float
+    multipliers: QpSolution = field(repr=False)
+    prepared: Prepared = field(repr=False)
+    stack: Vector = field(repr=False)
+    embedded: Vector = field(repr=False)
+    limits: tuple[Vector, Vector] = field(repr=False)
+    enforced: bool = False
+    status: str = "solved"
+
+    def _part(self, name: str) -> Matrix:
+        return self.prepared.functions.readout.part(name, self.stack)
+
+    @cached_property
+    def qp(self) -> SoftQp:
+        """The condensed QP that was solved."""
+        functions, prepared = self.prepared.functions, self.prepared
+        return SoftQp(
+            H=functions.preparation.part("H", prepared.stack),
+            f=functions.embedding.part("f", self.embedded),
+            lower=self.limits[0],
+            upper=self.limits[1],
+            rows=functions.preparation.part("Gamma", prepared.stack),
+            row_lower=functions.embedding.part("lower", self.embedded),
+            row_upper=functions.embedding.part("upper", self.embedded),
+            w=prepared.w,
+            W=prepared.W,
+        )
+
+    @cached_property
+    def predicted_states(self) -> Matrix:
+        """Predicted states x_0 … x_N, shape (N+1, n)."""
+        return self._part("xi") + self.prepared.functions.problem.reference_state
+
+    @cached_property
+    def predicted_actions(self) -> Matrix:
+        """Predicted actions u_0 … u_{N−1}, shape (N, m)."""
+        reference = self.prepared.functions.problem.reference_action
+        return self.multipliers.v.reshape(-1, reference.size) + reference
+
+    @property
+    def slack(self) -> Matrix:
+        """Slack of the soft state bounds at stages 1 … N, shape (N, n)."""
+        return self._part("t")
+
+    @property
+    def costates(self) -> Matrix:
+        """Multipliers χ_0 … χ_N of the initial value and the dynamics, shape (N+1, n)."""
+        return self._part("chi")
+
+    @property
+    def value_state_gradient(self) -> Vector:
+        """dV/ds or dQ/ds, shape (n,): the multiplier χ_0 of the initial value."""
+        return self.costates[0]
+
+    @property
+    def action_gradient(self) -> Vector:
+        """dQ/da, shape (m,): zero where the action was not enforced."""
+        if not self.enforced:
+            return np.zeros(self.action.size)
+        gradient: Vector = -self.multipliers.nu[: self.action.size]
+        return gradient
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """KKT residuals and duality gap of the QP's solution."""
+        return self.multipliers.residuals(self.qp)
+
+    @property
+    def residual(self) -> float:
+        """Largest KKT residual."""
+        return self.residuals.largest
+
+    @cached_property
+    def weakly_active(self) -> bool:
+        """Whether a limit is about to change its activity, so that derivatives are one-sided."""
+        return self.multipliers.weakly_active(self.qp)
+
+    @cached_property
+    def licq(self) -> bool:
+        """Whether the active constraints' gradients are linearly independent."""
+        return self.multipliers.licq_margin(self.qp) > 1e-9
+
+    @cached_property
+    def value_gradient(self) -> Vector:
+        """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
+        function = self.prepared.functions.gradient
+        self._write_solution(function)
+        function()
+        return function.stack.copy()
+
+    @property
+    def policy_jacobian(self) -> Matrix:
+        """dπ/dθ, shape (m, n_θ); raises ControllerError where the action was enforced."""
+        return self._policy[0]
+
+    @property
+    def policy_state_jacobian(self) -> Matrix:
+        """dπ/ds, shape (m, n); raises ControllerError where the action was enforced."""
+        return self._policy[1]
+
+    @cached_property
+    def _policy(self) -> tuple[Matrix, Matrix]:
+        if self.enforced:
+            raise ControllerError(
+                "the action was enforced, so this solution is Q(s, a) and has no policy; "
+                "call feedback(s) without an action"
+            )
+        dv, dt, dlam = self._adjoint_directions()
+        function = self.prepared.functions.policy
+        self._write_solution(function)
+        inputs = function.inputs
+        for name in ("A", "B"):
+            inputs[name][:] = self.prepared.stack[self.prepared.functions.preparation.slices[name]]
+        inputs["L"][:], inputs["L_N"][:] = self.prepared.L, self.prepared.L_N
+        inputs["dv"][:], inputs["dt"][:] = dv.reshape(-1), dt.reshape(-1)
+        inputs["dlam"][:] = dlam.reshape(-1)
+        if self.prepared.spectrum is not None:
+            inputs["dM"][:] = self._curvature_directions(dv).reshape(-1)
+        function()
+        return function.part("policy").copy(), function.part("state").copy()
+
+    def _write_solution(self, function: StackedFunction) -> None:
+        """Give a read-out function the solution and the point of linearisation."""
+        inputs, point = function.inputs, self.prepared.point
+        for name in ("xi", "t", "chi"):
+            inputs[name][:] = self.stack[self.prepared.functions.readout.slices[name]]
+        inputs["v"][:], inputs["lam"][:] = self.multipliers.v, self.multipliers.lam
+        inputs["x"][:], inputs["u"][:] = point.x.reshape(-1), point.u.reshape(-1)
+        inputs["theta"][:] = self.prepared.parameters.theta
+        if self.prepared.spectrum is not None:
+            step = self._step_from_point()
+            seed = step[:, :, None] * step[:, None, :] / 2
+            inputs["M"][:] = self.prepared.spectrum.contract(seed).reshape(-1)
+            inputs["guess"][:] = point.costates.reshape(-1)
+
+    def _step_from_point(self) -> Matrix:
+        """Δw of each stage, shape (N, n+m)."""
+        point = self.prepared.point
+        return np.concatenate(
+            [self.predicted_states[:-1] - point.x, self.predicted_actions - point.u], axis=1
+        )
+
+    def _adjoint_directions(self) -> tuple[Matrix, Matrix, Matrix]:
+        """Solutions of the KKT system for unit right-hand sides in u_0, a row an action.
+
+        The KKT matrix of the active set is symmetric, so these rows of its inverse are all that
+        dπ/dθ and dπ/ds need. A violated row adds its quadratic weight to the Hessian.
+        """
+        qp, m = self.qp, self.action.size
+        held, at_limit, violated = self.multipliers.active(qp)
+        free = np.flatnonzero(~held)
+        active, outside = qp.rows[at_limit][:, free], qp.rows[violated][:, free]
+        hessian = qp.H[np.ix_(free, free)] + 2 * (outside.T * qp.W[violated]) @ outside
+        size, count = free.size, active.shape[0]
+        kkt = np.zeros((size + count, size + count))
+        kkt[:size, :size], kkt[:size, size:], kkt[size:, :size] = hessian, active.T, active
+        seeds = np.zeros((size + count, m))
+        seeds[:size] = free[:, None] == np.arange(m)
+        try:
+            answer = np.linalg.solve(kkt, seeds)
+        except np.linalg.LinAlgError:  # LICQ fails, which `licq` reports; take the least-norm row
+            answer = np.linalg.lstsq(kkt, seeds)[0]
+        dv, dlam = np.zeros((m, qp.f.size)), np.zeros((m, qp.w.size))
+        dv[:, free] = answer[:size].T
+        dlam[:, at_limit] = answer[size:].T
+        moved = dv @ qp.rows.T
+        dlam[:, violated] = 2 * qp.W[violated] * moved[:, violated]
+        dt = np.where(violated, np.sign(self.multipliers.lam) * moved, 0.0)
+        return dv, dt, dlam
+
+    def _curvature_directions(self, dv: Matrix) -> Matrix:
+        """Directional derivatives of M along the adjoint directions, shape (m, N(n+m)²)."""
+        spectrum, step = self.prepared.spectrum, self._step_from_point()
+        assert spectrum is not None
+        horizon, m = self.predicted_actions.shape
+        n = self.predicted_states.shape[1]
+        result = []
+        for row in dv:
+            moved = np.zeros((horizon, n + m))
+            moved[1:, :n] = (self.qp.rows @ row).reshape(horizon, n)[:-1]
+            moved[:, n:] = row.reshape(horizon, m)
+            seed = (step[:, :, None] * moved[:, None, :] + moved[:, :, None] * step[:, None, :]) / 2
+            result.append(spectrum.contract(seed).reshape(-1))
+        return np.array(result)

@@ -138,7 +138,7 @@ class FmuPlant:
         fmi.initialise(self._started)
         self._started = True
         self._k = 0
-        self._penalty_now = self.penalty(self._states)
+        self._penalty_now = self.penalty(self._states[:])
         return self._copy_states()
 
     def step(self, a: Sequence[float] | Array) -> Step:
@@ -156,7 +156,7 @@ class FmuPlant:
         penalty, k = self._penalty_now, self._k
         self._k = _NOT_STARTED
         self._advance(k * self._h)
-        states, cost = self._states, self._outputs[0]
+        states, cost = self._states[:], self._outputs[0]
         if not isfinite(cost + sum(states)):
             self._refuse_output(k)
         self._k = k + 1
@@ -179,7 +179,7 @@ class FmuPlant:
             raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
         fmi.load(snapshot.handle)
         self._k = snapshot.k
-        self._penalty_now = self.penalty(self._states)
+        self._penalty_now = self.penalty(self._states[:])
         return self._copy_states()
 
     def serialise(self, snapshot: Snapshot) -> bytes:

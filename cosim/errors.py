@@ -27,3 +27,7 @@ class TrajectoryError(CosimError):
 
 class RecordingError(CosimError):
     """A recording that cannot be written, read or shown."""
+
+
+class FigureError(CosimError):
+    """A figure that cannot be drawn or written."""

@@ -125,7 +125,7 @@ class Exact:
         cost = 2 * self._discounts[:, None, None] * self._B
         raw = cost + call.part("D").reshape(-1, size, size)
         values, vectors = np.linalg.eigh(raw)
-        floor: Vector = self.FLOOR * self._discounts[:, None]
+        floor = np.asarray(self.FLOOR * self._discounts[:, None], dtype=np.float64)
         self.spectrum = Spectrum(values, vectors, floor)
         lifted = np.maximum(values, floor)
         self._L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)

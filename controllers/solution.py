@@ -106,7 +106,8 @@ class RtiSolution:
     def predicted_actions(self) -> Matrix:
         """Predicted actions u_0 … u_{N−1}, shape (N, m)."""
         reference = self.prepared.functions.problem.reference_action
-        return self.multipliers.v.reshape(-1, reference.size) + reference
+        actions: Matrix = self.multipliers.v.reshape(-1, reference.size) + reference
+        return actions
 
     @property
     def slack(self) -> Matrix:
@@ -121,7 +122,8 @@ class RtiSolution:
     @property
     def value_state_gradient(self) -> Vector:
         """dV/ds or dQ/ds, shape (n,): the multiplier χ_0 of the initial value."""
-        return self.costates[0]
+        gradient: Vector = self.costates[0]
+        return gradient
 
     @property
     def action_gradient(self) -> Vector:

@@ -1,0 +1,1 @@
+"""Dynamic programming on a state grid: quadrature, interpolation, policy iteration."""

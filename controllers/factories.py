@@ -1,0 +1,42 @@
+"""Controllers by name: each function takes a scenario and returns a controller for it.
+
+These are the package's entry points of the group `cosim.controllers`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from controllers.parameters import Parameters
+from controllers.problem import Problem, ScenarioLike
+from controllers.rti import RtiNmpc
+
+
+def rti(scenario: ScenarioLike, parameters: Parameters) -> RtiNmpc:
+    """RTI-NMPC for a scenario with given θ."""
+    settings = scenario.controller
+    return RtiNmpc(
+        Problem.from_scenario(scenario),
+        parameters,
+        hessian=settings.hessian,
+        backend=settings.backend,
+    )
+
+
+def naive_parameters(scenario: ScenarioLike, problem: Problem) -> Parameters:
+    """The paper's naive θ, with c_λ as the scenario says."""
+    if scenario.controller.value_offset == "discounted" and problem.discount < 1:
+        return Parameters.naive(
+            problem, value_offset=problem.reference_cost / (1 - problem.discount)
+        )
+    return Parameters.naive(problem)
+
+
+def naive(scenario: ScenarioLike) -> RtiNmpc:
+    """RTI-NMPC with the paper's naive guess: baseline (a)."""
+    return rti(scenario, naive_parameters(scenario, Problem.from_scenario(scenario)))
+
+
+def from_file(scenario: ScenarioLike, path: str | Path) -> RtiNmpc:
+    """RTI-NMPC with θ from a parameters file."""
+    return rti(scenario, Parameters.load(path, Problem.from_scenario(scenario)))

@@ -1,0 +1,88 @@
+"""Random problems for tests: parameters, linearisation points, states and actions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from controllers import Layout, LinearisationPoint, Parameters, Problem
+from controllers.evaporator import model
+
+
+def evaporator_problem(**changes: object) -> Problem:
+    """The evaporator's problem of scenario `paper`, independent of the package cosim."""
+    problem = Problem(
+        model=model(),
+        sampling_time=60.0,
+        horizon=10,
+        discount=0.99,
+        state_lower=[25, 40],
+        state_upper=[100, 80],
+        action_lower=[100, 100],
+        action_upper=[400, 400],
+        penalty_linear=[1e5, 1e5],
+        penalty_quadratic=[1, 1],
+        reference_state=[25, 49.74297463837443],
+        reference_action=[191.71322465335396, 215.88843973473226],
+        reference_cost=6210.384509575885,
+    )
+    return replace(problem, **changes)
+
+
+def random_parameters(
+    problem: Problem, layout: Layout, rng: np.random.Generator
+) -> Parameters:
+    """θ with positive definite Hessians, about the size that learning reaches."""
+
+    def definite(size: int) -> np.ndarray:
+        root = rng.normal(size=(size, size))
+        matrix = root @ root.T / size + 0.3 * np.eye(size)
+        return (matrix + matrix.T) / 2
+
+    n, m = problem.n_states, problem.n_actions
+    values = {
+        "B_lambda": definite(n) - np.eye(n),
+        "b_lambda": rng.normal(size=n) * 10,
+        "c_lambda": 6000 + rng.normal() * 100,
+        "B_Vf": definite(n),
+        "b_Vf": rng.normal(size=n) * 20,
+        "B_l": definite(n + m),
+        "b_l": rng.normal(size=n + m) * 20,
+        "c_f": rng.normal(size=n) * 0.1,
+        "x_l": problem.state_lower + rng.normal(size=n),
+        "x_u": problem.state_upper + rng.normal(size=n),
+    }
+    if "w_sigma" in layout:
+        values["w_sigma"] = 80 + 50 * rng.random(n)
+        values["W_sigma"] = 10 ** rng.uniform(0, 3, size=n)
+    parameters = Parameters.naive(problem, layout).replace(values)
+    if "p" in layout:
+        spread = 1 + 0.05 * rng.normal(size=layout.block("p").size)
+        parameters = parameters.replace({"p": parameters["p"] * spread})
+    return parameters
+
+
+def random_point(problem: Problem, rng: np.random.Generator) -> LinearisationPoint:
+    """A linearisation point around the reference, far from any converged trajectory."""
+    N, n, m = problem.horizon, problem.n_states, problem.n_actions
+    return LinearisationPoint(
+        x=problem.reference_state + rng.normal(size=(N, n)) * [2, 3],
+        u=problem.reference_action + rng.normal(size=(N, m)) * 25,
+        costates=rng.normal(size=(N, n)) * 100,
+    )
+
+
+def random_state(problem: Problem, rng: np.random.Generator) -> np.ndarray:
+    """A state around the reference, violating the lower bound about half the time."""
+    return problem.reference_state + rng.normal(size=problem.n_states) * [2, 4]
+
+
+def random_action(problem: Problem, rng: np.random.Generator) -> np.ndarray:
+    """An action about the reference; one in four components is saturated."""
+    action = problem.reference_action + rng.normal(size=problem.n_actions) * 40
+    saturated = np.where(
+        rng.random(problem.n_actions) < 0.5, problem.action_lower, problem.action_upper
+    )
+    chosen = np.where(rng.random(problem.n_actions) < 0.25, saturated, action)
+    return np.clip(chosen, problem.action_lower, problem.action_upper)

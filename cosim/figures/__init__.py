@@ -1,6 +1,23 @@
 """Figures of runs and comparisons, drawn without a screen; the same data give the same bytes."""
 
+from cosim.figures.density import plot_density
+from cosim.figures.learning import plot_learning_curves, plot_parameters_and_td_error
+from cosim.figures.pareto import plot_pareto
+from cosim.figures.phase import Portrait, plot_phase_portraits, policy_on_grid
 from cosim.figures.style import save
+from cosim.figures.timing import plot_step_times
 from cosim.figures.trajectory import plot_trajectory, trajectory_figure
 
-__all__ = ["plot_trajectory", "save", "trajectory_figure"]
+__all__ = [
+    "Portrait",
+    "plot_density",
+    "plot_learning_curves",
+    "plot_parameters_and_td_error",
+    "plot_pareto",
+    "plot_phase_portraits",
+    "plot_step_times",
+    "plot_trajectory",
+    "policy_on_grid",
+    "save",
+    "trajectory_figure",
+]

@@ -133,3 +133,14 @@ def limit(axes: Axes, value: float, text: str = "") -> None:
             fontsize=6.5,
             color=BOUND,
         )
+
+
+def legend_above(axes: Axes, columns: int = 2) -> None:
+    """Put the legend over the axes, where it hides no data."""
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=columns,
+        borderaxespad=0.2,
+        handlelength=1.4,
+    )

@@ -1,0 +1,59 @@
+"""Where a state lies with respect to its bound: the price of a back-off, in one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.figures.style import BOUND, colors, figure, label, legend_above, plain, save
+
+Array = NDArray[np.float64]
+
+
+def plot_density(
+    samples: Mapping[str, Array],
+    bound: float,
+    name: str,
+    unit: str,
+    path: str | Path,
+    *,
+    bins: int = 80,
+) -> Path:
+    """Draw each controller's density of one state, (K,) samples, against its lower bound.
+
+    The bins are common and an edge lies on the bound, so that no bin mixes both sides; the axis
+    leaves out the outermost 0.1 % of all samples. The legend gives the share below the bound.
+    """
+    everything = np.concatenate(list(samples.values()))
+    low, high = np.quantile(everything, (0.001, 0.999))
+    low, high = min(float(low), bound), max(float(high), bound)
+    width = (high - low) / bins
+    edges = bound + width * np.arange(
+        -np.ceil((bound - low) / width) - 1, np.ceil((high - bound) / width) + 2
+    )
+    with figure(2.9, 4.6) as drawn:
+        axes = drawn.subplots()
+        color = colors(list(samples))
+        for controller, values in samples.items():
+            share = float(np.mean(values < bound))
+            counts, _ = np.histogram(values, edges)
+            heights = counts / (len(values) * width)
+            axes.stairs(heights, edges, fill=True, alpha=0.12, color=color[controller])
+            axes.stairs(
+                heights,
+                edges,
+                color=color[controller],
+                linewidth=1.2,
+                label=f"{plain(controller)}: {100 * share:.1f} % below",
+            )
+        axes.axvline(bound, color=BOUND, linewidth=1.1, linestyle=(0, (4, 2)), label="bound")
+        axes.set_xlim(edges[0], edges[-1])
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlabel(label(name, unit))
+        inverse = f"1/({unit})" if "/" in unit else f"1/{unit}"
+        axes.set_ylabel("density" if unit in ("", "1") else f"density [{inverse}]")
+        legend_above(axes)
+    return save(drawn, path)

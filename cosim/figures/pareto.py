@@ -1,0 +1,69 @@
+"""Economic cost against violation: what a controller pays for keeping the bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from cosim.figures.style import REFERENCE, colors, figure, plain, save
+
+Array = NDArray[np.float64]
+
+
+def plot_pareto(
+    points: Mapping[str, tuple[Array, Array]],
+    path: str | Path,
+    *,
+    xlabel: str = "mean violation per sample",
+    ylabel: str = "economic cost per sample",
+) -> Path:
+    """Draw controllers by (violation (S,), economic cost (S,)) over S seeds.
+
+    Small dots are seeds, the large ones means with 95 % t intervals. The grey line joins the
+    controllers that no other one beats in both.
+    """
+    with figure(3.0, 4.6) as drawn:
+        axes = drawn.subplots()
+        color = colors(list(points))
+        means = {name: (float(np.mean(v)), float(np.mean(c))) for name, (v, c) in points.items()}
+        front = nondominated(np.array(list(means.values())))
+        best = sorted(mean for mean, keep in zip(means.values(), front, strict=True) if keep)
+        axes.plot(*np.array(best).T, color=REFERENCE, linewidth=0.9, linestyle=(0, (4, 2)))
+        for name, (violation, cost) in points.items():
+            axes.plot(violation, cost, ".", color=color[name], markersize=3, alpha=0.35, mew=0)
+            axes.errorbar(
+                *means[name],
+                xerr=half_width(violation),
+                yerr=half_width(cost),
+                fmt="o",
+                color=color[name],
+                markersize=5,
+                capsize=2,
+                linewidth=1.0,
+                label=plain(name),
+            )
+        axes.set_xlabel(xlabel)
+        axes.set_ylabel(ylabel)
+        axes.legend(loc="best")
+    return save(drawn, path)
+
+
+def half_width(values: Array, level: float = 0.95) -> float:
+    """Half the t interval of the mean of S independent values; 0 for one value."""
+    seeds = len(values)
+    if seeds < 2:
+        return 0.0
+    error = np.std(values, ddof=1) / np.sqrt(seeds)
+    return float(student.ppf(0.5 + level / 2, seeds - 1) * error)
+
+
+def nondominated(points: Array) -> NDArray[np.bool_]:
+    """Which of the points (K, d) no other one beats: none is as low in all and lower in one."""
+    lower = np.all(points[None] <= points[:, None], axis=2)
+    strictly = np.any(points[None] < points[:, None], axis=2)
+    beaten: NDArray[np.bool_] = np.any(lower & strictly, axis=1)
+    return ~beaten

@@ -73,18 +73,6 @@ def _made(factory: Callable[..., Any], name: str, scenario: Scenario) -> Control
 
 
 def _from_parameters(path: Path, scenario: Scenario) -> Controller:
-    from controllers.parameters import Parameters
-    from controllers.problem import Problem
-    from controllers.rti import RtiNmpc
+    from controllers.factories import from_file
 
-    problem = Problem.from_scenario(cast("Any", scenario))
-    settings = scenario.controller
-    return cast(
-        "Controller",
-        RtiNmpc(
-            problem,
-            Parameters.load(path, problem),
-            hessian=settings.hessian,
-            backend=settings.backend,
-        ),
-    )
+    return cast("Controller", from_file(cast("Any", scenario), path))

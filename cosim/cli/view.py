@@ -22,7 +22,7 @@ def view(
 ) -> None:
     """Open a recording in the Rerun viewer, draw it to a PNG, or (--json) print what it holds."""
     with output(json) as out:
-        from cosim.recording import open_viewer, read_recording, render
+        from cosim.recording import open_viewer, render, summarise
 
         if png is not None:
             render(file, png, at=at)
@@ -30,11 +30,4 @@ def view(
         elif not json:
             open_viewer(file)
         if json:
-            content = read_recording(file)
-            out.json(
-                {
-                    "samples": len(content.samples),
-                    "signals": dict.fromkeys(sorted(content.signals), "") | content.units,
-                    "properties": content.properties,
-                }
-            )
+            out.json(summarise(file))

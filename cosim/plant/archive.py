@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import shutil
 import stat
 import tempfile
 import threading
@@ -34,7 +36,6 @@ class UnpackedFmu:
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
-_folders: list[tempfile.TemporaryDirectory[str]] = []
 _lock = threading.Lock()
 
 
@@ -70,22 +71,21 @@ def _locate(fmu: str | Path) -> Path:
 
 
 def _unpack(path: Path) -> UnpackedFmu:
-    folder = tempfile.TemporaryDirectory(prefix="cosim-fmu-")
+    folder = Path(tempfile.mkdtemp(prefix="cosim-fmu-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     try:
         with path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         with zipfile.ZipFile(path) as archive:
             _check_entries(path, archive.infolist())
-            archive.extractall(folder.name)
+            archive.extractall(folder)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise PlantError(
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
     except OSError as error:
         raise PlantError(f"FMU '{path}' cannot be unpacked: {error}") from None
-    description = _describe(path, Path(folder.name))
-    _folders.append(folder)
-    return UnpackedFmu(path, digest, Path(folder.name), description)
+    return UnpackedFmu(path, digest, folder, _describe(path, folder))
 
 
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:

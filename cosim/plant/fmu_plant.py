@@ -13,7 +13,7 @@ from typing import NoReturn, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.errors import PlantError
+from cosim.errors import CapabilityError, PlantError
 from cosim.penalty import Penalty
 from cosim.plant.archive import SHIPPED, unpack
 from cosim.plant.fmi2 import Fmi2Instance
@@ -86,6 +86,8 @@ class FmuPlant:
         self.fmu_path = unpacked.path
         self.fmu_sha256 = unpacked.sha256
         self.units = wirer.units()
+        lower, upper = wirer.state_range()
+        self.state_range = (np.array(lower), np.array(upper))
         self.penalty = Penalty(
             self.scenario.state_lower,
             self.scenario.state_upper,
@@ -93,6 +95,8 @@ class FmuPlant:
             self.scenario.penalty_quadratic,
         )
         self._seeds = wirer.seeds()
+        self._initial = wirer.initial_states()
+        self._elsewhere = False
         self._h = self.scenario.sampling_time
         self._m = len(self.scenario.plant.actions)
         self._k = _NOT_STARTED
@@ -122,10 +126,11 @@ class FmuPlant:
         """Present state, (n,), a copy."""
         return self._copy_states()
 
-    def reset(self, seed: int) -> Array:
+    def reset(self, seed: int, initial_state: Sequence[float] | Array | None = None) -> Array:
         """Start again at k = 0 with the disturbances of a seed in [0, 2⁶⁴); return the state (n,).
 
-        Every start value is written anew, so that nothing of an earlier episode remains.
+        `initial_state` (n,) replaces the scenario's for this episode. Every start value is
+        written anew, so that nothing of an earlier episode remains.
         """
         fmi = self._instance
         if not 0 <= seed < 1 << 64:
@@ -134,6 +139,8 @@ class FmuPlant:
         for reference, width in self._seeds:
             fmi.change_start(reference, word if width == 64 else word & 0xFFFFFFFF)
             word >>= 32
+        if initial_state is not None or self._elsewhere:
+            self._start_from(fmi, initial_state)
         self._k = _NOT_STARTED
         fmi.initialise(self._started)
         self._started = True
@@ -252,6 +259,24 @@ class FmuPlant:
         if self._fmi is None:
             raise PlantError("the plant is closed")
         return self._fmi
+
+    def _start_from(self, fmi: Instance, state: Sequence[float] | Array | None) -> None:
+        """Replace the start values of the states, or put the scenario's back."""
+        table = self.scenario.plant
+        if not self._initial:
+            raise CapabilityError(
+                f"scenario '{self.scenario.name}' names no plant.mapping.initial_state: its plant "
+                "always starts where the FMU does"
+            )
+        values = np.asarray(table.initial_state if state is None else state, dtype=float)
+        if values.shape != (len(table.states),) or not np.isfinite(values).all():
+            names = ", ".join(table.states)
+            raise PlantError(
+                f"initial_state must be {len(table.states)} finite numbers ({names}), not {state}"
+            )
+        for reference, value in zip(self._initial, values.tolist(), strict=True):
+            fmi.change_start(reference, value)
+        self._elsewhere = state is not None
 
     def _refuse(self, a: object) -> NoReturn:
         names = ", ".join(self.scenario.plant.actions)

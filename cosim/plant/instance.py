@@ -134,7 +134,7 @@ class Instance:
         self._starts.append((name, self._function(name), arguments))
         self._slots |= {start.reference: (buffer, i) for i, start in enumerate(starts)}
 
-    def change_start(self, reference: int, value: int) -> None:
+    def change_start(self, reference: int, value: float) -> None:
         """Replace a start value that the next reset writes."""
         buffer, index = self._slots[reference]
         buffer[index] = value

@@ -45,6 +45,17 @@ class Wirer:
                 break
         return words
 
+    def initial_states(self) -> list[int]:
+        """Value references of the states' start parameters; none if the scenario names none."""
+        names = self._scenario.plant.mapping.initial_state
+        return [self._real(name, "plant.mapping.initial_state") for name in names]
+
+    def state_range(self) -> tuple[list[float], list[float]]:
+        """Least and greatest value that the FMU declares for each state, infinite if none."""
+        found = [self._find(name, "plant.states") for name in self._scenario.plant.states]
+        lower = [float("-inf") if v.min is None else float(v.min) for v in found]
+        return lower, [float("inf") if v.max is None else float(v.max) for v in found]
+
     def units(self) -> dict[str, str]:
         """Unit of each exchanged variable by name, empty where the FMU states none."""
         plant = self._scenario.plant

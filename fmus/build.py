@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 import fmpy
 
 from fmus.description import MODEL_IDENTIFIER, FmiVersion, build_description, model_description
+from fmus.documentation import RESOURCES, documentation_page
 from fmus.errors import BuildError
 from fmus.header import c_header
 
@@ -21,6 +23,7 @@ PACKAGE = Path(__file__).parent
 SOURCES = PACKAGE / "sources"
 FILE_NAMES: dict[FmiVersion, str] = {2: "evaporator.fmu", 3: "evaporator_fmi3.fmu"}
 HEADER = "variables.h"
+BUILD_FILE = "extra/org.rti-cosim/build.json"
 
 # No path, date or identification may enter the binary; no fused multiply-add may change a result.
 COMPILER_FLAGS = (
@@ -89,13 +92,38 @@ def compile_library(version: FmiVersion) -> bytes:
         return (Path(folder) / output).read_bytes()
 
 
+def build_record() -> bytes:
+    """How the binary was made (JSON): compiler, its flags and the tool that drove it."""
+    version = subprocess.run(
+        [compiler(), "--version"], capture_output=True, text=True, check=True
+    ).stdout.splitlines()[0]
+    record = {
+        "compiler": version,
+        "compiler_flags": list(COMPILER_FLAGS),
+        "linker_flags": list(LINKER_FLAGS),
+        "model_token": model_token(),
+    }
+    return (json.dumps(record, indent=2) + "\n").encode()
+
+
 def contents(version: FmiVersion) -> dict[str, bytes]:
     """Every file of the FMU by its path in the archive."""
-    files = {"modelDescription.xml": model_description(version, model_token()).encode()}
+    icon = (RESOURCES / "icon.png").read_bytes()
+    files = {
+        "modelDescription.xml": model_description(version, model_token()).encode(),
+        "documentation/index.html": documentation_page(version, BUILD_FILE).encode(),
+        "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
+        BUILD_FILE: build_record(),
+        f"binaries/{_PLATFORM[version]}/{MODEL_IDENTIFIER}.so": compile_library(version),
+    }
     files |= {f"sources/{name}": data for name, data in sources(version).items()}
-    library = f"binaries/{_PLATFORM[version]}/{MODEL_IDENTIFIER}.so"
-    files[library] = compile_library(version)
-    return files
+    if version == 2:
+        return files | {"model.png": icon}
+    name = "terminalsAndIcons.xml"
+    return files | {
+        "terminalsAndIcons/icon.png": icon,
+        f"terminalsAndIcons/{name}": (RESOURCES / name).read_bytes(),
+    }
 
 
 def archive(files: dict[str, bytes], target: Path) -> None:
@@ -118,6 +146,26 @@ def build(folder: Path) -> list[Path]:
         partial.replace(folder / name)
         built.append(folder / name)
     return built
+
+
+def differences(built: Path, shipped: Path) -> list[str]:
+    """The archive members that differ between two FMU files, or ``["(order or metadata)"]``.
+
+    Empty when the files are equal byte for byte. Raises BuildError when `shipped` is missing.
+    """
+    if not shipped.is_file():
+        raise BuildError(f"{shipped} is missing; reinstall the package")
+    if built.read_bytes() == shipped.read_bytes():
+        return []
+    members = [_members(path) for path in (built, shipped)]
+    names = sorted(set(members[0]) | set(members[1]))
+    differing = [name for name in names if members[0].get(name) != members[1].get(name)]
+    return differing or ["(order or metadata)"]
+
+
+def _members(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as container:
+        return {name: container.read(name) for name in container.namelist()}
 
 
 def build_in_place() -> list[Path]:

@@ -37,8 +37,13 @@ _COMMON_CAPABILITIES = {"canBeInstantiatedOnlyOncePerProcess": "false"}
 
 
 def exported(version: FmiVersion) -> list[Variable]:
-    """The variables of the table that FMI `version` shows."""
-    return [v for v in VARIABLES if version == 2 or v.type is not Type.SEED_HIGH]
+    """The variables of the table that FMI `version` shows.
+
+    FMI 3.0 has the whole seed in one variable; FMI 2.0 shows no time, which FMI Library refuses.
+    """
+    if version == 2:
+        return [v for v in VARIABLES if v.kind is not Kind.INDEPENDENT]
+    return [v for v in VARIABLES if v.type is not Type.SEED_HIGH]
 
 
 def model_description(version: FmiVersion, token: str) -> str:
@@ -187,7 +192,9 @@ def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
     if variable.type is Type.BOOLEAN:
         ElementTree.SubElement(scalar, "Boolean", _boolean(variable))
     elif variable.type is Type.LAW:
-        ElementTree.SubElement(scalar, "Enumeration", declaredType="Law", min="1", max="2", start="1")
+        ElementTree.SubElement(
+            scalar, "Enumeration", declaredType="Law", min="1", max="2", start="1"
+        )
     elif variable.type in (Type.SEED, Type.SEED_HIGH):
         ElementTree.SubElement(scalar, "Integer", min=_INT32[0], max=_INT32[1], start="0")
     else:

@@ -115,7 +115,9 @@ def _output(
     )
 
 
-def _disturbance(name: str, unit: str, nominal: float, low: float, high: float, text: str) -> Variable:
+def _disturbance(
+    name: str, unit: str, nominal: float, low: float, high: float, text: str
+) -> Variable:
     uses = (f"{name}_in", f"{name}_nominal", f"{name}_range", *_SWITCHES)
     return Variable(
         name, Kind.OUTPUT, Type.REAL, unit, None, low, high, nominal, f"realised {text}", uses
@@ -126,6 +128,18 @@ def _state(name: str, unit: str, high: float, nominal: float, text: str) -> Vari
     return Variable(
         name, Kind.STATE, Type.REAL, unit, None, 0.0, high, nominal, text, (f"{name}_start",)
     )
+
+
+def _range(disturbance: str, unit: str, start: float, high: float) -> Variable:
+    text = "half width (uniform) or standard deviation (normal)"
+    return _tunable(f"{disturbance}_range", unit, start, 0.0, high, text)
+
+
+def _start(state: str, unit: str, start: float, high: float, nominal: float) -> Variable:
+    return Variable(
+        f"{state}_start", Kind.FIXED, Type.REAL, unit, start, 0.0, high, nominal,
+        f"{state} at the start",
+    )  # fmt: skip
 
 
 def _derivative(state: str, unit: str, nominal: float, uses: str) -> Variable:
@@ -173,7 +187,7 @@ VARIABLES: tuple[Variable, ...] = (
     _output("Q100", "kW", -1e5, 1e5, 350.0, "heater duty", "UA1 T100 T2"),
     _output("Q200", "kW", -1e5, 1e5, 300.0, "condenser duty", "UA2 T3 T200 Cp F200"),
     _switch("stochastic", Kind.TUNABLE, True, "draw the disturbances; false: the nominal plant"),
-    _switch("override", Kind.TUNABLE, False, "take the disturbances from X1_in, F1_in, T1_in, T200_in"),
+    _switch("override", Kind.TUNABLE, False, "take the disturbances from the inputs *_in"),
     Variable("law", Kind.FIXED, Type.LAW, "", 1.0, 1.0, 2.0, None, "law of the disturbances"),
     _seed("seed", Type.SEED, "seed of the disturbances"),
     _seed("seedHigh", Type.SEED_HIGH, "upper 32 bits of the seed (FMI 2.0 Integers have 32)"),
@@ -183,12 +197,12 @@ VARIABLES: tuple[Variable, ...] = (
     _tunable("F1_nominal", "kg/min", 10.0, 0.1, 100.0, "nominal feed flow"),
     _tunable("T1_nominal", "degC", 40.0, 0.0, 200.0, "nominal feed temperature"),
     _tunable("T200_nominal", "degC", 25.0, 0.0, 200.0, "nominal cooling water inlet temperature"),
-    _tunable("X1_range", "%", 1.0, 0.0, 20.0, "half width (uniform), standard deviation (normal)"),
-    _tunable("F1_range", "kg/min", 2.0, 0.0, 40.0, "half width (uniform), standard deviation (normal)"),
-    _tunable("T1_range", "K", 8.0, 0.0, 100.0, "half width (uniform), standard deviation (normal)"),
-    _tunable("T200_range", "K", 5.0, 0.0, 100.0, "half width (uniform), standard deviation (normal)"),
-    Variable("X2_start", Kind.FIXED, Type.REAL, "%", 25.0, 0.0, 100.0, 25.0, "X2 at the start"),
-    Variable("P2_start", Kind.FIXED, Type.REAL, "kPa", 49.74297, 0.0, 400.0, 50.0, "P2 at the start"),
+    _range("X1", "%", 1.0, 20.0),
+    _range("F1", "kg/min", 2.0, 40.0),
+    _range("T1", "K", 8.0, 100.0),
+    _range("T200", "K", 5.0, 100.0),
+    _start("X2", "%", 25.0, 100.0, 25.0),
+    _start("P2", "kPa", 49.74297, 400.0, 50.0),
     _tunable("a", "K/kPa", 0.5616, 0.0, 10.0, "slope of T2 in P2"),
     _tunable("b", "K/%", 0.3126, 0.0, 10.0, "slope of T2 in X2"),
     _tunable("c", "degC", 48.43, -100.0, 200.0, "offset of T2"),

@@ -237,11 +237,12 @@ static Status check_reference(const Instance *instance, const char *function, un
     return OK;
 }
 
-/* In which modes the importer may give this variable a value. */
+/* In which modes the importer may give this variable a value. More than the standards demand: CasADi
+ * sets states by value reference, and tunable parameters also in continuous-time mode. */
 static unsigned settable_modes(const Instance *instance, unsigned vr) {
     switch (VARIABLES[vr].kind) {
         case FIXED: return INSTANTIATED | INITIALIZATION;
-        case TUNABLE: return INSTANTIATED | INITIALIZATION | EVENT | STEP;
+        case TUNABLE:
         case INPUT: return SETTABLE;
         case STATE:
             return instance->state.interface == MODEL_EXCHANGE ? EVENT | CONTINUOUS_TIME : 0;

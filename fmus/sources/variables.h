@@ -2,7 +2,7 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{f163e074-cf66-5872-8543-17398b74ec70}"
+#define MODEL_TOKEN "{a34037c0-362d-5ad0-a935-724c9ea6a650}"
 
 enum {
     VR_time = 0,

@@ -1,0 +1,49 @@
+"""Generate the FMU's documentation page from its template and the table of variables."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+from string import Template
+
+from fmus.description import (
+    DESCRIPTION,
+    LICENSE,
+    MODEL_VERSION,
+    FmiVersion,
+    exported,
+)
+from fmus.variables import Variable, value_reference
+
+RESOURCES = Path(__file__).parent / "resources"
+
+
+def documentation_page(version: FmiVersion, build_file: str) -> str:
+    """The text of documentation/index.html; `build_file` names the record of the build."""
+    template = Template((RESOURCES / "documentation.html").read_text(encoding="utf-8"))
+    return template.substitute(
+        description=escape(DESCRIPTION),
+        fmi_version=f"{version}.0",
+        model_version=MODEL_VERSION,
+        license=LICENSE,
+        diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
+        rows="\n".join(_row(variable) for variable in exported(version)),
+        source=f"fmi{version}.c",
+        build_file=build_file,
+    )
+
+
+def _row(variable: Variable) -> str:
+    numbers = "".join(
+        f'<td class="n">{_number(value)}</td>'
+        for value in (variable.start, variable.min, variable.max)
+    )
+    return (
+        f'<tr><td>{variable.name}</td><td class="n">{value_reference(variable.name)}</td>'
+        f"<td>{variable.kind}</td><td>{escape(variable.unit)}</td>{numbers}"
+        f"<td>{escape(variable.description)}</td></tr>"
+    )
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.10g}"

@@ -1,0 +1,127 @@
+"""Actor-critic: the deterministic policy gradient with a compatible advantage, batch by batch."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from cosim.scenario import Scenario
+from learning.configuration import Configuration, Count, Positive
+from learning.critic import lstdq, lstdv
+from learning.exploration import Strategy
+from learning.fit import policy_gradient_fit
+from learning.protocols import LearnableController, Sample, Update
+from learning.step import ParameterStep
+
+Vector = NDArray[np.float64]
+
+
+class ActorCriticConfiguration(Configuration):
+    """Hyperparameters of the actor-critic."""
+
+    batch_size: Count = Field(1000, description="samples per step of θ, all at one θ")
+    critic_discount: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="discount of the critic: 1 for mean cost, the scenario's if not given",
+    )
+    natural: bool = Field(True, description="natural gradient, else the plain one")
+    ridge: Positive = Field(
+        1e-4, description="ridge of regression and metric, relative to the mean of their diagonals"
+    )
+    step_size: Positive = Field(2.0, description="α of the fit, before the trust region")
+    radius: Positive = Field(
+        5.0, description="trust region at the start: RMS change of the action, in its units"
+    )
+    radius_end: Positive = Field(
+        0.2, description="trust region at the end, approached geometrically"
+    )
+
+
+class ActorCritic:
+    """Descends J along ∇J = E[∇π ∇πᵀ] w (paper.tex, eq. pg_update and pg_solution).
+
+    Each batch at one θ: LSTDV fits the smooth part W of V = penalty + W, LSTDQ the weights w of
+    the advantage A(s, a) = (a − π(s) − bias)ᵀ ∇π(s)ᵀ w, where `bias` is the mean that saturation
+    gives to the exploration. The known penalty is moved to the next state, r = ℓ + γ·penalty(s₊),
+    so that the critic meets no kink.
+    """
+
+    Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: ActorCriticConfiguration,
+        samples: int,
+        strategy: Strategy,
+    ) -> None:
+        self._configuration, self._strategy, self._samples = configuration, strategy, samples
+        self._discount = configuration.critic_discount or scenario.discount
+        self._step = ParameterStep(controller, configuration)
+        size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
+        rows = configuration.batch_size
+        self._batch = {
+            "states": np.empty((rows, n)),
+            "next_states": np.empty((rows, n)),
+            "reward": np.empty(rows),
+            "deviation": np.empty((rows, m)),
+            "jacobian": np.empty((rows, m, size)),
+        }
+        self._filled = 0
+        self.needs_action_value = False
+        self.needs_points = False
+
+    def observe(self, sample: Sample) -> Update | None:
+        """Take one sample; the last of a batch moves θ."""
+        batch, row = self._batch, self._filled
+        batch["states"][row], batch["next_states"][row] = sample.s, sample.next_s
+        batch["reward"][row] = sample.stage_cost + self._discount * sample.next_penalty
+        batch["deviation"][row] = self._deviation(sample)
+        batch["jacobian"][row] = sample.policy.policy_jacobian
+        self._filled += 1
+        if self._filled < self._configuration.batch_size:
+            return None
+        self._filled = 0
+        return self._update(sample.number)
+
+    def _deviation(self, sample: Sample) -> Vector:
+        """a − π(s) less its mean under saturated exploration, zero where the sample was greedy."""
+        if not sample.explored:
+            return np.zeros_like(sample.a)
+        action = sample.policy.action
+        return sample.a - action - np.nan_to_num(self._strategy.bias(action, sample.number))
+
+    def _update(self, number: int) -> Update:
+        settings, batch = self._configuration, self._batch
+        errors = lstdv(batch["states"], batch["next_states"], batch["reward"], self._discount)
+        jacobian = batch["jacobian"] * self._step.scale
+        advantage = np.einsum("kmi,km->ki", jacobian, batch["deviation"])
+        weights = lstdq(advantage, errors, settings.ridge)
+        fisher = np.einsum("kmi,kmj->ij", jacobian, jacobian) / len(errors)
+        gradient = fisher @ weights
+        metric = None
+        if settings.natural:
+            floor = settings.ridge * float(np.trace(fisher)) / weights.size
+            metric = fisher + (floor + np.finfo(float).tiny) * np.eye(weights.size)
+        fit = policy_gradient_fit(gradient, settings.step_size, metric)
+        moved = float(fit.minimiser @ fisher @ fit.minimiser) ** 0.5
+        share = min(number / self._samples, 1.0)
+        radius = settings.radius * (settings.radius_end / settings.radius) ** share
+        fit = fit.shrunk(min(1.0, radius / moved) if moved > 0 else 0.0)
+        return self._step.take(fit, float(np.sqrt(np.mean(errors * errors))))
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The part of the batch that is filled."""
+        return {name: values[: self._filled] for name, values in self._batch.items()}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._filled = len(state["reward"])
+        for name, values in state.items():
+            self._batch[name][: self._filled] = values

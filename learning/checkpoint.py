@@ -1,0 +1,110 @@
+"""Checkpoints: one file, whole or absent, checked on reading, without pickle.
+
+The file is an NPZ archive of plain arrays; its entry `about` is JSON (schema version, what the run
+is, every number that is no array) and its entry `digest` the SHA-256 of all others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.storage import write_atomically
+from learning.errors import CheckpointError
+
+SCHEMA = 1
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a run needs to go on: `run` says which run it is, `state` and `arrays` where it was."""
+
+    run: dict[str, Any]
+    state: dict[str, Any]
+    arrays: dict[str, Array]
+
+
+def save(path: Path, checkpoint: Checkpoint) -> Path:
+    """Write a checkpoint under a temporary name and rename it; raises OSError."""
+    about = {"schema": SCHEMA, "run": checkpoint.run, "state": checkpoint.state}
+    entries = dict(checkpoint.arrays)
+    entries["about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
+    for name, array in entries.items():
+        if array.dtype.hasobject:
+            raise CheckpointError(f"checkpoint entry '{name}' holds Python objects, not numbers")
+    entries["digest"] = np.frombuffer(_digest(entries), dtype=np.uint8)
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **entries)  # type: ignore[arg-type]
+    return write_atomically(path, stream.getvalue())
+
+
+def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
+    """Read a checkpoint; with `run`, refuse one that another run wrote.
+
+    Raises CheckpointError where the file is missing, damaged, of another schema or another run.
+    """
+    entries = _entries(path)
+    digest = entries.pop("digest", None)
+    if digest is None or "about" not in entries or digest.tobytes() != _digest(entries):
+        raise CheckpointError(f"{path}: the checkpoint is damaged (checksum); start the run anew")
+    about = json.loads(entries.pop("about").tobytes())
+    if about.get("schema") != SCHEMA:
+        raise CheckpointError(
+            f"{path}: schema is {about.get('schema')!r}; this version reads schema {SCHEMA}"
+        )
+    found: dict[str, Any] = about["run"]
+    if run is not None:
+        # Both sides through JSON, where tuples are lists.
+        wanted = json.loads(json.dumps(dict(run)))
+        for key in sorted(wanted.keys() | found.keys()):
+            if wanted.get(key) != found.get(key):
+                raise CheckpointError(
+                    f"{path}: the checkpoint is of another run: {key} is {found.get(key)!r} there "
+                    f"and {wanted.get(key)!r} here; use another --out or the same settings"
+                )
+    return Checkpoint(found, about["state"], entries)
+
+
+def _entries(path: Path) -> dict[str, Array]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{path}: there is no checkpoint to resume from; run without --resume"
+        ) from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
+
+
+def _digest(entries: Mapping[str, Array]) -> bytes:
+    digest = hashlib.sha256()
+    for name in sorted(entries):
+        array = np.ascontiguousarray(entries[name])
+        digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
+        digest.update(array.tobytes())
+    return digest.digest()
+
+
+def generator_state(rng: np.random.Generator) -> dict[str, Any]:
+    """State of a generator as JSON-ready numbers."""
+    state: dict[str, Any] = dict(rng.bit_generator.state)
+    return state
+
+
+def restore_generator(rng: np.random.Generator, state: dict[str, Any]) -> None:
+    """Put a generator back; raises CheckpointError where the state is of another kind."""
+    try:
+        rng.bit_generator.state = state
+    except (TypeError, ValueError, KeyError) as error:
+        raise CheckpointError(f"the generator's state cannot be restored ({error})") from error

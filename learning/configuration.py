@@ -1,0 +1,110 @@
+"""Hyperparameters: typed, documented, validated, overridable by `name=value`, stored with results."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from cosim.validation import describe, suggestion
+from learning.errors import ConfigurationError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Configuration(BaseModel):
+    """Hyperparameters that every algorithm has; an algorithm adds its own in a subclass.
+
+    A field's description is its documentation (`documentation`). Scaled coordinates are
+    θ / layout.scale, so that one step size fits all entries.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    parametrisation: Literal["paper", "extended"] = Field(
+        "extended",
+        description="θ of the paper, or that and the slack weights of the predicted stages",
+    )
+    value_offset: Literal["stage-cost", "discounted"] = Field(
+        "discounted", description="c_lambda at the start: ℓ_s (paper) or ℓ_s/(1−γ)"
+    )
+    slack_linear_weight: Positive = Field(
+        100.0, description="w_sigma at the start, extended θ; exact relaxation needs more than 60.3"
+    )
+    slack_linear_minimum: Positive = Field(
+        61.0, description="lower limit of w_sigma, just above the exactness threshold"
+    )
+    slack_quadratic_weight: Positive = Field(
+        1e3, description="W_sigma at the start, extended θ"
+    )
+    definiteness: Literal["lmi", "projection", "cholesky"] = Field(
+        "lmi", description="how B_l and B_Vf are kept positive definite"
+    )
+    smallest_eigenvalue: Positive = Field(
+        1e-3, description="least eigenvalue that B_l and B_Vf may have"
+    )
+    exploration: Literal["additive", "literal", "perturbed-cost", "scenario"] = Field(
+        "additive",
+        description="a = sat(π+e), a = sat(e), a = π of a cost with a random linear term in u, "
+        "or what the scenario says",
+    )
+    exploration_probability: Share = Field(
+        1.0, description="share of samples that explore, at the start"
+    )
+    exploration_probability_end: Share | None = Field(
+        None, description="share at the end, approached linearly; the same if not given"
+    )
+    exploration_deviation: tuple[NonNegative, ...] = Field(
+        (5.0,), description="standard deviation of e in the units of u, one or one per action"
+    )
+    exploration_deviation_end: tuple[NonNegative, ...] | None = Field(
+        None, description="the same at the end, approached linearly"
+    )
+
+    @classmethod
+    def from_assignments(cls, assignments: Iterable[str]) -> Self:
+        """Build from `name=value` texts, values as in TOML (a bare word is a string).
+
+        Raises ConfigurationError that names the field and what it may be.
+        """
+        values: dict[str, Any] = {}
+        for assignment in assignments:
+            name, equals, text = assignment.partition("=")
+            if not equals:
+                raise ConfigurationError(f"'{assignment}' is no hyperparameter; write name=value")
+            name = name.strip()
+            if name not in cls.model_fields:
+                raise ConfigurationError(
+                    f"there is no hyperparameter '{name}'{suggestion(name, cls.model_fields)}; "
+                    f"known are {', '.join(cls.model_fields)}"
+                )
+            values[name] = _value(text.strip())
+        return cls.from_dict(values)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Build from a mapping; raises ConfigurationError."""
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise ConfigurationError(f"hyperparameters: {describe(error, cls)}") from None
+
+    @classmethod
+    def documentation(cls) -> list[tuple[str, str, str]]:
+        """Name, default and meaning of each hyperparameter."""
+        return [
+            (name, repr(field.default), field.description or "")
+            for name, field in cls.model_fields.items()
+        ]
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

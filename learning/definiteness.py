@@ -1,0 +1,224 @@
+"""Positive definite stage and terminal Hessians, kept so in three interchangeable ways.
+
+A learning rule proposes a step (`learning.fit.Fit`); an enforcement turns it into one after which
+∇²ℓ_θ = 2 B_l and ∇²V^f_θ = 2 B_Vf satisfy B ⪰ εI (paper.tex, eq. q_pd_constr and pg_pd_constr).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import clarabel
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import solve_triangular
+
+from controllers.layout import Layout
+from learning.errors import DefinitenessError
+from learning.fit import Fit
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+HESSIANS = ("B_l", "B_Vf")
+SOLVED = ("Solved", "AlmostSolved")
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What vouches for a step: the least eigenvalue of each Hessian block after it.
+
+    `corrected` says that the free step would have violated the constraint, `refused` that no
+    admissible step was found and θ stays.
+    """
+
+    eigenvalues: dict[str, float]
+    corrected: bool = False
+    refused: bool = False
+
+    @property
+    def smallest(self) -> float:
+        """Least eigenvalue of all blocks."""
+        return min(self.eigenvalues.values())
+
+
+Enforcement = Callable[[Vector, Fit], tuple[Vector, Certificate]]
+"""Maps θ (n,) and a fit to the new θ and its certificate."""
+
+
+def certificate(
+    layout: Layout, theta: Vector, *, corrected: bool = False, refused: bool = False
+) -> Certificate:
+    """Least eigenvalue of B_l and B_Vf at θ."""
+    return Certificate(
+        {
+            name: float(np.linalg.eigvalsh(matrix_of(layout, theta, name))[0])
+            for name in HESSIANS
+        },
+        corrected,
+        refused,
+    )
+
+
+def matrix_of(layout: Layout, theta: Vector, name: str) -> Matrix:
+    """Symmetric block `name` of θ."""
+    return layout.block(name).unpack(theta[layout.slices[name]])
+
+
+class LinearMatrixInequality:
+    """The fit's own minimiser under B ⪰ εI, by Clarabel where the free minimiser violates it.
+
+    min dᵀMd − 2bᵀd  s.t.  B_l(θ+Sd) ⪰ εI, B_Vf(θ+Sd) ⪰ εI with scaled steps d (S = diag scale):
+    a quadratic programme over positive semidefinite cones (paper.tex, eq. q_solution, pg_solution).
+    """
+
+    def __init__(self, layout: Layout, smallest: float) -> None:
+        self._layout, self._smallest = layout, smallest
+        self._rows = {name: _triangle_rows(layout, name) for name in HESSIANS}
+
+    def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
+        """Step of the constrained fit; a failure of the solver refuses the step."""
+        layout = self._layout
+        free = theta + layout.scale * fit.minimiser
+        found = certificate(layout, free)
+        if found.smallest >= self._smallest:
+            return free, found
+        step = self.solve(theta, fit)
+        if step is None:
+            return theta, certificate(layout, theta, corrected=True, refused=True)
+        # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
+        theta = clip_eigenvalues(layout, theta + layout.scale * step, self._smallest)
+        return theta, certificate(layout, theta, corrected=True)
+
+    def solve(self, theta: Vector, fit: Fit) -> Vector | None:
+        """Scaled step of the constrained fit by the conic solver, (n,), or None where it fails."""
+        layout = self._layout
+        size = layout.size
+        matrices, offsets, cones = [], [], []
+        for name in HESSIANS:
+            block, where = layout.block(name), layout.slices[name]
+            order, weight = self._rows[name]
+            shifted = matrix_of(layout, theta, name) - self._smallest * np.eye(block.dimension)
+            rows = np.zeros((block.size, size))
+            rows[np.arange(block.size), where.start + order] = (
+                -weight * layout.scale[where][order]
+            )
+            matrices.append(rows)
+            offsets.append(weight * block.pack(shifted)[order])
+            cones.append(clarabel.PSDTriangleConeT(block.dimension))
+        # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
+        metric = fit.metric()
+        unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        solution = clarabel.DefaultSolver(
+            sparse.csc_matrix(np.triu(2 * metric / unit)),
+            -2 * fit.gradient / unit,
+            sparse.csc_matrix(np.vstack(matrices)),
+            np.concatenate(offsets),
+            cones,
+            settings,
+        ).solve()
+        if str(solution.status) not in SOLVED:
+            return None
+        return np.array(solution.x)
+
+
+class EigenvalueProjection:
+    """The free step, then each Hessian's eigenvalues raised to ε: nearest in Frobenius norm."""
+
+    def __init__(self, layout: Layout, smallest: float) -> None:
+        self._layout, self._smallest = layout, smallest
+
+    def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
+        """Clip the eigenvalues after the free step."""
+        free = theta + self._layout.scale * fit.minimiser
+        found = certificate(self._layout, free)
+        if found.smallest >= self._smallest:
+            return free, found
+        theta = clip_eigenvalues(self._layout, free, self._smallest)
+        return theta, certificate(self._layout, theta, corrected=True)
+
+
+class CholeskyParametrisation:
+    """The step taken in the factor L of B = LLᵀ + εI, so that B ≻ εI by construction.
+
+    dL is the change that reproduces the free step D of B to first order, dL Lᵀ + L dLᵀ = D:
+    dL = L Φ(L⁻¹ D L⁻ᵀ), where Φ takes the lower triangle and halves the diagonal.
+    """
+
+    FLOOR = 1e-9
+
+    def __init__(self, layout: Layout, smallest: float) -> None:
+        self._layout, self._smallest = layout, smallest
+
+    def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
+        """Move the factors; raises DefinitenessError where B(θ) ⪰ εI does not hold already."""
+        layout = self._layout
+        step = layout.scale * fit.minimiser
+        result = theta + step
+        corrected = certificate(layout, result).smallest < self._smallest
+        for name in HESSIANS:
+            block, where = layout.block(name), layout.slices[name]
+            shift = (self._smallest - self.FLOOR) * np.eye(block.dimension)
+            try:
+                factor = np.linalg.cholesky(matrix_of(layout, theta, name) - shift)
+            except np.linalg.LinAlgError as error:
+                raise DefinitenessError(
+                    f"θ block {name} does not have all eigenvalues above {self._smallest}; "
+                    "choose a smaller smallest_eigenvalue or start from another θ"
+                ) from error
+            inner = solve_triangular(factor, block.unpack(step[where]), lower=True)
+            inner = solve_triangular(factor, inner.T, lower=True)
+            lower = np.tril(inner)
+            np.fill_diagonal(lower, np.diag(inner) / 2)
+            moved = factor + factor @ lower
+            matrix = moved @ moved.T + self._smallest * np.eye(block.dimension)
+            result[where] = block.pack((matrix + matrix.T) / 2)
+        return result, certificate(layout, result, corrected=corrected)
+
+
+def clip_eigenvalues(layout: Layout, theta: Vector, smallest: float) -> Vector:
+    """Copy of θ whose Hessian blocks have no eigenvalue below `smallest`."""
+    theta = theta.copy()
+    for name in HESSIANS:
+        matrix = matrix_of(layout, theta, name)
+        values, vectors = np.linalg.eigh(matrix)
+        if values[0] < smallest:
+            # Rounding of the product must not take the last digits back.
+            values = np.maximum(values, smallest * (1 + 1e-9))
+            matrix = (vectors * values) @ vectors.T
+            theta[layout.slices[name]] = layout.block(name).pack((matrix + matrix.T) / 2)
+    return theta
+
+
+def _triangle_rows(layout: Layout, name: str) -> tuple[NDArray[np.intp], Vector]:
+    """Order and weights that turn a packed block into Clarabel's scaled triangle.
+
+    Clarabel stacks the upper triangle column by column with √2 on the off-diagonal.
+    """
+    dimension = layout.block(name).dimension
+    position = np.zeros((dimension, dimension), dtype=np.intp)
+    position[np.triu_indices(dimension)] = np.arange(layout.block(name).size)
+    pairs = [(i, j) for j in range(dimension) for i in range(j + 1)]
+    order = np.array([position[i, j] for i, j in pairs], dtype=np.intp)
+    weight = np.array([1.0 if i == j else np.sqrt(2.0) for i, j in pairs])
+    return order, weight
+
+
+ENFORCEMENTS: dict[str, type] = {
+    "lmi": LinearMatrixInequality,
+    "projection": EigenvalueProjection,
+    "cholesky": CholeskyParametrisation,
+}
+
+
+def enforcement(kind: str, layout: Layout, smallest: float) -> Enforcement:
+    """Enforcement by name; raises DefinitenessError on a name that there is not."""
+    if kind not in ENFORCEMENTS:
+        raise DefinitenessError(
+            f"there is no enforcement of definiteness '{kind}'; there are {', '.join(ENFORCEMENTS)}"
+        )
+    made: Enforcement = ENFORCEMENTS[kind](layout, smallest)
+    return made

@@ -1,0 +1,25 @@
+"""Errors of the learning package, each with one message that says what is wrong and where."""
+
+
+class LearningError(Exception):
+    """Base of all errors that the package raises."""
+
+
+class ConfigurationError(LearningError):
+    """A hyperparameter has an unknown name or a value out of its range."""
+
+
+class DefinitenessError(LearningError):
+    """A Hessian of θ cannot be kept positive definite as asked."""
+
+
+class CheckpointError(LearningError):
+    """A checkpoint is missing, damaged, or belongs to another run."""
+
+
+class AlgorithmLookupError(LearningError):
+    """No algorithm of this name is registered, or its entry point cannot be loaded."""
+
+
+class DivergenceError(LearningError):
+    """Learning left the region where θ means anything; the last good θ is kept."""

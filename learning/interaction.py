@@ -1,0 +1,198 @@
+"""The loop of plant, controller and exploration that learning takes its samples from."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.errors import QpError
+from controllers.solution import LinearisationPoint
+from cosim.penalty import Penalty
+from cosim.protocols import Step
+from cosim.scenario import Scenario
+from learning.exploration import Strategy
+from learning.protocols import Algorithm, LearnableController, LearnableSolution, Sample
+
+Vector = NDArray[np.float64]
+
+
+class ContinuablePlant(Protocol):
+    """A plant whose state goes through a checkpoint; `FmuPlant` is one."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario that the plant realises."""
+
+    def reset(self, seed: int) -> Vector:
+        """Start an episode."""
+
+    def step(self, a: Vector) -> Step:
+        """Hold an action for one sample."""
+
+
+class Interaction:
+    """One long episode in which V(s₊) of a sample is V(s) of the next, so a sample costs one QP.
+
+    `next` gives a sample, or None where the controller failed: then the last applied action is
+    applied once more, `failures` counts it and the controller starts from its reference.
+    """
+
+    def __init__(
+        self,
+        plant: ContinuablePlant,
+        controller: LearnableController,
+        algorithm: Algorithm,
+        strategy: Strategy,
+        rng: np.random.Generator,
+    ) -> None:
+        scenario = plant.scenario
+        self._plant, self._controller, self._rng = plant, controller, rng
+        self._strategy, self._algorithm = strategy, algorithm
+        self._penalty = Penalty(
+            scenario.state_lower,
+            scenario.state_upper,
+            scenario.penalty_linear,
+            scenario.penalty_quadratic,
+        )
+        self._applied = scenario.reference_action
+        self._policy: LearnableSolution | None = None
+        self._point: LinearisationPoint | None = None
+        self.s: Vector = scenario.initial_state
+        self.number = 0
+        self.failures = 0
+        self.explored = 0
+        self.saturated = 0
+
+    def start(self, seed: int) -> None:
+        """Begin the episode: reset plant and controller, solve for the first state."""
+        self.s = self._plant.reset(seed)
+        self._controller.reset()
+        self._policy = self._solve()
+
+    def next(self) -> tuple[Sample | None, float]:
+        """One sample of the plant; returns it, or None after a failure, and its cost."""
+        policy, point, s, number = self._policy, self._point, self.s, self.number
+        action_value = policy
+        if policy is None:
+            a = self._applied
+        else:
+            a = self._strategy(policy.action, self._rng, number, self._perturbed)
+            if a is not policy.action:
+                self._count(a)
+                if self._algorithm.needs_action_value:
+                    action_value = self._action_value(s, a)
+        step = self._plant.step(a)
+        self._applied, self.s, self.number = a, step.s, number + 1
+        self._policy = self._solve()
+        cost = step.stage_cost + step.penalty
+        if policy is None or action_value is None or self._policy is None:
+            return None, cost
+        keep = self._algorithm.needs_points
+        return Sample(
+            number=number,
+            s=s,
+            a=a,
+            explored=a is not policy.action,
+            policy=policy,
+            action_value=action_value,
+            stage_cost=step.stage_cost,
+            cost=cost,
+            next_s=self.s,
+            next_penalty=self._penalty(self.s.tolist()),
+            next_policy=self._policy,
+            point=point if keep else None,
+            next_point=self._point if keep else None,
+        ), cost
+
+    def renew(self) -> None:
+        """Solve once more for the present state, at the guess as it was: θ has moved."""
+        if self._point is None:
+            return
+        self._controller.prepare_at(self._point)
+        self._policy = self._feedback()
+
+    def restart(self) -> None:
+        """Forget all that a solver may carry from sample to sample but the guess itself.
+
+        Called at a checkpoint in the run that goes on as in the one that resumes, so that both
+        see the same digits ever after.
+        """
+        point = self._point
+        self._controller.reset()
+        if point is None:
+            self._policy = self._solve()
+        else:
+            self._controller.prepare_at(point)
+            self._policy = self._feedback()
+
+    def state(self) -> tuple[dict[str, int], dict[str, Vector]]:
+        """Numbers and arrays from which `resume` goes on."""
+        arrays = {"s": self.s, "applied": self._applied}
+        if self._point is not None:
+            arrays |= {f"point_{key}": value for key, value in self._point._asdict().items()}
+        counts = ("number", "failures", "explored", "saturated")
+        return {name: getattr(self, name) for name in counts}, arrays
+
+    def resume(self, numbers: dict[str, int], arrays: dict[str, Vector]) -> None:
+        """Take back what `state` gave; the plant must have been restored before."""
+        for name, value in numbers.items():
+            setattr(self, name, value)
+        self.s, self._applied = arrays["s"], arrays["applied"]
+        self._point = None
+        if "point_x" in arrays:
+            self._point = LinearisationPoint(
+                *(arrays[f"point_{name}"] for name in LinearisationPoint._fields)
+            )
+        self.restart()
+
+    def _solve(self) -> LearnableSolution | None:
+        try:
+            self._controller.prepare()
+            self._point = self._controller.linearisation_point
+        except QpError:
+            return self._failed()
+        return self._feedback()
+
+    def _feedback(self) -> LearnableSolution | None:
+        try:
+            return self._controller.feedback(self.s)
+        except QpError:
+            return self._failed()
+
+    def _failed(self) -> None:
+        self.failures += 1
+        self._controller.reset()
+        self._point = None
+
+    def _action_value(self, s: Vector, a: Vector) -> LearnableSolution | None:
+        """Q(s, a) where the algorithm asks for it; moves the guess towards the applied action."""
+        try:
+            return self._controller.feedback(s, a)
+        except QpError:
+            return self._failed()
+
+    def _perturbed(self, gradient: Vector) -> Vector:
+        """π(s) of the cost with a linear term on the actions added to b_l."""
+        controller, theta, point = self._controller, self._controller.theta, self._point
+        assert point is not None and self._policy is not None
+        where = controller.parameters.layout.slices["b_l"]
+        moved = theta.copy()
+        moved[where.stop - gradient.size : where.stop] += gradient
+        try:
+            controller.theta = moved
+            controller.prepare_at(point)
+            return controller.feedback(self.s).action
+        except QpError:
+            self.failures += 1
+            return self._policy.action
+        finally:
+            controller.theta = theta
+            controller.prepare_at(point)
+            controller.feedback(self.s)
+
+    def _count(self, a: Vector) -> None:
+        self.explored += 1
+        scenario = self._plant.scenario
+        self.saturated += bool(((a == scenario.action_lower) | (a == scenario.action_upper)).any())

@@ -1,0 +1,140 @@
+"""What the training loop asks of a learnable controller and of an algorithm."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.parameters import Parameters
+from controllers.solution import LinearisationPoint
+from cosim.scenario import Scenario
+from learning.configuration import Configuration
+from learning.exploration import Strategy
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+class LearnableSolution(Protocol):
+    """V or Q with its sensitivities to θ; `controllers.rti.RtiSolution` is one."""
+
+    @property
+    def action(self) -> Vector:
+        """Action, (m,)."""
+
+    @property
+    def value(self) -> float:
+        """V(s), or Q(s, a) when an action was enforced."""
+
+    @property
+    def value_gradient(self) -> Vector:
+        """dV/dθ or dQ/dθ, (n_θ,)."""
+
+    @property
+    def policy_jacobian(self) -> Matrix:
+        """dπ/dθ, (m, n_θ)."""
+
+
+class LearnableController(Protocol):
+    """A controller with parameters θ; `RtiNmpc` and `ConvergedNmpc` are."""
+
+    theta: Vector
+
+    @property
+    def parameters(self) -> Parameters:
+        """θ with its layout."""
+
+    @property
+    def linearisation_point(self) -> LinearisationPoint:
+        """Where the QP was linearised, copies."""
+
+    def reset(self) -> None:
+        """Forget every earlier sample."""
+
+    def prepare(self) -> None:
+        """Shift the last solution and linearise there."""
+
+    def prepare_at(self, point: LinearisationPoint) -> None:
+        """Linearise at a point, at the present θ."""
+
+    def feedback(self, s: Vector, a: Vector | None = None) -> LearnableSolution:
+        """Solve for V and π, or with the first action fixed for Q."""
+
+
+class Sample(NamedTuple):
+    """One transition (s, a, ℓ, s₊) as the training loop saw it, all at one θ.
+
+    `policy` is the solution for V(s) and π(s); `action_value` that for Q(s, a), the same object
+    where the sample was greedy (then Q = V) or the algorithm does not need it; `next_policy` that for V(s₊), π(s₊). `cost` is stage
+    cost plus penalty of s, the sample's share of J; `next_penalty` the penalty of s₊. `point` and
+    `next_point` are the linearisation points at s and s₊, None unless the algorithm
+    `needs_points`. `number` counts from 0.
+    """
+
+    number: int
+    s: Vector
+    a: Vector
+    explored: bool
+    policy: LearnableSolution
+    action_value: LearnableSolution
+    stage_cost: float
+    cost: float
+    next_s: Vector
+    next_penalty: float
+    next_policy: LearnableSolution
+    point: LinearisationPoint | None
+    next_point: LinearisationPoint | None
+
+
+class Update(NamedTuple):
+    """What an algorithm says of an update of θ, for the log.
+
+    `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
+    step, `smallest_eigenvalue` the certificate's; `corrected` and `refused` are its flags.
+    """
+
+    td_error: float
+    step: float
+    smallest_eigenvalue: float
+    corrected: bool = False
+    refused: bool = False
+
+
+class Algorithm(Protocol):
+    """A learning rule. Register its class in the entry-point group `cosim.algorithms`.
+
+    `Configuration` is the class of its hyperparameters. The loop constructs it with a controller
+    that it may move (`controller.theta`), calls `observe` once per sample, and evaluates anew the
+    policy whenever `observe` returned an Update. `state` and `restore` carry all else that it
+    remembers, as arrays, through a checkpoint.
+    """
+
+    Configuration: ClassVar[type[Configuration]]
+
+    @property
+    def needs_action_value(self) -> bool:
+        """Whether `Sample.action_value` must be solved for where the sample explored."""
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether `Sample.point` and `Sample.next_point` must be kept."""
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: Any,
+        samples: int,
+        strategy: Strategy,
+    ) -> None: ...
+
+    def observe(self, sample: Sample) -> Update | None:
+        """Take one sample; move θ and say so, or return None."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that must survive a checkpoint but θ."""
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""

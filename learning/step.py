@@ -1,0 +1,81 @@
+"""From a fit to a new θ: definite Hessians, slack weights and bounds that stay admissible."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.layout import Layout
+from learning.configuration import Configuration
+from learning.definiteness import Certificate, certificate, enforcement
+from learning.errors import DivergenceError
+from learning.fit import Fit
+from learning.protocols import LearnableController, Update
+
+Vector = NDArray[np.float64]
+
+
+class ParameterStep:
+    """Moves a controller's θ by a fit under every constraint on θ.
+
+    `scale` (n_θ,) are the coordinates of the fits: the layout's, or ones where the configuration
+    says `scaled = false`. Raises DivergenceError on a step that is not finite.
+    """
+
+    def __init__(
+        self, controller: LearnableController, configuration: Configuration, *, scaled: bool = True
+    ) -> None:
+        self._controller = controller
+        layout = controller.parameters.layout
+        self.layout = layout if scaled else unscaled(layout)
+        self.scale: Vector = self.layout.scale
+        self._enforce = enforcement(
+            configuration.definiteness, self.layout, configuration.smallest_eigenvalue
+        )
+        self._weight_minimum = configuration.slack_linear_minimum
+
+    def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
+        """The new θ that a fit leads to, and its certificate; the controller stays as it is."""
+        theta = self._controller.theta
+        if not np.isfinite(fit.minimiser).all():
+            raise DivergenceError("the step of θ is not finite")
+        new, vouched = self._enforce(theta, fit)
+        new = self._admissible(new)
+        lower, upper = self.layout.slices["x_l"], self.layout.slices["x_u"]
+        if not (new[lower] < new[upper]).all():
+            return theta, dataclasses.replace(
+                certificate(self.layout, theta), corrected=True, refused=True
+            )
+        return new, vouched
+
+    def take(self, fit: Fit, td_error: float) -> Update:
+        """Set the controller's θ to the fit's proposal and say what happened."""
+        old = self._controller.theta
+        new, vouched = self.proposal(fit)
+        self._controller.theta = new
+        return Update(
+            td_error=td_error,
+            step=float(np.linalg.norm((new - old) / self.scale)),
+            smallest_eigenvalue=vouched.smallest,
+            corrected=vouched.corrected,
+            refused=vouched.refused,
+        )
+
+    def _admissible(self, theta: Vector) -> Vector:
+        """Keep learned slack weights above what exactness (linear) and convexity ask for."""
+        if "w_sigma" not in self.layout:
+            return theta
+        theta = theta.copy()
+        for name, minimum in (("w_sigma", self._weight_minimum), ("W_sigma", 1.0)):
+            where = self.layout.slices[name]
+            theta[where] = np.maximum(theta[where], minimum)
+        return theta
+
+
+def unscaled(layout: Layout) -> Layout:
+    """The layout with every learning scale 1, for steps in θ itself."""
+    return Layout(
+        tuple(dataclasses.replace(block, scale=(1.0,) * block.size) for block in layout.blocks)
+    )

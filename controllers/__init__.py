@@ -1,5 +1,6 @@
 """NMPC as function approximator: parametric OCP, one QP per sample, its sensitivities."""
 
+from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
 from controllers.layout import Layout
 from controllers.model import Model, Quantity
@@ -10,6 +11,7 @@ from controllers.solution import LinearisationPoint, RtiSolution
 
 __all__ = [
     "ControllerError",
+    "ConvergedNmpc",
     "Layout",
     "LinearisationPoint",
     "Model",

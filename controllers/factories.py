@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from controllers.converged import ConvergedNmpc
 from controllers.parameters import Parameters
 from controllers.problem import Problem, ScenarioLike
 from controllers.rti import RtiNmpc
@@ -40,3 +41,11 @@ def naive(scenario: ScenarioLike) -> RtiNmpc:
 def from_file(scenario: ScenarioLike, path: str | Path) -> RtiNmpc:
     """RTI-NMPC with θ from a parameters file."""
     return rti(scenario, Parameters.load(path, Problem.from_scenario(scenario)))
+
+
+def converged(scenario: ScenarioLike) -> ConvergedNmpc:
+    """NMPC solved to convergence with the paper's naive guess."""
+    problem = Problem.from_scenario(scenario)
+    return ConvergedNmpc(
+        problem, naive_parameters(scenario, problem), backend=scenario.controller.backend
+    )

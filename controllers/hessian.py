@@ -18,7 +18,7 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 
 Vector = NDArray[np.float64]
-RULES = ("gauss-newton", "exact")
+RULES = ("gauss-newton", "exact", "exact-unlifted")
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,10 @@ class Exact:
     FLOOR = 1e-3
     spectrum: Spectrum | None = None
 
-    def __init__(self, problem: Problem, layout: Layout, prepared: BufferedFunction) -> None:
+    def __init__(
+        self, problem: Problem, layout: Layout, prepared: BufferedFunction, floor: float = FLOOR
+    ) -> None:
+        self._floor = floor
         self._cost = GaussNewton(problem, prepared)
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = np.concatenate([problem.reference_state, problem.reference_action])
@@ -125,7 +128,7 @@ class Exact:
         cost = 2 * self._discounts[:, None, None] * self._B
         raw = cost + call.part("D").reshape(-1, size, size)
         values, vectors = np.linalg.eigh(raw)
-        floor = np.asarray(self.FLOOR * self._discounts[:, None], dtype=np.float64)
+        floor = np.asarray(self._floor * self._discounts[:, None], dtype=np.float64)
         self.spectrum = Spectrum(values, vectors, floor)
         lifted = np.maximum(values, floor)
         self._L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
@@ -139,9 +142,15 @@ class Exact:
 def make_hessian(
     name: str, problem: Problem, layout: Layout, prepared: BufferedFunction
 ) -> HessianRule:
-    """Rule by name, `gauss-newton` or `exact`; raises ControllerError on another."""
+    """Rule by name; raises ControllerError on an unknown one.
+
+    `exact-unlifted` leaves an indefinite Hessian as it is: right for the sensitivities of a
+    converged programme, not for a QP that is still to be solved.
+    """
     if name == "gauss-newton":
         return GaussNewton(problem, prepared)
     if name == "exact":
         return Exact(problem, layout, prepared)
+    if name == "exact-unlifted":
+        return Exact(problem, layout, prepared, floor=-np.inf)
     raise ControllerError(f"there is no Hessian '{name}'; choose {' or '.join(RULES)}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -11,7 +14,7 @@ from controllers.lagrangian import readout, sensitivities
 from controllers.ocp import embedding, preparation
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.qp import SoftQp, Stages, make_backend
+from controllers.qp import QpBackend, SoftQp, Stages, make_backend
 from controllers.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 
 Vector = NDArray[np.float64]
@@ -30,7 +33,8 @@ class RtiNmpc:
     it, then `feedback(s)`. A second `prepare()` without a feedback in between changes nothing, and
     `feedback(s, a)` after `feedback(s)` uses the same QP data.
 
-    `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp` or `qpsolvers:SOLVER`.
+    `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
+    or a function that makes a `QpBackend`.
     Raises ControllerError on another choice.
     """
 
@@ -42,13 +46,14 @@ class RtiNmpc:
         parameters: Parameters,
         *,
         hessian: str = "gauss-newton",
-        backend: str = "daqp",
+        backend: str | Callable[[], QpBackend] = "daqp",
     ) -> None:
         """Build the CasADi functions and the workspace of the backend; see the class."""
         self.problem = problem
         layout = parameters.layout
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        self._backend_name, self._backend = backend, make_backend(backend)
+        self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
+        self._backend = self._make_backend()
         self._prepare = preparation(problem, layout)
         self._embed = embedding(problem, layout, self._prepare)
         self._hessian = make_hessian(hessian, problem, layout, self._prepare)
@@ -153,7 +158,7 @@ class RtiNmpc:
         self._costates[:] = 0.0
         self._pending: RtiSolution | None = None
         self._prepared = None
-        self._backend = make_backend(self._backend_name)
+        self._backend = self._make_backend()
 
     def prepare(self) -> None:
         """Preparation phase: shift the last solution, linearise along it, condense, factorise.

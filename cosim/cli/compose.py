@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
-from importlib.metadata import EntryPoint, entry_points
+import sys
+from contextlib import suppress
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -28,51 +29,53 @@ def build_plant(scenario: Scenario) -> FmuPlant:
 def build_controller(name: str, scenario: Scenario) -> Controller:
     """Build a controller for a scenario; raises ControllerLookupError and the controller's own.
 
-    `name` is an entry point of the group `cosim.controllers`, a `module:factory` with
-    factory(scenario) -> Controller, or the path of a θ file (TOML) for the RTI-NMPC.
+    `name` is an entry point of the group `cosim.controllers`, the path of a θ file (TOML) for the
+    RTI-NMPC, or a `module:factory` with factory(scenario) -> Controller, importable from the
+    Python path or the working directory.
     """
-    known = _entry_points()
+    known = {point.name: point for point in entry_points(group=GROUP)}
     if name in known:
-        return _made(known[name].load(), name, scenario)
+        return _made(name, known[name].value, scenario)
     if name.endswith(".toml"):
-        return _from_parameters(Path(name), scenario)
-    module, colon, factory = name.partition(":")
-    if colon:
-        return _made(_imported(name, module, factory), name, scenario)
+        from controllers.factories import from_file
+
+        return _named(cast("Controller", from_file(cast("Any", scenario), name)), Path(name).stem)
+    if ":" in name:
+        return _made(name, name, scenario)
     from cosim.validation import suggestion
 
     raise ControllerLookupError(
-        f"unknown controller '{name}'{suggestion(name, known)}; give one of {', '.join(known)}, "
-        "a parameters file (.toml), or module:factory"
+        f"unknown controller '{name}'{suggestion(name, known)}; give one of "
+        f"{', '.join(sorted(known))}, a parameters file (.toml), or module:factory"
     )
 
 
-def _entry_points() -> dict[str, EntryPoint]:
-    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda p: p.name)}
-
-
-def _imported(name: str, module: str, factory: str) -> Callable[..., Any]:
-    try:
-        return cast("Callable[..., Any]", getattr(importlib.import_module(module), factory))
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ControllerLookupError(f"controller '{name}' cannot be imported: {error}") from None
-
-
-def _made(factory: Callable[..., Any], name: str, scenario: Scenario) -> Controller:
+def _made(name: str, target: str, scenario: Scenario) -> Controller:
     from cosim.protocols import Controller
 
-    if not callable(factory):
-        raise ControllerLookupError(f"controller '{name}' is not a factory: it cannot be called")
-    controller = factory(scenario)
+    module, _, attribute = target.partition(":")
+    if (folder := str(Path.cwd())) not in sys.path:
+        sys.path.append(folder)
+    try:
+        factory = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ControllerLookupError(f"controller '{name}' cannot be imported: {error}") from None
+    try:
+        controller = factory(scenario)
+    except TypeError as error:
+        raise ControllerLookupError(
+            f"controller '{name}' is not a factory of one scenario: {error}"
+        ) from error
     if not isinstance(controller, Controller):
         raise ControllerLookupError(
             f"controller '{name}' made a {type(controller).__name__}, which lacks reset, prepare "
             "or feedback"
         )
+    return _named(controller, name)
+
+
+def _named(controller: Controller, name: str) -> Controller:
+    """Let tables and recordings call the controller what the user called it."""
+    with suppress(AttributeError):
+        setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
     return controller
-
-
-def _from_parameters(path: Path, scenario: Scenario) -> Controller:
-    from controllers.factories import from_file
-
-    return cast("Controller", from_file(cast("Any", scenario), path))

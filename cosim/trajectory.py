@@ -183,6 +183,14 @@ def signal_names(scenario: Scenario) -> list[str]:
 
 def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:
     """Read what `Trajectory.write_csv` wrote; raises TrajectoryError with file and line."""
+    return Trajectory(scenario, *read_signals(path))
+
+
+def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
+    """Read the signals by name and the status of each sample from a trajectory's CSV file.
+
+    Raises TrajectoryError with file and line.
+    """
     try:
         with Path(path).open(newline="", encoding="utf-8") as stream:
             rows = list(csv.reader(stream))
@@ -203,4 +211,4 @@ def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:
     for title, column in zip(header, values.T, strict=False):
         name, _, unit = title.partition(" [")
         signals[name] = Signal(name, unit.removesuffix("]"), column.copy())
-    return Trajectory(scenario, signals, [row[-1] for row in body])
+    return signals, [row[-1] for row in body]

@@ -1,0 +1,63 @@
+"""Small controllers to drive the loop with, in place of an NMPC."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class Answer:
+    action: np.ndarray
+    value: float = float("nan")
+    status: str = "solved"
+    residual: float = float("nan")
+    predicted_states: np.ndarray | None = None
+    predicted_actions: np.ndarray | None = None
+
+
+class Proportional:
+    """u = u_s + gain (x_s − x), with the pressure of steam following the concentration."""
+
+    name = "proportional"
+
+    def __init__(self, scenario, gain=10.0):
+        self._scenario = scenario
+        self._gain = gain
+        self.resets = 0
+
+    def reset(self):
+        self.resets += 1
+
+    def prepare(self):
+        pass
+
+    def feedback(self, s, a=None):
+        error = self._scenario.reference_state - s
+        action = self._scenario.reference_action + self._gain * np.array([error[0], 0.0])
+        return Answer(action, value=float(error[0]))
+
+
+class SolverFailed(Exception):
+    is_solver_failure = True
+
+
+class Failing(Proportional):
+    """Fails to solve at given samples, in `prepare` or in `feedback`."""
+
+    def __init__(self, scenario, at, phase="feedback"):
+        super().__init__(scenario)
+        self._at, self._phase, self._k = set(at), phase, -1
+
+    def prepare(self):
+        self._k += 1
+        if self._phase == "prepare" and self._k in self._at:
+            raise SolverFailed("no solution")
+
+    def feedback(self, s, a=None):
+        if self._phase == "feedback" and self._k in self._at:
+            raise SolverFailed("no solution")
+        return super().feedback(s)
+
+
+def proportional(scenario):
+    return Proportional(scenario)

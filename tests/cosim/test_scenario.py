@@ -1,0 +1,213 @@
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cosim.errors import ScenarioError
+from cosim.scenario import Scenario, presets
+
+
+def test_presets_are_those_that_the_design_names():
+    assert presets() == ["fast-sampling", "nominal", "paper"]
+
+
+def test_paper_holds_the_numbers_of_the_paper(paper):
+    assert paper.sampling_time == 60.0
+    assert paper.discount == 0.99
+    assert paper.plant.states == ("X2", "P2")
+    assert paper.plant.actions == ("P100", "F200")
+    assert paper.disturbance.law == "uniform"
+    assert paper.disturbance.nominal == (5.0, 10.0, 40.0, 25.0)
+    assert paper.disturbance.ranges == (1.0, 2.0, 8.0, 5.0)
+    np.testing.assert_array_equal(paper.state_lower, [25, 40])
+    np.testing.assert_array_equal(paper.state_upper, [100, 80])
+    np.testing.assert_array_equal(paper.action_lower, [100, 100])
+    np.testing.assert_array_equal(paper.action_upper, [400, 400])
+    np.testing.assert_array_equal(paper.penalty_linear, [1e5, 1e5])
+    np.testing.assert_array_equal(paper.penalty_quadratic, [1, 1])
+    assert paper.controller.horizon == 10
+    assert paper.controller.value_offset == "stage-cost"
+    assert paper.exploration.kind == "additive"
+    assert paper.exploration.probability == 0.1
+    np.testing.assert_allclose(np.square(paper.exploration.standard_deviation), 10, rtol=1e-15)
+
+
+def test_paper_reference_is_the_nominal_optimum_of_the_paper(paper):
+    assert paper.reference_state.round(2).tolist() == [25.0, 49.74]
+    assert paper.reference_action.round(2).tolist() == [191.71, 215.89]
+    assert round(paper.controller.reference_cost, 4) == 6210.3845
+
+
+def test_other_presets_differ_from_paper_in_one_point_each(paper):
+    differing = {
+        name: {
+            key
+            for key, value in Scenario.load(name).to_dict().items()
+            if value != paper.to_dict()[key] and key not in ("name", "description")
+        }
+        for name in presets()
+    }
+    assert differing == {
+        "paper": set(),
+        "nominal": {"disturbance"},
+        "fast-sampling": {"sampling_time"},
+    }
+
+
+@pytest.mark.parametrize("name", presets())
+def test_toml_round_trip_is_exact(name, tmp_path):
+    scenario = Scenario.load(name)
+    path = tmp_path / "copy.toml"
+    path.write_text(scenario.to_toml())
+    assert Scenario.load(path) == scenario
+    assert Scenario.load(path).hash == scenario.hash
+
+
+def test_hash_sees_every_number_but_not_the_name(paper):
+    assert paper.replace({"name": "mine", "description": "other"}).hash == paper.hash
+    changed = [
+        {"discount": 0.9},
+        {"penalty": {"quadratic": [1.0, 1.01]}},
+        {"disturbance": {"law": "normal"}},
+        {"plant": {"parameters": {"UA2": 6.9}}},
+        {"controller": {"horizon": 11}},
+    ]
+    hashes = {paper.hash} | {paper.replace(change).hash for change in changed}
+    assert len(hashes) == 1 + len(changed)
+
+
+def test_extends_states_only_what_differs(tmp_path, paper):
+    (tmp_path / "a.toml").write_text('extends = "paper"\nname = "a"\ndiscount = 0.9\n')
+    (tmp_path / "b.toml").write_text('extends = "a.toml"\nname = "b"\nsampling_time = 30.0\n')
+    scenario = Scenario.load(tmp_path / "b.toml")
+    expected = paper.replace({"name": "b", "discount": 0.9, "sampling_time": 30.0})
+    assert scenario == expected
+
+
+def test_an_fmu_path_is_relative_to_the_scenario_file(tmp_path):
+    (tmp_path / "mine.toml").write_text('extends = "paper"\n[plant]\nfmu = "my.fmu"\n')
+    assert Scenario.load(tmp_path / "mine.toml").plant.fmu == str(tmp_path / "my.fmu")
+
+
+def test_vectors_cannot_be_changed(paper):
+    with pytest.raises(ValueError, match="read-only"):
+        paper.state_lower[0] = 0.0
+
+
+BAD = {
+    "unknown preset": ("papr", None, ["unknown scenario 'papr'", "did you mean 'paper'", "nominal"]),
+    "missing file": ("none.toml", None, ["none.toml", "does not exist"]),
+    "not TOML": ("x.toml", "a = = 1", ["x.toml", "not valid TOML", "line 1"]),
+    "not text": ("x.toml", b"\xff\xfe\x00", ["x.toml", "UTF-8"]),
+    "empty": ("x.toml", "", ["schema", "is missing", "more problems"]),
+    "wrong schema": ("x.toml", 'extends="paper"\nschema = 2', ["schema", "must be 1", "not 2"]),
+    "wrong type": (
+        "x.toml",
+        'extends="paper"\nsampling_time = "60"',
+        ["x.toml", "sampling_time", "must be a number", "not '60'"],
+    ),
+    "wrong type of table": (
+        "x.toml",
+        'extends="paper"\nplant = 3',
+        ["plant", "must be a table", "not 3"],
+    ),
+    "unknown field": (
+        "x.toml",
+        'extends="paper"\n[plant]\nstate = ["X2"]',
+        ["plant.state", "unknown field", "did you mean 'states'", "stage_cost"],
+    ),
+    "unknown table": ("x.toml", 'extends="paper"\n[plan]\n', ["plan", "did you mean 'plant'"]),
+    "not finite": (
+        "x.toml",
+        'extends="paper"\n[penalty]\nlinear = [nan, 1.0]',
+        ["penalty.linear[0]", "must be finite"],
+    ),
+    "negative": (
+        "x.toml",
+        'extends="paper"\nsampling_time = -1.0',
+        ["sampling_time", "must be greater than 0"],
+    ),
+    "discount": ("x.toml", 'extends="paper"\ndiscount = 1.5', ["discount", "less than or equal"]),
+    "wrong size": (
+        "x.toml",
+        'extends="paper"\n[bounds]\nstate_lower = [25.0]',
+        ["bounds.state_lower", "one entry per state (2), not 1"],
+    ),
+    "bounds crossed": (
+        "x.toml",
+        'extends="paper"\n[bounds]\naction_lower = [500.0, 100.0]',
+        ["bounds.action_lower", "below action_upper"],
+    ),
+    "choice": (
+        "x.toml",
+        'extends="paper"\n[disturbance]\nlaw = "poisson"',
+        ["disturbance.law", "'uniform', 'normal' or 'none'", "'poisson'"],
+    ),
+    "law that is not mapped": (
+        "x.toml",
+        'extends="paper"\n[plant.mapping]\nlaw_codes = {uniform = "one"}',
+        ["plant.mapping.law_codes.uniform", "whole number"],
+    ),
+    "name twice": (
+        "x.toml",
+        'extends="paper"\n[plant]\nactions = ["P100", "X2"]',
+        ["plant", "'X2' twice"],
+    ),
+    "extends a number": ("x.toml", "extends = 3", ["extends", "not 3"]),
+    "extends itself": ("x.toml", 'extends = "x.toml"', ["extends leads back to itself"]),
+    "extends nothing": ("x.toml", 'extends = "y.toml"', ["y.toml", "does not exist"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_documents_are_refused_in_one_clear_line(case, tmp_path, monkeypatch):
+    source, text, expected = BAD[case]
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / source).write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ScenarioError) as error:
+        Scenario.load(source)
+    message = str(error.value)
+    assert "\n" not in message
+    for part in expected:
+        assert part in message
+
+
+def _leaves(table, path=()):
+    for key, value in table.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, (*path, key))
+        else:
+            yield (*path, key)
+
+
+JUNK = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 3),
+    st.floats(),
+    st.text(max_size=3),
+    st.lists(st.one_of(st.floats(), st.text(max_size=2)), max_size=3),
+    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
+)
+
+
+@given(data=st.data())
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_any_junk_in_any_field_is_accepted_or_refused_by_name(data):
+    document = tomllib.loads(Scenario.load("paper").to_toml())
+    path = data.draw(st.sampled_from(list(_leaves(document))))
+    table = document
+    for key in path[:-1]:
+        table = table[key]
+    table[path[-1]] = data.draw(JUNK)
+    try:
+        scenario = Scenario.from_dict(document)
+    except ScenarioError as error:
+        message = str(error)
+        assert "\n" not in message
+        assert path[0] in message
+    else:
+        assert Scenario.from_dict(tomllib.loads(scenario.to_toml())) == scenario

@@ -31,3 +31,7 @@ class RecordingError(CosimError):
 
 class FigureError(CosimError):
     """A figure that cannot be drawn or written."""
+
+
+class ComparisonError(CosimError):
+    """Two runs that cannot be compared as asked."""

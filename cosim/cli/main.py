@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli import benchmark, demo, scenario, simulate, view
+from cosim.cli import benchmark, compare, demo, scenario, simulate, view
 
 app = typer.Typer(
     name="cosim",
@@ -21,6 +21,7 @@ app = typer.Typer(
 app.command("demo")(demo.demo)
 app.command("simulate")(simulate.simulate)
 app.command("view")(view.view)
+app.command("compare")(compare.compare)
 app.command("scenario")(scenario.scenario)
 app.add_typer(benchmark.app, name="benchmark")
 

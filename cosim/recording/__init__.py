@@ -1,5 +1,6 @@
 """Rerun recordings: of runs, of training and of comparisons; the only importer of rerun."""
 
+from cosim.recording.overlay import record_comparison
 from cosim.recording.reading import Recording, read_recording, read_signals, summarise
 from cosim.recording.run import RerunRecorder
 from cosim.recording.viewer import open_viewer, render
@@ -10,6 +11,7 @@ __all__ = [
     "open_viewer",
     "read_recording",
     "read_signals",
+    "record_comparison",
     "render",
     "summarise",
 ]

@@ -66,7 +66,7 @@ class Channel:
         low, high = self.seen
         if low > high:
             low, high = self._expected()
-        span = max(high - low, 1e-3 * max(abs(low), abs(high)), 1e-9)
+        span = max(high - low, 1e-3 * max(abs(low), abs(high))) or 1.0
         if low - span <= lower:
             low = min(low, lower)
         if upper <= high + span:

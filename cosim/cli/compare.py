@@ -1,0 +1,80 @@
+"""`cosim compare`: two runs side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosim.cli.output import JsonOption, output
+
+DIFFERENT = 1
+
+
+def compare(
+    a: Annotated[
+        Path, typer.Argument(help="Run: its folder, trajectory.csv or .rrd.", show_default=False)
+    ],
+    b: Annotated[Path, typer.Argument(help="Run to compare it with.", show_default=False)],
+    tolerance: Annotated[
+        list[str] | None,
+        typer.Option("--tolerance", "-t", help="NAME=VALUE in the signal's unit; repeatable."),
+    ] = None,
+    relative: Annotated[
+        float,
+        typer.Option(
+            "--relative", min=0.0, help="Tolerance of the others, per largest magnitude in A."
+        ),
+    ] = 0.0,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Write a Rerun recording with both overlaid.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Compare two runs sample by sample; exit code 1 if they differ.
+
+    Without tolerances every bit of every signal counts; wall-clock times never do.
+    """
+    with output(json) as out_:
+        from cosim import comparison
+
+        runs = comparison.load_run(a), comparison.load_run(b)
+        result = comparison.compare(*runs, _tolerances(tolerance or []), relative=relative)
+        if record is not None:
+            from cosim.recording import record_comparison
+
+            record_comparison(record, *runs, result)
+            out_.note(f"both runs are overlaid in {record.resolve()}")
+        rows = [
+            (
+                d.name,
+                d.unit,
+                f"{d.maximum:.6g}",
+                str(d.at) if d.maximum > 0 else "",
+                f"{d.tolerance:.6g}",
+                "" if d.first is None else str(d.first),
+            )
+            for d in result.differences
+        ]
+        header = ("signal", "unit", "largest difference", "at sample", "tolerance", "first beyond")
+        out_.table(f"{a} against {b}, {min(result.samples)} samples", header, rows)
+        out_.note("\n".join(result.lines()) or "no signal differs by more than its tolerance")
+        out_.json(comparison.as_document(result))
+    if not result.equal:
+        raise typer.Exit(DIFFERENT)
+
+
+def _tolerances(options: list[str]) -> dict[str, float]:
+    from cosim.errors import ComparisonError
+
+    tolerances = {}
+    for option in options:
+        name, _, value = option.rpartition("=")
+        try:
+            tolerances[name] = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise ComparisonError(f"--tolerance {option}: give NAME=VALUE, e.g. X2=1e-9")
+    return tolerances

@@ -1,0 +1,123 @@
+"""Records two runs over each other: the same plots, prefixed entities, and their difference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from cosim.comparison import Comparison, Run
+from cosim.recording.channels import Channel
+from cosim.recording.layout import framed, series, time_axis, union
+from cosim.recording.palette import SERIES
+from cosim.recording.stream import Stream, line, sample_times
+from cosim.recording.text import drawable
+
+_SIDES = ("A", "B")
+
+
+def record_comparison(path: str | Path, a: Run, b: Run, comparison: Comparison) -> None:
+    """Write a recording with runs A and B overlaid, and A − B; raises RecordingError.
+
+    Entities are `A/<signal>`, `B/<signal>` and `difference/<signal>`.
+    """
+    names = [d.name for d in comparison.differences if d.name != "time"]
+    overlaid = {name: _channels(name, (a, b)) for name in names}
+    differences = {name: _difference(name, a, b) for name in names}
+    duration = max(float(_time(run)[-1]) if len(run) else 0.0 for run in (a, b))
+    stream = Stream(path, _blueprint(duration, overlaid, differences), "comparison")
+    text = _text(a, b, comparison)
+    stream.static("about", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    for run, side in zip((a, b), _SIDES, strict=True):
+        times = sample_times(np.arange(len(run)), _time(run))
+        for name in names:
+            channel = overlaid[name][_SIDES.index(side)]
+            stream.static(channel.entity, line(side, channel.color))
+            stream.scalars(channel.entity, times, run.signals[name].values)
+    common = min(len(a), len(b))
+    times = sample_times(np.arange(common), _time(a)[:common])
+    for channel, values in differences.values():
+        stream.static(channel.entity, line("A - B", channel.color))
+        stream.scalars(channel.entity, times, values)
+    stream.close()
+
+
+def _channels(name: str, runs: tuple[Run, Run]) -> list[Channel]:
+    return [
+        Channel(side, name, run.signals[name].unit, color).with_values(run.signals[name].values)
+        for side, run, color in zip(_SIDES, runs, SERIES, strict=False)
+    ]
+
+
+def _difference(name: str, a: Run, b: Run) -> tuple[Channel, np.ndarray]:
+    common = min(len(a), len(b))
+    with np.errstate(invalid="ignore"):
+        values = a.signals[name].values[:common] - b.signals[name].values[:common]
+    channel = Channel("difference", name, a.signals[name].unit, SERIES[3]).with_values(values)
+    return channel, values
+
+
+def _time(run: Run) -> np.ndarray:
+    return run.signals["time"].values if "time" in run.signals else np.arange(float(len(run)))
+
+
+def _blueprint(
+    duration: float,
+    overlaid: dict[str, list[Channel]],
+    differences: dict[str, tuple[Channel, np.ndarray]],
+) -> rrb.Blueprint:
+    axis = time_axis(duration)
+    runs = [
+        series(
+            channels[0].label,
+            [f"/{channel.entity}" for channel in channels],
+            axis,
+            union(channels),
+            legend=True,
+        )
+        for channels in overlaid.values()
+    ]
+    deviations = [
+        series(f"A - B: {channel.label}", [f"/{channel.entity}"], axis, channel.window())
+        for channel, _ in differences.values()
+    ]
+    return framed(
+        rrb.Tabs(
+            rrb.Grid(*runs, grid_columns=3, name="A and B"),
+            rrb.Grid(*deviations, grid_columns=3, name="A - B"),
+            rrb.TextDocumentView(name="what differs", origin="/about"),
+        )
+    )
+
+
+def _text(a: Run, b: Run, comparison: Comparison) -> str:
+    found = comparison.lines() or ["no signal differs by more than its tolerance"]
+    rows = "\n".join(
+        f"| {d.name} | {d.unit or '-'} | {_number(d.maximum)} | {d.at} | {_number(d.tolerance)} |"
+        for d in comparison.differences
+    )
+    page = f"""# A against B
+
+A: {a.name}
+
+B: {b.name}
+
+{_bullets(found)}
+
+| signal | unit | largest difference | at sample | tolerance |
+|---|---|---|---|---|
+{rows}
+"""
+    return drawable(page)
+
+
+def _bullets(lines: Sequence[str]) -> str:
+    return "\n".join(f"- {text}" for text in lines)
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}" if isfinite(value) else "NaN in one run only"

@@ -25,7 +25,7 @@ _EXPECTED = {
 
 def suggestion(word: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)` if a known word is close, else nothing."""
-    close = get_close_matches(word, list(known), n=1)
+    close = get_close_matches(word, list(known), n=1, cutoff=0.5)
     return f" (did you mean '{close[0]}'?)" if close else ""
 
 

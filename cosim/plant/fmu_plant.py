@@ -85,6 +85,7 @@ class FmuPlant:
         self.fmi_version = version
         self.fmu_path = unpacked.path
         self.fmu_sha256 = unpacked.sha256
+        wiring = wirer.wiring()
         self.units = wirer.units()
         lower, upper = wirer.state_range()
         self.state_range = (np.array(lower), np.array(upper))
@@ -103,7 +104,7 @@ class FmuPlant:
         self._started = False
         self._penalty_now = 0.0
         self.is_shipped = str(self.scenario.plant.fmu if fmu is None else fmu) in SHIPPED
-        self._fmi = interface(unpacked, wirer.wiring(), self._h)
+        self._fmi = interface(unpacked, wiring, self._h)
         self._advance = self._fmi.advance
         self._inputs = self._fmi.inputs
         self._outputs = self._fmi.outputs

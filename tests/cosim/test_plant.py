@@ -1,0 +1,309 @@
+import gc
+import subprocess
+import sys
+
+import numpy as np
+import psutil
+import pytest
+
+from cosim import FmuPlant, Scenario
+from cosim.errors import PlantError
+from cosim.simulation import spawn_seeds
+
+ACTIONS = np.random.default_rng(7).uniform(100, 400, (50, 2))
+
+
+def run(plant, seed, steps=50):
+    rows = [plant.reset(seed)]
+    for a in ACTIONS[:steps]:
+        rows.append(np.concatenate([np.atleast_1d(part) for part in plant.step(a)]))
+    return np.concatenate(rows).tobytes()
+
+
+def test_reset_gives_the_scenarios_initial_state(plant, paper):
+    np.testing.assert_array_equal(plant.reset(1), paper.initial_state)
+    assert (plant.k, plant.time) == (0, 0.0)
+
+
+def test_nominal_plant_rests_at_the_reference():
+    with FmuPlant("nominal") as plant:
+        scenario = plant.scenario
+        plant.reset(0)
+        for _ in range(100):
+            step = plant.step(scenario.reference_action)
+        np.testing.assert_allclose(step.s, scenario.reference_state, rtol=0, atol=1e-9)
+        assert step.stage_cost == pytest.approx(scenario.controller.reference_cost, abs=1e-6)
+        assert step.disturbance.tolist() == list(scenario.disturbance.nominal)
+
+
+def test_time_is_a_multiple_of_the_sampling_time_not_a_sum():
+    with FmuPlant(Scenario.load("paper").replace({"sampling_time": 0.1})) as plant:
+        plant.reset(0)
+        for _ in range(1000):
+            plant.step([200.0, 200.0])
+        assert plant.time == 1000 * 0.1
+
+
+def test_penalty_is_that_of_the_state_before_the_step(plant):
+    plant.reset(3)
+    before = plant.state
+    for a in ([100.0, 200.0], [100.0, 200.0], [300.0, 200.0]):
+        step = plant.step(a)
+        assert step.penalty == plant.penalty(before.tolist())
+        before = step.s
+    assert step.penalty > 0
+
+
+def test_stage_cost_is_that_of_the_paper_for_state_action_and_disturbance(plant):
+    plant.reset(4)
+    for p100, f200 in ACTIONS[:20]:
+        x2, p2 = plant.state
+        step = plant.step([p100, f200])
+        _, f1, t1, _ = step.disturbance
+        t2 = 0.5616 * p2 + 0.3126 * x2 + 48.43
+        q100 = 0.16 * (f1 + 50) * (0.1538 * p100 + 90 - t2)
+        f2 = f1 - (q100 - f1 * 0.07 * (t2 - t1)) / 38.5
+        cost = 10.09 * (f2 + 50) + 600 * q100 / 36.6 + 0.6 * f200
+        assert step.stage_cost == pytest.approx(cost, rel=1e-12)
+
+
+def test_both_fmi_versions_give_the_same_bits(paper):
+    with FmuPlant(paper, "evaporator") as fmi2, FmuPlant(paper, "evaporator_fmi3") as fmi3:
+        assert (fmi2.fmi_version, fmi3.fmi_version) == ("2.0", "3.0")
+        for seed in (0, 5, 2**40 + 3, 2**64 - 1):
+            assert run(fmi2, seed) == run(fmi3, seed)
+
+
+def test_a_seed_repeats_after_reset_and_another_differs(plant):
+    first = run(plant, 11)
+    assert run(plant, 12) != first
+    assert run(plant, 11) == first
+
+
+def test_every_bit_of_the_seed_counts(plant):
+    runs = {run(plant, seed, 2) for seed in (0, 1, 2**31, 2**32, 2**63)}
+    assert len(runs) == 5
+
+
+def test_another_process_repeats_the_run(plant):
+    code = (
+        "import sys; sys.path.insert(0, 'tests/cosim')\n"
+        "from cosim import FmuPlant; from test_plant import run; import hashlib\n"
+        f"plant = FmuPlant('paper', {plant.fmu_path.stem!r})\n"
+        "print(hashlib.sha256(run(plant, 21)).hexdigest())"
+    )
+    import hashlib
+
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert other.stdout.strip() == hashlib.sha256(run(plant, 21)).hexdigest()
+
+
+def test_disturbances_do_not_depend_on_the_actions(plant):
+    plant.reset(6)
+    one = [plant.step(a).disturbance for a in ACTIONS[:10]]
+    plant.reset(6)
+    other = [plant.step([150.0, 150.0]).disturbance for _ in range(10)]
+    np.testing.assert_array_equal(one, other)
+
+
+def test_uniform_disturbances_stay_in_their_ranges_and_fill_them(paper, plant):
+    plant.reset(spawn_seeds(1)[0])
+    drawn = np.array([plant.step(paper.reference_action).disturbance for _ in range(2000)])
+    offset = (drawn - paper.disturbance.nominal) / paper.disturbance.ranges
+    assert np.abs(offset).max() <= 1.0
+    np.testing.assert_allclose(offset.std(axis=0), 1 / np.sqrt(3), rtol=0.05)
+
+
+def test_the_normal_law_is_a_choice_of_the_scenario(paper):
+    scenario = paper.replace({"disturbance": {"law": "normal"}})
+    with FmuPlant(scenario) as plant:
+        plant.reset(2)
+        drawn = np.array([plant.step(paper.reference_action).disturbance for _ in range(2000)])
+    offset = (drawn - paper.disturbance.nominal) / paper.disturbance.ranges
+    assert np.abs(offset).max() > 2.5
+    np.testing.assert_allclose(offset.std(axis=0), 1.0, rtol=0.1)
+
+
+def test_plant_parameters_of_the_scenario_reach_the_fmu(paper):
+    with (
+        FmuPlant(paper) as one,
+        FmuPlant(paper.replace({"plant": {"parameters": {"UA2": 7.0}}})) as two,
+    ):
+        assert run(one, 1) != run(two, 1)
+
+
+def test_an_episode_can_start_elsewhere_and_the_next_starts_at_home(plant, paper):
+    assert plant.reset(1, [30.0, 60.0]).tolist() == [30.0, 60.0]
+    assert plant.reset(1).tolist() == paper.initial_state.tolist()
+
+
+def test_restore_repeats_what_followed_the_snapshot(plant):
+    plant.reset(8)
+    for a in ACTIONS[:5]:
+        plant.step(a)
+    snapshot = plant.snapshot()
+    state = plant.state
+    first = [plant.step(a) for a in ACTIONS[5:15]]
+    for _ in range(2):
+        np.testing.assert_array_equal(plant.restore(snapshot), state)
+        assert plant.k == 5
+        for a, step in zip(ACTIONS[5:15], first, strict=True):
+            again = plant.step(a)
+            assert again.stage_cost == step.stage_cost
+            assert again.penalty == step.penalty
+            np.testing.assert_array_equal(again.s, step.s)
+            np.testing.assert_array_equal(again.disturbance, step.disturbance)
+
+
+def test_a_snapshot_survives_a_reset(plant):
+    plant.reset(8)
+    plant.step(ACTIONS[0])
+    snapshot = plant.snapshot()
+    expected = plant.step(ACTIONS[1]).s
+    plant.reset(9)
+    plant.restore(snapshot)
+    np.testing.assert_array_equal(plant.step(ACTIONS[1]).s, expected)
+
+
+def test_a_serialised_state_continues_in_another_plant(plant, paper):
+    plant.reset(8)
+    for a in ACTIONS[:5]:
+        plant.step(a)
+    data = plant.serialise(plant.snapshot())
+    expected = [plant.step(a).s for a in ACTIONS[5:15]]
+    with FmuPlant(paper, plant.fmu_path.stem) as other:
+        other.restore(other.deserialise(data))
+        assert other.k == 5
+        np.testing.assert_array_equal([other.step(a).s for a in ACTIONS[5:15]], expected)
+
+
+def test_dropped_snapshots_hand_on_their_memory(plant):
+    plant.reset(0)
+    process = psutil.Process()
+    for _ in range(2000):
+        plant.snapshot()
+    gc.collect()
+    before = process.memory_info().rss
+    for _ in range(50_000):
+        plant.snapshot()
+    assert process.memory_info().rss - before < 1 << 20
+
+
+@pytest.mark.slow
+def test_creating_and_freeing_plants_leaves_memory_flat(paper):
+    process = psutil.Process()
+    sizes = []
+    for _ in range(4):
+        for _ in range(500):
+            with FmuPlant(paper) as plant:
+                plant.reset(1)
+                plant.step(paper.reference_action)
+        gc.collect()
+        sizes.append(process.memory_info().rss)
+    assert sizes[-1] - sizes[1] < 4 << 20
+
+
+BAD_ACTIONS = {
+    "NaN": [float("nan"), 200.0],
+    "infinite": [float("inf"), 200.0],
+    "too short": [200.0],
+    "too long": [200.0, 200.0, 200.0],
+    "matrix": np.array([[200.0, 200.0]]),
+    "text": ["a", "b"],
+    "none": None,
+    "a number": 3.0,
+}
+
+
+@pytest.mark.parametrize("case", BAD_ACTIONS)
+def test_a_bad_action_is_refused_by_name_and_leaves_the_plant_as_it_was(case, plant):
+    plant.reset(1)
+    state = plant.state
+    with pytest.raises(PlantError, match=r"action must be 2 finite numbers \(P100, F200\)"):
+        plant.step(BAD_ACTIONS[case])
+    np.testing.assert_array_equal(plant.state, state)
+    plant.step([200.0, 200.0])
+
+
+def test_an_action_out_of_the_fmus_range_is_refused_with_its_own_words(plant):
+    plant.reset(1)
+    with pytest.raises(PlantError, match=r"P100 = 500 is outside \[100, 400\]"):
+        plant.step([500.0, 200.0])
+    with pytest.raises(PlantError, match="call reset first"):
+        plant.step([200.0, 200.0])
+    plant.reset(1)
+    plant.step([200.0, 200.0])
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 64])
+def test_a_seed_out_of_range_is_refused(plant, seed):
+    with pytest.raises(PlantError, match="seed"):
+        plant.reset(seed)
+
+
+@pytest.mark.parametrize("state", [[1.0], [float("nan"), 50.0], [[25.0, 50.0]]])
+def test_a_bad_initial_state_is_refused(plant, state):
+    with pytest.raises(PlantError, match=r"initial_state must be 2 finite numbers \(X2, P2\)"):
+        plant.reset(0, state)
+
+
+def test_calls_out_of_order_are_refused(plant):
+    with pytest.raises(PlantError, match="call reset first"):
+        plant.step([200.0, 200.0])
+    with pytest.raises(PlantError, match="call reset first"):
+        plant.snapshot()
+    plant.reset(0)
+    snapshot = plant.snapshot()
+    plant.close()
+    plant.close()
+    for call in (
+        lambda: plant.reset(0),
+        lambda: plant.step([200.0, 200.0]),
+        plant.snapshot,
+        lambda: plant.restore(snapshot),
+    ):
+        with pytest.raises(PlantError, match="closed"):
+            call()
+
+
+def test_a_snapshot_of_another_plant_is_refused(plant, paper):
+    plant.reset(0)
+    with FmuPlant(paper) as other:
+        other.reset(0)
+        with pytest.raises(PlantError, match="another plant"):
+            other.restore(plant.snapshot())
+
+
+def test_corrupt_serialised_states_are_refused(plant):
+    plant.reset(0)
+    data = plant.serialise(plant.snapshot())
+    for bad in (b"", data[:10], b"x" + data[1:], data[:-1], data + b"x", data[:20] + b"?" * 40):
+        with pytest.raises(PlantError):
+            plant.deserialise(bad)
+    flipped = bytearray(data)
+    flipped[len(data) // 2 + 30] ^= 0x10
+    with pytest.raises(PlantError, match="state"):
+        plant.deserialise(bytes(flipped))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"states": ["X2", "P3"]}, ["no variable 'P3'", "plant.states", "did you mean"]),
+        ({"actions": ["P100", "X2"]}, ["twice"]),
+        ({"actions": ["P100", "F2"]}, ["'F2'", "not an input", "plant.actions"]),
+        ({"stage_cost": "cost"}, ["no variable 'cost'"]),
+        ({"stage_cost": "law"}, ["'law'", "Enumeration"]),
+        ({"parameters": {"X2": 3.0}}, ["'X2'", "output", "plant.parameters"]),
+        ({"parameters": {"law": 1.5}}, ["'law'", "cannot take 1.5"]),
+        ({"mapping": {"seed": ["h"]}}, ["'h'", "plant.mapping.seed"]),
+        ({"mapping": {"sampling_time": "Ts"}}, ["no variable 'Ts'", "plant.mapping.sampling_time"]),
+    ],
+)
+def test_a_scenario_that_does_not_fit_the_fmu_is_refused_by_name(paper, change, words):
+    from cosim.errors import CosimError
+
+    with pytest.raises(CosimError) as error:
+        FmuPlant(paper.replace({"plant": change}))
+    for word in words:
+        assert word in str(error.value)

@@ -70,8 +70,7 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
     ENTER(INITIALIZATION);
-    leave_initialization(instance);
-    return fmi2OK;
+    return (fmi2Status)leave_initialization(instance, __func__);
 }
 
 fmi2Status fmi2Terminate(fmi2Component c) {

@@ -91,8 +91,7 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
 
 fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
     ENTER(INITIALIZATION);
-    leave_initialization(self);
-    return fmi3OK;
+    return (fmi3Status)leave_initialization(self, __func__);
 }
 
 fmi3Status fmi3EnterEventMode(fmi3Instance instance) {

@@ -32,6 +32,7 @@ static Grid make_grid(double sampling_time) {
 
 /* Times beyond this many integration steps cannot be told apart well enough. */
 #define MAX_GRID_POINT 1e12
+#define MAX_TIME 1e13 /* s */
 
 static int on_grid_range(Grid grid, double time) {
     return fabs(time / grid.step) <= MAX_GRID_POINT;

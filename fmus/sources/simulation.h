@@ -11,8 +11,7 @@ static double time_tolerance(double time) { return 1e-9 * fmax(1.0, fabs(time));
 
 static Status set_experiment(Instance *instance, const char *function, double start_time,
                              int stop_defined, double stop_time) {
-    const Grid finest = make_grid(VARIABLES[VR_sampling_time].min);
-    if (!isfinite(start_time) || !on_grid_range(finest, start_time))
+    if (!isfinite(start_time) || fabs(start_time) > MAX_TIME)
         return report(instance, ERROR, "%s: start time %g is not usable.", function, start_time);
     if (stop_defined && !(isfinite(stop_time) && stop_time >= start_time))
         return report(instance, ERROR, "%s: stop time %g is before the start time %g.", function,
@@ -39,10 +38,13 @@ static Status check_stop_time(const Instance *instance, const char *function, do
                   stop_time);
 }
 
-static void leave_initialization(Instance *instance) {
+static Status leave_initialization(Instance *instance, const char *function) {
     State *state = &instance->state;
+    const Status status = check_time(instance, function, state->v[VR_time]);
+    if (status != OK) return status;
     refresh(state);
     state->mode = state->interface == CO_SIMULATION ? STEP : EVENT;
+    return OK;
 }
 
 /* Integrate between two positions of one sample, in which input and disturbance are constant. */

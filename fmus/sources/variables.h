@@ -2,7 +2,7 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{a34037c0-362d-5ad0-a935-724c9ea6a650}"
+#define MODEL_TOKEN "{a14efd48-e075-5614-b846-17ec8f330912}"
 
 enum {
     VR_time = 0,

@@ -44,7 +44,7 @@ def save(path: Path, checkpoint: Checkpoint) -> Path:
             raise CheckpointError(f"checkpoint entry '{name}' holds Python objects, not numbers")
     entries["digest"] = np.frombuffer(_digest(entries), dtype=np.uint8)
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **entries)  # type: ignore[arg-type]
+    np.savez(stream, allow_pickle=False, **entries)
     return write_atomically(path, stream.getvalue())
 
 

@@ -1,4 +1,4 @@
-"""Hyperparameters: typed, documented, validated, overridable by `name=value`, stored with results."""
+"""Hyperparameters: typed, documented, validated, overridable by `name=value`, stored."""
 
 from __future__ import annotations
 
@@ -39,9 +39,7 @@ class Configuration(BaseModel):
     slack_linear_minimum: Positive = Field(
         61.0, description="lower limit of w_sigma, just above the exactness threshold"
     )
-    slack_quadratic_weight: Positive = Field(
-        1e3, description="W_sigma at the start, extended θ"
-    )
+    slack_quadratic_weight: Positive = Field(1e3, description="W_sigma at the start, extended θ")
     definiteness: Literal["lmi", "projection", "cholesky"] = Field(
         "lmi", description="how B_l and B_Vf are kept positive definite"
     )

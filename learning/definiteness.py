@@ -52,10 +52,7 @@ def certificate(
 ) -> Certificate:
     """Least eigenvalue of B_l and B_Vf at θ."""
     return Certificate(
-        {
-            name: float(np.linalg.eigvalsh(matrix_of(layout, theta, name))[0])
-            for name in HESSIANS
-        },
+        {name: float(np.linalg.eigvalsh(matrix_of(layout, theta, name))[0]) for name in HESSIANS},
         corrected,
         refused,
     )
@@ -101,9 +98,7 @@ class LinearMatrixInequality:
             order, weight = self._rows[name]
             shifted = matrix_of(layout, theta, name) - self._smallest * np.eye(block.dimension)
             rows = np.zeros((block.size, size))
-            rows[np.arange(block.size), where.start + order] = (
-                -weight * layout.scale[where][order]
-            )
+            rows[np.arange(block.size), where.start + order] = -weight * layout.scale[where][order]
             matrices.append(rows)
             offsets.append(weight * block.pack(shifted)[order])
             cones.append(clarabel.PSDTriangleConeT(block.dimension))

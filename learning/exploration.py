@@ -1,7 +1,7 @@
 """Exploration of the actions: additive, literal, by a perturbed cost; schedules; saturation.
 
-A strategy maps (π(s), generator) to the action to apply and is saturated to the actuators' bounds;
-it returns the very array it was given where the sample stays greedy.
+A strategy maps (π(s), generator) to the action to apply, which the loop saturates to the actuators'
+bounds. It returns the very array it was given where the sample stays greedy.
 """
 
 from __future__ import annotations
@@ -81,9 +81,7 @@ class Additive(Exploration):
     ) -> Vector:
         """Action to apply, (m,)."""
         e = self.noise(rng, sample)
-        if e is None:
-            return action
-        return np.minimum(np.maximum(action + e, self.lower), self.upper)
+        return action if e is None else action + e
 
     def bias(self, action: Vector, sample: int) -> Vector:
         """Mean of sat(π + e) − π, (m,), by the moments of the censored normal distribution."""
@@ -103,9 +101,7 @@ class Literal(Exploration):
     ) -> Vector:
         """Action to apply, (m,)."""
         e = self.noise(rng, sample)
-        if e is None:
-            return action
-        return np.minimum(np.maximum(e, self.lower), self.upper)
+        return action if e is None else e
 
     def bias(self, action: Vector, sample: int) -> Vector:
         """Mean of sat(e) − π, (m,)."""

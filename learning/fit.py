@@ -13,13 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from learning.errors import DivergenceError
+
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The problem min_d dᵀMd − 2bᵀd: `gradient` b (n,), `minimiser` M⁻¹b (n,), `metric()` M (n, n)."""
+    """The problem min_d dᵀMd − 2bᵀd.
+
+    `gradient` is b (n,), `minimiser` M⁻¹b (n,), `metric()` M (n, n).
+    """
 
     gradient: Vector
     minimiser: Vector
@@ -69,8 +74,11 @@ def least_squares(information: Matrix, gradient: Vector, ridge: float) -> Fit:
     """Gauss–Newton or Newton-like fit with M = A + ρ diag(A) + a floor, b = Σ δ∇Q.
 
     `information` A (n, n), symmetric positive semidefinite; the Levenberg–Marquardt term `ridge` ρ
-    is relative to each entry's own information, so the step does not depend on units.
+    is relative to each entry's own information, so the step does not depend on units. Raises
+    DivergenceError where the data are not finite.
     """
+    if not (np.isfinite(information).all() and np.isfinite(gradient).all()):
+        raise DivergenceError("TD errors or gradients are not finite")
     diagonal = np.diag(information)
     floor = max(float(diagonal.max()), np.finfo(float).tiny) * 1e-8
     metric = information + np.diag(ridge * diagonal + floor)
@@ -91,14 +99,10 @@ def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix | Non
     if metric is None:
         return Fit(half, step_size * half, lambda: np.eye(gradient.size) / step_size)
     fisher = metric
-    return Fit(
-        half, step_size * cho_solve(cho_factor(fisher), half), lambda: fisher / step_size
-    )
+    return Fit(half, step_size * cho_solve(cho_factor(fisher), half), lambda: fisher / step_size)
 
 
-def line_search(
-    error: Callable[[float], float], *, shrink: float = 0.5, trials: int = 8
-) -> float:
+def line_search(error: Callable[[float], float], *, shrink: float = 0.5, trials: int = 8) -> float:
     """Largest of the steps 1, β, β², … that does not raise |TD error|, else 0.
 
     `error(t)` is the TD error with the fit's step scaled by t, its target held (paper.tex, after

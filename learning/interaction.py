@@ -50,6 +50,7 @@ class Interaction:
         scenario = plant.scenario
         self._plant, self._controller, self._rng = plant, controller, rng
         self._strategy, self._algorithm = strategy, algorithm
+        self._lower, self._upper = scenario.action_lower, scenario.action_upper
         self._penalty = Penalty(
             scenario.state_lower,
             scenario.state_upper,
@@ -74,13 +75,17 @@ class Interaction:
     def next(self) -> tuple[Sample | None, float]:
         """One sample of the plant; returns it, or None after a failure, and its cost."""
         policy, point, s, number = self._policy, self._point, self.s, self.number
-        action_value = policy
+        action_value, explored = policy, False
         if policy is None:
             a = self._applied
         else:
             a = self._strategy(policy.action, self._rng, number, self._perturbed)
-            if a is not policy.action:
-                self._count(a)
+            explored = a is not policy.action
+            # The QP keeps bounds to its tolerance, the actuator exactly.
+            a = np.minimum(np.maximum(a, self._lower), self._upper)
+            if explored:
+                self.explored += 1
+                self.saturated += bool(((a == self._lower) | (a == self._upper)).any())
                 if self._algorithm.needs_action_value:
                     action_value = self._action_value(s, a)
         step = self._plant.step(a)
@@ -94,7 +99,7 @@ class Interaction:
             number=number,
             s=s,
             a=a,
-            explored=a is not policy.action,
+            explored=explored,
             policy=policy,
             action_value=action_value,
             stage_cost=step.stage_cost,
@@ -152,16 +157,18 @@ class Interaction:
             self._controller.prepare()
             self._point = self._controller.linearisation_point
         except QpError:
-            return self._failed()
+            self._fail()
+            return None
         return self._feedback()
 
     def _feedback(self) -> LearnableSolution | None:
         try:
             return self._controller.feedback(self.s)
         except QpError:
-            return self._failed()
+            self._fail()
+            return None
 
-    def _failed(self) -> None:
+    def _fail(self) -> None:
         self.failures += 1
         self._controller.reset()
         self._point = None
@@ -171,7 +178,8 @@ class Interaction:
         try:
             return self._controller.feedback(s, a)
         except QpError:
-            return self._failed()
+            self._fail()
+            return None
 
     def _perturbed(self, gradient: Vector) -> Vector:
         """π(s) of the cost with a linear term on the actions added to b_l."""
@@ -191,8 +199,3 @@ class Interaction:
             controller.theta = theta
             controller.prepare_at(point)
             controller.feedback(self.s)
-
-    def _count(self, a: Vector) -> None:
-        self.explored += 1
-        scenario = self._plant.scenario
-        self.saturated += bool(((a == scenario.action_lower) | (a == scenario.action_upper)).any())

@@ -1,0 +1,39 @@
+"""Algorithms by name, from the entry-point group `cosim.algorithms`."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+
+from cosim.validation import suggestion
+from learning.errors import AlgorithmLookupError
+from learning.protocols import Algorithm
+
+GROUP = "cosim.algorithms"
+
+
+def algorithms() -> list[str]:
+    """Names of the algorithms that are registered."""
+    return sorted(point.name for point in entry_points(group=GROUP))
+
+
+def load_algorithm(name: str) -> type[Algorithm]:
+    """Class of an algorithm; raises AlgorithmLookupError."""
+    known = {point.name: point for point in entry_points(group=GROUP)}
+    if name not in known:
+        raise AlgorithmLookupError(
+            f"unknown algorithm '{name}'{suggestion(name, known)}; registered are "
+            f"{', '.join(sorted(known))}"
+        )
+    try:
+        found = known[name].load()
+    except (ImportError, AttributeError) as error:
+        raise AlgorithmLookupError(f"algorithm '{name}' cannot be imported: {error}") from error
+    missing = [
+        part
+        for part in ("Configuration", "observe", "state", "restore")
+        if not hasattr(found, part)
+    ]
+    if missing:
+        raise AlgorithmLookupError(f"algorithm '{name}' lacks {', '.join(missing)}")
+    algorithm: type[Algorithm] = found
+    return algorithm

@@ -17,7 +17,7 @@ NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 
 
 class Instance:
-    """An instance of the shipped FMU; `messages` holds what it logged as (status, category, text)."""
+    """An instance of the shipped FMU; `messages` holds its log as (status, category, text)."""
 
     def __init__(self, folder: Path, version: int, exchange: bool, logging: bool = False) -> None:
         self.version = version
@@ -53,7 +53,9 @@ class Instance:
     def close(self) -> None:
         self.fmu.freeInstance()
 
-    def initialise(self, start: float = 0.0, stop: float | None = None, **values: float) -> Instance:
+    def initialise(
+        self, start: float = 0.0, stop: float | None = None, **values: float
+    ) -> Instance:
         self.set(**values)
         self.enter_initialisation(start, stop)
         self.fmu.exitInitializationMode()

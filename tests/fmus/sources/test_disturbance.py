@@ -68,7 +68,7 @@ def test_override_of_the_recorded_disturbances_repeats_the_trajectory(open_fmu, 
     recorded = open_fmu(version).initialise(seed=9)
     replayed = open_fmu(version).initialise(override=True, seed=1)
     for k in range(20):
-        given = dict(zip((f"{n}_in" for n in NAMES), recorded.get(*NAMES)))
+        given = dict(zip((f"{n}_in" for n in NAMES), recorded.get(*NAMES), strict=True))
         replayed.set(**given)
         recorded.step(60.0 * k, 60.0)
         replayed.step(60.0 * k, 60.0)

@@ -9,8 +9,24 @@ from scipy.integrate import solve_ivp
 from fmus.variables import BY_NAME
 
 DISTURBANCES = ("X1", "F1", "T1", "T200")
-PARAMETERS = "a b c d e f g h M C UA2 Cp lambda_ lambda_s F3".split()
-ALGEBRAIC = "F2 F4 F5 F100 T2 T3 T100 UA1 Q100 Q200 economic_cost".split()
+PARAMETERS = [
+    "a",
+    "b",
+    "c",
+    "d",
+    "e",
+    "f",
+    "g",
+    "h",
+    "M",
+    "C",
+    "UA2",
+    "Cp",
+    "lambda_",
+    "lambda_s",
+    "F3",
+]
+ALGEBRAIC = ["F2", "F4", "F5", "F100", "T2", "T3", "T100", "UA1", "Q100", "Q200", "economic_cost"]
 
 
 def outputs(x, u, d, p) -> dict[str, float]:
@@ -25,7 +41,7 @@ def outputs(x, u, d, p) -> dict[str, float]:
     cost = 10.09 * (f2 + p["F3"]) + 600 * f100 + 0.6 * f200
     rates = np.array([(f1 * x1 - f2 * x2) / p["M"], (f4 - f5) / p["C"]])
     values = (f2, f4, f5, f100, t2, t3, t100, ua1, q100, q200, cost)
-    return dict(zip(ALGEBRAIC, values)) | {"rates": rates}
+    return dict(zip(ALGEBRAIC, values, strict=True)) | {"rates": rates}
 
 
 def defaults() -> dict[str, float]:
@@ -46,7 +62,7 @@ def random_points(count: int, seed: int = 0) -> list[tuple[np.ndarray, np.ndarra
 
 
 def start(plant, x, u, d, p):
-    given = {f"{name}_in": value for name, value in zip(DISTURBANCES, d)}
+    given = {f"{name}_in": value for name, value in zip(DISTURBANCES, d, strict=True)}
     return plant.initialise(
         override=True, X2_start=x[0], P2_start=x[1], P100=u[0], F200=u[1], **given, **p
     )

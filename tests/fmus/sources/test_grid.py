@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ STATES = ("X2", "P2")
 
 def run(plant, points: list[float], **values: float) -> list[float]:
     plant.initialise(start=points[0], seed=3, **values)
-    for begin, end in zip(points, points[1:]):
+    for begin, end in itertools.pairwise(points):
         plant.step(begin, end - begin)
     return plant.get(*STATES, "X1", "economic_cost")
 
@@ -70,5 +72,7 @@ def test_tiny_steps_are_not_lost(plant) -> None:
 def test_sampling_time_that_no_second_divides(open_fmu, version: int) -> None:
     sampling_time = 100.0 / 7.0
     whole = run(open_fmu(version), [0.0, 700.0], sampling_time=sampling_time)
-    split = run(open_fmu(version), [k * sampling_time for k in range(50)], sampling_time=sampling_time)
+    split = run(
+        open_fmu(version), [k * sampling_time for k in range(50)], sampling_time=sampling_time
+    )
     assert split == whole

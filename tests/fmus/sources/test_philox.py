@@ -13,9 +13,11 @@ def philox(counter: list[int], key: list[int]) -> list[int]:
     """The algorithm as published, in Python integers."""
     x, k = list(counter), list(key)
     for _ in range(10):
-        high, low = zip(*(divmod(m * x[2 * i], 1 << 32) for i, m in enumerate(_MULTIPLIERS)))
+        high, low = zip(
+            *(divmod(m * x[2 * i], 1 << 32) for i, m in enumerate(_MULTIPLIERS)), strict=True
+        )
         x = [high[1] ^ x[1] ^ k[0], low[1], high[0] ^ x[3] ^ k[1], low[0]]
-        k = [(a + b) & _WORD for a, b in zip(k, _WEYL)]
+        k = [(a + b) & _WORD for a, b in zip(k, _WEYL, strict=True)]
     return x
 
 
@@ -24,7 +26,7 @@ def uniforms(seed: int, sample: int) -> list[float]:
     key = [seed & _WORD, seed >> 32]
     k = sample % (1 << 64)
     words = [w for b in (0, 1) for w in philox([k & _WORD, k >> 32, b, 0], key)]
-    pairs = zip(words[::2], words[1::2])
+    pairs = zip(words[::2], words[1::2], strict=True)
     return [((high >> 5) * 2**26 + (low >> 6)) / 2**53 for high, low in pairs]
 
 
@@ -59,7 +61,9 @@ def test_draws_are_philox_of_seed_and_sample(plant, sample: int) -> None:
     plant.initialise(start=60.0 * sample, seed=12345)
     expected = [
         nominal + half_width * (2 * u - 1)
-        for nominal, half_width, u in zip((5, 10, 40, 25), (1, 2, 8, 5), uniforms(12345, sample))
+        for nominal, half_width, u in zip(
+            (5, 10, 40, 25), (1, 2, 8, 5), uniforms(12345, sample), strict=True
+        )
     ]
     assert plant.get("X1", "F1", "T1", "T200") == expected
 

@@ -1,0 +1,98 @@
+"""Directional derivatives against central differences of the FMU's own outputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+
+from fmus.variables import BY_NAME, VARIABLES, Kind, Type, value_reference
+
+REALS = [v for v in VARIABLES if v.type is Type.REAL]
+UNKNOWNS = [v.name for v in REALS if v.kind in (Kind.OUTPUT, Kind.DERIVATIVE, Kind.STATE)]
+KNOWNS = [v.name for v in REALS if v.kind in (Kind.INPUT, Kind.TUNABLE)]
+SWITCHES = [{}, {"law": 2}, {"stochastic": False}, {"override": True}]
+
+
+def jacobian(instance, unknowns: list[str], knowns: list[str]) -> np.ndarray:
+    columns = [instance.directional(unknowns, [known], [1.0]) for known in knowns]
+    return np.array(columns).T
+
+
+def differences(instance, unknowns: list[str], known: str) -> np.ndarray:
+    """Central differences of the sixth order, whose truncation error is below rounding."""
+    centre = instance.get(known)[0]
+    h = 1e-3 * max(1e-2, abs(centre))
+    total = np.zeros(len(unknowns))
+    for offset, weight in ((1, 45), (2, -9), (3, 1)):
+        for sign in (1, -1):
+            instance.set(**{known: centre + sign * offset * h})
+            total += sign * weight * np.array(instance.get(*unknowns))
+    instance.set(**{known: centre})
+    return total / (60 * h)
+
+
+@pytest.mark.parametrize("switches", SWITCHES, ids=str)
+def test_inputs_and_parameters(plant, switches: dict[str, float]) -> None:
+    plant.initialise(seed=2, X2_start=31.0, P2_start=55.0, P100=250.0, F200=160.0, **switches)
+    plant.step(0.0, 60.0)
+    exact = jacobian(plant, UNKNOWNS, KNOWNS)
+    for known, column in zip(KNOWNS, exact.T, strict=True):
+        numeric = differences(plant, UNKNOWNS, known)
+        np.testing.assert_allclose(column, numeric, rtol=1e-7, atol=1e-7, err_msg=known)
+
+
+def test_states(model) -> None:
+    model.initialise(X2_start=31.0, P2_start=55.0, P100=250.0)
+    model.start_continuous_time()
+    exact = jacobian(model, UNKNOWNS, ["X2", "P2"])
+    for i, column in enumerate(exact.T):
+        numeric = np.zeros(len(UNKNOWNS))
+        for sign in (1, -1):
+            x = [31.0, 55.0]
+            x[i] += sign * 1e-3
+            model.set_states(x)
+            numeric += sign * np.array(model.get(*UNKNOWNS)) / 2e-3
+        np.testing.assert_allclose(column, numeric, rtol=1e-7, atol=1e-7)
+
+
+def test_start_parameters_in_initialisation_mode(plant) -> None:
+    plant.enter_initialisation()
+    exact = jacobian(plant, UNKNOWNS, ["X2_start", "P2_start"])
+    for known, column in zip(["X2_start", "P2_start"], exact.T, strict=True):
+        numeric = differences(plant, UNKNOWNS, known)
+        np.testing.assert_allclose(column, numeric, rtol=1e-7, atol=1e-7)
+
+
+def test_start_parameters_do_not_act_afterwards(plant) -> None:
+    plant.initialise()
+    assert not np.any(jacobian(plant, UNKNOWNS, ["X2_start", "P2_start"]))
+
+
+def test_seed_of_several_knowns_is_the_sum_of_columns(plant) -> None:
+    plant.initialise(seed=2, override=True)
+    seed = np.linspace(-1.0, 2.0, len(KNOWNS))
+    together = plant.directional(UNKNOWNS, KNOWNS, list(seed))
+    np.testing.assert_allclose(
+        together, jacobian(plant, UNKNOWNS, KNOWNS) @ seed, rtol=1e-12, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(("unknown", "known"), [("P100", "F200"), ("F2", "F4"), ("X2", "time")])
+def test_variable_in_the_wrong_role_is_an_error(plant, unknown: str, known: str) -> None:
+    plant.initialise()
+    with pytest.raises(FMICallException) as caught:
+        plant.directional([unknown], [known], [1.0])
+    assert caught.value.status == 3
+    assert "is not" in plant.messages[-1][2]
+
+
+def test_unknown_reference_is_an_error(plant) -> None:
+    plant.initialise()
+    with pytest.raises(FMICallException):
+        plant.fmu.getDirectionalDerivative([value_reference("F2")], [999], [1.0])
+    assert "unknown value reference 999" in plant.messages[-1][2]
+
+
+def test_every_unknown_is_covered() -> None:
+    assert {BY_NAME[name].kind for name in UNKNOWNS} == {Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT}

@@ -1,0 +1,98 @@
+"""The co-simulation step: its arguments, the stop time, and instances beside each other."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fmpy.fmi1 import FMICallException
+
+DISCARD, ERROR = 2, 3
+
+
+def refused(plant, call) -> tuple[int, str]:
+    with pytest.raises(FMICallException) as caught:
+        call()
+    assert plant.messages[-1][0] == caught.value.status
+    return caught.value.status, plant.messages[-1][2]
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, math.nan, math.inf])
+def test_step_size_must_be_positive_and_finite(plant, size: float) -> None:
+    plant.initialise()
+    status, text = refused(plant, lambda: plant.step(0.0, size))
+    assert status == ERROR
+    assert "step size" in text
+
+
+@pytest.mark.parametrize("time", [60.0, -60.0, 1e-3, math.nan, math.inf])
+def test_communication_point_must_be_the_current_time(plant, time: float) -> None:
+    plant.initialise()
+    status, text = refused(plant, lambda: plant.step(time, 60.0))
+    assert status == ERROR
+    assert "communication point" in text
+
+
+def test_step_past_the_stop_time_is_an_error_and_changes_nothing(plant) -> None:
+    plant.initialise(stop=100.0)
+    plant.step(0.0, 60.0)
+    before = plant.run(0)
+    status, text = refused(plant, lambda: plant.step(60.0, 60.0))
+    assert status == ERROR
+    assert "past the stop time 100" in text
+    assert plant.run(0) == before
+    plant.step(60.0, 40.0)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop"),
+    [(10.0, 5.0), (0.0, math.nan), (0.0, math.inf), (math.nan, None), (1e300, None)],
+)
+def test_impossible_experiment_is_an_error(plant, start: float, stop: float | None) -> None:
+    assert refused(plant, lambda: plant.initialise(start=start, stop=stop))[0] == ERROR
+
+
+def test_time_too_far_for_the_sampling_grid_is_an_error(plant) -> None:
+    status, text = refused(plant, lambda: plant.initialise(start=1e12, sampling_time=0.01))
+    assert status == ERROR
+    assert "out of range" in text
+
+
+def test_step_of_too_many_integration_steps_is_discarded_at_once(plant) -> None:
+    plant.initialise()
+    status, text = refused(plant, lambda: plant.step(0.0, 1e9))
+    assert status == DISCARD
+    assert "integration steps" in text
+    plant.step(0.0, 86400.0)
+
+
+def test_same_seed_same_bits_in_both_versions(open_fmu) -> None:
+    runs = [open_fmu(version).initialise(seed=11).run(200) for version in (2, 3, 2)]
+    assert runs[0] == runs[1] == runs[2]
+
+
+def test_another_seed_differs(open_fmu, version: int) -> None:
+    runs = [open_fmu(version).initialise(seed=seed).run(5) for seed in (1, 2)]
+    assert runs[0] != runs[1]
+
+
+def test_instances_do_not_touch_each_other(open_fmu, version: int) -> None:
+    alone = open_fmu(version).initialise(seed=1).run(10)
+    first, second = open_fmu(version).initialise(seed=1), open_fmu(version).initialise(seed=2)
+    rows = [first.run(0)[0]]
+    for k in range(10):
+        first.step(60.0 * k, 60.0)
+        second.step(60.0 * k, 60.0)
+        rows += first.run(0)
+    assert rows == alone
+
+
+def test_inputs_act_from_the_communication_point_on(plant) -> None:
+    plant.initialise(stochastic=False)
+    cost = plant.get("economic_cost")[0]
+    states = plant.get("X2", "P2")
+    plant.set(P100=250.0)
+    assert plant.get("X2", "P2") == states
+    assert plant.get("economic_cost")[0] > cost
+    plant.step(0.0, 60.0)
+    assert plant.get("X2")[0] > states[0]

@@ -1,0 +1,186 @@
+"""State handles and serialised states."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from ctypes import c_void_p
+
+import pytest
+from fmpy.fmi1 import FMICallException
+
+ERROR = 3
+
+
+def refused(plant, call) -> str:
+    with pytest.raises(FMICallException) as caught:
+        call()
+    assert caught.value.status == plant.messages[-1][0] == ERROR
+    return plant.messages[-1][2]
+
+
+def stepped(plant, steps: int = 7, **values: float):
+    plant.initialise(**values)
+    plant.run(steps)
+    return plant
+
+
+def test_restored_instance_continues_bit_identically(open_fmu, version: int) -> None:
+    plant = stepped(open_fmu(version), seed=4)
+    state = plant.save()
+    first = plant.run(10, start=420.0)
+    plant.restore(state)
+    assert plant.run(10, start=420.0) == first
+    plant.free(state)
+
+
+def test_state_moves_to_another_instance_with_all_its_parameters(open_fmu, version: int) -> None:
+    source = stepped(open_fmu(version), seed=4, law=2, M=25.0)
+    state = source.save()
+    target = open_fmu(version)
+    target.restore(state)
+    assert target.run(10, start=420.0) == source.run(10, start=420.0)
+    source.free(state)
+
+
+def test_snapshot_restores_the_mode_too(plant) -> None:
+    before = plant.save()
+    plant.initialise()
+    plant.restore(before)
+    plant.initialise(seed=3)
+    plant.free(before)
+
+
+def test_a_handle_is_used_again(plant) -> None:
+    plant.initialise()
+    state = plant.save()
+    address = state.value
+    name = "fmi2GetFMUstate" if plant.version == 2 else "fmi3GetFMUState"
+    getattr(plant.fmu, name)(plant.fmu.component, state)
+    assert state.value == address
+    plant.free(state)
+    assert state.value is None
+
+
+def test_serialised_state_continues_bit_identically_in_another_process(
+    open_fmu, version, folders, tmp_path
+) -> None:
+    plant = stepped(open_fmu(version), seed=4)
+    state = plant.save()
+    (tmp_path / "state").write_bytes(plant.serialise(state))
+    plant.free(state)
+    expected = plant.run(10, start=420.0)
+    code = f"""
+import importlib.util, pathlib, sys
+spec = importlib.util.spec_from_file_location("adapter", {__file__!r}.replace(
+    "sources/test_snapshot.py", "conftest.py"))
+adapter = importlib.util.module_from_spec(spec)
+sys.modules["adapter"] = adapter
+spec.loader.exec_module(adapter)
+plant = adapter.Instance(pathlib.Path({str(folders[version])!r}), {version}, False)
+plant.restore(plant.deserialise(pathlib.Path({str(tmp_path / "state")!r}).read_bytes()))
+print(repr(plant.run(10, start=420.0)))
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == repr(expected)
+
+
+@pytest.mark.parametrize("position", ["magic", "version", "value", "checksum", "any"])
+def test_flipped_bit_in_a_serialised_state_is_an_error(plant, position: str) -> None:
+    plant.initialise()
+    state = plant.save()
+    data = bytearray(plant.serialise(state))
+    plant.free(state)
+    offsets = {"magic": [0], "version": [8], "value": [200], "checksum": [len(data) - 1],
+               "any": range(0, len(data), 37)}[position]  # fmt: skip
+    for offset in offsets:
+        data[offset] ^= 0x10
+        text = refused(plant, lambda: plant.deserialise(bytes(data)))
+        assert "corrupt" in text or "not a state of this FMU" in text
+        data[offset] ^= 0x10
+    plant.free(plant.deserialise(bytes(data)))
+
+
+@pytest.mark.parametrize("size", [0, 1, 100])
+def test_serialised_state_of_another_length_is_an_error(plant, size: int) -> None:
+    plant.initialise()
+    assert "bytes" in refused(plant, lambda: plant.deserialise(b"\x00" * size))
+
+
+def test_implausible_state_with_a_right_checksum_is_an_error(plant) -> None:
+    """A forged state must not bring in what the setters refuse."""
+    plant.initialise(P100=321.0)
+    state = plant.save()
+    data = bytearray(plant.serialise(state))
+    plant.free(state)
+    import struct
+
+    at = data.index(struct.pack("<d", 321.0))
+    for value in (float("nan"), 1e9):
+        data[at : at + 8] = struct.pack("<d", value)
+        data[-8:] = struct.pack("<Q", fnv1a(data[:-8]))
+        assert "corrupt" in refused(plant, lambda: plant.deserialise(bytes(data)))
+    data[at : at + 8] = struct.pack("<d", 123.0)
+    data[-8:] = struct.pack("<Q", fnv1a(data[:-8]))
+    plant.restore(handle := plant.deserialise(bytes(data)))
+    assert plant.get("P100") == [123.0]
+    plant.free(handle)
+
+
+def fnv1a(data: bytes) -> int:
+    value = 14695981039346656037
+    for byte in data:
+        value = (value ^ byte) * 1099511628211 % 2**64
+    return value
+
+
+def test_state_of_the_other_interface_is_an_error(open_fmu, version: int) -> None:
+    plant, model = open_fmu(version), open_fmu(version, exchange=True)
+    state = plant.save()
+    assert "other interface" in refused(model, lambda: model.restore(state))
+    plant.free(state)
+
+
+def test_null_state_is_an_error_and_freeing_it_is_not(plant) -> None:
+    assert "null state" in refused(plant, lambda: plant.restore(c_void_p()))
+    plant.free(c_void_p())
+
+
+@pytest.mark.slow
+def test_a_million_snapshots_leave_memory_flat(plant) -> None:
+    import psutil
+
+    plant.initialise()
+    process = psutil.Process()
+    plant.free(plant.save())
+    before = process.memory_info().rss
+    for _ in range(1_000_000):
+        state = plant.save()
+        plant.restore(state)
+        plant.free(state)
+    assert process.memory_info().rss - before < 2**20
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_instances_leave_memory_flat(open_fmu, version: int) -> None:
+    import psutil
+
+    plant = open_fmu(version)
+    fmu = plant.fmu
+    free = fmu.fmi2FreeInstance if version == 2 else fmu.fmi3FreeInstance
+
+    def cycle() -> None:
+        free(fmu.component)
+        arguments = {"callbacks": fmu.callbacks} if version == 2 else {"logMessage": plant._log3}
+        fmu.instantiate(**arguments)
+        plant.initialise()
+        plant.step(0.0, 60.0)
+
+    for _ in range(1000):
+        cycle()
+    before = psutil.Process().memory_info().rss
+    for _ in range(100_000):
+        cycle()
+    assert psutil.Process().memory_info().rss - before < 2**20

@@ -113,7 +113,7 @@ def _cost(axes: Axes, time: Array, values: Array, color: str) -> None:
     mean = float(np.mean(values))
     axes.axhline(mean, color="#222222", linewidth=0.8, linestyle=(0, (1, 1)))
     axes.annotate(
-        f"mean {mean:.4g}",
+        f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
         (0.99, 0.95),
         xycoords="axes fraction",
         ha="right",

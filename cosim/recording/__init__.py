@@ -3,11 +3,13 @@
 from cosim.recording.overlay import record_comparison
 from cosim.recording.reading import Recording, read_recording, read_signals, summarise
 from cosim.recording.run import RerunRecorder
+from cosim.recording.training import TrainingRecorder
 from cosim.recording.viewer import open_viewer, render
 
 __all__ = [
     "Recording",
     "RerunRecorder",
+    "TrainingRecorder",
     "open_viewer",
     "read_recording",
     "read_signals",

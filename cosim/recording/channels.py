@@ -21,7 +21,8 @@ Range = tuple[float, float]
 class Channel:
     """One scalar signal; `bounds` may be infinite, `seen` is the range of its values so far.
 
-    `step` says that a value holds until the next sample.
+    `step` says that a value holds until the next sample; `tail` is the share of the largest values
+    that the range seen leaves out.
     """
 
     group: str
@@ -31,6 +32,7 @@ class Channel:
     bounds: Range = (-inf, inf)
     reference: float | None = None
     step: bool = False
+    tail: float = 0.0
     seen: Range = (inf, -inf)
 
     @property
@@ -54,7 +56,8 @@ class Channel:
         if not values.size:
             return self
         low, high = self.seen
-        return replace(self, seen=(min(low, float(values.min())), max(high, float(values.max()))))
+        top = float(np.quantile(values, 1.0 - self.tail) if self.tail else values.max())
+        return replace(self, seen=(min(low, float(values.min())), max(high, top)))
 
     def window(self) -> Range:
         """Range of view: the values seen, and each bound not farther from them than their span.
@@ -121,8 +124,8 @@ def run_channels(scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:
         Channel("flags", "violation", "", BOUND),
         Channel("solver", "value", cost, SERIES[2]),
         Channel("solver", "residual", "", SERIES[3]),
-        Channel("solver", "prepare_time", "s", SERIES[5]),
-        Channel("solver", "feedback_time", "s", SERIES[1]),
+        Channel("solver", "prepare_time", "s", SERIES[5], tail=0.05),
+        Channel("solver", "feedback_time", "s", SERIES[1], tail=0.05),
         Channel("flags", "explored", "", SERIES[3], step=True),
         Channel("flags", "failed", "", SERIES[1], step=True),
         Channel("clock", "time", "s", SERIES[5]),

@@ -22,7 +22,7 @@ def draw(stream: Stream, scenario: Scenario, controller: str, theta: str | None)
         "noise": (f"disturbance: {law}", (-250.0, 0.0), SERIES[4]),
         "plant": (plant, (0.0, 0.0), SERIES[0]),
         "controller": (policy, (0.0, 170.0), SERIES[2]),
-        "exploration": (f"exploration: {explore}", (-250.0, 170.0), SERIES[3]),
+        "exploration": (f"exploration: {explore}, if on", (-250.0, 170.0), SERIES[3]),
         "cost": ("stage cost + penalty", (250.0, 0.0), SERIES[1]),
         "recorder": ("recorder, learner", (250.0, 170.0), "#606870"),
     }

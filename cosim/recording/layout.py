@@ -97,11 +97,20 @@ def union(channels: Sequence[Channel]) -> Range | None:
     return (min(low for low, _ in windows), max(high for _, high in windows)) if windows else None
 
 
-def framed(root: rrb.Container) -> rrb.Blueprint:
-    """The views with a paused time panel on the run's time, and no other panels in the way."""
+def sample_axis(samples: int) -> rrb.TimeAxis:
+    """Horizontal axis that shows samples 0 … `samples`."""
+    whole = rr.TimeRange(
+        start=rr.TimeRangeBoundary.absolute(seq=0),
+        end=rr.TimeRangeBoundary.absolute(seq=samples),
+    )
+    return rrb.TimeAxis(view_range=whole)
+
+
+def framed(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
+    """The views with a paused time panel on a timeline, and no other panels in the way."""
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIME, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="paused"),
     )

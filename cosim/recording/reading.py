@@ -66,7 +66,7 @@ def read_recording(path: str | Path) -> Recording:
     samples, time = np.empty(0, np.int64), np.empty(0)
     for entity, texts in marks.items():
         name = texts[f"{SIGNAL}:name"]
-        units[name] = texts[f"{SIGNAL}:unit"]
+        units[name] = texts.get(f"{SIGNAL}:unit", "")
         found, values = _column(rows[entity])
         signals[name] = values
         if len(found) > len(samples):

@@ -20,6 +20,7 @@ SIGNAL = "cosim.Signal"
 
 TIME = "time"
 SAMPLE = "sample"
+UPDATE = "update"
 
 
 class Stream:
@@ -96,7 +97,9 @@ def line(label: str, color: str, *, step: bool = False, width: float = 1.5) -> r
 
 def mark(name: str, unit: str) -> rr.DynamicArchetype:
     """Static mark of an entity that holds the signal `name`, by which `read_signals` finds it."""
-    return rr.DynamicArchetype(SIGNAL, components={"name": name, "unit": unit})
+    # Rerun takes an empty text for no value at all.
+    texts = {"name": name, **({"unit": unit} if unit else {})}
+    return rr.DynamicArchetype(SIGNAL, components=texts)
 
 
 def sample_times(samples: NDArray[np.int64], time: NDArray[np.float64]) -> list[rr.TimeColumn]:

@@ -17,7 +17,7 @@ from rerun.experimental import ViewerClient
 
 from controllers.storage import write_atomically
 from cosim.errors import RecordingError
-from cosim.recording.stream import TIME
+from cosim.recording.stream import SAMPLE, TIME
 
 LOOPBACK = "127.0.0.1"
 _NO_DRIVER = ("No graphics adapter", "Failed to get render context")
@@ -31,10 +31,10 @@ def open_viewer(path: str | Path) -> None:
     RecordingError : no such file, or the viewer failed (no display, no graphics driver).
     """
     command = [*_viewer(), "--port", "auto", str(_existing(path))]
+    if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
+        raise RecordingError(f"no display to show {path} on; draw it with --png FILE instead")
     if subprocess.run(command, check=False).returncode not in (0, 130):
-        raise RecordingError(
-            f"the viewer could not show {path}; on a machine without a screen use --png FILE"
-        )
+        raise RecordingError(f"the viewer could not show {path}; its messages are above")
 
 
 def render(
@@ -45,7 +45,9 @@ def render(
     size: tuple[int, int] = (1920, 1080),
     timeout: float = 60.0,
 ) -> None:
-    """Draw a recording to a PNG without a screen, with the time cursor at `at` seconds.
+    """Draw a recording to a PNG without a screen, with the time cursor at `at`.
+
+    `at` is in seconds of the run, or a sample's number where there is no time (a training).
 
     Raises
     ------
@@ -57,12 +59,23 @@ def render(
         client.open(str(path.resolve()))
         _wait(lambda: not client.get_state().loading, deadline, f"loading {path}")
         if at is not None:
-            client.set_time(TIME, duration=at, play_state="paused")
+            _set_cursor(client, at)
         image = _settled(client, deadline)
         for view in client.get_state().views:
             for report in view.reports:
                 raise RecordingError(f"view '{view.name}' of {path}: {report.summary}")
-    write_atomically(png, image)
+    try:
+        write_atomically(png, image)
+    except OSError as error:
+        raise RecordingError(f"cannot write {png}: {error.strerror}") from None
+
+
+def _set_cursor(client: ViewerClient, at: float) -> None:
+    timelines = {t.name for recording in client.get_state().recordings for t in recording.timelines}
+    if TIME in timelines:
+        client.set_time(TIME, duration=at, play_state="paused")
+    else:
+        client.set_time(SAMPLE, sequence=round(at), play_state="paused")
 
 
 def _existing(path: str | Path) -> Path:

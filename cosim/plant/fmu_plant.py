@@ -259,6 +259,8 @@ class FmuPlant:
     def _instance(self) -> Instance:
         if self._fmi is None:
             raise PlantError("the plant is closed")
+        if self._fmi.fatal:
+            raise PlantError("the FMU ended in a fatal error; close this plant and make a new one")
         return self._fmi
 
     def _start_from(self, fmi: Instance, state: Sequence[float] | Array | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ _STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 # fmpy changes the working directory while it loads a library.
 construction_lock = threading.Lock()
+_alive: Counter[str] = Counter()
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,13 @@ class Instance:
         interface = fmu.description.coSimulation
         self._can_save = bool(interface.canGetAndSetFMUstate)
         self._can_serialise = bool(interface.canSerializeFMUstate)
-        self._fatal = False
+        self.fatal = False
+        if interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
+            raise CapabilityError(
+                f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
+            )
         self._slave = self._load(interface.modelIdentifier)
+        _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
@@ -160,7 +166,7 @@ class Instance:
 
     def free(self, handle: ctypes.c_void_p) -> None:
         """Free a handle's memory."""
-        if handle.value is not None and not self._fatal:
+        if handle.value is not None and not self.fatal:
             self._free_state(self._component, ctypes.byref(handle))
 
     def serialise(self, handle: ctypes.c_void_p) -> bytes:
@@ -206,7 +212,7 @@ class Instance:
 
     def fail(self, function: str, status: int) -> None:
         """Raise PlantError for a failed call, with what the FMU logged about it."""
-        self._fatal |= status == FATAL
+        self.fatal |= status == FATAL
         label = _STATUS.get(status, f"status {status}")
         raise PlantError(
             f"FMU '{self.fmu.path.name}': {self.prefix}{function} returned {label}{self._log()}"
@@ -219,5 +225,6 @@ class Instance:
 
     def close(self) -> None:
         """Free the instance; after a fatal error FMI forbids every call, this one too."""
-        if not self._fatal:
+        _alive[self.fmu.sha256] -= 1
+        if not self.fatal:
             self._slave.freeInstance()

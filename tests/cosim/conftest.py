@@ -5,7 +5,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from cosim import FmuPlant, Scenario  # noqa: E402
+from cosim import FmuPlant, Scenario
 
 
 @pytest.fixture(scope="session")

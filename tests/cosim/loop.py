@@ -61,3 +61,23 @@ class Failing(Proportional):
 
 def proportional(scenario):
     return Proportional(scenario)
+
+
+class Hold:
+    """Applies one action for ever."""
+
+    def __init__(self, action):
+        self._answer = Answer(np.array(action))
+
+    def reset(self):
+        pass
+
+    def prepare(self):
+        pass
+
+    def feedback(self, s, a=None):
+        return self._answer
+
+
+def hold(scenario):
+    return Hold(scenario.reference_action)

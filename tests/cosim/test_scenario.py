@@ -97,7 +97,11 @@ def test_vectors_cannot_be_changed(paper):
 
 
 BAD = {
-    "unknown preset": ("papr", None, ["unknown scenario 'papr'", "did you mean 'paper'", "nominal"]),
+    "unknown preset": (
+        "papr",
+        None,
+        ["unknown scenario 'papr'", "did you mean 'paper'", "nominal"],
+    ),
     "missing file": ("none.toml", None, ["none.toml", "does not exist"]),
     "not TOML": ("x.toml", "a = = 1", ["x.toml", "not valid TOML", "line 1"]),
     "not text": ("x.toml", b"\xff\xfe\x00", ["x.toml", "UTF-8"]),

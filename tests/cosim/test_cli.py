@@ -1,0 +1,250 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+from time import perf_counter
+
+import pytest
+
+from cosim.cli import main
+
+
+@pytest.fixture
+def cosim(monkeypatch, capfd, tmp_path):
+    """Run the command line in this process; returns exit code, standard output and error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["cosim", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        out, err = capfd.readouterr()
+        return exit_.value.code or 0, out, err
+
+    return run
+
+
+def test_demo_writes_all_that_it_names(cosim, tmp_path):
+    code, out, err = cosim("demo", "--steps", 60)
+    assert code == 0, err
+    for row in ("economic cost", "mean violation", "violating share", "J = ", "feedback time"):
+        assert row in out
+    folder = tmp_path / "cosim-demo"
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "run.rrd",
+        "scenario.toml",
+        "summary.json",
+        "timing.csv",
+        "trajectory.csv",
+        "trajectory.png",
+    }
+    assert str(folder) in err.replace("\n", "")
+    assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
+    assert len((folder / "trajectory.csv").read_text().splitlines()) == 61
+
+
+def test_the_recording_of_a_run_holds_the_csvs_bits(cosim, tmp_path, paper):
+    from cosim.recording import read_signals
+    from cosim.trajectory import read_csv
+
+    assert cosim("simulate", "--steps", 40, "--out", "r", "--record")[0] == 0
+    recorded = read_signals(tmp_path / "r" / "run.rrd")
+    trajectory = read_csv(tmp_path / "r" / "trajectory.csv", paper)
+    common = [name for name in trajectory.signals if name in recorded]
+    assert {"X2", "P2", "P100", "F200", "X1", "stage_cost", "penalty"} <= set(common)
+    for name in common:
+        assert recorded[name].tobytes() == trajectory[name].tobytes(), name
+
+
+def test_json_is_all_that_goes_to_standard_output_and_equals_the_file(cosim, tmp_path):
+    code, out, _ = cosim("simulate", "--steps", 30, "--seed", 4, "--out", "a", "--json")
+    assert code == 0
+    summary = json.loads(out)
+    assert summary == json.loads((tmp_path / "a" / "summary.json").read_text())
+    contract = {"economic_cost", "mean_violation", "violating_share", "J", "failures", "timing"}
+    assert contract <= set(summary)
+    assert (summary["controller"], summary["scenario"], summary["seed"]) == ("naive", "paper", 4)
+
+
+def test_the_same_command_and_seed_write_the_same_bytes(cosim, tmp_path):
+    for folder in ("a", "b"):
+        assert cosim("simulate", "--steps", 50, "--seed", 3, "--out", folder)[0] == 0
+    for name in ("trajectory.csv", "scenario.toml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    one, two = (json.loads((tmp_path / f / "summary.json").read_text()) for f in ("a", "b"))
+    assert one.pop("timing") != two.pop("timing")
+    assert one == two
+
+
+def test_a_written_scenario_repeats_the_run(cosim, tmp_path):
+    assert cosim("simulate", "-s", "fast-sampling", "--steps", 50, "--out", "a")[0] == 0
+    assert cosim("simulate", "-s", "a/scenario.toml", "--steps", 50, "--out", "b")[0] == 0
+    files = [(tmp_path / folder / "trajectory.csv").read_bytes() for folder in ("a", "b")]
+    assert files[0] == files[1]
+
+
+def test_simulate_takes_a_factory_from_the_working_directory(cosim, tmp_path):
+    (tmp_path / "my_controller.py").write_text(
+        "import numpy as np\nfrom types import SimpleNamespace\n"
+        "class Mine:\n"
+        "    def reset(self): pass\n"
+        "    def prepare(self): pass\n"
+        "    def feedback(self, s, a=None):\n"
+        "        nan = float('nan')\n"
+        "        return SimpleNamespace(action=np.array([200., 200.]), value=nan, residual=nan,\n"
+        "            status='solved', predicted_states=None, predicted_actions=None)\n"
+        "def make(scenario): return Mine()\n"
+    )
+    code, out, err = cosim(
+        "simulate", "-c", "my_controller:make", "--steps", 5, "--out", "o", "--json"
+    )
+    assert code == 0, err
+    assert json.loads(out)["controller"] == "my_controller:make"
+
+
+def test_simulate_takes_a_parameters_file(cosim, tmp_path, paper):
+    from controllers.factories import naive
+
+    naive(paper).parameters.save(tmp_path / "theta.toml")
+    assert cosim("simulate", "--steps", 30, "--out", "a")[0] == 0
+    assert cosim("simulate", "-c", "theta.toml", "--steps", 30, "--out", "b")[0] == 0
+    files = [(tmp_path / folder / "trajectory.csv").read_bytes() for folder in ("a", "b")]
+    assert files[0] == files[1]
+
+
+def test_a_foreign_fmu_is_announced_with_its_hash(cosim, tmp_path):
+    import hashlib
+
+    import fmus
+
+    data = fmus.path().read_bytes()
+    (tmp_path / "mine.fmu").write_bytes(data)
+    (tmp_path / "mine.toml").write_text('extends = "paper"\n[plant]\nfmu = "mine.fmu"\n')
+    code, _, err = cosim("simulate", "-s", "mine.toml", "--steps", 5, "--out", "a")
+    assert code == 0
+    assert hashlib.sha256(data).hexdigest() in err.replace("\n", "")
+    assert "native code" in err
+    assert "native code" not in cosim("simulate", "--steps", 5, "--out", "a")[2]
+
+
+def test_view_prints_what_a_recording_holds(cosim):
+    cosim("simulate", "--steps", 20, "--out", "a", "--record")
+    code, out, _ = cosim("view", "a/run.rrd", "--json")
+    assert code == 0
+    content = json.loads(out)
+    assert content["samples"] == 20
+    assert content["signals"]["X2"]["unit"] == "%"
+
+
+def test_scenario_lists_the_presets_and_prints_one(cosim, paper):
+    code, out, _ = cosim("scenario")
+    assert code == 0
+    assert "fast-sampling" in out
+    assert cosim("scenario", "paper")[1] == f"# hash {paper.hash}\n{paper.to_toml()}"
+    assert json.loads(cosim("scenario", "--json")[1])["presets"]["paper"] == paper.hash
+
+
+def test_version_gives_the_fmus_hashes(cosim):
+    import hashlib
+
+    import fmus
+
+    _, out, _ = cosim("--version")
+    assert out.startswith("cosim 0.")
+    assert hashlib.sha256(fmus.path("evaporator_fmi3").read_bytes()).hexdigest() in out
+
+
+def test_help_is_there_for_every_command_and_starts_quickly():
+    times = []
+    for _ in range(3):
+        begin = perf_counter()
+        result = subprocess.run(
+            [sys.executable, "-m", "cosim", "--help"], capture_output=True, text=True, check=True
+        )
+        times.append(perf_counter() - begin)
+    for command in ("demo", "simulate", "view", "benchmark"):
+        assert command in result.stdout
+    assert min(times) < 0.5
+
+
+def test_help_loads_no_numerics():
+    code = (
+        "import sys; sys.argv = ['cosim', '--help']\n"
+        "from cosim.cli import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "heavy = {'numpy', 'pydantic', 'casadi', 'fmpy', 'rerun', 'matplotlib', 'scipy'}\n"
+        "print(sorted(heavy & set(sys.modules)), file=sys.stderr)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stderr.strip() == "[]"
+
+
+BAD_INPUT = {
+    "unknown preset": (["simulate", "-s", "papr"], ["unknown scenario 'papr'", "paper"]),
+    "missing scenario": (["simulate", "-s", "no.toml"], ["no.toml", "does not exist"]),
+    "wrong type": (["simulate", "-s", "type.toml"], ["type.toml", "discount", "must be a number"]),
+    "unknown field": (["simulate", "-s", "field.toml"], ["plant.fmuu", "did you mean 'fmu'"]),
+    "missing FMU": (["simulate", "-s", "missing.toml"], ["none.fmu", "does not exist"]),
+    "corrupt FMU": (["simulate", "-s", "corrupt.toml"], ["corrupt.fmu", "corrupt or not an FMU"]),
+    "unknown FMU": (["simulate", "-s", "name.toml"], ["unknown FMU 'evap'", "evaporator"]),
+    "unknown variable": (["simulate", "-s", "variable.toml"], ["no variable 'X7'", "plant.states"]),
+    "unknown controller": (["simulate", "-c", "nave"], ["unknown controller 'nave'", "naive"]),
+    "missing module": (["simulate", "-c", "nomodule:make"], ["nomodule"]),
+    "missing factory": (["simulate", "-c", "json:make"], ["json:make", "make"]),
+    "not a factory": (["simulate", "-c", "json:loads"], ["json:loads", "factory"]),
+    "not a controller": (["simulate", "-c", "builtins:type"], ["lacks reset, prepare or feedback"]),
+    "missing parameters": (["simulate", "-c", "no-theta.toml"], ["no-theta.toml"]),
+    "bad parameters": (["simulate", "-c", "type.toml"], ["type.toml"]),
+    "NaN action": (["simulate", "-c", "bad:nan"], ["finite numbers (P100, F200)"]),
+    "short action": (["simulate", "-c", "bad:short"], ["shape (1,), not (2,)"]),
+    "no steps": (["simulate", "--steps", "0"], ["--steps"]),
+    "steps not a number": (["simulate", "--steps", "many"], ["--steps", "integer"]),
+    "negative seed": (["simulate", "--seed", "-1"], ["--seed"]),
+    "unwritable folder": (["simulate", "--out", "/proc/none"], ["cannot write", "/proc/none"]),
+    "a file as folder": (["simulate", "--out", "corrupt.fmu"], ["cannot write", "corrupt.fmu"]),
+    "demo, unwritable": (["demo", "--out", "/proc/none"], ["cannot write", "/proc/none"]),
+    "missing recording": (["view", "none.rrd"], ["none.rrd"]),
+    "missing recording, json": (["view", "none.rrd", "--json"], ["none.rrd"]),
+    "not a recording": (["view", "corrupt.fmu", "--json"], ["corrupt.fmu"]),
+    "unknown command": (["simulat"], ["simulat"]),
+    "unknown option": (["simulate", "--sed", "1"], ["--sed"]),
+    "benchmark, missing FMU": (["benchmark", "plant", "--fmu", "no.fmu"], ["no.fmu"]),
+    "scenario, unknown": (["scenario", "papper"], ["papper", "paper"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_input_gives_one_clear_message_and_exit_code_2(case, cosim, tmp_path):
+    documents = {
+        "type": 'discount = "high"',
+        "field": '[plant]\nfmuu = "x"',
+        "missing": '[plant]\nfmu = "none.fmu"',
+        "corrupt": '[plant]\nfmu = "corrupt.fmu"',
+        "name": '[plant]\nfmu = "evap"',
+        "variable": '[plant]\nstates = ["X7", "P2"]',
+    }
+    for name, text in documents.items():
+        (tmp_path / f"{name}.toml").write_text(f'extends = "paper"\n{text}\n')
+    (tmp_path / "corrupt.fmu").write_bytes(b"PK\x03\x04 no")
+    (tmp_path / "bad.py").write_text(
+        "import sys, numpy as np\n"
+        f"sys.path.append({str(Path(__file__).parent)!r})\n"
+        "from loop import Hold\n"
+        "def nan(scenario): return Hold([float('nan'), 200.])\n"
+        "def short(scenario): return Hold([200.])\n"
+    )
+    arguments, words = BAD_INPUT[case]
+    code, out, err = cosim(*arguments)
+    assert code == 2
+    assert out == ""
+    assert "Traceback" not in err
+    if err.startswith("error: "):
+        assert err.count("\n") == 1
+    else:
+        assert err.startswith("Usage: ")
+    for word in words:
+        assert word in err

@@ -1,0 +1,129 @@
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from loop import Proportional
+
+import cosim.environment  # noqa: F401 (registers the environment)
+from cosim import FmuPlant, simulate
+from cosim.environment import PlantEnv, PlantVectorEnv
+from cosim.errors import PlantError
+
+# Actions are in physical units on purpose; the checker recommends a normalised space.
+NORMALISED = "ignore:.*symmetric and normalized space.*:UserWarning"
+
+
+@pytest.fixture
+def env():
+    env = gymnasium.make("cosim/Evaporator-v0")
+    yield env
+    env.close()
+
+
+@pytest.mark.filterwarnings("error", NORMALISED)
+def test_passes_the_checker(env):
+    check_env(env.unwrapped)
+
+
+def test_is_found_by_gymnasium_without_importing_us_first():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gymnasium.make("cosim.environment:cosim/Evaporator-v0").close()
+
+
+def test_a_seeded_episode_is_the_simulated_run_of_that_seed(env, paper):
+    with FmuPlant(paper) as plant:
+        trajectory = simulate(plant, Proportional(paper), 50, seed=12)
+    observation, _ = env.reset(seed=12)
+    for k in range(50):
+        np.testing.assert_array_equal(observation, trajectory.states[k])
+        observation, reward, terminated, truncated, info = env.step(trajectory.actions[k])
+        assert reward == -(trajectory["stage_cost"][k] + trajectory["penalty"][k])
+        assert info["stage_cost"] == trajectory["stage_cost"][k]
+        assert info["penalty"] == trajectory["penalty"][k]
+        np.testing.assert_array_equal(info["disturbance"], trajectory.disturbances[k])
+        assert not terminated
+        assert not truncated
+
+
+def test_later_episodes_of_a_seed_differ_and_repeat(env):
+    def episodes():
+        rows = []
+        for seed in (3, None, None):
+            env.reset(seed=seed)
+            rows.append(env.step(np.array([200.0, 200.0]))[0].tolist())
+        return rows
+
+    first = episodes()
+    assert len({tuple(row) for row in first}) == 3
+    assert episodes() == first
+
+
+def test_actions_are_saturated(env):
+    env.reset(seed=0)
+    one = env.step(np.array([1e6, -1e6]))[0]
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.step(np.array([400.0, 100.0]))[0], one)
+
+
+def test_an_episode_is_truncated_by_the_time_limit():
+    env = gymnasium.make("cosim/Evaporator-v0", max_episode_steps=3)
+    env.reset(seed=0)
+    assert [env.step(np.array([200.0, 200.0]))[3] for _ in range(3)] == [False, False, True]
+    env.close()
+
+
+def test_episodes_can_start_from_a_given_state(env):
+    start = np.array([30.0, 60.0])
+    np.testing.assert_array_equal(env.reset(seed=0, options={"initial_state": start})[0], start)
+    with pytest.raises(PlantError, match=r"unknown reset option \['start'\]"):
+        env.reset(options={"start": start})
+
+
+def test_a_nan_action_is_refused(env):
+    env.reset(seed=0)
+    with pytest.raises(PlantError, match="finite"):
+        env.step(np.array([np.nan, 200.0]))
+
+
+def test_the_vector_form_is_many_single_ones():
+    vector = gymnasium.make_vec(
+        "cosim/Evaporator-v0", num_envs=3, vectorization_mode="vector_entry_point"
+    )
+    assert isinstance(vector, PlantVectorEnv)
+    singles = [PlantEnv() for _ in range(3)]
+    states, _ = vector.reset(seed=5)
+    for i, single in enumerate(singles):
+        np.testing.assert_array_equal(single.reset(seed=5 + i)[0], states[i])
+    actions = np.random.default_rng(0).uniform(50, 450, (20, 3, 2))
+    for each in actions:
+        states, rewards, terminated, truncated, info = vector.step(each)
+        assert not terminated.any()
+        assert not truncated.any()
+        for i, single in enumerate(singles):
+            observation, reward, _, _, single_info = single.step(each[i])
+            np.testing.assert_array_equal(states[i], observation)
+            assert rewards[i] == reward
+            assert info["stage_cost"][i] == single_info["stage_cost"]
+            np.testing.assert_array_equal(info["disturbance"][i], single_info["disturbance"])
+    vector.close()
+    for single in singles:
+        single.close()
+
+
+def test_the_vector_form_starts_a_new_episode_in_the_step_after_truncation():
+    vector = PlantVectorEnv(2, max_episode_steps=2)
+    first, _ = vector.reset(seed=1)
+    action = np.full((2, 2), 200.0)
+    assert not vector.step(action)[3].any()
+    assert vector.step(action)[3].all()
+    states, rewards, _, truncated, info = vector.step(action)
+    np.testing.assert_array_equal(states, first)
+    np.testing.assert_array_equal(rewards, 0.0)
+    assert not truncated.any()
+    assert not info["_stage_cost"].any()
+    after = vector.step(action)
+    assert after[4]["_stage_cost"].all()
+    vector.close()

@@ -1,0 +1,146 @@
+"""FMUs that this project did not write, or that misbehave."""
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from loop import Hold
+from tank import build_tank, edited, without_attribute, write_scenario
+
+import fmus
+from cosim import FmuPlant, PlantPool, Scenario, simulate
+from cosim.errors import CapabilityError, PlantError
+
+
+@pytest.fixture(scope="module")
+def tanks(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tank")
+    return {saves: build_tank(folder, saves) for saves in (True, False)}
+
+
+@pytest.mark.parametrize("saves", [True, False])
+def test_a_foreign_fmu_runs_in_the_loop(tanks, tmp_path, saves):
+    with FmuPlant(write_scenario(tmp_path, tanks[saves])) as plant:
+        trajectory = simulate(plant, Hold([2.0]), 20, seed=0)
+    k = np.arange(20)
+    expected = 2.0 + (1.0 - 2.0) * np.exp(-k * 0.5 / 4.0)
+    np.testing.assert_allclose(trajectory["x"], expected, rtol=1e-12)
+    np.testing.assert_array_equal(trajectory["stage_cost"], np.full(20, 4.0))
+    np.testing.assert_array_equal(trajectory["penalty"], np.zeros(20))
+    assert trajectory.signals["x"].unit == "m"
+    assert trajectory.disturbances.shape == (20, 0)
+
+
+def test_a_foreign_fmu_that_saves_its_state_has_snapshots(tanks, tmp_path):
+    with FmuPlant(write_scenario(tmp_path, tanks[True])) as plant:
+        plant.reset(0)
+        plant.step([3.0])
+        snapshot = plant.snapshot()
+        expected = plant.step([2.0]).s
+        plant.restore(snapshot)
+        np.testing.assert_array_equal(plant.step([2.0]).s, expected)
+        with pytest.raises(CapabilityError, match=r"serialise its state.*canSerializeFMUstate"):
+            plant.serialise(snapshot)
+
+
+def test_a_missing_capability_is_an_error_only_when_asked_for(tanks, tmp_path):
+    with FmuPlant(write_scenario(tmp_path, tanks[False], mapped=False)) as plant:
+        plant.reset(0)
+        plant.step([3.0])
+        with pytest.raises(CapabilityError, match=r"save and restore.*canGetAndSetFMUstate"):
+            plant.snapshot()
+        with pytest.raises(CapabilityError, match=r"plant\.mapping\.initial_state"):
+            plant.reset(0, [2.0])
+        plant.reset(0)
+        plant.step([3.0])
+
+
+@pytest.mark.parametrize("name", ["evaporator", "evaporator_fmi3"])
+def test_an_fmu_that_declares_no_state_saving_still_steps(tmp_path, paper, name):
+    drop = without_attribute(
+        "canGetAndSetFMUstate",
+        "canSerializeFMUstate",
+        "canGetAndSetFMUState",
+        "canSerializeFMUState",
+    )
+    path = edited(fmus.path(name), tmp_path / "plain.fmu", drop)
+    with FmuPlant(paper, path) as plain, FmuPlant(paper, name) as ours:
+        np.testing.assert_array_equal(plain.reset(3), ours.reset(3))
+        a = paper.reference_action
+        np.testing.assert_array_equal(plain.step(a).s, ours.step(a).s)
+        with pytest.raises(CapabilityError, match="save and restore"):
+            plain.snapshot()
+
+
+def test_one_instance_per_process_is_kept_to(tmp_path, paper):
+    def only_once(text):
+        flag = 'canBeInstantiatedOnlyOncePerProcess="{}"'
+        assert flag.format("false") in text
+        return text.replace(flag.format("false"), flag.format("true"))
+
+    path = edited(fmus.path(), tmp_path / "single.fmu", only_once)
+    with FmuPlant(paper, path) as plant:
+        plant.reset(0)
+        with pytest.raises(CapabilityError, match="only once per process"):
+            FmuPlant(paper, path)
+    with pytest.raises(CapabilityError, match="only once per process"):
+        PlantPool(paper, 2, path)
+    FmuPlant(paper, path).close()
+
+
+def test_returned_nan_is_an_error_that_names_variable_and_step(tanks, tmp_path):
+    with FmuPlant(write_scenario(tmp_path, tanks[True], fault=1)) as plant:
+        plant.reset(0)
+        with pytest.raises(PlantError, match="returned x = nan at step 0"):
+            plant.step([1.0])
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"), [(2, "error: tank: out of water"), (3, "fatal: tank: burst")]
+)
+def test_a_failed_call_reports_what_the_fmu_logged(tanks, tmp_path, fault, words):
+    with FmuPlant(write_scenario(tmp_path, tanks[True], fault=fault)) as plant:
+        plant.reset(0)
+        with pytest.raises(PlantError, match=f"fmi2DoStep returned {words}"):
+            plant.step([1.0])
+
+
+def test_after_an_error_the_plant_can_be_reset(tanks, tmp_path):
+    with FmuPlant(write_scenario(tmp_path, tanks[True], fault=2)) as plant:
+        for _ in range(2):
+            plant.reset(0)
+            with pytest.raises(PlantError, match="out of water"):
+                plant.step([1.0])
+
+
+def test_after_a_fatal_error_every_call_is_refused(tanks, tmp_path):
+    plant = FmuPlant(write_scenario(tmp_path, tanks[True], fault=3))
+    plant.reset(0)
+    with pytest.raises(PlantError, match="burst"):
+        plant.step([1.0])
+    with pytest.raises(PlantError, match="fatal"):
+        plant.reset(0)
+    plant.close()
+
+
+def test_a_chatty_fmu_does_not_spoil_json(tanks, tmp_path):
+    scenario = write_scenario(tmp_path, tanks[True], fault=4)
+    command = [sys.executable, "-m", "cosim", "simulate", "--scenario", str(scenario)]
+    command += ["--controller", "loop:hold", "--steps", "3", "--json"]
+    command += ["--out", str(tmp_path / "out")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd="tests/cosim")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["samples"] == 3
+    assert "a chatty FMU" in result.stderr
+
+
+def test_the_tank_follows_its_equation(tanks, tmp_path):
+    with FmuPlant(Scenario.load(write_scenario(tmp_path, tanks[False]))) as plant:
+        s = plant.reset(0, [2.5])
+        assert s.tolist() == [2.5]
+        step = plant.step([0.5])
+        assert step.s[0] == pytest.approx(0.5 + 2.0 * math.exp(-0.5 / 4.0), rel=1e-14)
+        assert step.stage_cost == 0.25

@@ -1,0 +1,235 @@
+from time import perf_counter
+
+import numpy as np
+import pytest
+from loop import Answer, Failing, Hold, Proportional
+
+from cosim import FmuPlant, Scenario, simulate
+from cosim.errors import CosimError, PlantError
+from cosim.protocols import Step
+from cosim.simulation import BLOCK, spawn_seeds
+from cosim.trajectory import FALLBACK
+
+
+@pytest.fixture
+def evaporator(paper):
+    with FmuPlant(paper) as plant:
+        yield plant
+
+
+def same(one, other):
+    return all(
+        one[name].tobytes() == other[name].tobytes() for name in one.signals
+    ) and list(one.status) == list(other.status)  # fmt: skip
+
+
+def test_a_run_is_what_the_plant_does_under_the_controllers_actions(evaporator, paper):
+    trajectory = simulate(evaporator, Proportional(paper), 50, seed=3)
+    controller = Proportional(paper)
+    s = evaporator.reset(spawn_seeds(3)[0])
+    for k in range(50):
+        action = np.clip(controller.feedback(s).action, paper.action_lower, paper.action_upper)
+        np.testing.assert_array_equal(trajectory.states[k], s)
+        np.testing.assert_array_equal(trajectory.actions[k], action)
+        step = evaporator.step(action)
+        np.testing.assert_array_equal(trajectory.disturbances[k], step.disturbance)
+        assert trajectory["stage_cost"][k] == step.stage_cost
+        assert trajectory["penalty"][k] == step.penalty
+        assert trajectory["value"][k] == controller.feedback(s).value
+        s = step.s
+    np.testing.assert_array_equal(trajectory.final_state, s)
+
+
+def test_the_same_seed_repeats_and_another_differs(evaporator, paper):
+    first = simulate(evaporator, Proportional(paper), 40, seed=1)
+    assert same(first, simulate(evaporator, Proportional(paper), 40, seed=1))
+    assert not same(first, simulate(evaporator, Proportional(paper), 40, seed=2))
+
+
+def test_controllers_with_one_seed_meet_the_same_noise(evaporator, paper):
+    def explore(action, rng):
+        return action + rng.normal(size=2)
+
+    one = simulate(evaporator, Proportional(paper), 40, seed=1, exploration=explore)
+    two = simulate(evaporator, Hold(paper.reference_action), 40, seed=1, exploration=explore)
+    np.testing.assert_array_equal(one.disturbances, two.disturbances)
+    noise = two.actions - paper.reference_action
+    rng = spawn_seeds(1)[1]
+    np.testing.assert_allclose(noise, [rng.normal(size=2) for _ in range(40)], atol=1e-12)
+
+
+def test_sampling_instants_are_multiples_of_the_sampling_time():
+    with FmuPlant(Scenario.load("paper").replace({"sampling_time": 0.1})) as plant:
+        trajectory = simulate(plant, Proportional(plant.scenario), 1000, seed=0)
+    np.testing.assert_array_equal(trajectory.time, np.arange(1000) * 0.1)
+
+
+def test_actuators_saturate_what_controller_and_exploration_ask_for(evaporator, paper):
+    trajectory = simulate(evaporator, Hold([1000.0, -5.0]), 10, seed=0)
+    np.testing.assert_array_equal(trajectory.actions, np.tile([400.0, 100.0], (10, 1)))
+
+
+def test_only_changed_samples_count_as_explored(evaporator, paper):
+    def explore(action, rng):
+        return action + 1.0 if rng.random() < 0.3 else action
+
+    trajectory = simulate(evaporator, Hold([200.0, 200.0]), 200, seed=4, exploration=explore)
+    moved = (trajectory.actions != 200.0).all(axis=1)
+    np.testing.assert_array_equal(trajectory["explored"], moved)
+    assert trajectory.summary()["explored"] == moved.sum() > 30
+
+
+@pytest.mark.parametrize("phase", ["prepare", "feedback"])
+def test_a_failed_solve_repeats_the_last_action_and_is_counted(evaporator, paper, phase):
+    controller = Failing(paper, at=[0, 7, 8], phase=phase)
+    trajectory = simulate(evaporator, controller, 20, seed=6)
+    np.testing.assert_array_equal(trajectory.actions[0], paper.reference_action)
+    np.testing.assert_array_equal(trajectory.actions[7], trajectory.actions[6])
+    np.testing.assert_array_equal(trajectory.actions[8], trajectory.actions[6])
+    assert not np.array_equal(trajectory.actions[6], trajectory.actions[9])
+    assert np.flatnonzero(trajectory["failed"]).tolist() == [0, 7, 8]
+    assert [k for k, word in enumerate(trajectory.status) if word == FALLBACK] == [0, 7, 8]
+    assert np.isnan(trajectory["value"][[0, 7, 8]]).all()
+    summary = trajectory.summary()
+    assert summary["failures"] == 3
+    assert summary["statuses"] == {"fallback": 3, "solved": 17}
+    assert controller.resets == 1 + 3
+
+
+def test_a_failure_leaves_the_exploration_noise_in_step(evaporator, paper):
+    def explore(action, rng):
+        return action + rng.normal(size=2)
+
+    whole = simulate(evaporator, Hold(paper.reference_action), 20, seed=6, exploration=explore)
+    failing = Failing(paper, at=[4])
+    failing._gain = 0.0
+    broken = simulate(evaporator, failing, 20, seed=6, exploration=explore)
+    np.testing.assert_array_equal(whole.actions[5:], broken.actions[5:])
+    np.testing.assert_array_equal(broken.actions[4], broken.actions[3])
+
+
+def test_any_other_exception_of_the_controller_ends_the_run(evaporator, paper):
+    class Broken(Proportional):
+        def feedback(self, s, a=None):
+            raise ZeroDivisionError("bug")
+
+    with pytest.raises(ZeroDivisionError, match="bug"):
+        simulate(evaporator, Broken(paper), 5, seed=0)
+
+
+def test_a_nan_action_ends_the_run_with_the_plants_message(evaporator):
+    with pytest.raises(PlantError, match="finite numbers"):
+        simulate(evaporator, Hold([float("nan"), 200.0]), 5, seed=0)
+
+
+def test_an_action_of_wrong_length_ends_the_run_by_name(evaporator):
+    with pytest.raises(CosimError, match=r"Hold gave an action of shape \(3,\), not \(2,\)"):
+        simulate(evaporator, Hold([200.0, 200.0, 200.0]), 5, seed=0)
+
+
+@pytest.mark.parametrize(("steps", "seed"), [(0, 0), (-1, 0), (5, -1)])
+def test_bad_arguments_are_refused(evaporator, paper, steps, seed):
+    with pytest.raises(CosimError, match=r"steps must be|seed must not"):
+        simulate(evaporator, Proportional(paper), steps, seed)
+
+
+class Recorder:
+    """Keeps copies of what it is given."""
+
+    def __init__(self, fail_at=None):
+        self.calls, self.blocks, self._fail_at = [], [], fail_at
+
+    def start(self, scenario, controller, seed, steps, units):
+        self.calls.append(("start", scenario.name, controller.name, seed, steps, units["P2"]))
+
+    def record(self, block):
+        if block.first == self._fail_at:
+            raise OSError("disk full")
+        self.blocks.append((block.first, block.states.copy(), list(block.status), block))
+
+    def close(self):
+        self.calls.append(("close",))
+
+
+class Predicting(Proportional):
+    """Gives a prediction with every second solution."""
+
+    def feedback(self, s, a=None):
+        answer = super().feedback(s)
+        if s[0] > 25.0:
+            answer.predicted_states = np.tile(s, (4, 1))
+            answer.predicted_actions = np.tile(answer.action, (3, 1))
+        return answer
+
+
+def test_a_recorder_gets_the_whole_run_in_blocks(evaporator, paper):
+    recorder, done = Recorder(), []
+    steps = 2 * BLOCK + 17
+    trajectory = simulate(
+        evaporator, Predicting(paper), steps, seed=9, recorder=recorder, progress=done.append
+    )
+    assert recorder.calls == [("start", "paper", "proportional", 9, steps, "kPa"), ("close",)]
+    assert [first for first, *_ in recorder.blocks] == [0, BLOCK, 2 * BLOCK]
+    assert done == [BLOCK, 2 * BLOCK, steps]
+    states = np.concatenate([states for _, states, *_ in recorder.blocks])
+    np.testing.assert_array_equal(states, trajectory.states)
+    for _, states, status, block in recorder.blocks:
+        assert len(status) == len(states) == len(block.predicted_states)
+        predicted = states[:, 0] > 25.0
+        np.testing.assert_array_equal(block.predicted_states[predicted][:, 3], states[predicted])
+        assert np.isnan(block.predicted_states[~predicted]).all()
+        assert block.predicted_actions.shape[1:] == (3, 2)
+
+
+def test_recording_does_not_change_the_run(evaporator, paper):
+    plain = simulate(evaporator, Predicting(paper), 600, seed=9)
+    assert same(plain, simulate(evaporator, Predicting(paper), 600, seed=9, recorder=Recorder()))
+
+
+def test_the_recorder_is_closed_when_the_run_fails(evaporator, paper):
+    recorder = Recorder(fail_at=BLOCK)
+    with pytest.raises(OSError, match="disk full"):
+        simulate(evaporator, Proportional(paper), 2 * BLOCK, seed=0, recorder=recorder)
+    assert recorder.calls[-1] == ("close",)
+    assert len(recorder.blocks) == 1
+
+
+class Stub:
+    """A plant that costs nothing, to time the loop alone."""
+
+    def __init__(self, scenario):
+        self.scenario = scenario
+        self.units = dict.fromkeys(
+            (*scenario.plant.states, *scenario.plant.actions, *scenario.plant.disturbances), ""
+        ) | {scenario.plant.stage_cost: ""}
+        self._step = Step(scenario.initial_state, 1.0, 0.0, np.zeros(4))
+
+    def reset(self, seed):
+        return self._step.s
+
+    def step(self, a):
+        return self._step
+
+
+def test_the_loop_itself_costs_less_than_ten_microseconds_a_step(paper):
+    plant, controller = Stub(paper), Hold(paper.reference_action)
+    times = []
+    for _ in range(5):
+        begin = perf_counter()
+        simulate(plant, controller, 2000, seed=0)
+        times.append(perf_counter() - begin)
+    assert min(times) / 2000 < 10e-6
+
+
+def test_any_object_that_keeps_the_protocol_is_a_controller(evaporator, paper):
+    class Minimal:
+        def reset(self):
+            pass
+
+        def prepare(self):
+            pass
+
+        def feedback(self, s, a=None):
+            return Answer(np.array([200.0, 200.0]))
+
+    assert simulate(evaporator, Minimal(), 3, seed=0).controller == "Minimal"

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+from loop import Proportional
+
+from cosim import FmuPlant, simulate
+from cosim.errors import TrajectoryError
+from cosim.trajectory import Signal, Trajectory, read_csv, signal_names
+
+
+@pytest.fixture(scope="module")
+def trajectory(paper):
+    with FmuPlant(paper) as plant:
+        return simulate(plant, Proportional(paper), 300, seed=5)
+
+
+def test_signals_have_the_fmus_names_and_units(trajectory):
+    headers = [signal.header for signal in trajectory.signals.values()]
+    assert headers[:5] == ["time [s]", "X2 [%]", "P2 [kPa]", "P100 [kPa]", "F200 [kg/min]"]
+    assert headers[5:9] == ["X1 [%]", "F1 [kg/min]", "T1 [degC]", "T200 [degC]"]
+
+
+def test_csv_reads_back_to_the_same_bits(trajectory, tmp_path):
+    trajectory.write_csv(tmp_path / "t.csv")
+    copy = read_csv(tmp_path / "t.csv", trajectory.scenario)
+    assert list(copy.signals) == list(trajectory.signals)
+    for name, signal in trajectory.signals.items():
+        assert copy[name].tobytes() == signal.values.tobytes()
+        assert copy.signals[name].unit == signal.unit
+    assert list(copy.status) == list(trajectory.status)
+    assert copy.to_csv() == trajectory.to_csv()
+
+
+def test_summary_is_the_means_of_the_definitions(trajectory, paper):
+    v = np.maximum(
+        np.maximum(paper.state_lower - trajectory.states, trajectory.states - paper.state_upper), 0
+    )
+    penalty = (v * paper.penalty_linear + v**2 * paper.penalty_quadratic).sum(axis=1)
+    summary = trajectory.summary()
+    assert summary["samples"] == 300
+    assert summary["economic_cost"] == pytest.approx(trajectory["stage_cost"].mean(), rel=1e-14)
+    assert summary["mean_violation"] == pytest.approx(v.sum(axis=1).mean(), rel=1e-12)
+    assert summary["violating_share"] == np.mean((v > 0).any(axis=1)) > 0
+    expected = (trajectory["stage_cost"] + penalty).mean()
+    assert summary["J"] == pytest.approx(expected, rel=1e-12)
+    assert summary["failures"] == 0
+    assert summary["statuses"] == {"solved": 300}
+
+
+def test_clock_readings_are_only_in_the_timing(trajectory, tmp_path):
+    assert set(trajectory.timing) == {"prepare", "feedback", "plant"}
+    assert not {"timing", "prepare", "feedback", "plant"} & set(trajectory.summary())
+    trajectory.write_timing_csv(tmp_path / "timing.csv")
+    lines = (tmp_path / "timing.csv").read_text().splitlines()
+    assert lines[0] == "prepare [us],feedback [us],plant [us]"
+    assert len(lines) == 301
+
+
+def test_an_unknown_signal_is_refused_with_those_there_are(trajectory):
+    with pytest.raises(TrajectoryError, match=r"no signal 'X9'; there are time, X2, P2"):
+        trajectory["X9"]
+
+
+def test_signals_of_unequal_length_are_refused(paper):
+    signals = {name: Signal(name, "", np.zeros(3)) for name in signal_names(paper)}
+    Trajectory(paper, signals, ["solved"] * 3)
+    signals["P2"] = Signal("P2", "", np.zeros(2))
+    with pytest.raises(TrajectoryError, match="signal 'P2' has shape"):
+        Trajectory(paper, signals, ["solved"] * 3)
+
+
+BAD = {
+    "missing": (None, "cannot be read"),
+    "empty": ("", "not a trajectory"),
+    "other table": ("a,b\n1,2\n", "not a trajectory"),
+    "short row": ("time [s],status\n0.0\n", "line 2: 1 fields, not 2"),
+    "text in a number": ("time [s],status\n0.0,ok\nx,ok\n", "line 3"),
+    "missing signal": ("time [s],status\n0.0,ok\n", "lacks the signal X2"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_file_is_refused_with_its_name_and_line(case, tmp_path, paper):
+    text, words = BAD[case]
+    path = tmp_path / "t.csv"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(TrajectoryError, match=words):
+        read_csv(path, paper)

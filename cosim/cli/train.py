@@ -1,0 +1,228 @@
+"""`cosim train`: learn θ from plant data."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cosim.cli.output import JsonOption, Output, dump, open_folder, output
+from cosim.cli.simulate import ScenarioOption
+
+if TYPE_CHECKING:
+    from learning.training import Result, Run
+
+AlgorithmOption = Annotated[
+    str,
+    typer.Option(
+        "--algorithm", "-a", help="actor-critic, batch-q-learning, q-learning or a registered one."
+    ),
+]
+
+
+def train(
+    algorithm: AlgorithmOption,
+    scenario: ScenarioOption = "paper",
+    samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="Plant samples.")] = 50_000,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=999_999, help="Seed of noise and exploration.")
+    ] = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
+        "cosim-train"
+    ),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the folder's checkpoint.")
+    ] = False,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Hyperparameter as name=value; may be repeated."),
+    ] = None,
+    controller: Annotated[
+        str, typer.Option("--controller", help="What carries θ: rti or converged.")
+    ] = "rti",
+    optimum: Annotated[
+        str | None,
+        typer.Option("--optimum", help="Controller whose J is J* of the gap closed: optimal."),
+    ] = None,
+    log_every: Annotated[int, typer.Option("--log-every", min=1, help="Samples per row.")] = 1000,
+    evaluate_every: Annotated[
+        int, typer.Option("--evaluate-every", min=1, help="Samples per greedy evaluation.")
+    ] = 5000,
+    checkpoint_every: Annotated[
+        int, typer.Option("--checkpoint-every", min=1, help="Samples per checkpoint.")
+    ] = 5000,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")
+    ] = False,
+    record: Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Train a controller's θ and write parameters.toml, learning.csv and summary.json.
+
+    Exit code 1: learning diverged; the files then hold the last good θ and the summary says why.
+    """
+    with output(json) as out_:
+        from cosim.scenario import Scenario
+        from learning.registry import load_algorithm
+        from learning.training import Run
+
+        found = load_algorithm(algorithm)
+        if explain:
+            _explain(algorithm, found.Configuration.documentation(), out_)
+            return
+        run = Run(
+            algorithm=algorithm,
+            scenario=Scenario.load(scenario),
+            samples=samples,
+            seed=seed,
+            configuration=found.Configuration.from_assignments(assignments or []),
+            controller=controller,
+            log_every=log_every,
+            evaluate_every=evaluate_every,
+            checkpoint_every=checkpoint_every,
+        )
+        folder = open_folder(out)
+        begin = time.perf_counter()
+        result = _execute(run, found, folder, optimum, resume, record, out_)
+        summary = summarise(run, result)
+        summary["timing"] = {"wall_seconds": time.perf_counter() - begin}
+        _write(folder, run, result, summary)
+        _show(summary, out_)
+        out_.json(summary)
+    if result.status != "finished":
+        raise typer.Exit(1)
+
+
+def _execute(
+    run: Run,
+    algorithm: Any,
+    folder: Path,
+    optimum: str | None,
+    resume: bool,
+    record: bool,
+    output: Output,
+) -> Result:
+    from cosim.cli.compose import build_controller, build_plant
+    from learning.training import Training
+
+    recorder: Any = None
+    if record:
+        from cosim.recording import TrainingRecorder
+
+        recorder = TrainingRecorder(folder / "training.rrd")
+    with (
+        build_plant(run.scenario) as plant,
+        build_plant(run.scenario) as evaluation_plant,
+        _progress(run, output) as progress,
+    ):
+        training = Training(
+            run,
+            algorithm,
+            plant,
+            evaluation_plant,
+            optimum=build_controller(optimum, run.scenario) if optimum else None,
+            out=folder,
+            recorder=recorder,
+        )
+        return training.go(resume=resume, progress=progress)
+
+
+def _progress(run: Run, output: Output) -> Any:
+    """Progress bar with J, TD error, gap closed and the smallest eigenvalue."""
+    from contextlib import contextmanager
+    from math import isnan
+
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeRemainingColumn as Remaining
+
+    @contextmanager
+    def bar() -> Any:
+        console = output.console()
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            Remaining(),
+            TextColumn("{task.fields[figures]}"),
+        )
+        hidden = output.as_json or not console.is_terminal
+        with Progress(*columns, console=console, disable=hidden) as view:
+            task = view.add_task(run.algorithm, total=run.samples, figures="")
+            seen = {"greedy_J": float("nan"), "gap_closed": float("nan")}
+
+            def update(done: int, row: dict[str, float] | None) -> None:
+                if row is None:
+                    return
+                seen.update({name: row[name] for name in seen if not isnan(row[name])})
+                figures = (
+                    f"J {row['J']:.0f}  greedy {seen['greedy_J']:.0f}  "
+                    f"gap closed {100 * seen['gap_closed']:.1f} %  TD {row['td_error']:.3g}  "
+                    f"λmin {row['smallest_eigenvalue']:.2g}"
+                )
+                view.update(task, completed=done, figures=figures)
+
+            yield update
+
+    return bar()
+
+
+def summarise(run: Run, result: Result) -> dict[str, Any]:
+    """What `summary.json` says of a run, but for its timing."""
+    from importlib.metadata import version
+
+    last = result.rows[-1] if result.rows else {}
+    return {
+        "version": version("rti-cosim"),
+        "algorithm": run.algorithm,
+        "scenario": run.scenario.name,
+        "scenario_hash": run.scenario.hash,
+        "controller": run.controller,
+        "samples": int(last.get("samples", 0)),
+        "seed": run.seed,
+        "status": result.status,
+        "hyperparameters": run.configuration.model_dump(mode="json"),
+        "parameters_hash": result.parameters.hash,
+        "evaluation_seeds": run.evaluation_seeds,
+        "evaluation_steps": run.evaluation_steps,
+        **result.evaluation,
+        "gap_closed": last.get("gap_closed"),
+        "smallest_eigenvalue": last.get("smallest_eigenvalue"),
+        "td_error": last.get("td_error"),
+        "training_failures": last.get("failures"),
+    }
+
+
+def _write(folder: Path, run: Run, result: Result, summary: dict[str, Any]) -> None:
+    from controllers.storage import write_atomically
+    from learning.training import to_csv
+
+    write_atomically(folder / "learning.csv", to_csv(result.rows))
+    result.parameters.save(folder / "parameters.toml")
+    write_atomically(folder / "scenario.toml", run.scenario.to_toml())
+    write_atomically(folder / "summary.json", dump(summary))
+
+
+def _show(summary: dict[str, Any], output: Output) -> None:
+    title = "{algorithm} on {scenario}, {samples} samples, seed {seed}: {status}".format(**summary)
+    gap = summary["gap_closed"]
+    rows = [
+        ("greedy J on held-out noise", f"{summary['J']:.2f}"),
+        ("economic cost", f"{summary['economic_cost']:.2f}"),
+        ("mean violation", f"{summary['mean_violation']:.6f}"),
+        ("violating share", f"{100 * summary['violating_share']:.2f} %"),
+        ("failures", str(summary["failures"])),
+    ]
+    if gap is not None and gap == gap:  # noqa: PLR0124 (NaN where J* is not known)
+        rows.append(("gap closed", f"{100 * gap:.2f} %"))
+    output.table(title, ("per sample", "value"), rows)
+
+
+def _explain(algorithm: str, documentation: list[tuple[str, str, str]], output: Output) -> None:
+    output.table(
+        f"hyperparameters of {algorithm}", ("name", "default", "meaning"), documentation
+    )
+    output.json(
+        {name: {"default": default, "meaning": text} for name, default, text in documentation}
+    )

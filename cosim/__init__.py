@@ -4,6 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from cosim.evaluation import Evaluation as Evaluation
+    from cosim.evaluation import evaluate as evaluate
     from cosim.plant import FmuPlant as FmuPlant
     from cosim.pool import PlantPool as PlantPool
     from cosim.scenario import Scenario as Scenario
@@ -12,6 +14,8 @@ if TYPE_CHECKING:
 
 # Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
 _HOMES = {
+    "Evaluation": "cosim.evaluation",
+    "evaluate": "cosim.evaluation",
     "FmuPlant": "cosim.plant",
     "PlantPool": "cosim.pool",
     "Scenario": "cosim.scenario",
@@ -19,7 +23,7 @@ _HOMES = {
     "simulate": "cosim.simulation",
 }
 
-__all__ = ["FmuPlant", "PlantPool", "Scenario", "Trajectory", "simulate"]
+__all__ = ["Evaluation", "FmuPlant", "PlantPool", "Scenario", "Trajectory", "evaluate", "simulate"]
 
 
 def __getattr__(name: str) -> Any:

@@ -35,3 +35,11 @@ class FigureError(CosimError):
 
 class ComparisonError(CosimError):
     """Two runs that cannot be compared as asked."""
+
+
+class EvaluationError(CosimError):
+    """An evaluation that cannot be set up, or whose workers failed."""
+
+
+class ResultsError(CosimError):
+    """Stored results that are missing, malformed, or differ from what is computed now."""

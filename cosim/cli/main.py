@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli import benchmark, compare, demo, scenario, simulate, view
+from cosim.cli import benchmark, compare, demo, evaluate, scenario, simulate, train, view
 
 app = typer.Typer(
     name="cosim",
@@ -20,6 +20,8 @@ app = typer.Typer(
 )
 app.command("demo")(demo.demo)
 app.command("simulate")(simulate.simulate)
+app.command("evaluate")(evaluate.evaluate)
+app.command("train")(train.train)
 app.command("view")(view.view)
 app.command("compare")(compare.compare)
 app.command("scenario")(scenario.scenario)

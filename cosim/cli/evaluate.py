@@ -1,0 +1,173 @@
+"""`cosim evaluate`: controllers × seeds on common random numbers."""
+
+from __future__ import annotations
+
+import shlex
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from cosim.cli.output import JsonOption, Output, dump, open_folder, output
+from cosim.cli.simulate import ScenarioOption, StepsOption
+
+
+def evaluate(
+    controllers: Annotated[
+        str,
+        typer.Option(
+            "--controllers",
+            "-c",
+            help="Comma-separated: naive, tuned, converged, optimal, a parameters file or "
+            "module:factory; NAME=… gives one another name.",
+        ),
+    ] = "naive",
+    scenario: ScenarioOption = "paper",
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of seeds.")] = 10,
+    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
+    steps: StepsOption = 1000,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
+        "cosim-evaluation"
+    ),
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; default: one per core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs."),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Compare controllers on the same disturbances, seed by seed.
+
+    Writes evaluation.csv and evaluation.parquet (a row per controller and seed), summary.json,
+    timing.csv and scenario.toml. Run again with the same --out to go on after an interruption.
+    """
+    with output(json) as out_:
+        from controllers.storage import write_atomically
+        from cosim.cli.compose import build_controller
+        from cosim.evaluation import evaluate as run
+        from cosim.evaluation.parallel import cores
+        from cosim.scenario import Scenario
+
+        task = Scenario.load(scenario)
+        named = named_controllers(controllers)
+        options = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
+        options |= {"first-seed": first_seed} if first_seed else {}
+        folder = open_folder(out)
+        units = len(named) * (seeds + 1)
+        with out_.progress(f"{', '.join(named)} on {task.name}", units) as progress:
+            evaluation = run(
+                task,
+                {name: partial(build_controller, spec) for name, spec in named.items()},
+                range(first_seed, first_seed + seeds),
+                steps,
+                folder=folder,
+                jobs=jobs or cores(),
+                scheduler=scheduler,
+                progress=progress,
+                command=_command(options | {"steps": steps}),
+            )
+        summary = evaluation.summary()
+        evaluation.write(folder)
+        write_atomically(folder / "scenario.toml", task.to_toml())
+        write_atomically(folder / "summary.json", dump(summary))
+        show(summary, out_)
+        out_.note(f"files are in {folder.resolve()}")
+        out_.json(summary)
+
+
+def named_controllers(text: str) -> dict[str, str]:
+    """Read `A,B,NAME=SPEC`: what to build, by the name to show; raises EvaluationError."""
+    from cosim.errors import EvaluationError
+
+    named: dict[str, str] = {}
+    for item in filter(None, (part.strip() for part in text.split(","))):
+        name, equals, spec = item.partition("=")
+        name, spec = (name.strip(), spec.strip()) if equals else (item, item)
+        if not name or not spec:
+            raise EvaluationError(f"--controllers: '{item}' is not NAME=CONTROLLER")
+        if name in named:
+            raise EvaluationError(f"--controllers names '{name}' twice; write NAME=… for one")
+        named[name] = spec
+    if not named:
+        raise EvaluationError("--controllers is empty")
+    return named
+
+
+def _command(options: dict[str, Any]) -> str:
+    """The command without what has no bearing on the table: --out, --jobs, --scheduler."""
+    words = ["cosim", "evaluate"]
+    for name, value in options.items():
+        words += [f"--{name}", str(value)]
+    return shlex.join(words)
+
+
+def show(summary: dict[str, Any], output: Output) -> None:
+    """Print the table of controllers and the paired comparisons."""
+    title = "{scenario}, {steps} samples × {count} seeds".format(
+        **summary, count=len(summary["seeds"])
+    )
+    controllers = summary["controllers"].items()
+    output.table(
+        title,
+        ("controller", "economic cost", "violation", "violating %", "J", "gap closed %"),
+        [
+            (
+                name,
+                f"{row['economic_cost']:.1f}",
+                f"{row['mean_violation']:.5f}",
+                f"{100 * row['violating_share']:.2f}",
+                f"{row['J']:.1f}",
+                percent(row["gap_closed"]) if "gap_closed" in row else "",
+            )
+            for name, row in controllers
+        ],
+    )
+    output.table(
+        "behaviour",
+        ("controller", "input effort", "settling time s", "failures", "median step µs"),
+        [
+            (
+                name,
+                f"{row['input_effort']:.4f}",
+                f"{row['settling_time']:.0f}",
+                str(row["failures"]),
+                f"{_step_time(summary['timing'][name]):.1f}",
+            )
+            for name, row in controllers
+        ],
+    )
+    if not summary["comparisons"]:
+        return
+    output.table(
+        "paired comparisons (95 % t interval over seeds)",
+        ("controller against reference", "ΔJ", "economic gain %"),
+        [
+            (
+                f"{row['controller']} − {row['reference']}",
+                interval(row["differences"]["J"], 1.0),
+                percent(row["economic_gain"]),
+            )
+            for row in summary["comparisons"]
+        ],
+    )
+
+
+def _step_time(timing: dict[str, float]) -> float:
+    return timing["prepare_median_us"] + timing["feedback_median_us"]
+
+
+def interval(estimate: dict[str, Any], scale: float, digits: int = 2) -> str:
+    """`value [low, high]` of an estimate."""
+    text = f"{scale * estimate['value']:.{digits}f}"
+    if estimate["t"] is None:
+        return text
+    low, high = (scale * end for end in estimate["t"])
+    return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def percent(estimate: dict[str, Any]) -> str:
+    """An estimate in per cent."""
+    return interval(estimate, 100.0)

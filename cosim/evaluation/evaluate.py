@@ -1,0 +1,145 @@
+"""Controllers × seeds, cut into work units, run in parallel and put together again."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import EvaluationError
+from cosim.evaluation.parallel import run_all
+from cosim.evaluation.provenance import code_hash, controller_hash, parameters_hash, versions
+from cosim.evaluation.store import Store, unit_key
+from cosim.evaluation.table import Evaluation
+from cosim.evaluation.unit import Factory, Result, Unit, release, run
+from cosim.plant import FmuPlant
+from cosim.scenario import Scenario
+
+REFERENCE, OPTIMUM = "naive", "optimal"
+
+
+def evaluate(
+    scenario: Scenario | str | Path,
+    controllers: Mapping[str, Factory],
+    seeds: int | Sequence[int],
+    steps: int,
+    *,
+    folder: str | Path | None = None,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: Callable[[int], None] | None = None,
+    command: str = "cosim.evaluate",
+) -> Evaluation:
+    """Run every controller on every seed and return the table; the bytes depend on no worker.
+
+    A seed means the same disturbances to all controllers (common random numbers), so differences
+    are to be taken seed by seed.
+
+    Parameters
+    ----------
+    controllers : factory(scenario) -> Controller by name, importable where the workers run. The
+        one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
+    seeds : the seeds, or their number S for 0 … S−1.
+    steps : samples per run.
+    folder : where finished work units are kept and found again; None keeps none.
+    jobs : worker processes; 1 works in this process.
+    scheduler : address of a Dask scheduler, used in place of `jobs`.
+    progress : called with the number of units done, of controllers × (seeds + 1) in all.
+    command : the text of the column `command`.
+
+    Raises EvaluationError on a malformed request or failed workers, and whatever building or
+    running a controller raises.
+    """
+    scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+    numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
+    _check(controllers, numbers, steps)
+    plan = _Plan(scenario, controllers, numbers, steps)
+    store = Store(None if folder is None else Path(folder))
+    results = {key: result for key in plan.units if (result := store.load(key)) is not None}
+    report = progress or (lambda _: None)
+    report(len(results))
+
+    def done(key: str, result: Result) -> None:
+        store.save(key, result)
+        results[key] = result
+        report(len(results))
+
+    missing = {key: unit for key, unit in plan.units.items() if key not in results}
+    try:
+        run_all(run, missing, done, jobs=jobs, scheduler=scheduler)
+    finally:
+        release()
+    return plan.assemble(results, command)
+
+
+def _check(controllers: Mapping[str, Factory], seeds: Sequence[int], steps: int) -> None:
+    if not controllers:
+        raise EvaluationError("no controller to evaluate")
+    if not seeds:
+        raise EvaluationError("no seed to evaluate on; give at least one")
+    if len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise EvaluationError("seeds must be distinct and not negative")
+    if steps < 1:
+        raise EvaluationError(f"steps must be at least 1, not {steps}")
+
+
+class _Plan:
+    """The units under their keys. Building each controller here finds every mistake at once."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        controllers: Mapping[str, Factory],
+        seeds: Sequence[int],
+        steps: int,
+    ) -> None:
+        self._scenario, self._names, self._seeds = scenario, list(controllers), list(seeds)
+        with FmuPlant(scenario) as plant:
+            fmu = plant.fmu_sha256
+        code = code_hash()
+        self._facts: dict[str, Any] = {
+            "scenario": scenario.name,
+            "steps": steps,
+            "version": versions().partition("rti-cosim ")[2].partition(";")[0],
+            "versions": versions(),
+            "code_hash": code,
+            "scenario_hash": scenario.hash,
+            "fmu_sha256": fmu,
+        }
+        self._parameters: dict[str, str] = {}
+        self._keys: dict[tuple[str, int | None], str] = {}
+        self.units: dict[str, Unit] = {}
+        session = secrets.token_hex(8)
+        for name, factory in controllers.items():
+            controller = factory(scenario)
+            self._parameters[name] = parameters_hash(controller)
+            facts = self._facts | {
+                "scenario": None,
+                "controller": name,
+                "controller_hash": controller_hash(controller),
+                "parameters_hash": self._parameters[name],
+            }
+            for seed in (None, *seeds):
+                key = unit_key(facts | {"seed": seed})
+                self._keys[name, seed] = key
+                self.units[key] = Unit(session, name, factory, scenario, seed, steps, code)
+
+    def assemble(self, results: Mapping[str, Result], command: str) -> Evaluation:
+        names = self._names
+        return Evaluation(
+            controllers=names,
+            seeds=self._seeds,
+            results={
+                (name, seed): results[self._keys[name, seed]]
+                for name in names
+                for seed in self._seeds
+            },
+            settling={
+                name: results[self._keys[name, None]].indicators["settling_time"] for name in names
+            },
+            parameters=self._parameters,
+            facts=self._facts | {"command": command},
+            reference=REFERENCE if REFERENCE in names else names[0],
+            optimum=OPTIMUM if OPTIMUM in names else None,
+        )

@@ -1,0 +1,50 @@
+"""Finished work units on disk: an evaluation that was interrupted goes on where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from controllers.storage import write_atomically
+from cosim.errors import EvaluationError
+from cosim.evaluation.unit import Result, as_document, from_document
+
+FOLDER = ".units"
+FORMAT = 1
+
+
+class Store:
+    """One small JSON file per finished unit, under a hash of all that its result depends on.
+
+    Without a folder nothing is stored. Only the process that started the evaluation writes, so
+    workers need no shared disk.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = None if folder is None else folder / FOLDER
+        if self._folder is not None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+
+    def load(self, key: str) -> Result | None:
+        """The stored result, or None; raises EvaluationError where the file is damaged."""
+        if self._folder is None or not (path := self._folder / f"{key}.json").is_file():
+            return None
+        try:
+            return from_document(json.loads(path.read_text("utf-8")))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            raise EvaluationError(
+                f"the finished work unit '{path}' is damaged; delete it to compute it again"
+            ) from None
+
+    def save(self, key: str, result: Result) -> None:
+        """Store a result, whole or not at all."""
+        if self._folder is not None:
+            write_atomically(self._folder / f"{key}.json", json.dumps(as_document(result)))
+
+
+def unit_key(facts: Mapping[str, str | int | None]) -> str:
+    """Name of a unit's file: a hash of the facts that its result depends on."""
+    canonical = json.dumps({"format": FORMAT, **facts}, sort_keys=True)
+    return hashlib.sha256(canonical.encode()).hexdigest()[:32]

@@ -1,0 +1,120 @@
+"""The work unit: one controller on one seed, run wherever a worker is free."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+from cosim.errors import EvaluationError
+from cosim.evaluation.provenance import code_hash
+from cosim.kpis import displaced, indicators, settling_time
+from cosim.plant import FmuPlant
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.simulation import simulate
+
+Factory = Callable[[Scenario], Controller]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a worker needs to know; `seed` None is the settling run without disturbances.
+
+    `session` tells evaluations apart, so that a worker keeps its controllers within one; `code`
+    is the hash of the code that the evaluation was started with.
+    """
+
+    session: str
+    controller: str
+    factory: Factory
+    scenario: Scenario
+    seed: int | None
+    steps: int
+    code: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """Indicators of a unit, and what the clock said: `timing` in s and µs, never in the table."""
+
+    indicators: dict[str, float]
+    timing: dict[str, float]
+
+
+class _Kept:
+    """Controllers and plants of the present session: building one costs more than a run."""
+
+    def __init__(self) -> None:
+        self.session = ""
+        self.controllers: dict[str, Controller] = {}
+        self.plants: dict[str, FmuPlant] = {}
+
+    def enter(self, session: str) -> None:
+        if session != self.session:
+            for plant in self.plants.values():
+                plant.close()
+            self.controllers, self.plants, self.session = {}, {}, session
+
+    def controller(self, unit: Unit) -> Controller:
+        if unit.controller not in self.controllers:
+            self.controllers[unit.controller] = unit.factory(unit.scenario)
+        return self.controllers[unit.controller]
+
+    def plant(self, scenario: Scenario) -> FmuPlant:
+        if scenario.hash not in self.plants:
+            self.plants[scenario.hash] = FmuPlant(scenario)
+        return self.plants[scenario.hash]
+
+
+_kept = _Kept()
+
+
+def release() -> None:
+    """Close what this process keeps for the evaluation that it worked on."""
+    _kept.enter("")
+
+
+def run(unit: Unit) -> Result:
+    """Run a unit; the result depends on nothing but the unit, so any worker may do it.
+
+    Raises EvaluationError if this worker has other code than the evaluation was started with, and
+    whatever plant and controller raise.
+    """
+    if code_hash() != unit.code:
+        raise EvaluationError(
+            f"a worker runs other code ({code_hash()}) than the evaluation ({unit.code}); install "
+            "the same version of rti-cosim everywhere"
+        )
+    _kept.enter(unit.session)
+    controller = _kept.controller(unit)
+    if unit.seed is None:
+        return _settle(unit, controller)
+    begin = perf_counter()
+    trajectory = simulate(_kept.plant(unit.scenario), controller, unit.steps, unit.seed)
+    timing = {"wall_time_s": perf_counter() - begin}
+    for name, quantiles in trajectory.timing_summary().items():
+        timing |= {f"{name}_{key}": value for key, value in quantiles.items()}
+    return Result(indicators(trajectory), timing)
+
+
+def _settle(unit: Unit, controller: Controller) -> Result:
+    scenario = displaced(unit.scenario)
+    if scenario is None:
+        return Result({"settling_time": float("nan")}, {})
+    trajectory = simulate(_kept.plant(scenario), controller, unit.steps, 0)
+    return Result({"settling_time": settling_time(trajectory)}, {})
+
+
+def as_document(result: Result) -> dict[str, Any]:
+    """A result as a JSON document."""
+    return {"indicators": result.indicators, "timing": result.timing}
+
+
+def from_document(document: dict[str, Any]) -> Result:
+    """Read back what `as_document` gave; raises KeyError, TypeError or ValueError."""
+    return Result(
+        {str(key): float(value) for key, value in document["indicators"].items()},
+        {str(key): float(value) for key, value in document["timing"].items()},
+    )

@@ -13,7 +13,7 @@ from controllers.qp.qpsolvers_backend import QpsolversBackend
 
 
 class QpBackend(Protocol):
-    """A solver of `SoftQp`s of one size; whether it condenses the dynamics is its own affair."""
+    """A solver of `SoftQp`s of one size with finite data; condensed or not is its own affair."""
 
     def load(self, qp: SoftQp) -> None:
         """Take over the matrices H, rows and weights (the preparation phase)."""

@@ -69,7 +69,7 @@ class DaqpBackend:
         n = qp.f.size
         self._write_limits(qp)
         self._sense[:] = self._free
-        self._sense[:n][qp.lower >= qp.upper] = FIXED
+        self._sense[:n][qp.lower == qp.upper] = FIXED
         flag = self._factorised
         if flag >= 0:
             flag = self._model.update(

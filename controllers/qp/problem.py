@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.errors import QpError
+
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
@@ -60,6 +62,15 @@ class SoftQp:
         """Deep copy, for a QP that is kept beyond the next sample."""
         copied: SoftQp = _copied(self)
         return copied
+
+    def require_convex(self) -> None:
+        """Raise QpError where H is not positive definite; for backends that do not notice."""
+        try:
+            np.linalg.cholesky(self.H)
+        except np.linalg.LinAlgError as error:
+            raise QpError(
+                "the QP is not strictly convex", status="not convex", qp=self.copy()
+            ) from error
 
     def slack(self, v: Vector) -> Vector:
         """Least slack t ≥ 0 of each row at v."""
@@ -147,7 +158,7 @@ class QpSolution(NamedTuple):
         """
         v, nu, lam = self
         small = tolerance * max(1.0, float(np.abs(nu).max()))
-        free = qp.lower < qp.upper
+        free = qp.lower != qp.upper
         at_bound = np.minimum(v - qp.lower, qp.upper - v) < tolerance * (1 + np.abs(v))
         if (free & at_bound & (np.abs(nu) < small)).any():
             return True
@@ -164,17 +175,16 @@ class QpSolution(NamedTuple):
     def active(self, qp: SoftQp) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
         """Masks: variables held by a bound, rows held at a limit, rows violated.
 
-        By the multipliers, which are exactly zero for inactive limits of an active-set solver and
-        nearly so for an interior one; `weakly_active` says where that is not safe.
+        They are the branches of the proximal operators in `residuals`: of a distance and a
+        multiplier that should exclude each other, the larger decides. `weakly_active` says where
+        that is not safe.
         """
         v, nu, lam = self
-        at_bound = np.minimum(v - qp.lower, qp.upper - v) < np.abs(nu)
-        held = (qp.lower >= qp.upper) | at_bound
-        y = qp.rows @ v
-        outside = np.maximum(np.maximum(qp.row_lower - y, y - qp.row_upper), 0.0)
-        violated = np.abs(lam) - qp.w > outside
-        inside = np.minimum(y - qp.row_lower, qp.row_upper - y)
-        return held, ~violated & (np.abs(lam) > inside), violated
+        held = (qp.lower == qp.upper) | (np.minimum(v - qp.lower, qp.upper - v) < np.abs(nu))
+        y, size = qp.rows @ v, np.abs(lam)
+        outside = np.maximum(qp.row_lower - y, y - qp.row_upper)
+        violated = size + outside > qp.w
+        return held, ~violated & (size + outside > 0), violated
 
     def licq_margin(self, qp: SoftQp) -> float:
         """Least singular value of the active constraints' normalised gradients; ∞ without any.

@@ -23,7 +23,11 @@ class ProxQpBackend:
         self._qp: proxqp.dense.QP | None = None
 
     def load(self, qp: SoftQp) -> None:
-        """Hand over the matrices; the first call allocates the workspace."""
+        """Hand over the matrices; the first call allocates the workspace.
+
+        Raises QpError where the QP is not convex, since ProxQP would return a stationary point.
+        """
+        qp.require_convex()
         n, rows = qp.f.size, qp.w.size
         if self._qp is None:
             self._hessian = np.zeros((n + rows, n + rows))

@@ -30,7 +30,8 @@ class QpsolversBackend:
         self._solver = solver
 
     def load(self, qp: SoftQp) -> None:
-        """Do nothing: the problem is built when it is solved."""
+        """Raise QpError where the QP is not convex; it is built when it is solved."""
+        qp.require_convex()
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the matrices and vectors of `qp`; raises QpError where the solver does not."""
@@ -59,7 +60,7 @@ def full_space(qp: SoftQp, *, dense: bool) -> tuple[qpsolvers.Problem, np.ndarra
     hessian, gradient = _cost(stages)
     P = sp.block_diag([hessian, sp.diags(2 * qp.W)])
     q = np.concatenate([gradient, qp.w])
-    fixed = np.flatnonzero(qp.lower >= qp.upper)
+    fixed = np.flatnonzero(qp.lower == qp.upper)
     picks = sp.csc_matrix(
         (np.ones(fixed.size), (np.arange(fixed.size), rows + fixed)), (fixed.size, 2 * rows + n)
     )

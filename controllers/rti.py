@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from math import isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -181,24 +182,34 @@ class RtiNmpc:
     def prepare_at(self, point: LinearisationPoint) -> None:
         """Prepare at a given point without shifting, as replay does.
 
-        Raises ControllerError where an array has a wrong shape or is not finite.
+        Raises ControllerError where an array has a wrong shape or is not finite, and then changes
+        nothing; QpError where the QP is not finite.
         """
-        targets = {"x": self._x, "u": self._u, "costates": self._costates}
-        for name, target in targets.items():
-            array = np.asarray(getattr(point, name), dtype=np.float64)
+        targets = (self._x, self._u, self._costates)
+        arrays = [np.asarray(values, dtype=np.float64) for values in point]
+        for name, target, array in zip(point._fields, targets, arrays, strict=True):
             if array.shape != target.shape or not np.isfinite(array).all():
                 raise ControllerError(
                     f"linearisation point: {name} must be finite with shape {target.shape}, "
                     f"not {array.shape}"
                 )
+        for target, array in zip(targets, arrays, strict=True):
             target[:] = array
         self._pending = None
         self._linearise()
 
     def _linearise(self) -> None:
         prepare = self._prepare
+        self._prepared = None
         self._constant = self._hessian.fill(self._x, self._u, self._costates)
         prepare()
+        if not isfinite(prepare.stack.sum()):
+            raise QpError(
+                "the QP is not finite: the model has no finite value or derivative at the point of "
+                "linearisation",
+                status="QP not finite",
+                qp=self._qp.copy(),
+            )
         self._backend.load(self._qp)
         self._prepared = Prepared(
             point=LinearisationPoint(self._x.copy(), self._u.copy(), self._costates.copy()),
@@ -232,7 +243,7 @@ class RtiNmpc:
         return solution
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
-        s = _finite_vector("state", s, self.problem.n_states)
+        s = _vector("state", s, self.problem.n_states)
         if self._prepared is None:
             self.prepare()
         prepared, qp, m = self._prepared, self._qp, self.problem.n_actions
@@ -243,8 +254,14 @@ class RtiNmpc:
         if a is None:
             qp.lower[:m], qp.upper[:m] = self._action_lower[:m], self._action_upper[:m]
         else:
-            qp.lower[:m] = _finite_vector("action", a, m) - self.problem.reference_action
+            qp.lower[:m] = _vector("action", a, m) - self.problem.reference_action
             qp.upper[:m] = qp.lower[:m]
+        if not isfinite(self._embed.stack.sum() + qp.lower[:m].sum()):
+            raise QpError(
+                f"the QP is not finite: state {s}, action {a!r}",
+                status="state or action not finite",
+                qp=qp.copy(),
+            )
         multipliers = self._backend.solve(qp)
         inputs = self._readout.inputs
         inputs["s"][:], inputs["constant"][0] = s, self._constant
@@ -277,10 +294,8 @@ class RtiNmpc:
         return self._solve(s, None).action
 
 
-def _finite_vector(kind: str, values: ArrayLike, size: int) -> Vector:
+def _vector(kind: str, values: ArrayLike, size: int) -> Vector:
     vector = np.asarray(values, dtype=np.float64)
     if vector.shape != (size,):
         raise ControllerError(f"the {kind} must have {size} entries, not shape {vector.shape}")
-    if not np.isfinite(vector).all():
-        raise QpError(f"the {kind} is not finite: {vector}", status=f"{kind} not finite")
     return vector

@@ -53,7 +53,7 @@ class Block:
         """Flatten an unpacked value; raises ParameterError on a wrong shape, NaN or asymmetry."""
         try:
             array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ParameterError(f"θ block {self.name} holds no numbers: {value!r}") from error
         if array.shape != self.shape:
             raise ParameterError(
@@ -71,9 +71,10 @@ class Block:
         """Value of the block in its own shape from its packed entries."""
         if not self.symmetric:
             return packed.reshape(self.shape).copy()
-        matrix = np.zeros(self.shape)
-        matrix[np.triu_indices(self.dimension)] = packed
-        return matrix + np.triu(matrix, 1).T
+        matrix = np.empty(self.shape)
+        rows, columns = np.triu_indices(self.dimension)
+        matrix[rows, columns] = matrix[columns, rows] = packed
+        return matrix
 
 
 @dataclass(frozen=True)

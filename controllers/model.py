@@ -51,8 +51,10 @@ class Model:
         return np.array([quantity.nominal for quantity in self.parameters])
 
     def parameter_indices(self, names: tuple[str, ...]) -> list[int]:
-        """Positions of the named parameters in p; raises ModelError on a name the model lacks."""
+        """Positions of the named parameters in p; ModelError if one is unknown or doubled."""
         known = [quantity.name for quantity in self.parameters]
+        if len(set(names)) < len(names):
+            raise ModelError(f"model parameters must be named once each: {', '.join(names)}")
         for name in names:
             if name not in known:
                 raise ModelError(

@@ -14,7 +14,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.errors import ParameterError
+from controllers.errors import ModelError, ParameterError
 from controllers.layout import Layout
 from controllers.problem import Problem
 from controllers.storage import write_atomically
@@ -119,11 +119,14 @@ class Parameters:
         """
         document = _read_document(Path(path))
         blocks = document["theta"]
-        layout = Layout.of(
-            problem,
-            slack_weights="w_sigma" in blocks or "W_sigma" in blocks,
-            model_parameters=tuple(document.get("model_parameters", ())),
-        )
+        try:
+            layout = Layout.of(
+                problem,
+                slack_weights="w_sigma" in blocks or "W_sigma" in blocks,
+                model_parameters=tuple(document.get("model_parameters", ())),
+            )
+        except ModelError as error:
+            raise ParameterError(f"{path}: {error}") from error
         missing = [name for name in layout.slices if name not in blocks]
         unknown = [name for name in blocks if name not in layout]
         if missing or unknown:

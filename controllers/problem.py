@@ -30,8 +30,13 @@ class ScenarioLike(Protocol):
     hash: str
 
 
-def _frozen(values: ArrayLike) -> Vector:
-    array = np.array(values, dtype=np.float64)
+def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"problem: {name} holds no numbers: {values!r}") from error
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise ModelError(f"problem: {name} must be {size} finite numbers, not {array}")
     array.flags.writeable = False
     return array
 
@@ -74,10 +79,7 @@ class Problem:
             ("reference_state", n),
             ("reference_action", m),
         ):
-            array = _frozen(getattr(self, name))
-            if array.shape != (size,) or not np.isfinite(array).all():
-                raise ModelError(f"problem: {name} must be {size} finite numbers, not {array}")
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, _frozen(name, getattr(self, name), size))
         for kind in ("state", "action"):
             if not (getattr(self, f"{kind}_lower") < getattr(self, f"{kind}_upper")).all():
                 raise ModelError(f"problem: {kind}_lower must be below {kind}_upper everywhere")
@@ -88,6 +90,13 @@ class Problem:
                 f"problem: horizon {self.horizon} must be at least 1 and discount "
                 f"{self.discount} in (0, 1]"
             )
+        if not 0 < self.sampling_time < np.inf or self.substeps < 1:
+            raise ModelError(
+                f"problem: sampling_time {self.sampling_time} s must be positive and finite and "
+                f"substeps {self.substeps} at least 1"
+            )
+        if not np.isfinite(self.reference_cost):
+            raise ModelError(f"problem: reference_cost must be finite, not {self.reference_cost}")
 
     @property
     def n_states(self) -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from ctypes import c_double
+from ctypes import c_double, c_void_p
+from functools import cache
 from pathlib import Path
 
 import fmpy
@@ -16,6 +17,11 @@ from fmus.variables import BY_NAME, VARIABLES, Type, value_reference
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 
 
+@cache
+def _token(folder: Path) -> str:
+    return str(fmpy.read_model_description(str(folder)).guid)
+
+
 class Instance:
     """An instance of the shipped FMU; `messages` holds its log as (status, category, text)."""
 
@@ -23,7 +29,6 @@ class Instance:
         self.version = version
         self.exchange = exchange
         self.messages: list[tuple[int, str, str]] = []
-        description = fmpy.read_model_description(str(folder))
         kind = {
             (2, False): fmi2.FMU2Slave,
             (2, True): fmi2.FMU2Model,
@@ -31,7 +36,7 @@ class Instance:
             (3, True): fmi3.FMU3Model,
         }[version, exchange]
         self.fmu = kind(
-            guid=description.guid,
+            guid=_token(folder),
             unzipDirectory=str(folder),
             modelIdentifier="evaporator",
             instanceName="test",
@@ -49,6 +54,11 @@ class Instance:
 
     def _log3(self, _: object, status: int, category: bytes, text: bytes) -> None:
         self.messages.append((status, category.decode(), text.decode()))
+
+    @property
+    def handle(self) -> c_void_p:
+        """The instance pointer, for calls that fmpy's classes do not have."""
+        return c_void_p(self.fmu.component)
 
     def close(self) -> None:
         self.fmu.freeInstance()

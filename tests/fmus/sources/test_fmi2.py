@@ -1,0 +1,135 @@
+"""FMI 2.0: which function is allowed in which state, for co-simulation and model exchange."""
+
+from __future__ import annotations
+
+from ctypes import byref, c_double, c_int, c_size_t, c_uint32, c_void_p
+
+import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi2 import fmi2EventInfo
+
+DISCARD, ERROR = 2, 3
+STATES = ["instantiated", "initialization", "step", "event", "continuous", "terminated"]
+READABLE = {"initialization", "step", "event", "continuous", "terminated"}
+SETTABLE = {"instantiated", "initialization", "step", "event", "continuous"}
+EXCHANGE = {"instantiated", "initialization", "event", "continuous", "terminated"}
+ALL = set(STATES)
+
+none = (c_uint32 * 0)()
+zero = c_size_t(0)
+two = c_size_t(2)
+doubles = (c_double * 2)(25.0, 50.0)
+flag = c_int()
+
+# function → (states in which it is allowed, arguments that are right there)
+FUNCTIONS = {
+    "SetDebugLogging": (ALL, (0, zero, None)),
+    "SetupExperiment": ({"instantiated"}, (0, c_double(0), c_double(0), 0, c_double(0))),
+    "EnterInitializationMode": ({"instantiated"}, ()),
+    "ExitInitializationMode": ({"initialization"}, ()),
+    "Terminate": ({"step", "event", "continuous"}, ()),
+    "Reset": (ALL, ()),
+    "GetReal": (READABLE, (none, zero, None)),
+    "GetInteger": (READABLE, (none, zero, None)),
+    "GetBoolean": (READABLE, (none, zero, None)),
+    "GetString": (READABLE, (none, zero, None)),
+    "SetReal": (SETTABLE, (none, zero, None)),
+    "SetInteger": (SETTABLE, (none, zero, None)),
+    "SetBoolean": (SETTABLE, (none, zero, None)),
+    "SetString": (SETTABLE, (none, zero, None)),
+    "GetFMUstate": (ALL, (byref(c_void_p()),)),
+    "FreeFMUstate": (ALL, (byref(c_void_p()),)),
+    "GetDirectionalDerivative": (READABLE, (none, zero, none, zero, None, None)),
+    "EnterEventMode": ({"event", "continuous"}, ()),
+    "NewDiscreteStates": ({"event"}, (byref(fmi2EventInfo()),)),
+    "EnterContinuousTimeMode": ({"event"}, ()),
+    "CompletedIntegratorStep": ({"continuous"}, (1, byref(flag), byref(flag))),
+    "SetTime": ({"event", "continuous"}, (c_double(0),)),
+    "SetContinuousStates": ({"continuous"}, (doubles, two)),
+    "GetDerivatives": ({"event", "continuous", "terminated"}, (doubles, two)),
+    "GetEventIndicators": (EXCHANGE - {"instantiated"}, (doubles, zero)),
+    "GetContinuousStates": (EXCHANGE - {"instantiated"}, (doubles, two)),
+    "GetNominalsOfContinuousStates": (EXCHANGE - {"initialization"}, (doubles, two)),
+    "DoStep": ({"step"}, (c_double(0), c_double(60), 1)),
+    "CancelStep": (set(), ()),
+    "GetRealStatus": ({"step", "terminated"}, (2, byref(c_double()))),
+    "GetBooleanStatus": ({"step", "terminated"}, (3, byref(flag))),
+}
+CO_SIMULATION_ONLY = {"DoStep", "CancelStep", "GetRealStatus", "GetBooleanStatus"}
+EXCHANGE_ONLY = {
+    "EnterEventMode", "NewDiscreteStates", "EnterContinuousTimeMode", "CompletedIntegratorStep",
+    "SetTime", "SetContinuousStates", "GetDerivatives", "GetEventIndicators",
+    "GetContinuousStates", "GetNominalsOfContinuousStates",
+}  # fmt: skip
+
+
+def bring_to(open_fmu, state: str, exchange: bool):
+    instance = open_fmu(2, exchange=exchange)
+    if state == "instantiated":
+        instance.fmu.setupExperiment()
+        return instance
+    instance.enter_initialisation()
+    if state == "initialization":
+        return instance
+    instance.fmu.exitInitializationMode()
+    if state == "continuous":
+        instance.start_continuous_time()
+    if state == "terminated":
+        instance.fmu.terminate()
+    return instance
+
+
+@pytest.mark.parametrize(
+    ("state", "exchange"),
+    [(s, False) for s in STATES if s not in ("event", "continuous")]
+    + [(s, True) for s in STATES if s != "step"],
+)
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_state_machine(open_fmu, function: str, state: str, exchange: bool) -> None:
+    states, arguments = FUNCTIONS[function]
+    offered = function not in (CO_SIMULATION_ONLY if exchange else EXCHANGE_ONLY)
+    instance = bring_to(open_fmu, state, exchange)
+    status = getattr(instance.fmu.dll, f"fmi2{function}")(instance.handle, *arguments)
+    if offered and state in states:
+        assert status == 0
+        assert instance.messages == []
+    else:
+        assert status == ERROR
+        assert [message[0] for message in instance.messages] == [ERROR]
+        assert f"fmi2{function}" in instance.messages[0][2]
+
+
+def test_initialisation_needs_an_experiment(open_fmu) -> None:
+    instance = open_fmu(2)
+    with pytest.raises(FMICallException):
+        instance.fmu.enterInitializationMode()
+    assert "call fmi2SetupExperiment first" in instance.messages[-1][2]
+
+
+@pytest.mark.parametrize("kind", ["", "Real", "Integer", "Boolean", "String"])
+def test_there_is_no_pending_step_to_ask_for(open_fmu, kind: str) -> None:
+    instance = open_fmu(2).initialise()
+    status = getattr(instance.fmu.dll, f"fmi2Get{kind}Status")(instance.handle, 0, None)
+    assert status == DISCARD
+    assert "doStep is synchronous" in instance.messages[-1][2]
+
+
+def test_last_successful_time(open_fmu) -> None:
+    instance = open_fmu(2).initialise()
+    instance.step(0.0, 90.0)
+    time = c_double()
+    instance.fmu.dll.fmi2GetRealStatus(instance.handle, 2, byref(time))
+    assert time.value == 90.0
+
+
+@pytest.mark.parametrize("function", ["SetRealInputDerivatives", "GetRealOutputDerivatives"])
+def test_interpolation_is_refused_with_a_message(open_fmu, function: str) -> None:
+    instance = open_fmu(2).initialise()
+    call = getattr(instance.fmu.dll, f"fmi2{function}")
+    assert call(instance.handle, none, c_size_t(0), None, None) == ERROR
+    assert function in instance.messages[-1][2]
+
+
+def test_versions_are_told(open_fmu) -> None:
+    fmu = open_fmu(2).fmu
+    assert (fmu.getVersion(), fmu.getTypesPlatform()) == ("2.0", "default")

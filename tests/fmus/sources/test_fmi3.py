@@ -1,0 +1,178 @@
+"""FMI 3.0: which function is allowed in which state, and what the FMU does not offer."""
+
+from __future__ import annotations
+
+from ctypes import byref, c_bool, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
+
+import pytest
+
+ERROR = 3
+STATES = ["instantiated", "initialization", "step", "event", "continuous", "terminated"]
+READABLE = {"initialization", "step", "event", "continuous", "terminated"}
+SETTABLE = {"instantiated", "initialization", "step", "event", "continuous"}
+ALL = set(STATES)
+
+none = (c_uint32 * 0)()
+zero = c_size_t(0)
+two = c_size_t(2)
+doubles = (c_double * 2)(25.0, 50.0)
+flag = c_bool()
+number = c_double()
+off, on = c_bool(False), c_bool(True)
+EMPTY = (none, zero, None, zero)
+
+# function → (states in which it is allowed, arguments that are right there)
+FUNCTIONS = {
+    "SetDebugLogging": (ALL, (off, zero, None)),
+    "EnterInitializationMode": ({"instantiated"}, (off, number, number, off, number)),
+    "ExitInitializationMode": ({"initialization"}, ()),
+    "EnterEventMode": ({"continuous"}, ()),
+    "Terminate": ({"step", "event", "continuous"}, ()),
+    "Reset": (ALL, ()),
+    "GetFMUState": (ALL, (byref(c_void_p()),)),
+    "FreeFMUState": (ALL, (byref(c_void_p()),)),
+    "GetDirectionalDerivative": (READABLE, (none, zero, none, zero, None, zero, None, zero)),
+    "GetAdjointDerivative": (READABLE, (none, zero, none, zero, None, zero, None, zero)),
+    "UpdateDiscreteStates": ({"event"}, (*[byref(flag)] * 5, byref(number))),
+    "EvaluateDiscreteStates": ({"initialization", "event"}, ()),
+    "EnterContinuousTimeMode": ({"event"}, ()),
+    "CompletedIntegratorStep": ({"continuous"}, (on, byref(flag), byref(flag))),
+    "SetTime": ({"event", "continuous"}, (number,)),
+    "SetContinuousStates": ({"continuous"}, (doubles, two)),
+    "GetContinuousStateDerivatives": (READABLE, (doubles, two)),
+    "GetEventIndicators": (READABLE, (doubles, zero)),
+    "GetContinuousStates": (READABLE, (doubles, two)),
+    "GetNominalsOfContinuousStates": (ALL, (doubles, two)),
+    "GetNumberOfEventIndicators": (ALL, (byref(c_size_t()),)),
+    "GetNumberOfContinuousStates": (ALL, (byref(c_size_t()),)),
+    "DoStep": ({"step"}, (number, c_double(60), on, *[byref(flag)] * 3, byref(number))),
+}
+TYPES = ["Float32", "Float64", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64",
+         "UInt64", "Boolean", "String"]  # fmt: skip
+FUNCTIONS |= {f"Get{kind}": (READABLE, EMPTY) for kind in TYPES}
+FUNCTIONS |= {f"Set{kind}": (SETTABLE, EMPTY) for kind in TYPES}
+FUNCTIONS["GetBinary"] = (READABLE, (none, zero, None, None, zero))
+FUNCTIONS["SetBinary"] = (SETTABLE, (none, zero, None, None, zero))
+FUNCTIONS["GetClock"] = (READABLE, (none, zero, None))
+FUNCTIONS["SetClock"] = (SETTABLE, (none, zero, None))
+CO_SIMULATION_ONLY = {"DoStep"}
+EXCHANGE_ONLY = {
+    "EnterEventMode", "UpdateDiscreteStates", "EnterContinuousTimeMode", "SetTime",
+    "CompletedIntegratorStep", "SetContinuousStates", "GetContinuousStateDerivatives",
+    "GetEventIndicators", "GetContinuousStates", "GetNominalsOfContinuousStates",
+    "GetNumberOfEventIndicators", "GetNumberOfContinuousStates",
+}  # fmt: skip
+
+
+def bring_to(open_fmu, state: str, exchange: bool):
+    instance = open_fmu(3, exchange=exchange)
+    if state == "instantiated":
+        return instance
+    instance.enter_initialisation()
+    if state == "initialization":
+        return instance
+    instance.fmu.exitInitializationMode()
+    if state == "continuous":
+        instance.start_continuous_time()
+    if state == "terminated":
+        instance.fmu.terminate()
+    return instance
+
+
+@pytest.mark.parametrize(
+    ("state", "exchange"),
+    [(s, False) for s in STATES if s not in ("event", "continuous")]
+    + [(s, True) for s in STATES if s != "step"],
+)
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_state_machine(open_fmu, function: str, state: str, exchange: bool) -> None:
+    states, arguments = FUNCTIONS[function]
+    offered = function not in (CO_SIMULATION_ONLY if exchange else EXCHANGE_ONLY)
+    instance = bring_to(open_fmu, state, exchange)
+    number.value = 0.0
+    status = getattr(instance.fmu.dll, f"fmi3{function}")(instance.handle, *arguments)
+    if offered and state in states:
+        assert status == 0
+        assert instance.messages == []
+    else:
+        assert status == ERROR
+        assert [message[0] for message in instance.messages] == [ERROR]
+        assert f"fmi3{function}" in instance.messages[0][2]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        ("EnterConfigurationMode", ()),
+        ("ExitConfigurationMode", ()),
+        ("EnterStepMode", ()),
+        ("GetNumberOfVariableDependencies", (1, byref(c_size_t()))),
+        ("GetVariableDependencies", (1, None, None, None, None, zero)),
+        ("GetOutputDerivatives", (none, zero, None, None, zero)),
+        ("ActivateModelPartition", (1, number)),
+        ("GetIntervalDecimal", (none, zero, None, None)),
+        ("GetIntervalFraction", (none, zero, None, None, None)),
+        ("GetShiftDecimal", (none, zero, None)),
+        ("GetShiftFraction", (none, zero, None, None)),
+        ("SetIntervalDecimal", (none, zero, None)),
+        ("SetIntervalFraction", (none, zero, None, None)),
+        ("SetShiftDecimal", (none, zero, None)),
+        ("SetShiftFraction", (none, zero, None, None)),
+    ],
+)
+def test_what_is_not_offered_is_refused_with_a_message(open_fmu, function, arguments) -> None:
+    instance = open_fmu(3).initialise()
+    call = getattr(instance.fmu.dll, f"fmi3{function}")
+    assert call(instance.handle, *arguments) == ERROR
+    assert instance.messages == [
+        (ERROR, "logStatusError", f"fmi3{function}: not offered by this FMU.")
+    ]
+    assert call(None, *arguments) == ERROR
+
+
+@pytest.mark.parametrize("option", ["eventModeUsed", "requiredIntermediateVariables"])
+def test_event_mode_and_intermediate_update_are_refused(open_fmu, option: str) -> None:
+    instance = open_fmu(3)
+    handle = instance.fmu.component
+    value = True if option == "eventModeUsed" else [1]
+    with pytest.raises(Exception, match="Failed to instantiate"):
+        instance.fmu.instantiate(logMessage=instance._log3, **{option: value})
+    instance.fmu.component = handle
+    assert "not offered" in instance.messages[-1][2]
+
+
+def test_scheduled_execution_is_refused_with_a_message(open_fmu) -> None:
+    instance = open_fmu(3)
+    call = instance.fmu.dll.fmi3InstantiateScheduledExecution
+    call.restype = c_void_p
+    callbacks = instance.fmu.logMessage, *(kind() for kind in call.argtypes[-3:])
+    assert call(b"a", b"b", b"", off, off, None, *callbacks) is None
+    assert "scheduled execution is not offered" in instance.messages[-1][2]
+
+
+def test_last_successful_time_of_a_refused_step(open_fmu) -> None:
+    instance = open_fmu(3).initialise(stop=60.0)
+    time = c_double()
+    flags = [byref(c_bool()) for _ in range(3)]
+    arguments = (c_double(0), c_double(61), on, *flags, byref(time))
+    assert instance.fmu.dll.fmi3DoStep(instance.handle, *arguments) == ERROR
+    assert time.value == 0.0
+
+
+def test_time_is_a_variable(open_fmu) -> None:
+    instance = open_fmu(3).initialise(start=30.0)
+    instance.step(30.0, 60.0)
+    assert instance.get("time") == [90.0]
+
+
+def test_seed_survives_all_64_bits(open_fmu) -> None:
+    instance = open_fmu(3)
+    for seed in (0, 2**32, 2**64 - 1):
+        instance.set(seed=seed)
+        value, status = (c_uint64 * 1)(), c_int()
+        instance.enter_initialisation()
+        status = instance.fmu.dll.fmi3GetUInt64(
+            instance.handle, (c_uint32 * 1)(29), c_size_t(1), value, c_size_t(1)
+        )
+        assert (status, value[0]) == (0, seed)
+        instance.fmu.reset()

@@ -20,7 +20,6 @@ SIGNAL = "cosim.Signal"
 
 TIME = "time"
 SAMPLE = "sample"
-UPDATE = "update"
 
 
 class Stream:

@@ -3,28 +3,82 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import isfinite, nan, sqrt
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from cosim.protocols import Controller
 from cosim.recording.channels import Channel, escaped
 from cosim.recording.layout import framed, sample_axis, series, union
-from cosim.recording.palette import SERIES, packed_all
-from cosim.recording.policy_map import ENTITY as POLICY
+from cosim.recording.palette import SERIES, packed, packed_all
 from cosim.recording.policy_map import PolicyMap
-from cosim.recording.stream import SAMPLE, UPDATE, Stream, line, mark
+from cosim.recording.stream import SAMPLE, Stream, line, mark
 from cosim.recording.text import drawable
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
-_TOGETHER = ("td_error", "td_error_mean")
+WINDOW = 10_000
+ROWS = 64
+_THETA = "theta "
+_TOGETHER = {
+    "cost per sample": ("J", "greedy_J"),
+    "TD error": ("td_error", "td_error_mean"),
+    "smallest eigenvalue": ("smallest_eigenvalue",),
+    "violating share": ("greedy_violating_share",),
+}
+
+
+class Parameters(Protocol):
+    """θ with its layout; `controllers.parameters.Parameters` is one."""
+
+    @property
+    def theta(self) -> Array:
+        """Flat vector, (n_θ,)."""
+
+    @property
+    def layout(self) -> Any:
+        """Its `slices` give each block's place in θ, its `labels` a name for each entry."""
+
+    @property
+    def hash(self) -> str:
+        """Hash of layout and values."""
+
+
+class TrainingRun(Protocol):
+    """What is trained; `learning.training.Run` is one."""
+
+    @property
+    def algorithm(self) -> str:
+        """Name of the algorithm."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """Scenario trained on."""
+
+    @property
+    def samples(self) -> int:
+        """Budget in samples."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of disturbances and exploration."""
+
+    @property
+    def configuration(self) -> Any:
+        """Pydantic model of the hyperparameters."""
 
 
 class TrainingRecorder:
-    """A `.rrd` file of a training run; the training loop hands it blocks of updates.
+    """A `.rrd` file of a training run; the training loop hands it the rows of its log.
+
+    Signals: `theta/<block>`, each column of the log, `td_error_mean` (root mean square over the
+    preceding 10 000 samples, the average of paper.tex, fig. nmpc_learn), and, where a row has a
+    greedy evaluation, `policy/<input>` and `policy/value` on a grid of the first two states.
 
     Raises
     ------
@@ -35,133 +89,134 @@ class TrainingRecorder:
         self.path = Path(path)
         self._stream: Stream | None = None
 
-    def start(
-        self,
-        scenario: Scenario,
-        algorithm: str,
-        blocks: Mapping[str, Sequence[str]],
-        theta: Array,
-        samples: int,
-        properties: Mapping[str, object],
-    ) -> None:
-        """Open the file.
-
-        `blocks` names the blocks of θ in order and the entries of each; `theta` (n_θ,) is θ₀, from
-        which the plots count; `samples` is the budget; `properties` (seed, hashes, settings) are
-        shown as they are.
-        """
-        self._scenario, self._samples = scenario, samples
-        self._start = np.array(theta)
-        ends = np.cumsum([len(entries) for entries in blocks.values()])
-        self._slices = {
-            name: slice(int(end) - len(entries), int(end))
-            for (name, entries), end in zip(blocks.items(), ends, strict=True)
-        }
-        self._blocks = {name: Channel("theta", name, "", SERIES[0]) for name in blocks}
+    def start(self, run: TrainingRun, parameters: Parameters) -> None:
+        """Open the file; the plots of θ count from these parameters."""
+        self._samples, self._start = run.samples, parameters.theta.copy()
+        self._slices = parameters.layout.slices
+        self._blocks = {name: Channel("theta", name, "", SERIES[0]) for name in self._slices}
         self._scalars: dict[str, Channel] = {}
+        self._rows: list[Mapping[str, float]] = []
+        self._thetas: list[Array] = []
+        self._recent: list[tuple[float, float]] = []
         self._map: PolicyMap | None = None
-        name = f"{algorithm} on {scenario.name}"
+        scenario, name = run.scenario, f"{run.algorithm} on {run.scenario.name}"
         stream = self._stream = Stream(self.path, self._blueprint(), name)
-        described: dict[str, object] = {
-            "algorithm": algorithm,
+        properties = {
+            "algorithm": run.algorithm,
             "scenario": scenario.name,
             "scenario_hash": scenario.hash,
-            **properties,
+            "seed": run.seed,
+            "samples": run.samples,
+            "theta_hash": parameters.hash,
+            **run.configuration.model_dump(mode="json"),
         }
-        stream.properties("run", described)
-        facts = "\n".join(f"| {key.replace('_', ' ')} | {v} |" for key, v in described.items())
+        stream.properties("run", properties)
+        facts = "\n".join(f"| {key.replace('_', ' ')} | {v} |" for key, v in properties.items())
         text = f"# {name}\n\n{scenario.description}\n\n| training | |\n|---|---|\n{facts}\n"
         document = rr.TextDocument(drawable(text), media_type=rr.MediaType.MARKDOWN)
         stream.static("about", document)
-        for block, entries in blocks.items():
-            stream.static(f"theta/{escaped(block)}", mark(f"theta/{block}", ""))
-            colors = packed_all([SERIES[i % len(SERIES)] for i in range(len(entries))])
-            names = [drawable(entry) for entry in entries]
-            stream.static(
-                f"increment/{escaped(block)}",
-                rr.SeriesLines(names=names, colors=colors, widths=np.full(len(entries), 1.5)),
-            )
+        if len(scenario.plant.states) >= 2 and len(scenario.plant.actions) >= 2:
+            self._map = PolicyMap(stream, scenario)
+        for block, entries in self._slices.items():
+            _declare_block(stream, block, parameters.layout.labels[entries])
 
     def record(
-        self,
-        updates: NDArray[np.int64],
-        samples: NDArray[np.int64],
-        theta: Array,
-        scalars: Mapping[str, Array],
+        self, row: Mapping[str, float], parameters: Parameters, controller: Controller
     ) -> None:
-        """Append K updates: their numbers, the samples seen so far, θ (K, n_θ) after each.
-
-        `scalars` are further columns (K,) by name, NaN where an update has none: `td_error`,
-        `td_error_mean`, `smallest_eigenvalue`, `J`, ….
-        """
-        stream = self._open
-        times = [
-            rr.TimeColumn(SAMPLE, sequence=samples),
-            rr.TimeColumn(UPDATE, sequence=updates),
-        ]
-        for name, entries in self._slices.items():
-            values, increments = theta[:, entries], (theta - self._start)[:, entries]
-            stream.scalars(f"theta/{escaped(name)}", times, values)
-            stream.scalars(f"increment/{escaped(name)}", times, increments)
-            self._blocks[name] = self._blocks[name].with_values(increments)
-        for name, values in scalars.items():
-            if name not in self._scalars:
-                color = SERIES[len(self._scalars) % len(SERIES)]
-                channel = self._scalars[name] = Channel("scalars", name, "", color)
-                stream.static(channel.entity, mark(name, ""), line(name.replace("_", " "), color))
-            self._scalars[name] = self._scalars[name].with_values(values)
-            stream.scalars(self._scalars[name].entity, times, values)
-
-    def record_policy(
-        self, update: int, sample: int, x: Array, y: Array, actions: Array, values: Array
-    ) -> None:
-        """Append the policy (ny, nx, 2) and value (ny, nx) on a grid of the first two states.
-
-        The grid x (nx,), y (ny,) must be the same in every call.
-        """
-        if self._map is None:
-            self._map = PolicyMap(self._open, self._scenario, x, y)
-        self._map.send(update, sample, actions, values)
+        """Append a row of the log, with θ after it and a controller that has this θ."""
+        if self._stream is None:
+            raise RuntimeError("TrainingRecorder.start must come first, and close last")
+        scalars = {name: value for name, value in row.items() if not name.startswith(_THETA)}
+        self._rows.append({**scalars, "td_error_mean": self._td_error_mean(row)})
+        self._thetas.append(parameters.theta.copy())
+        if self._map is not None and isfinite(row.get("greedy_J", nan)):
+            self._map.send(int(row["samples"]), controller)
+        if len(self._rows) >= ROWS:
+            self._send()
 
     def close(self) -> None:
         """Send the layout with the ranges that were needed, and give the file its name."""
         if self._stream is not None:
+            self._send()
             self._stream.blueprint(self._blueprint())
             self._stream.close()
             self._stream = None
 
-    @property
-    def _open(self) -> Stream:
-        if self._stream is None:
-            raise RuntimeError("TrainingRecorder.start must come first, and close last")
-        return self._stream
+    def _td_error_mean(self, row: Mapping[str, float]) -> float:
+        """Root mean square over the rows of the preceding `WINDOW` samples."""
+        number = row["samples"]
+        self._recent.append((number, row.get("td_error", nan)))
+        self._recent = [entry for entry in self._recent if entry[0] > number - WINDOW]
+        squares = [error**2 for _, error in self._recent if isfinite(error)]
+        return sqrt(sum(squares) / len(squares)) if squares else nan
+
+    def _send(self) -> None:
+        if self._stream is None or not self._rows:
+            return
+        stream, rows, theta = self._stream, self._rows, np.array(self._thetas)
+        times = [rr.TimeColumn(SAMPLE, sequence=[int(row["samples"]) for row in rows])]
+        for name, entries in self._slices.items():
+            increments = (theta - self._start)[:, entries]
+            stream.scalars(f"theta/{escaped(name)}", times, theta[:, entries])
+            stream.scalars(f"increment/{escaped(name)}", times, increments)
+            self._blocks[name] = self._blocks[name].with_values(increments)
+        for name in rows[0]:
+            values = np.array([row[name] for row in rows], dtype=np.float64)
+            if name not in self._scalars:
+                color = SERIES[len(self._scalars) % len(SERIES)]
+                channel = self._scalars[name] = Channel("log", name, "", color)
+                stream.static(channel.entity, mark(name, ""), _line(name, color))
+                if np.isnan(values).any():
+                    # Lines break at NaN: what is measured now and then needs points to be seen.
+                    points = rr.SeriesPoints(colors=packed(color), marker_sizes=4.0)
+                    stream.static(channel.entity, points)
+            self._scalars[name] = self._scalars[name].with_values(values)
+            stream.scalars(self._scalars[name].entity, times, values)
+        self._rows, self._thetas = [], []
 
     def _blueprint(self) -> rrb.Blueprint:
         axis = sample_axis(self._samples)
-        theta = rrb.Grid(
-            *(
-                series(f"increment of {name}", [f"/increment/{escaped(name)}"], axis, c.window())
-                for name, c in self._blocks.items()
-            ),
-            grid_columns=2,
-        )
-        together = [self._scalars[name] for name in _TOGETHER if name in self._scalars]
-        alone = [c for name, c in self._scalars.items() if name not in _TOGETHER]
-        views: list[rrb.View] = []
-        if together:
-            entities = [f"/{channel.entity}" for channel in together]
-            views.append(series("TD error", entities, axis, union(together), legend=True))
-        for channel in alone:
-            name = channel.name.replace("_", " ")
-            views.append(series(name, [f"/{channel.entity}"], axis, channel.window()))
+        increments = [
+            series(f"increment of {name}", [f"/increment/{escaped(name)}"], axis, c.window())
+            for name, c in self._blocks.items()
+        ]
+        grouped = {
+            title: [self._scalars[name] for name in names if name in self._scalars]
+            for title, names in _TOGETHER.items()
+        }
+        shown = {channel.name for channels in grouped.values() for channel in channels}
+        others = [[channel] for name, channel in self._scalars.items() if name not in shown]
+        figures = [_view(title, channels, axis) for title, channels in grouped.items() if channels]
+        rest = [_view(channels[0].name, channels, axis) for channels in others]
         about = rrb.TextDocumentView(name="about this training", origin="/about")
-        right: list[rrb.View] = [about]
-        if self._map is not None:
-            x_range, y_range = self._map.bounds
-            bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
-            origin = f"/{POLICY}/map"
-            right.insert(
-                0, rrb.Spatial2DView(name="policy and value", origin=origin, visual_bounds=bounds)
-            )
-        columns = [theta, *([rrb.Vertical(*views)] if views else []), rrb.Vertical(*right)]
+        more = rrb.Tabs(about, *([rrb.Grid(*rest, name="the rest of the log")] if rest else []))
+        right = [more] if self._map is None else [self._map.view(), more]
+        columns = [
+            rrb.Grid(*increments, grid_columns=2),
+            *([rrb.Vertical(*figures)] if figures else []),
+            rrb.Vertical(*right),
+        ]
         return framed(rrb.Horizontal(*columns), SAMPLE)
+
+
+def _declare_block(stream: Stream, block: str, labels: Sequence[str]) -> None:
+    stream.static(f"theta/{escaped(block)}", mark(f"theta/{block}", ""))
+    stream.static(
+        f"increment/{escaped(block)}",
+        rr.SeriesLines(
+            names=[drawable(label) for label in labels],
+            colors=packed_all([SERIES[i % len(SERIES)] for i in range(len(labels))]),
+            widths=np.full(len(labels), 1.5),
+        ),
+    )
+
+
+def _line(name: str, color: str) -> rr.SeriesLines:
+    return line(name.replace("_", " "), color)
+
+
+def _view(title: str, channels: Sequence[Channel], axis: rrb.TimeAxis) -> rrb.TimeSeriesView:
+    entities = [f"/{channel.entity}" for channel in channels]
+    return series(
+        title.replace("_", " "), entities, axis, union(channels), legend=len(channels) > 1
+    )

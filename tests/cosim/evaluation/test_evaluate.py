@@ -1,0 +1,171 @@
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from loop import Proportional, hold, proportional
+from workers import LEDGER, mortal, noting
+
+from cosim import FmuPlant, evaluate, simulate
+from cosim.errors import EvaluationError
+
+BOTH = {"proportional": proportional, "hold": hold}
+
+
+def contents(evaluation):
+    return (
+        evaluation.to_csv(),
+        evaluation.to_parquet(),
+        json.dumps(evaluation.summary()["controllers"]),
+    )
+
+
+@pytest.fixture
+def ledger(tmp_path, monkeypatch):
+    path = tmp_path / "ledger"
+    monkeypatch.setenv(LEDGER, str(path))
+    return lambda: path.read_text().split()
+
+
+def test_rows_are_what_single_runs_give(paper):
+    evaluation = evaluate(paper, BOTH, 3, 50)
+    with FmuPlant(paper) as plant:
+        alone = simulate(plant, Proportional(paper), 50, 2).summary()
+    row = next(r for r in evaluation.rows if r["controller"] == "proportional" and r["seed"] == 2)
+    assert len(evaluation.rows) == 6
+    for name in ("economic_cost", "mean_violation", "violating_share", "J", "failures"):
+        assert row[name] == alone[name]
+
+
+def test_a_controller_against_itself_differs_by_nothing(paper):
+    evaluation = evaluate(paper, {"a": proportional, "b": proportional}, 4, 50)
+    (comparison,) = evaluation.summary()["comparisons"]
+    for estimate in (*comparison["differences"].values(), comparison["economic_gain"]):
+        assert estimate == {"value": 0.0, "t": (0.0, 0.0), "bootstrap": (0.0, 0.0)}
+
+
+def test_gain_and_gap_are_taken_against_naive_and_optimal(paper):
+    named = {"optimal": proportional, "naive": hold, "mine": proportional}
+    evaluation = evaluate(paper, named, 3, 100)
+    summary = evaluation.summary()
+    gap = {name: row["gap_closed"]["value"] for name, row in summary["controllers"].items()}
+    assert gap == pytest.approx({"optimal": 1.0, "naive": 0.0, "mine": 1.0})
+    cost = {name: np.mean(evaluation.column(name, "J")) for name in named}
+    gain = next(
+        c["economic_gain"]["value"]
+        for c in summary["comparisons"]
+        if (c["controller"], c["reference"]) == ("mine", "naive")
+    )
+    assert gain == pytest.approx(1.0 - cost["mine"] / cost["naive"], rel=1e-12)
+
+
+def test_parquet_holds_the_table_of_the_csv(paper):
+    evaluation = evaluate(paper, BOTH, 2, 20)
+    table = pq.read_table(io.BytesIO(evaluation.to_parquet())).to_pylist()
+    lines = evaluation.to_csv().splitlines()
+    header = lines[0].split(",")
+    assert [row["J"] for row in table] == [
+        float(line.split(",")[header.index("J")]) for line in lines[1:]
+    ]
+    assert list(table[0]) == header
+
+
+def test_two_workers_give_the_bytes_of_one(paper):
+    assert contents(evaluate(paper, BOTH, 4, 40, jobs=2)) == contents(evaluate(paper, BOTH, 4, 40))
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_of_two_processes_gives_the_bytes_of_one(paper):
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        there = evaluate(paper, BOTH, 4, 40, scheduler=cluster.scheduler_address)
+    assert contents(there) == contents(evaluate(paper, BOTH, 4, 40))
+
+
+def test_a_finished_evaluation_is_read_not_run_again(paper, tmp_path, ledger):
+    first = evaluate(paper, {"noting": noting}, 3, 20, folder=tmp_path / "out")
+    runs = len(ledger())
+    again = evaluate(paper, {"noting": noting}, 3, 20, folder=tmp_path / "out")
+    assert (runs, len(ledger())) == (4, 4)
+    assert contents(first) == contents(again)
+    assert first.timing_csv() == again.timing_csv()
+
+
+def test_more_seeds_run_only_what_is_new(paper, tmp_path, ledger):
+    evaluate(paper, {"noting": noting}, 2, 20, folder=tmp_path / "out")
+    evaluate(paper, {"noting": noting}, 4, 20, folder=tmp_path / "out")
+    assert len(ledger()) == 5
+
+
+def test_another_scenario_takes_nothing_from_the_store(paper, tmp_path, ledger):
+    evaluate(paper, {"noting": noting}, 2, 20, folder=tmp_path / "out")
+    dearer = paper.replace({"penalty": {"linear": [1.01e5, 1e5]}})
+    evaluate(dearer, {"noting": noting}, 2, 20, folder=tmp_path / "out")
+    assert len(ledger()) == 6
+
+
+def test_a_damaged_unit_is_named(paper, tmp_path):
+    evaluate(paper, {"hold": hold}, 1, 5, folder=tmp_path)
+    for path in (tmp_path / ".units").iterdir():
+        path.write_text("{")
+    with pytest.raises(EvaluationError, match=r"finished work unit '.*\.units.*' is damaged"):
+        evaluate(paper, {"hold": hold}, 1, 5, folder=tmp_path)
+
+
+def test_a_killed_worker_loses_nothing(paper, tmp_path, ledger):
+    broken = evaluate(paper, {"mortal": mortal}, 5, 20, folder=tmp_path / "out", jobs=2)
+    assert len(set(ledger())) > 2, "no worker was replaced"
+    whole = evaluate(paper, {"mortal": mortal}, 5, 20)
+    assert contents(broken) == contents(whole)
+
+
+def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
+    here = Path(__file__).parent
+    paths = os.pathsep.join(map(str, (here, here.parent)))
+    environment = os.environ | {LEDGER: str(tmp_path / "ledger"), "PYTHONPATH": paths}
+
+    def command(out):
+        arguments = f"evaluate -c workers:slow --seeds 6 --steps 100 --jobs 1 --out {out}"
+        return [sys.executable, "-m", "cosim", *arguments.split()]
+
+    out = tmp_path / "out"
+    with subprocess.Popen(command(out), env=environment, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 60
+        while len(list(out.glob(".units/*.json"))) < 2:
+            assert process.poll() is None, "the run ended before it could be killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    kept = {path: path.stat().st_mtime_ns for path in out.glob(".units/*.json")}
+    assert 2 <= len(kept) < 7
+    assert not (out / "evaluation.csv").exists()
+    subprocess.run(command(out), env=environment, check=True, capture_output=True)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    subprocess.run(command(tmp_path / "whole"), env=environment, check=True, capture_output=True)
+    for name in ("evaluation.csv", "evaluation.parquet"):
+        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("controllers", "seeds", "steps", "message"),
+    [
+        ({}, 1, 1, "no controller"),
+        (BOTH, 0, 1, "no seed"),
+        (BOTH, [1, 1], 1, "seeds must be distinct"),
+        (BOTH, [-1], 1, "not negative"),
+        (BOTH, 1, 0, "steps must be at least 1, not 0"),
+    ],
+)
+def test_a_malformed_request_is_refused(paper, controllers, seeds, steps, message):
+    with pytest.raises(EvaluationError, match=message):
+        evaluate(paper, controllers, seeds, steps)

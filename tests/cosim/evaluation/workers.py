@@ -1,0 +1,71 @@
+"""Tasks and controllers that ruin their worker, at module level so that workers can import them."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from loop import Proportional
+
+LEDGER = "COSIM_TEST_LEDGER"
+
+
+def square(number):
+    return number * number
+
+
+def refuse_three(number):
+    if number == 3:
+        raise ValueError("three")
+    return number
+
+
+def die(_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_once(task):
+    """Square a number; the first process to come here is killed."""
+    number, marker = task
+    try:
+        Path(marker).touch(exist_ok=False)
+    except FileExistsError:
+        return number * number
+    # The others' results must be in before the pool breaks, or nothing is there to be lost.
+    time.sleep(0.3)
+    return die(number)
+
+
+class Noting(Proportional):
+    """Writes a line to the ledger for every run, before it starts."""
+
+    def reset(self):
+        with Path(os.environ[LEDGER]).open("a") as ledger:
+            ledger.write(f"{os.getpid()}\n")
+        super().reset()
+
+
+def noting(scenario):
+    return Noting(scenario)
+
+
+class Slow(Noting):
+    def prepare(self):
+        time.sleep(1e-3)
+
+
+def slow(scenario):
+    return Slow(scenario)
+
+
+class Mortal(Noting):
+    """The third run of all kills the worker that does it."""
+
+    def reset(self):
+        super().reset()
+        if len(Path(os.environ[LEDGER]).read_text().split()) == 3:
+            die(None)
+
+
+def mortal(scenario):
+    return Mortal(scenario)

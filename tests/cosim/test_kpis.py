@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+from loop import Hold, Proportional
+
+from cosim import FmuPlant, simulate
+from cosim.kpis import displaced, indicators, input_effort, settling_time
+from cosim.trajectory import Signal, Trajectory, signal_names
+
+
+def run_with_states(scenario, time, states):
+    columns = {name: np.zeros(len(time)) for name in signal_names(scenario)}
+    columns["time"] = time
+    columns |= dict(zip(scenario.plant.states, states.T, strict=True))
+    signals = {name: Signal(name, "", values) for name, values in columns.items()}
+    return Trajectory(scenario, signals, ["solved"] * len(time))
+
+
+def test_input_effort_is_the_share_of_the_range_moved_per_sample():
+    actions = np.array([[100.0, 200.0], [130.0, 200.0], [130.0, 170.0]])
+    effort = input_effort(actions, np.array([100.0, 100.0]), np.array([400.0, 400.0]))
+    assert effort == pytest.approx((0.1 + 0.1) / 2)
+
+
+def test_one_sample_has_no_input_effort():
+    assert input_effort(np.ones((1, 2)), np.zeros(2), np.ones(2)) == 0.0
+
+
+def test_a_first_order_lag_settles_into_five_per_cent_after_three_time_constants(paper):
+    time = np.arange(2000) * 1.0
+    states = np.exp(-time / 50.0)[:, None] * np.array([2.0, -3.0]) + np.array([25.0, 50.0])
+    assert settling_time(run_with_states(paper, time, states)) == pytest.approx(
+        50.0 * np.log(20.0), abs=1.0
+    )
+
+
+def test_the_slowest_state_decides_the_settling_time(paper):
+    time = np.arange(4000) * 1.0
+    states = np.stack([np.exp(-time / 10.0), np.exp(-time / 200.0)], axis=1)
+    assert settling_time(run_with_states(paper, time, states)) == pytest.approx(
+        200.0 * np.log(20.0), abs=1.0
+    )
+
+
+def test_a_state_that_still_drifts_has_not_settled(paper):
+    time = np.arange(100) * 1.0
+    states = np.stack([np.exp(-time / 5.0), 1.0 - time / 100.0], axis=1)
+    assert np.isnan(settling_time(run_with_states(paper, time, states)))
+
+
+def test_the_displaced_plant_starts_off_the_operating_point_and_is_not_disturbed(paper):
+    away = displaced(paper)
+    np.testing.assert_allclose(away.initial_state, 1.1 * paper.reference_state)
+    with FmuPlant(away) as plant:
+        run = simulate(plant, Hold(paper.reference_action), 5, 0)
+    np.testing.assert_array_equal(run.disturbances, np.tile([5.0, 10.0, 40.0, 25.0], (5, 1)))
+
+
+def test_displacement_stays_within_the_bounds(paper):
+    tight = paper.replace({"bounds": {"state_upper": [26.0, 80.0]}})
+    np.testing.assert_allclose(displaced(tight).initial_state, paper.reference_state * [0.9, 1.1])
+
+
+def test_a_plant_without_settable_start_has_no_displaced_scenario(paper):
+    assert displaced(paper.replace({"plant": {"mapping": {"initial_state": []}}})) is None
+
+
+def test_indicators_are_the_definitions_applied_to_the_signals(paper):
+    with FmuPlant(paper) as plant:
+        run = simulate(plant, Proportional(paper), 200, 3)
+    found = indicators(run)
+    violation = np.maximum(paper.state_lower - run.states, 0) + np.maximum(
+        run.states - paper.state_upper, 0
+    )
+    penalty = (1e5 * violation + violation**2).sum(axis=1)
+    assert found["mean_violation"] == pytest.approx(violation.sum(axis=1).mean(), rel=1e-12)
+    assert found["violating_share"] == np.mean(np.any(violation > 0, axis=1))
+    assert found["J"] == pytest.approx(np.mean(run["stage_cost"] + penalty), rel=1e-12)
+    assert found["economic_cost"] == pytest.approx(np.mean(run["stage_cost"]), rel=1e-12)
+    assert found["failures"] == 0

@@ -1,0 +1,97 @@
+"""Run every independent importer that is installed on an FMU, each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from fmpy import read_model_description
+
+from fmus.checks import casadi_check, ecospy_check, fmpy_check, fmutool_check, libcosimpy_check
+from fmus.checks.outcome import NotInstalledError, NotOfferedError
+from fmus.errors import CheckError, FmuError
+
+TIMEOUT = 300.0  # s for one importer
+
+
+class Status(StrEnum):
+    """What came of one check."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    NOT_INSTALLED = "not installed"
+    NOT_OFFERED = "not offered"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table: which tool looked at what, and what it found."""
+
+    tool: str
+    subject: str
+    status: Status
+    detail: str
+
+
+# (tool, subject) → a function that returns a detail, or raises CheckError, NotInstalledError, …
+CHECKS: dict[tuple[str, str], Callable[[Path], str]] = {
+    ("fmpy", "validation"): fmpy_check.validate,
+    ("fmpy", "co-simulation"): fmpy_check.co_simulation,
+    ("fmpy", "model exchange, CVode"): fmpy_check.model_exchange,
+    ("casadi", "model exchange, Jacobian"): casadi_check.jacobian,
+    ("ecospy", "co-simulation"): ecospy_check.co_simulation,
+    ("libcosimpy", "co-simulation"): libcosimpy_check.co_simulation,
+    ("fmutool", "conformity"): fmutool_check.conformity,
+}
+
+
+def check(fmu: Path) -> list[Finding]:
+    """Check the file `fmu` with every importer, in the order of `CHECKS`.
+
+    Raises CheckError when the file is missing or is no FMU.
+    """
+    if not fmu.is_file():
+        raise CheckError(f"there is no file {fmu}")
+    try:
+        read_model_description(str(fmu), validate=False)
+    except Exception as error:
+        raise CheckError(f"{fmu} is not an FMU: {error}") from error
+    return [_in_own_process(tool, subject, fmu) for tool, subject in CHECKS]
+
+
+def run(tool: str, subject: str, fmu: Path) -> Finding:
+    """Run one check in this process."""
+    try:
+        detail = CHECKS[tool, subject](fmu)
+    except NotInstalledError as error:
+        return Finding(tool, subject, Status.NOT_INSTALLED, str(error))
+    except NotOfferedError as error:
+        return Finding(tool, subject, Status.NOT_OFFERED, str(error))
+    except FmuError as error:
+        return Finding(tool, subject, Status.FAILED, str(error))
+    except Exception as error:
+        return Finding(tool, subject, Status.FAILED, f"{type(error).__name__}: {error}")
+    return Finding(tool, subject, Status.PASSED, detail)
+
+
+def _in_own_process(tool: str, subject: str, fmu: Path) -> Finding:
+    """Native importers write to the console, and one that crashes must not end the others."""
+    command = [sys.executable, "-m", "fmus.checks", tool, subject, str(fmu.resolve())]
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Finding(tool, subject, Status.FAILED, f"no result after {TIMEOUT:.0f} s")
+    lines = result.stdout.splitlines()
+    if result.returncode != 0 or not lines:
+        words = result.stderr.strip().splitlines()[-1:] or [""]
+        detail = f"the process ended with code {result.returncode}. {words[0]}"
+        return Finding(tool, subject, Status.FAILED, detail)
+    status, detail = json.loads(lines[-1])
+    return Finding(tool, subject, Status(status), detail)

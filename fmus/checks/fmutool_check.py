@@ -1,0 +1,27 @@
+"""fmutool of the FMU Manipulation Toolbox: conformity and semantic checks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from fmus.checks.outcome import require
+from fmus.errors import CheckError
+
+
+def conformity(fmu: Path) -> str:
+    """`fmutool -check` must log neither an error nor a warning."""
+    require("fmu_manipulation_toolbox", "fmu-manipulation-toolbox")
+    program = Path(sys.executable).parent / "fmutool"
+    result = subprocess.run(
+        [str(program), "-input", str(fmu), "-check"], capture_output=True, text=True, check=False
+    )
+    output = result.stdout + result.stderr
+    bad = [
+        line for line in output.splitlines() if line.startswith(("ERROR", "WARNING", "CRITICAL"))
+    ]
+    if result.returncode != 0 or bad:
+        raise CheckError("; ".join(bad) or f"fmutool ended with code {result.returncode}")
+    found = [line.split("|")[-1].strip() for line in output.splitlines() if "compliant" in line]
+    return " ".join(found) or "no problem found"

@@ -9,6 +9,7 @@ from controllers.errors import QpError
 from controllers.qp.problem import QpSolution, SoftQp
 
 TOLERANCE = 1e-9
+GAP = 1e-7
 INFINITE = 1e20
 
 
@@ -45,6 +46,9 @@ class ProxQpBackend:
             self._qp = proxqp.dense.QP(n + rows, 0, 2 * rows, True)
             settings = self._qp.settings
             settings.eps_abs, settings.eps_rel = TOLERANCE, 0.0
+            # Without the gap ProxQP stops at multipliers that do not fit the rows' slack.
+            settings.check_duality_gap = True
+            settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = GAP, 0.0
             settings.max_iter = 1000
             settings.initial_guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
             self._qp.init(

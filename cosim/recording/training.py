@@ -165,11 +165,8 @@ class TrainingRecorder:
             if name not in self._scalars:
                 color = SERIES[len(self._scalars) % len(SERIES)]
                 channel = self._scalars[name] = Channel("log", name, "", color)
-                stream.static(channel.entity, mark(name, ""), _line(name, color))
-                if np.isnan(values).any():
-                    # Lines break at NaN: what is measured now and then needs points to be seen.
-                    points = rr.SeriesPoints(colors=packed(color), marker_sizes=4.0)
-                    stream.static(channel.entity, points)
+                style = _style(name, color, sparse=bool(np.isnan(values).any()))
+                stream.static(channel.entity, mark(name, ""), style)
             self._scalars[name] = self._scalars[name].with_values(values)
             stream.scalars(self._scalars[name].entity, times, values)
         self._rows, self._thetas = [], []
@@ -211,8 +208,12 @@ def _declare_block(stream: Stream, block: str, labels: Sequence[str]) -> None:
     )
 
 
-def _line(name: str, color: str) -> rr.SeriesLines:
-    return line(name.replace("_", " "), color)
+def _style(name: str, color: str, *, sparse: bool) -> rr.SeriesLines | rr.SeriesPoints:
+    """A line, or points for what is measured now and then: a line breaks at every NaN."""
+    label = name.replace("_", " ")
+    if sparse:
+        return rr.SeriesPoints(names=label, colors=packed(color), marker_sizes=4.0)
+    return line(label, color)
 
 
 def _view(title: str, channels: Sequence[Channel], axis: rrb.TimeAxis) -> rrb.TimeSeriesView:

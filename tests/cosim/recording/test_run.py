@@ -1,0 +1,170 @@
+import hashlib
+from time import perf_counter
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from blocks import random_block
+from loop import Failing, Proportional
+from rerun.chunk import RrdReader
+
+from controllers.factories import naive
+from cosim import FmuPlant, simulate
+from cosim.errors import RecordingError
+from cosim.recording import RerunRecorder, read_recording
+from cosim.trajectory import read_csv
+
+CONTROLLER = SimpleNamespace(name="mine", parameters=SimpleNamespace(hash="0123456789abcdef"))
+
+
+def recorded(path, scenario, blocks, units=None, steps=100):
+    recorder = RerunRecorder(path)
+    recorder.start(scenario, CONTROLLER, 5, steps, units or {})
+    for block in blocks:
+        recorder.record(block)
+    recorder.close()
+    return read_recording(path)
+
+
+def test_signals_equal_the_csv_bit_for_bit(tmp_path, paper):
+    with FmuPlant(paper) as plant:
+        recorder = RerunRecorder(tmp_path / "run.rrd")
+        simulate(plant, naive(paper), 2600, 3, recorder=recorder).write_csv(tmp_path / "run.csv")
+    csv = read_csv(tmp_path / "run.csv", paper)
+    recording = read_recording(tmp_path / "run.rrd")
+    for name, signal in csv.signals.items():
+        assert recording.signals[name].tobytes() == signal.values.tobytes(), name
+        assert recording.units[name] == signal.unit, name
+    assert recording.status == csv.status
+    assert recording.samples.tolist() == list(range(2600))
+    assert np.array_equal(recording.time, csv.time)
+
+
+def test_times_are_those_of_the_loop_and_predictions_those_of_the_controller(
+    tmp_path, paper, rng, units
+):
+    blocks = [random_block(paper, rng, first, 700) for first in range(0, 4900, 700)]
+    recording = recorded(tmp_path / "run.rrd", paper, blocks, units, 4900)
+    for name in ("prepare_time", "feedback_time"):
+        expected = np.concatenate([getattr(block, name) for block in blocks])
+        assert recording.signals[name].tobytes() == expected.tobytes()
+    states = np.concatenate([block.predicted_states for block in blocks])
+    actions = np.concatenate([block.predicted_actions for block in blocks])
+    for i, name in enumerate(paper.plant.states):
+        assert np.array_equal(recording.signals[f"prediction/{name}"], states[:, :, i])
+    for i, name in enumerate(paper.plant.actions):
+        assert np.array_equal(recording.signals[f"prediction/{name}"], actions[:, :, i])
+
+
+def test_a_block_that_the_loop_overwrites_is_recorded_as_it_was(tmp_path, paper, rng):
+    block = random_block(paper, rng)
+    before = block.states.copy()
+    recorder = RerunRecorder(tmp_path / "run.rrd")
+    recorder.start(paper, CONTROLLER, 0, 10, {})
+    recorder.record(block)
+    block.states[:] = 0.0
+    recorder.close()
+    recording = read_recording(tmp_path / "run.rrd")
+    assert np.array_equal(recording.signals["X2"], before[:, 0])
+
+
+def test_a_controller_without_predictions_is_recorded(tmp_path, paper, rng):
+    recording = recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng, predicts=False)])
+    assert len(recording.samples) == 10
+    assert not [name for name in recording.signals if name.startswith("prediction/")]
+
+
+def test_samples_without_a_prediction_are_gaps(tmp_path, paper, rng):
+    blocks = [random_block(paper, rng, 0, 5, predicts=False), random_block(paper, rng, 5, 5)]
+    prediction = recorded(tmp_path / "run.rrd", paper, blocks).signals["prediction/X2"]
+    assert np.isnan(prediction[:5]).all()
+    assert np.array_equal(prediction[5:], blocks[1].predicted_states[:, :, 0])
+
+
+def test_status_is_recorded_sample_by_sample(tmp_path, paper):
+    with FmuPlant(paper) as plant:
+        recorder = RerunRecorder(tmp_path / "run.rrd")
+        trajectory = simulate(plant, Failing(paper, [3, 4, 9]), 12, 0, recorder=recorder)
+    assert read_recording(tmp_path / "run.rrd").status == trajectory.status
+    assert trajectory.status.count("fallback") == 3
+
+
+def test_a_run_that_breaks_off_leaves_the_samples_it_made(tmp_path, paper):
+    class Breaking(Proportional):
+        def prepare(self):
+            self.k = getattr(self, "k", -1) + 1
+            if self.k == 700:
+                raise RuntimeError("sensor lost")
+
+    with FmuPlant(paper) as plant, pytest.raises(RuntimeError, match="sensor lost"):
+        simulate(plant, Breaking(paper), 900, 0, recorder=RerunRecorder(tmp_path / "run.rrd"))
+    assert len(read_recording(tmp_path / "run.rrd").samples) == 500
+
+
+def test_properties_say_what_was_run(tmp_path, paper, rng):
+    properties = recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng)]).properties
+    assert properties["scenario"] == "paper"
+    assert properties["scenario_hash"] == paper.hash
+    assert properties["seed"] == "5"
+    assert properties["theta_hash"] == "0123456789abcdef"
+    assert properties["controller"] == "mine"
+    assert properties["package"].startswith("rti-cosim ")
+
+
+def test_names_and_units_of_any_spelling_come_back(tmp_path, foreign, rng):
+    block = random_block(foreign, rng)
+    units = {"tank[1].level": "m³", "der(x)/dt": "∇"}
+    recording = recorded(tmp_path / "run.rrd", foreign, [block], units)
+    assert np.array_equal(recording.signals["tank[1].level"], block.states[:, 0])
+    assert np.array_equal(recording.signals["der(x)/dt"], block.actions[:, 0])
+    assert recording.units["tank[1].level"] == "m³"
+    assert recording.units["der(x)/dt"] == "∇"
+
+
+def test_the_layout_comes_before_the_data_and_again_with_the_ranges_needed(tmp_path, paper, rng):
+    recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng)])
+    reader = RrdReader(tmp_path / "run.rrd")
+    assert len(reader.blueprints()) == 2
+    application = reader.recordings()[0].application_id
+    assert {entry.application_id for entry in reader.blueprints()} == {application}
+    content = (tmp_path / "run.rrd").read_bytes()
+    first_layout = min(content.find(entry.recording_id.encode()) for entry in reader.blueprints())
+    assert 0 < first_layout < content.find(reader.recordings()[0].recording_id.encode())
+
+
+def test_the_file_is_whole_or_not_there(tmp_path, paper, rng):
+    path = tmp_path / "run.rrd"
+    recorder = RerunRecorder(path)
+    recorder.start(paper, CONTROLLER, 0, 10, {})
+    recorder.record(random_block(paper, rng))
+    assert not path.exists()
+    recorder.close()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.rrd"]
+    assert len(RrdReader(path).store()) > 0  # only a file with a footer can be opened so
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    recorder.close()
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == digest
+
+
+def test_an_unwritable_folder_is_named(tmp_path, paper):
+    recorder = RerunRecorder(tmp_path / "none" / "run.rrd")
+    with pytest.raises(RecordingError, match=r"cannot write .*none/run\.rrd"):
+        recorder.start(paper, CONTROLLER, 0, 10, {})
+
+
+@pytest.mark.slow
+def test_recording_ten_thousand_steps_costs_at_most_a_tenth_more(tmp_path, paper):
+    controller = naive(paper)
+    times = {"plain": [], "recorded": []}
+    with FmuPlant(paper) as plant:
+        simulate(plant, controller, 2500, 0, recorder=RerunRecorder(tmp_path / "run.rrd"))
+        # Alternating runs and minima, since other programs share the machine.
+        for _ in range(7):
+            for kind, seconds in times.items():
+                recorder = RerunRecorder(tmp_path / "run.rrd") if kind == "recorded" else None
+                begin = perf_counter()
+                simulate(plant, controller, 10_000, 0, recorder=recorder)
+                seconds.append(perf_counter() - begin)
+    ratio = min(times["recorded"]) / min(times["plain"])
+    print(f"recorded/plain = {ratio:.3f} of {100 * min(times['plain']):.0f} µs a step")
+    assert ratio <= 1.10

@@ -1,0 +1,146 @@
+import re
+import subprocess
+import threading
+from pathlib import Path
+from time import sleep
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from blocks import random_block
+from matplotlib.image import imread
+from test_run import recorded
+
+from cosim.errors import RecordingError
+from cosim.recording import open_viewer, render, viewer
+
+slow = pytest.mark.slow
+
+
+@pytest.fixture
+def recording(tmp_path, paper, rng, units):
+    path = tmp_path / "run.rrd"
+    recorded(path, paper, [random_block(paper, rng, 0, 50)], units, 50)
+    return path
+
+
+def drawn(recording, png, **options):
+    """Render, or skip where no graphics driver is installed."""
+    try:
+        render(recording, png, **options)
+    except RecordingError as error:
+        if "no graphics driver" in str(error):
+            pytest.skip(str(error))
+        raise
+    return imread(png)
+
+
+@slow
+def test_a_recording_is_drawn_without_a_screen(recording, tmp_path):
+    image = drawn(recording, tmp_path / "a.png", at=600.0, size=(1280, 720))
+    assert image.shape[:2] == (720, 1280)
+    assert len(np.unique((image[..., :3] * 255).astype(int).reshape(-1, 3), axis=0)) > 200
+
+
+@slow
+def test_names_that_the_viewers_font_lacks_do_not_stop_it(tmp_path, foreign, rng):
+    path = tmp_path / "run.rrd"
+    units = {"tank[1].level": "∇水"}
+    recorded(path, foreign, [random_block(foreign, rng, status="∇ failed")], units, 10)
+    drawn(path, tmp_path / "a.png")
+
+
+@slow
+def test_the_viewer_listens_on_loopback_only_and_ends(recording, tmp_path):
+    seen = set()
+    stop = threading.Event()
+
+    def watch():
+        while not stop.is_set():
+            for process in processes():
+                seen.update(listening(process))
+            sleep(0.05)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        drawn(recording, tmp_path / "a.png")
+    finally:
+        stop.set()
+        watcher.join()
+    assert seen == {"0100007F"}
+    assert not processes()
+
+
+def processes():
+    """Viewers without a window that this test's user runs."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (entry / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if b"--headless" in command and Path(command[0].decode()).name == "rerun":
+            found.append(entry)
+    return found
+
+
+def listening(process):
+    """Local addresses (hexadecimal) of the process's listening sockets."""
+    try:
+        inodes = {
+            match[1]
+            for link in (process / "fd").iterdir()
+            if (match := re.match(r"socket:\[(\d+)\]", str(link.readlink())))
+        }
+        rows = [line.split() for line in (process / "net/tcp").read_text().splitlines()[1:]]
+        six = [line.split() for line in (process / "net/tcp6").read_text().splitlines()[1:]]
+    except OSError:
+        return set()
+    return {row[1].split(":")[0] for row in rows + six if row[3] == "0A" and row[9] in inodes}
+
+
+@slow
+def test_without_a_graphics_driver_the_message_says_what_to_install(
+    recording, tmp_path, monkeypatch
+):
+    for variable in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
+        monkeypatch.setenv(variable, "/nonexistent")
+    with pytest.raises(RecordingError, match="mesa-vulkan-drivers"):
+        render(recording, tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
+
+
+@slow
+def test_an_unwritable_png_is_named(recording, tmp_path):
+    with pytest.raises(RecordingError, match=r"cannot write .*no/a\.png|no graphics driver"):
+        render(recording, tmp_path / "no" / "a.png")
+
+
+def test_a_missing_recording_is_named(tmp_path):
+    for show in (open_viewer, lambda path: render(path, tmp_path / "a.png")):
+        with pytest.raises(RecordingError, match=r"there is no recording .*none\.rrd"):
+            show(tmp_path / "none.rrd")
+
+
+def test_without_a_display_the_message_says_how_to_draw(recording, monkeypatch):
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(RecordingError, match=r"no display .*--png"):
+        open_viewer(recording)
+
+
+def test_the_window_binds_loopback(recording, monkeypatch):
+    commands = []
+
+    def run(command, **options):
+        commands.append(command)
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(subprocess, "run", run)
+    open_viewer(recording)
+    command = commands[0]
+    assert command[command.index("--bind") + 1] == "127.0.0.1"
+    assert command[-1] == str(recording)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from fmus.errors import BuildError, CheckError, FmuError
 
-__all__ = ["BuildError", "CheckError", "FmuError", "path"]
+__all__ = ["NAMES", "BuildError", "CheckError", "FmuError", "path"]
 
-_NAMES = ("evaporator", "evaporator_fmi3")
+NAMES = ("evaporator", "evaporator_fmi3")
 
 
 def path(name: str = "evaporator") -> Path:
@@ -16,6 +16,6 @@ def path(name: str = "evaporator") -> Path:
 
     Raises FmuError for another name.
     """
-    if name not in _NAMES:
-        raise FmuError(f"there is no FMU {name!r}; shipped are {', '.join(_NAMES)}")
+    if name not in NAMES:
+        raise FmuError(f"there is no FMU {name!r}; shipped are {', '.join(NAMES)}")
     return Path(__file__).parent / f"{name}.fmu"

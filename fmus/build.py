@@ -163,6 +163,12 @@ def differences(built: Path, shipped: Path) -> list[str]:
     return differing or ["(order or metadata)"]
 
 
+def compare_with_shipped() -> dict[str, list[str]]:
+    """Build anew; file name → `differences` from the shipped file."""
+    with tempfile.TemporaryDirectory() as folder:
+        return {path.name: differences(path, PACKAGE / path.name) for path in build(Path(folder))}
+
+
 def _members(path: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(path) as container:
         return {name: container.read(name) for name in container.namelist()}

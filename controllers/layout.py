@@ -52,9 +52,12 @@ class Block:
     def pack(self, value: ArrayLike) -> Vector:
         """Flatten an unpacked value; raises ParameterError on a wrong shape, NaN or asymmetry."""
         try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ParameterError(f"θ block {self.name} holds no numbers: {value!r}") from error
+            array = np.asarray(value)
+        except ValueError:  # ragged nesting
+            array = np.array(None)
+        if array.dtype.kind not in "iuf":
+            raise ParameterError(f"θ block {self.name} holds no float64 numbers: {value!s:.80}")
+        array = array.astype(np.float64)
         if array.shape != self.shape:
             raise ParameterError(
                 f"θ block {self.name} has shape {array.shape}; it must have {self.shape}"

@@ -30,9 +30,7 @@ def evaporator_problem(**changes: object) -> Problem:
     return replace(problem, **changes)
 
 
-def random_parameters(
-    problem: Problem, layout: Layout, rng: np.random.Generator
-) -> Parameters:
+def random_parameters(problem: Problem, layout: Layout, rng: np.random.Generator) -> Parameters:
     """θ with positive definite Hessians, about the size that learning reaches."""
 
     def definite(size: int) -> np.ndarray:

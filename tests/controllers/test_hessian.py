@@ -1,0 +1,135 @@
+import casadi as ca
+import numpy as np
+import pytest
+from sampling import evaporator_problem, random_parameters, random_point
+
+from controllers import Layout
+from controllers.errors import ControllerError
+from controllers.hessian import Exact, Spectrum, make_hessian
+from controllers.model import discretise
+from controllers.ocp import preparation
+
+N, n, m = 10, 2, 2
+DISCOUNTS = 0.99 ** np.arange(N)
+
+
+@pytest.fixture(scope="module")
+def layout():
+    return Layout.of(evaporator_problem())
+
+
+@pytest.fixture(scope="module")
+def prepared(layout):
+    return preparation(evaporator_problem(), layout)
+
+
+def filled(name, prepared, layout, problem, parameters, point):
+    rule = make_hessian(name, problem, layout, prepared)
+    rule.set_parameters(parameters)
+    constant = rule.fill(*point)
+    L, q = (prepared.inputs[part].reshape(N, n + m, -1).copy() for part in ("L", "q"))
+    return rule, L, q[:, :, 0], constant
+
+
+def lift(matrix, floor):
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, floor)) @ vectors.T
+
+
+def spectrum_of(matrix, floor):
+    values, vectors = np.linalg.eigh(matrix[None])
+    return Spectrum(values, vectors, np.array([[floor]]))
+
+
+def test_gauss_newton_is_the_discounted_cost_itself(prepared, layout, problem, rng):
+    parameters = random_parameters(problem, layout, rng)
+    _, L, q, constant = filled(
+        "gauss-newton", prepared, layout, problem, parameters, random_point(problem, rng)
+    )
+    for k in range(N):
+        np.testing.assert_allclose(L[k], 2 * DISCOUNTS[k] * parameters["B_l"], rtol=1e-14)
+        np.testing.assert_allclose(q[k], DISCOUNTS[k] * parameters["b_l"], rtol=1e-14)
+    assert constant == 0.0
+    end = 0.99**N
+    np.testing.assert_allclose(
+        prepared.inputs["L_N"].reshape(n, n), 2 * end * parameters["B_Vf"], rtol=1e-14
+    )
+    np.testing.assert_allclose(prepared.inputs["q_N"], end * parameters["b_Vf"], rtol=1e-14)
+
+
+def test_exact_unlifted_is_the_hessian_of_the_stage_lagrangian(prepared, layout, problem, rng):
+    parameters, point = random_parameters(problem, layout, rng), random_point(problem, rng)
+    _, L, _, _ = filled("exact-unlifted", prepared, layout, problem, parameters, point)
+    model = problem.model
+    x, u, d, p = model.symbols()
+    chi = ca.SX.sym("chi", n)
+    f = discretise(model, problem.sampling_time, problem.substeps)
+    hessian, _ = ca.hessian(ca.dot(chi, f(x, u, d, p)), ca.vertcat(x, u))
+    curvature = ca.Function("curvature", [x, u, d, p, chi], [hessian])
+    for k in range(N):
+        D = curvature(
+            point.x[k], point.u[k], model.nominal_disturbance, model.nominal_parameters,
+            point.costates[k],
+        )  # fmt: skip
+        expected = 2 * DISCOUNTS[k] * parameters["B_l"] + np.array(D)
+        np.testing.assert_allclose(L[k], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_exact_lifts_only_what_is_below_the_floor(prepared, layout, problem, rng):
+    parameters, point = random_parameters(problem, layout, rng), random_point(problem, rng)
+    point.costates[:5] *= -300
+    _, raw, _, _ = filled("exact-unlifted", prepared, layout, problem, parameters, point)
+    _, L, _, _ = filled("exact", prepared, layout, problem, parameters, point)
+    least = np.linalg.eigvalsh(raw)[:, 0]
+    assert (least < 0).any(), "the test needs indefinite blocks"
+    assert (least > Exact.FLOOR).any(), "the test needs definite blocks"
+    for k in range(N):
+        np.testing.assert_allclose(L[k], lift(raw[k], Exact.FLOOR * DISCOUNTS[k]), atol=1e-10)
+    assert (np.linalg.eigvalsh(L)[:, 0] >= 0.999 * Exact.FLOOR * DISCOUNTS).all()
+
+
+@pytest.mark.parametrize("name", ["exact", "exact-unlifted"])
+def test_the_model_of_the_cost_touches_it_at_the_point(name, prepared, layout, problem, rng):
+    parameters, point = random_parameters(problem, layout, rng), random_point(problem, rng)
+    _, L, q, constant = filled(name, prepared, layout, problem, parameters, point)
+    w = np.concatenate([point.x, point.u], axis=1)
+    w -= np.concatenate([problem.reference_state, problem.reference_action])
+    B, b = parameters["B_l"], parameters["b_l"]
+    true = (DISCOUNTS * (np.einsum("ki,ij,kj->k", w, B, w) + w @ b)).sum()
+    model = constant + (np.einsum("ki,kij,kj->k", w, L, w) / 2 + (q * w).sum(axis=1)).sum()
+    assert model == pytest.approx(true, rel=1e-11)
+    gradient = np.einsum("kij,kj->ki", L, w) + q
+    np.testing.assert_allclose(gradient, DISCOUNTS[:, None] * (2 * w @ B + b), rtol=1e-9, atol=1e-8)
+
+
+@pytest.mark.parametrize("floor", [-3.0, 0.1, 50.0])
+def test_contract_is_the_adjoint_of_the_derivative_of_the_lift(floor, rng):
+    for _ in range(20):
+        X, dX, seed = rng.normal(size=(3, 4, 4))
+        X, dX, seed = X + X.T, dX + dX.T, seed + seed.T
+        M = spectrum_of(X, floor).contract(seed[None])[0]
+        h = 1e-3
+
+        def slope(h, X=X, dX=dX):
+            return (lift(X + h * dX, floor) - lift(X - h * dX, floor)) / (2 * h)
+
+        derivative = (4 * slope(h / 2) - slope(h)) / 3
+        scale = np.abs(seed).max() * np.abs(dX).max()
+        assert (M * dX).sum() == pytest.approx(
+            (seed * derivative).sum(), rel=1e-7, abs=1e-8 * scale
+        )
+
+
+def test_contract_holds_for_repeated_eigenvalues(rng):
+    # P is the identity above the floor and constant below it, also where eigenvalues coincide.
+    seed = rng.normal(size=(4, 4))
+    seed = seed + seed.T
+    above = spectrum_of(2 * np.eye(4), 1.0).contract(seed[None])[0]
+    below = spectrum_of(np.eye(4) / 2, 1.0).contract(seed[None])[0]
+    np.testing.assert_allclose(above, seed, atol=1e-15)
+    np.testing.assert_allclose(below, 0, atol=1e-15)
+
+
+def test_an_unknown_rule_is_refused_with_the_choices(prepared, layout, problem):
+    with pytest.raises(ControllerError, match="no Hessian 'bfgs'; choose gauss-newton or exact"):
+        make_hessian("bfgs", problem, layout, prepared)

@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controllers import Layout
+from controllers.errors import ModelError, ParameterError
+from controllers.layout import Block
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+MATRIX = Block("B", "symmetric", 3, (1.0,) * 6)
+
+
+def test_the_papers_theta_has_its_blocks_in_order(problem):
+    layout = Layout.of(problem)
+    assert list(layout.slices) == [
+        "B_lambda", "b_lambda", "c_lambda", "B_Vf", "b_Vf", "B_l", "b_l", "c_f", "x_l", "x_u",
+    ]  # fmt: skip
+    assert layout.size == 3 + 2 + 1 + 3 + 2 + 10 + 4 + 2 + 2 + 2
+
+
+def test_slices_cover_theta_without_gap_or_overlap(problem):
+    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
+    covered = np.concatenate([np.arange(layout.size)[part] for part in layout.slices.values()])
+    np.testing.assert_array_equal(covered, np.arange(layout.size))
+    assert layout.scale.shape == (layout.size,)
+    assert (layout.scale > 0).all()
+
+
+def test_labels_name_each_entry(problem):
+    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
+    assert len(set(layout.labels)) == layout.size
+    part = layout.labels[layout.slices["B_l"]]
+    assert part[:5] == ("B_l[0,0]", "B_l[0,1]", "B_l[0,2]", "B_l[0,3]", "B_l[1,1]")
+    assert layout.labels[layout.slices["c_lambda"]] == ("c_lambda",)
+    assert layout.labels[layout.slices["p"]] == ("p[UA2]", "p[h]")
+
+
+def test_a_symmetric_matrix_is_packed_by_upper_rows():
+    matrix = [[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]]
+    np.testing.assert_array_equal(MATRIX.pack(matrix), [1, 2, 3, 4, 5, 6])
+
+
+@given(st.lists(FINITE, min_size=6, max_size=6))
+def test_packing_undoes_unpacking_bit_for_bit(entries):
+    packed = np.array(entries)
+    assert MATRIX.pack(MATRIX.unpack(packed)).tobytes() == packed.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ([[1.0, 2.0], [2.0, 1.0]], r"shape \(2, 2\); it must have \(3, 3\)"),
+        ([[1, 0, 0], [0, 1, 0], [1e-9, 0, 1]], "must be symmetric"),
+        ([[np.nan, 0, 0], [0, 1, 0], [0, 0, 1]], "not finite"),
+        ([[1, 0, 0], [0, np.inf, 0], [0, 0, 1]], "not finite"),
+        ([[1, 0], [0, 1, 0]], "holds no float64 numbers"),
+        ("identity", "holds no float64 numbers"),
+        ({"a": 1}, "holds no float64 numbers"),
+        (10**400, "holds no float64 numbers"),
+        (
+            [[True, False, False], [False, True, False], [False, False, True]],
+            "holds no float64 numbers",
+        ),
+    ],
+)
+def test_a_bad_value_is_refused_with_the_block_named(value, message):
+    with pytest.raises(ParameterError, match=f"θ block B .*{message}"):
+        MATRIX.pack(value)
+
+
+def test_an_unknown_block_is_named_with_those_there_are(problem):
+    with pytest.raises(ParameterError, match=r"no block 'B_f'; it has B_lambda, .*x_u"):
+        Layout.of(problem).block("B_f")
+
+
+def test_model_parameters_scale_with_their_nominal_value(problem):
+    layout = Layout.of(problem, model_parameters=("UA2", "h"))
+    np.testing.assert_allclose(layout.scale[layout.slices["p"]], [0.684, 0.016])
+
+
+def test_an_unknown_model_parameter_is_refused(problem):
+    with pytest.raises(ModelError, match="no parameter 'U'"):
+        Layout.of(problem, model_parameters=("U",))

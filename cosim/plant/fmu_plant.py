@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import operator
 import struct
 from collections.abc import Sequence
 from math import isfinite
@@ -27,6 +28,16 @@ Array = NDArray[np.float64]
 _HEADER = struct.Struct("<8sq32s")
 _MAGIC = b"cosimfs1"
 _NOT_STARTED = -1
+
+
+def _checked_seed(seed: int) -> int:
+    try:
+        word = operator.index(seed)
+    except TypeError:
+        word = -1
+    if not 0 <= word < 1 << 64:
+        raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
+    return word
 
 
 class Snapshot:
@@ -134,9 +145,7 @@ class FmuPlant:
         written anew, so that nothing of an earlier episode remains.
         """
         fmi = self._instance
-        if not 0 <= seed < 1 << 64:
-            raise PlantError(f"seed {seed} is not in [0, 2^64)")
-        word = int(seed)
+        word = _checked_seed(seed)
         for reference, width in self._seeds:
             fmi.change_start(reference, word if width == 64 else word & 0xFFFFFFFF)
             word >>= 32

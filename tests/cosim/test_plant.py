@@ -1,9 +1,11 @@
 import gc
+import mmap
 import subprocess
 import sys
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from cosim import FmuPlant, Scenario
@@ -11,6 +13,11 @@ from cosim.errors import PlantError
 from cosim.simulation import spawn_seeds
 
 ACTIONS = np.random.default_rng(7).uniform(100, 400, (50, 2))
+
+
+def resident():
+    """Resident memory of this process in bytes (Linux)."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
 
 
 def run(plant, seed, steps=50):
@@ -177,21 +184,43 @@ def test_a_serialised_state_continues_in_another_plant(plant, paper):
         np.testing.assert_array_equal([other.step(a).s for a in ACTIONS[5:15]], expected)
 
 
+def test_a_step_allocates_no_more_than_it_returns(plant):
+    plant.reset(0)
+    step = [plant.step(a) for a in ACTIONS[:20]][-1]
+    tracemalloc.start()
+    for k in range(20, 1020):
+        plant._advance(k * 60.0)
+    kept, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 1000
+    assert peak < 1000
+    assert step.s.base is None
+
+
 def test_dropped_snapshots_hand_on_their_memory(plant):
     plant.reset(0)
-    process = psutil.Process()
     for _ in range(2000):
         plant.snapshot()
     gc.collect()
-    before = process.memory_info().rss
+    before = resident()
     for _ in range(50_000):
         plant.snapshot()
-    assert process.memory_info().rss - before < 1 << 20
+    assert resident() - before < 1 << 20
+
+
+@pytest.mark.slow
+def test_a_million_snapshots_leave_memory_flat(plant):
+    plant.reset(0)
+    sizes = []
+    for _ in range(4):
+        for _ in range(250_000):
+            plant.restore(plant.snapshot())
+        sizes.append(resident())
+    assert sizes[-1] - sizes[0] < 1 << 20
 
 
 @pytest.mark.slow
 def test_creating_and_freeing_plants_leaves_memory_flat(paper):
-    process = psutil.Process()
     sizes = []
     for _ in range(4):
         for _ in range(500):
@@ -199,7 +228,7 @@ def test_creating_and_freeing_plants_leaves_memory_flat(paper):
                 plant.reset(1)
                 plant.step(paper.reference_action)
         gc.collect()
-        sizes.append(process.memory_info().rss)
+        sizes.append(resident())
     assert sizes[-1] - sizes[1] < 4 << 20
 
 
@@ -235,9 +264,9 @@ def test_an_action_out_of_the_fmus_range_is_refused_with_its_own_words(plant):
     plant.step([200.0, 200.0])
 
 
-@pytest.mark.parametrize("seed", [-1, 1 << 64])
-def test_a_seed_out_of_range_is_refused(plant, seed):
-    with pytest.raises(PlantError, match="seed"):
+@pytest.mark.parametrize("seed", [-1, 1 << 64, 1.5, None, "1"])
+def test_a_seed_that_is_no_64_bit_integer_is_refused(plant, seed):
+    with pytest.raises(PlantError, match="seed must be an integer"):
         plant.reset(seed)
 
 

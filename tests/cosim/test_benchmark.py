@@ -1,0 +1,32 @@
+import json
+
+import pytest
+from test_cli import cosim  # noqa: F401 (fixture)
+
+from cosim.plant.benchmark import measure
+
+COMPARED = {
+    "FmuPlant.step",
+    "fmpy convenience methods",
+    "fmpy simulate_fmu",
+    "fmpy simulate_fmu, kept instance",
+    "fmpy simulate_fmu, open loop",
+    "reset",
+    "snapshot and restore",
+}
+
+
+def test_the_command_prints_medians_and_ratios(cosim):  # noqa: F811
+    code, out, err = cosim("benchmark", "plant", "--steps", 200, "--json")
+    assert code == 0, err
+    result = json.loads(out)
+    assert {row["name"] for row in result["rows"]} == COMPARED
+    assert all(row["median_us"] > 0 for row in result["rows"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fmu", ["evaporator", "evaporator_fmi3"])
+def test_the_plant_is_as_fast_as_promised(fmu):
+    rows = measure("paper", fmu)["rows"]
+    missed = [row["name"] for row in rows if row["met"] is False]
+    assert missed == []

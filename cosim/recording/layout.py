@@ -12,7 +12,7 @@ from cosim.recording.channels import Channel, Range
 from cosim.recording.stream import TIME
 from cosim.recording.text import drawable
 
-GROUPS = ("states", "actions", "disturbances", "costs", "solver", "flags")
+GROUPS = ("states", "actions", "disturbances", "costs", "step_time")
 
 
 def series(
@@ -54,15 +54,14 @@ def run_blueprint(duration: float, channels: Sequence[Channel], predicts: bool) 
     def alone(channel: Channel) -> rrb.TimeSeriesView:
         return series(channel.label, [f"/{channel.entity}/**"], axis, channel.window())
 
+    def bundle(title: str, name: str) -> rrb.TimeSeriesView:
+        return series(title, [f"/{name}"], axis, union(group[name]), legend=True)
+
     loop = rrb.Vertical(*map(alone, [*group["states"], *group["actions"]]))
-    clocks = [c for c in group["solver"] if c.name.endswith("_time")]
-    times = [f"/{clock.entity}" for clock in clocks]
     causes = rrb.Vertical(
         *map(alone, group["costs"]),
-        series(
-            "disturbances", ["/disturbances/**"], axis, union(group["disturbances"]), legend=True
-        ),
-        series("prepare and feedback time [s]", times, axis, union(clocks), legend=True),
+        bundle("disturbances", "disturbances"),
+        bundle("prepare and feedback time [s]", "step_time"),
         series("log10 of the KKT residual", ["/display/log_residual"], axis),
         rrb.StateTimelineView(name="QP status", contents=["/solver/status"], time_view=axis),
         row_shares=[2] * len(group["costs"]) + [2, 1.6, 1.4, 1],

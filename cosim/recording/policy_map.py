@@ -37,10 +37,8 @@ class PolicyMap:
         self._height, self._width = len(self._y), len(self._x)
         columns, rows = np.meshgrid(np.arange(self._width), np.arange(self._height)[::-1])
         self._centres = np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
-        names = [*scenario.plant.actions[:2], "value"]
-        self._entities = [f"{ENTITY}/signals/{i}" for i in range(len(names))]
-        for entity, name in zip(self._entities, names, strict=True):
-            stream.static(entity, mark(f"policy/{name}", ""))
+        names = [f"policy/{name}" for name in (*scenario.plant.actions[:2], "value")]
+        stream.static(f"{ENTITY}/signals", mark(names, [""] * len(names)))
         style = rr.Arrows2D.from_fields(colors=packed("#FFFFFF"), radii=0.05, draw_order=20.0)
         stream.static(f"{ENTITY}/map/actions", style)
         self._frame(self._x, self._y)
@@ -59,8 +57,8 @@ class PolicyMap:
         answers = np.array([[self._answer(controller, x, y) for x in self._x] for y in self._y])
         controller.reset()
         times = [rr.TimeColumn(SAMPLE, sequence=[sample])]
-        for i, entity in enumerate(self._entities):
-            self._stream.scalars(entity, times, answers[..., i].reshape(1, -1))
+        row = np.moveaxis(answers, -1, 0).reshape(1, -1)
+        self._stream.scalars(f"{ENTITY}/signals", times, row)
         scenario = self._scenario
         width = (scenario.action_upper - scenario.action_lower)[:2]
         field = (answers[..., :2] - scenario.reference_action[:2]) / width

@@ -50,28 +50,30 @@ def read_recording(path: str | Path) -> Recording:
     ------
     RecordingError : no such file, not a recording, or not one of this package.
     """
-    static: dict[str, dict[str, str]] = {}
+    static: dict[str, dict[str, list[str]]] = {}
     rows: dict[str, list[pa.RecordBatch]] = defaultdict(list)
     for chunk in _chunks(Path(path)):
         batch = chunk.to_record_batch()
         if chunk.is_static:
-            texts = {name: _text(batch.column(name)) for name in batch.schema.names}
+            texts = {name: _texts(batch.column(name)) for name in batch.schema.names}
             static.setdefault(chunk.entity_path, {}).update(texts)
         elif SAMPLE in batch.schema.names:
             rows[chunk.entity_path].append(batch)
     marks = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
     if not marks:
         raise RecordingError(f"{path} holds no signals of rti-cosim")
-    signals, units = {}, {}
+    signals: dict[str, NDArray[np.float64]] = {}
+    units: dict[str, str] = {}
     samples, time = np.empty(0, np.int64), np.empty(0)
     for entity, texts in marks.items():
-        name = texts[f"{SIGNAL}:name"]
-        units[name] = texts.get(f"{SIGNAL}:unit", "")
-        found, values = _column(rows[entity])
-        signals[name] = values
+        names = texts[f"{SIGNAL}:name"]
+        units |= dict(zip(names, texts[f"{SIGNAL}:unit"], strict=True))
+        found, values = _columns(rows[entity], len(names))
+        signals |= dict(zip(names, values, strict=True))
         if len(found) > len(samples):
             samples, time = found, _time(rows[entity])
-    properties = next((dict(t) for e, t in static.items() if e.endswith("/run")), {})
+    described = next((t for e, t in static.items() if e.endswith("/run")), {})
+    properties = {key: text[0] for key, text in described.items() if ":" not in key and text}
     properties.pop("rerun.controls.RowId", None)
     status = _status(rows.get("/solver/status", []), samples)
     return Recording(dict(sorted(signals.items())), samples, time, units, properties, status)
@@ -108,12 +110,10 @@ def _chunks(path: Path) -> list[Chunk]:
         ) from None
 
 
-def _text(column: pa.Array) -> str:
-    """First value of a static column, as text."""
+def _texts(column: pa.Array) -> list[str]:
+    """Values of a static column, as text."""
     value: Any = column[0].as_py()
-    while isinstance(value, list):
-        value = value[0] if value else ""
-    return str(value)
+    return [str(item) for item in value] if isinstance(value, list) else [str(value)]
 
 
 def _order(batches: list[pa.RecordBatch]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
@@ -122,16 +122,18 @@ def _order(batches: list[pa.RecordBatch]) -> tuple[NDArray[np.int64], NDArray[np
     return samples[order], order
 
 
-def _column(
-    batches: list[pa.RecordBatch],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _columns(
+    batches: list[pa.RecordBatch], signals: int
+) -> tuple[NDArray[np.int64], list[NDArray[np.float64]]]:
+    """Sample numbers and, for each signal of a bundle, its values (K,) or (K, N)."""
     if not batches:
-        return np.empty(0, np.int64), np.empty(0)
+        return np.empty(0, np.int64), [np.empty(0)] * signals
     samples, order = _order(batches)
     lists = [batch.column(_SCALARS) for batch in batches]
     flat = np.concatenate([column.flatten().to_numpy() for column in lists])
-    values = flat.reshape(len(samples), -1)[order]
-    return samples, values[:, 0] if values.shape[1] == 1 else values
+    values = flat.reshape(len(samples), signals, -1)[order]
+    parts = [np.ascontiguousarray(values[:, i]) for i in range(signals)]
+    return samples, [part[:, 0] if part.shape[1] == 1 else part for part in parts]
 
 
 def _time(batches: list[pa.RecordBatch]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import deepcopy
 from importlib.metadata import version
 from pathlib import Path
@@ -15,11 +16,11 @@ from cosim.protocols import Block, Controller, controller_name
 from cosim.recording import diagram
 from cosim.recording.about import describe
 from cosim.recording.blocks import joined
-from cosim.recording.channels import Channel, escaped, run_channels, run_columns
+from cosim.recording.channels import Channel, run_channels, run_columns
 from cosim.recording.horizon import Horizon, Strip
 from cosim.recording.layout import run_blueprint
 from cosim.recording.palette import BOUND, GOOD, SERIES, packed
-from cosim.recording.stream import Stream, line, mark, sample_times
+from cosim.recording.stream import Stream, line, lines, mark, sample_times
 from cosim.recording.text import drawable
 from cosim.scenario import Scenario
 
@@ -104,15 +105,15 @@ class RerunRecorder:
         samples = np.arange(block.first, block.first + len(block.time))
         times = sample_times(samples, block.time)
         ends = sample_times(samples[[0, -1]], block.time[[0, -1]])
-        for i, (channel, values) in enumerate(
-            zip(self._channels, run_columns(block, self._violation), strict=True)
-        ):
-            stream.scalars(channel.entity, times, values)
-            self._channels[i] = channel.with_values(values)
-            for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
-                # Two rows a block are enough to draw a constant line.
-                if np.isfinite(bound):
-                    stream.scalars(f"{channel.bound_entity}/{side}", ends, np.full(2, bound))
+        columns = run_columns(block, self._violation)
+        for i, values in enumerate(columns):
+            self._channels[i] = self._channels[i].with_values(values)
+        for entity, rows in self._entities().items():
+            values = np.column_stack([columns[i] for i in rows])
+            stream.scalars(entity, times, values)
+        for entity, bound in self._bounds():
+            # Two rows a block are enough to draw a constant line.
+            stream.scalars(entity, ends, np.full(2, bound))
         with np.errstate(divide="ignore", invalid="ignore"):
             stream.scalars("display/log_residual", times, np.log10(block.residual))
         self._changes_of_status(stream, samples, block)
@@ -121,17 +122,29 @@ class RerunRecorder:
     def _blueprint(self) -> Blueprint:
         return run_blueprint(self._duration, self._channels, predicts=self._horizon is not None)
 
-    def _declare(self, stream: Stream) -> None:
+    def _entities(self) -> dict[str, list[int]]:
+        """Channels of each entity, by their numbers."""
+        entities: dict[str, list[int]] = {}
+        for i, channel in enumerate(self._channels):
+            entities.setdefault(channel.entity, []).append(i)
+        return entities
+
+    def _bounds(self) -> Iterator[tuple[str, float]]:
+        """Entity and value of every finite bound."""
         for channel in self._channels:
-            stream.static(
-                channel.entity,
-                mark(channel.name, channel.unit),
-                line(channel.label, channel.color, step=channel.step),
-            )
             for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
                 if np.isfinite(bound):
-                    style = line(f"{side} bound", BOUND, width=2.0)
-                    stream.static(f"{channel.bound_entity}/{side}", style)
+                    yield f"{channel.bound_entity}/{side}", bound
+
+    def _declare(self, stream: Stream) -> None:
+        for entity, rows in self._entities().items():
+            channels = [self._channels[i] for i in rows]
+            labels, colors = [c.label for c in channels], [c.color for c in channels]
+            style = lines(labels, colors, step=channels[0].step)
+            stream.static(entity, mark([c.name for c in channels], [c.unit for c in channels]))
+            stream.static(entity, style)
+        for entity, _ in self._bounds():
+            stream.static(entity, line(entity.rpartition("/")[2], BOUND, width=2.0))
         stream.static("display/log_residual", line("log10 residual", SERIES[2]))
         stream.static(
             "solver/status", rr.StateConfiguration(values=["solved"], colors=[packed(GOOD)])
@@ -149,18 +162,18 @@ class RerunRecorder:
         states, actions = block.predicted_states, block.predicted_actions
         if states is None or actions is None:
             return
-        strips: dict[str, list[Strip]] = {"states": [], "actions": []}
+        strips: list[list[Strip]] = []
         for group, values in (("states", states), ("actions", actions)):
             channels = [channel for channel in self._channels if channel.group == group]
-            for i, channel in enumerate(channels):
-                entity = f"prediction/{escaped(channel.name)}"
-                if self._horizon is None:
-                    stream.static(entity, mark(f"prediction/{channel.name}", channel.unit))
-                    strips[group].append(_strip(channel.with_values(values[:, :, i])))
-                stream.scalars(entity, times, values[:, :, i])
+            if self._horizon is None:
+                names = [f"prediction/{channel.name}" for channel in channels]
+                stream.static(f"predicted/{group}", mark(names, [c.unit for c in channels]))
+                seen = [c.with_values(values[:, :, i]) for i, c in enumerate(channels)]
+                strips.append([_strip(channel) for channel in seen])
+            rows = values.transpose(0, 2, 1).reshape(len(values), -1)
+            stream.scalars(f"predicted/{group}", times, rows)
         if self._horizon is None:
-            stages = actions.shape[1]
-            self._horizon = Horizon(stream, strips["states"], strips["actions"], stages)
+            self._horizon = Horizon(stream, strips[0], strips[1], actions.shape[1])
         self._horizon.send(times, states, actions)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.errors import RecordingError
-from cosim.recording.palette import packed
+from cosim.recording.palette import packed_all
 from cosim.recording.text import drawable
 
 APPLICATION = "rti-cosim"
@@ -82,23 +82,31 @@ class Stream:
 
 
 def line(label: str, color: str, *, step: bool = False, width: float = 1.5) -> rr.SeriesLines:
-    """Style of a line; `step` holds each value until the next one (inputs, disturbances)."""
+    """Style of one line; `step` holds each value until the next one (inputs, disturbances)."""
+    return lines([label], [color], step=step, width=width)
+
+
+def lines(
+    labels: Sequence[str], colors: Sequence[str], *, step: bool = False, width: float = 1.5
+) -> rr.SeriesLines:
+    """Style of the lines of an entity with several numbers a row."""
     mode, policy = rr.components.InterpolationMode, rr.components.AggregationPolicy
     return rr.SeriesLines(
-        names=drawable(label),
-        colors=packed(color),
-        widths=width,
+        names=[drawable(label) for label in labels],
+        colors=packed_all(colors),
+        widths=np.full(len(labels), width),
         # The default average would hide the violations of a run that is wider than the screen.
         aggregation_policy=policy.MinMax,
         interpolation_mode=mode.StepAfter if step else mode.Linear,
     )
 
 
-def mark(name: str, unit: str) -> rr.DynamicArchetype:
-    """Static mark of an entity that holds the signal `name`, by which `read_signals` finds it."""
-    # Rerun takes an empty text for no value at all.
-    texts = {"name": name, **({"unit": unit} if unit else {})}
-    return rr.DynamicArchetype(SIGNAL, components=texts)
+def mark(names: Sequence[str], units: Sequence[str]) -> rr.DynamicArchetype:
+    """Static mark of an entity that holds signals, by which `read_recording` finds them.
+
+    Its rows have one number per name, or as many more as they divide into evenly.
+    """
+    return rr.DynamicArchetype(SIGNAL, components={"name": list(names), "unit": list(units)})
 
 
 def sample_times(samples: NDArray[np.int64], time: NDArray[np.float64]) -> list[rr.TimeColumn]:

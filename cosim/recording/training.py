@@ -166,7 +166,7 @@ class TrainingRecorder:
                 color = SERIES[len(self._scalars) % len(SERIES)]
                 channel = self._scalars[name] = Channel("log", name, "", color)
                 style = _style(name, color, sparse=bool(np.isnan(values).any()))
-                stream.static(channel.entity, mark(name, ""), style)
+                stream.static(channel.entity, mark([name], [""]), style)
             self._scalars[name] = self._scalars[name].with_values(values)
             stream.scalars(self._scalars[name].entity, times, values)
         self._rows, self._thetas = [], []
@@ -197,7 +197,7 @@ class TrainingRecorder:
 
 
 def _declare_block(stream: Stream, block: str, labels: Sequence[str]) -> None:
-    stream.static(f"theta/{escaped(block)}", mark(f"theta/{block}", ""))
+    stream.static(f"theta/{escaped(block)}", mark([f"theta/{block}"], [""]))
     stream.static(
         f"increment/{escaped(block)}",
         rr.SeriesLines(

@@ -22,6 +22,7 @@ class Run:
     seed: int
     out: Path
     record: bool
+    isolate: bool = False
 
 
 def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
@@ -31,13 +32,14 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     the summary's `timing`; all other bytes are the same for the same command and seed.
     """
     from controllers.storage import write_atomically
-    from cosim.cli.compose import build_controller, build_plant
+    from cosim.cli.compose import build_controller
+    from cosim.plant import FmuPlant, IsolatedPlant
     from cosim.scenario import Scenario
     from cosim.simulation import simulate
 
     scenario = Scenario.load(run.scenario)
     folder = open_folder(run.out)
-    with build_plant(scenario) as plant:
+    with IsolatedPlant(scenario) if run.isolate else FmuPlant(scenario) as plant:
         if not plant.is_shipped:
             output.note(f"native code of {plant.fmu_path}, sha256 {plant.fmu_sha256}")
         controller = build_controller(run.controller, scenario)

@@ -34,6 +34,10 @@ def simulate(
         "cosim-run"
     ),
     record: Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")] = False,
+    isolate: Annotated[
+        bool,
+        typer.Option("--isolate", help="Run the FMU in a process of its own, in case it crashes."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Run a controller on a scenario's plant.
@@ -41,7 +45,7 @@ def simulate(
     Writes trajectory.csv, timing.csv, summary.json, scenario.toml and, with --record, run.rrd.
     """
     with output(json) as out_:
-        _, summary = execute(Run(scenario, controller, steps, seed, out, record), out_)
+        _, summary = execute(Run(scenario, controller, steps, seed, out, record, isolate), out_)
         show(summary, out_)
         out_.note(f"files are in {out.resolve()}")
         out_.json(summary)

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import hashlib
+import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 from fmpy import read_model_description
-from fmpy.model_description import InterfaceType, ModelDescription, ScalarVariable
+from fmpy.model_description import ScalarVariable
 
 from fmus.errors import FmuError
 
+_INTERFACES = {
+    "CoSimulation": "co-simulation",
+    "ModelExchange": "model exchange",
+    "ScheduledExecution": "scheduled execution",
+}
+# Spelt differently by FMI 2.0 and 3.0: compared in lower case, without a plural's s.
 _CAPABILITIES = {
-    "canGetAndSetFMUstate": "get and set the state",
-    "canSerializeFMUstate": "serialise the state",
-    "providesDirectionalDerivative": "directional derivatives",
-    "providesAdjointDerivatives": "adjoint derivatives",
-    "canHandleVariableCommunicationStepSize": "variable communication step",
-    "canBeInstantiatedOnlyOncePerProcess": "one instance per process only",
+    "cangetandsetfmustate": "get and set the state",
+    "canserializefmustate": "serialise the state",
+    "providesdirectionalderivative": "directional derivatives",
+    "providesadjointderivative": "adjoint derivatives",
+    "canhandlevariablecommunicationstepsize": "variable communication step",
+    "canbeinstantiatedonlyonceperproces": "one instance per process only",
 }
 
 
@@ -62,7 +71,7 @@ def information(fmu: Path) -> Information:
         description = read_model_description(str(fmu), validate=False)
     except Exception as error:
         raise FmuError(f"{fmu} is not an FMU: {error}") from error
-    interfaces = _interfaces(description)
+    interfaces = _interfaces(fmu)
     experiment = description.defaultExperiment
     times = [getattr(experiment, n, None) for n in ("startTime", "stopTime", "stepSize")]
     start, stop, step = (None if t is None else float(t) for t in times)
@@ -73,7 +82,7 @@ def information(fmu: Path) -> Information:
         name=description.modelName,
         description=description.description or "",
         interfaces=tuple(interfaces),
-        capabilities=_capabilities(list(interfaces.values())),
+        capabilities=_capabilities(interfaces.values()),
         start_time=start,
         stop_time=stop,
         step_size=step,
@@ -81,21 +90,22 @@ def information(fmu: Path) -> Information:
     )
 
 
-def _interfaces(description: ModelDescription) -> dict[str, InterfaceType]:
-    found = {
-        "co-simulation": description.coSimulation,
-        "model exchange": description.modelExchange,
-        "scheduled execution": description.scheduledExecution,
+def _interfaces(fmu: Path) -> dict[str, dict[str, str]]:
+    """Interface → its attributes, from the XML: fmpy misses FMI 3.0's directional derivatives."""
+    with zipfile.ZipFile(fmu) as container:
+        root = ElementTree.fromstring(container.read("modelDescription.xml"))
+    found = {name: root.find(tag) for tag, name in _INTERFACES.items()}
+    return {name: element.attrib for name, element in found.items() if element is not None}
+
+
+def _capabilities(interfaces: Iterable[dict[str, str]]) -> tuple[str, ...]:
+    given = {
+        key.lower().rstrip("s")
+        for attributes in interfaces
+        for key, value in attributes.items()
+        if value in ("true", "1")
     }
-    return {name: interface for name, interface in found.items() if interface is not None}
-
-
-def _capabilities(interfaces: list[InterfaceType]) -> tuple[str, ...]:
-    return tuple(
-        text
-        for attribute, text in _CAPABILITIES.items()
-        if any(getattr(interface, attribute, False) for interface in interfaces)
-    )
+    return tuple(text for key, text in _CAPABILITIES.items() if key in given)
 
 
 def _summary(variable: ScalarVariable) -> VariableSummary:

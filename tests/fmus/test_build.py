@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+
+import fmus
+from fmus import build
+from fmus.errors import BuildError
+
+HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
+needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="there is no C compiler")
+
+
+def shipped_record(name: str = "evaporator") -> dict:
+    with zipfile.ZipFile(fmus.path(name)) as container:
+        return json.loads(container.read(build.BUILD_FILE))
+
+
+@pytest.fixture(scope="module")
+def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both FMUs, built by a copy of the package in another folder."""
+    root = tmp_path_factory.mktemp("clean checkout")
+    ignored = shutil.ignore_patterns("__pycache__", "*.fmu", "variables.h")
+    shutil.copytree(build.PACKAGE, root / "fmus", ignore=ignored)
+    code = "from pathlib import Path; from fmus.build import build; build(Path('out'))"
+    subprocess.run([sys.executable, "-c", code], cwd=root, check=True)
+    return root / "out"
+
+
+@needs_compiler
+def test_clean_build_elsewhere_equals_the_shipped_files(rebuilt: Path) -> None:
+    for name in fmus.NAMES:
+        differing = build.differences(rebuilt / f"{name}.fmu", fmus.path(name))
+        if json.loads(build.build_record())["compiler"] != shipped_record()["compiler"]:
+            binary = {build.BUILD_FILE, *(n for n in differing if n.startswith("binaries/"))}
+            assert set(differing) <= binary
+            pytest.skip("another compiler than the one of the shipped binary")
+        assert differing == []
+
+
+@needs_compiler
+def test_two_builds_are_byte_identical(rebuilt: Path, tmp_path: Path) -> None:
+    for path in build.build(tmp_path):
+        assert path.read_bytes() == (rebuilt / path.name).read_bytes()
+
+
+@needs_compiler
+def test_library_exports_the_fmi_functions_only(folders: dict[int, Path]) -> None:
+    if shutil.which("nm") is None:
+        pytest.skip("there is no nm")
+    for version, folder in folders.items():
+        (library,) = folder.glob("binaries/*/evaporator.so")
+        listing = subprocess.run(
+            ["nm", "-D", "--defined-only", str(library)], capture_output=True, text=True, check=True
+        ).stdout
+        names = [line.split()[-1] for line in listing.splitlines()]
+        assert names
+        assert all(name.startswith(f"fmi{version}") for name in names)
+
+
+@needs_compiler
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
+    from fmpy.build import build_platform_binary
+
+    search = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    if shutil.which("cmake", path=search) is None:
+        pytest.skip("there is no cmake")
+    name = fmus.NAMES[fmi - 2]
+    folder = tmp_path / "unzipped"
+    fmpy.extract(str(fmus.path(name)), str(folder))
+    shutil.rmtree(folder / "binaries")
+    options = {"CMAKE_C_FLAGS:STRING": "-ffp-contract=off", "CMAKE_C_STANDARD_LIBRARIES": "-lm"}
+    old = os.environ["PATH"]
+    os.environ["PATH"] = search
+    try:
+        build_platform_binary(str(folder), cmake_options=options)
+    finally:
+        os.environ["PATH"] = old
+    experiment = {"stop_time": 600.0, "output_interval": 60.0, "fmi_type": "CoSimulation"}
+    ours = fmpy.simulate_fmu(str(fmus.path(name)), **experiment)
+    theirs = fmpy.simulate_fmu(str(folder), **experiment)
+    assert np.array_equal(ours, theirs)
+
+
+def test_every_member_but_the_binary_is_up_to_date(version: int) -> None:
+    """Needs no compiler: generated text, sources and resources in the shipped file."""
+    name = fmus.NAMES[version - 2]
+    with zipfile.ZipFile(fmus.path(name)) as container:
+        for member, data in build.sources(version).items():
+            assert container.read(f"sources/{member}") == data, member
+        description = build.model_description(version, build.model_token()).encode()
+        assert container.read("modelDescription.xml") == description
+        page = build.documentation_page(version, build.BUILD_FILE).encode()
+        assert container.read("documentation/index.html") == page
+
+
+def test_archive_is_sorted_with_fixed_dates(version: int) -> None:
+    with zipfile.ZipFile(fmus.path(fmus.NAMES[version - 2])) as container:
+        entries = container.infolist()
+    assert [e.filename for e in entries] == sorted(e.filename for e in entries)
+    assert {e.date_time for e in entries} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_fmi2_file_has_no_terminals_and_no_header_of_the_standard() -> None:
+    with zipfile.ZipFile(fmus.path()) as container:
+        names = container.namelist()
+    assert not [n for n in names if "terminals" in n or Path(n).name.startswith("fmi2F")]
+
+
+def test_record_names_the_compiler() -> None:
+    record = shipped_record()
+    assert record["compiler"]
+    assert "-ffp-contract=off" in record["compiler_flags"]
+    assert record["model_token"] == build.model_token()
+
+
+def test_missing_compiler_is_an_error_that_says_what_to_do(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(BuildError, match="install gcc or set CC"):
+        build.build(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_compiler
+def test_compiler_error_is_told(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(build, "COMPILER_FLAGS", ("--no-such-flag",))
+    with pytest.raises(BuildError, match="no-such-flag"):
+        build.build(tmp_path)
+
+
+def test_difference_names_the_member(tmp_path: Path) -> None:
+    build.archive({"a": b"1", "b": b"2"}, tmp_path / "one")
+    build.archive({"a": b"1", "b": b"3", "c": b""}, tmp_path / "two")
+    assert build.differences(tmp_path / "one", tmp_path / "two") == ["b", "c"]
+    with pytest.raises(BuildError, match="missing"):
+        build.differences(tmp_path / "one", tmp_path / "three")

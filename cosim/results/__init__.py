@@ -1,0 +1,1 @@
+"""Stored results: what was measured, by which command, and whether it still holds."""

@@ -1,4 +1,4 @@
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 import pytest
@@ -214,10 +214,10 @@ class Stub:
 def test_the_loop_itself_costs_less_than_ten_microseconds_a_step(paper):
     plant, controller = Stub(paper), Hold(paper.reference_action)
     times = []
-    for _ in range(5):
-        begin = perf_counter()
+    for _ in range(10):
+        begin = process_time()
         simulate(plant, controller, 2000, seed=0)
-        times.append(perf_counter() - begin)
+        times.append(process_time() - begin)
     assert min(times) / 2000 < 10e-6
 
 

@@ -11,7 +11,7 @@ def with_backend(scenario, backend):
     return scenario.replace({"controller": {"backend": backend}})
 
 
-@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
+@pytest.mark.parametrize("backend", ["daqp", pytest.param("proxqp", marks=pytest.mark.slow)])
 def test_rti_settles_at_the_economic_steady_state_from_feasible_starts(backend):
     scenario = with_backend(Scenario.load("nominal"), backend)
     starts = np.random.default_rng(2).uniform(scenario.state_lower, scenario.state_upper, (2, 2))

@@ -66,8 +66,10 @@ def read_recording(path: str | Path) -> Recording:
     units: dict[str, str] = {}
     samples, time = np.empty(0, np.int64), np.empty(0)
     for entity, texts in marks.items():
-        names = texts[f"{SIGNAL}:name"]
-        units |= dict(zip(names, texts[f"{SIGNAL}:unit"], strict=True))
+        names, spelled = texts[f"{SIGNAL}:name"], texts.get(f"{SIGNAL}:unit", [])
+        if len(names) != len(spelled):
+            raise RecordingError(f"{path} was recorded by another version of rti-cosim")
+        units |= dict(zip(names, spelled, strict=True))
         found, values = _columns(rows[entity], len(names))
         signals |= dict(zip(names, values, strict=True))
         if len(found) > len(samples):

@@ -67,3 +67,13 @@ def test_what_a_killed_process_leaves_is_repaired_as_the_message_says(tmp_path, 
     command = [sys.executable, "-m", "rerun", "rrd", "optimize", str(torn), "-o", str(repaired)]
     subprocess.run(command, check=True, capture_output=True)
     assert len(read_recording(repaired).samples) == 3000
+
+
+def test_another_versions_recording_is_refused(tmp_path):
+    path = tmp_path / "old.rrd"
+    stream = rr.RecordingStream("old")
+    stream.save(path)
+    stream.log("a", rr.DynamicArchetype("cosim.Signal", components={"name": "X2"}), static=True)
+    stream.disconnect()
+    with pytest.raises(RecordingError, match="another version"):
+        read_recording(path)

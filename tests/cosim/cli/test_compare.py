@@ -1,0 +1,73 @@
+import json
+
+import pytest
+from loop import Proportional
+
+from cosim import FmuPlant, Scenario, simulate
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Folders s0 and s1 with runs of two seeds."""
+    folder, scenario = tmp_path_factory.mktemp("runs"), Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        for seed in (0, 1):
+            (folder / f"s{seed}").mkdir()
+            trajectory = simulate(plant, Proportional(scenario), 30, seed)
+            trajectory.write_csv(folder / f"s{seed}" / "trajectory.csv")
+            trajectory.write_timing_csv(folder / f"s{seed}" / "timing.csv")
+    return folder
+
+
+@pytest.fixture
+def runs(cosim, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_equal_runs_end_with_0_and_others_with_1(cosim, runs):
+    assert cosim("compare", "s0", "s0/trajectory.csv")[0] == 0
+    code, out, err = cosim("compare", "s0", "s1")
+    assert code == 1
+    assert "P100" in out
+    assert "first difference at sample 0 (time 0 s): X1 differs by up to" in err
+
+
+def test_tolerances_make_runs_equal(cosim, runs):
+    assert cosim("compare", "s0", "s1", "--relative", "1e-9")[0] == 1
+    assert cosim("compare", "s0", "s1", "--relative", "1e9")[0] == 0
+    signals = json.loads(cosim("compare", "s0", "s1", "--json")[1])["signals"]
+    options = [x for name, d in signals.items() for x in ("-t", f"{name}={d['maximum']}")]
+    assert cosim("compare", "s0", "s1", *options)[0] == 0
+
+
+def test_json_is_all_that_goes_to_standard_output(cosim, runs):
+    code, out, _ = cosim("compare", "s0", "s1", "--json")
+    document = json.loads(out)
+    assert (code, document["equal"], document["first_difference"]) == (1, False, 0)
+    assert document["signals"]["X1"]["unit"] == "%"
+
+
+def test_record_writes_an_overlay(cosim, runs):
+    assert cosim("compare", "s0", "s1", "--record", "both.rrd")[0] == 1
+    assert (runs / "both.rrd").stat().st_size > 10_000
+
+
+BAD_INPUT = {
+    "no such run": (["none", "s0"], "no run at 'none'"),
+    "unknown signal": (["s0", "s1", "-t", "X9=1"], "unknown signal 'X9'"),
+    "tolerance without a name": (["s0", "s1", "-t", "1"], "give NAME=VALUE"),
+    "tolerance without a number": (["s0", "s1", "-t", "X2=much"], "give NAME=VALUE"),
+    "negative tolerance": (["s0", "s1", "-t", "X2=-1"], "must not be negative"),
+    "unwritable recording": (["s0", "s1", "--record", "no/c.rrd"], "cannot write"),
+    "not a trajectory": (["s0/timing.csv", "s1"], "not a trajectory"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_input_gives_one_clear_message_and_exit_code_2(case, cosim, runs):
+    arguments, message = BAD_INPUT[case]
+    code, _, err = cosim("compare", *arguments)
+    assert code == 2
+    assert message in err.replace("\n", " ")
+    assert "Traceback" not in err

@@ -1,0 +1,41 @@
+import json
+
+import pytest
+
+
+@pytest.fixture
+def recording(cosim):
+    assert cosim("simulate", "--steps", 20, "--out", "run", "--record")[0] == 0
+    return "run/run.rrd"
+
+
+def test_json_tells_properties_and_ranges(cosim, recording, paper):
+    code, out, _ = cosim("view", recording, "--json")
+    content = json.loads(out)
+    assert code == 0
+    assert content["properties"]["scenario_hash"] == paper.hash
+    assert content["signals"]["P2"]["unit"] == "kPa"
+
+
+def test_the_cursor_needs_a_png(cosim, recording):
+    code, _, err = cosim("view", recording, "--at", 60)
+    assert code == 2
+    assert "--png" in err
+
+
+def test_without_a_display_the_message_says_how_to_draw(cosim, recording, monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    code, _, err = cosim("view", recording)
+    assert code == 2
+    assert "no display" in err
+
+
+@pytest.mark.slow
+def test_png_draws_the_recording(cosim, recording, tmp_path):
+    code, _, err = cosim("view", recording, "--png", "run.png", "--at", 600)
+    if "no graphics driver" in err:
+        pytest.skip(err)
+    assert code == 0
+    assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")

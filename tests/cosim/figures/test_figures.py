@@ -1,0 +1,117 @@
+"""Each figure draws what its data say; how it looks is for the eye."""
+
+import numpy as np
+import pytest
+from loop import Failing, Proportional
+from scipy.stats import t as student
+
+from cosim import FmuPlant, Scenario, simulate
+from cosim.figures import (
+    Portrait,
+    plot_density,
+    plot_learning_curves,
+    plot_parameters_and_td_error,
+    plot_pareto,
+    plot_phase_portraits,
+    plot_step_times,
+    plot_trajectory,
+    policy_on_grid,
+    trajectory_figure,
+)
+from cosim.figures.pareto import half_width, nondominated
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+@pytest.fixture(scope="module")
+def trajectory():
+    paper = Scenario.load("paper")
+    with FmuPlant(paper) as plant:
+        return simulate(plant, Failing(paper, [5, 6]), 120, 0)
+
+
+def axes_by_label(figure):
+    return {axes.get_ylabel(): axes for axes in figure.axes}
+
+
+def test_a_trajectory_shows_every_signal_with_its_unit(trajectory, paper):
+    axes = axes_by_label(trajectory_figure(trajectory, paper))
+    expected = {"$X_{2}$ [%]", "$P_{2}$ [kPa]", "$P_{100}$ [kPa]", "$F_{200}$ [kg/min]"}
+    assert expected | {"$T_{1}$ [°C]", "stage cost", "penalty"} <= set(axes)
+    state = axes["$X_{2}$ [%]"].lines[0]
+    assert np.array_equal(state.get_ydata(), trajectory["X2"])
+    assert np.allclose(state.get_xdata(), np.arange(120.0))
+
+
+def test_a_trajectory_shows_the_bound_and_the_fallbacks(trajectory, paper):
+    axes = axes_by_label(trajectory_figure(trajectory, paper))
+    levels = [set(np.asarray(line.get_ydata())) for line in axes["$X_{2}$ [%]"].lines[1:]]
+    assert {25.0} in levels
+    marks = [line for line in axes["$P_{100}$ [kPa]"].lines if line.get_marker() == "x"]
+    assert [list(line.get_xdata()) for line in marks] == [[5.0, 6.0]]
+
+
+def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
+    with FmuPlant(paper) as plant:
+        run = simulate(plant, Proportional(paper), 1, 0)
+    assert plot_trajectory(run, paper, tmp_path / "a.png").stat().st_size > 10_000
+
+
+def figures(rng, paper):
+    samples = np.arange(0.0, 50_001.0, 1000.0)
+    cloud = rng.normal((25.5, 50.0), 0.5, size=(500, 2))
+    x, y = np.linspace(24.0, 28.0, 7), np.linspace(47.0, 53.0, 6)
+    actions = policy_on_grid(lambda s: np.array([200.0 - s[0], 215.0 + s[1]]), x, y)
+    portraits = [Portrait(name, cloud, actions) for name in ("naive", "$mine", "optimal", "d")]
+    curves = {"q": (samples, rng.random((5, len(samples)))), "one": (samples, rng.random(51))}
+    cost = {name: (rng.random(9), rng.random(9)) for name in ("naive", "$mine", "tuned")}
+    increments = {"B_l": rng.random((51, 10)), "c_lambda": rng.random(51), "x_u": np.zeros((51, 2))}
+    return {
+        "phase": lambda path: plot_phase_portraits(portraits, x, y, paper, path),
+        "density": lambda path: plot_density(
+            {"naive": cloud[:, 0], "$mine": cloud[:, 0] + 1}, 25.0, "X2", "%", path
+        ),
+        "learning": lambda path: plot_learning_curves(curves, path, references={"optimal": 0.1}),
+        "parameters": lambda path: plot_parameters_and_td_error(
+            samples, increments, samples[10:], rng.random(41), path
+        ),
+        "pareto": lambda path: plot_pareto(cost, path),
+        "times": lambda path: plot_step_times({"a": rng.random(99) + 9, "$b": rng.random(9)}, path),
+    }
+
+
+@pytest.mark.parametrize("name", ["phase", "density", "learning", "parameters", "pareto", "times"])
+def test_every_figure_repeats_its_bytes(name, tmp_path, paper):
+    files = []
+    for i in range(2):
+        draw = figures(np.random.default_rng(1), paper)[name]
+        files.append(draw(tmp_path / f"{i}.svg").read_bytes())
+        assert draw(tmp_path / f"{i}.png").stat().st_size > 10_000
+    assert files[0] == files[1]
+
+
+def test_a_policy_is_laid_out_with_rows_of_the_second_state():
+    grid = policy_on_grid(lambda s: s, np.array([1.0, 2.0, 3.0]), np.array([5.0, 6.0]))
+    assert grid.shape == (2, 3, 2)
+    assert grid[1, 2].tolist() == [3.0, 6.0]
+
+
+def test_half_widths_are_students(rng):
+    values = rng.normal(size=12)
+    low, high = student.interval(
+        0.95, 11, loc=values.mean(), scale=values.std(ddof=1) / np.sqrt(12)
+    )
+    assert half_width(values) == pytest.approx((high - low) / 2, rel=1e-12)
+    assert half_width(np.array([1.0])) == 0.0
+
+
+def test_the_front_is_what_no_other_point_beats(rng):
+    points = rng.integers(0, 6, size=(60, 2)).astype(float)
+    expected = [
+        not any((q <= p).all() and (q < p).any() for j, q in enumerate(points) if j != i)
+        for i, p in enumerate(points)
+    ]
+    assert nondominated(points).tolist() == expected

@@ -1,0 +1,149 @@
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from loop import Proportional
+
+from cosim import FmuPlant, simulate
+from cosim.cli.output import dump
+from cosim.comparison import Run, as_document, compare, load_run
+from cosim.errors import ComparisonError, RecordingError, TrajectoryError
+from cosim.recording import RerunRecorder
+from cosim.trajectory import Signal
+
+values = st.one_of(st.floats(-1e3, 1e3), st.just(float("nan")), st.just(float("inf")))
+
+
+def run(status=(), **signals):
+    table = {name: Signal(name, "kPa", np.array(v, dtype=float)) for name, v in signals.items()}
+    return Run("run", table, status)
+
+
+def test_equal_runs_are_equal():
+    a = run(("solved",) * 3, P2=[1.0, np.nan, np.inf])
+    result = compare(a, run(("solved",) * 3, P2=[1.0, np.nan, np.inf]))
+    assert result.equal
+    assert result.first is None
+    assert result.lines() == []
+    assert result.differences[0].maximum == 0.0
+
+
+def test_one_bit_counts_without_a_tolerance():
+    result = compare(run(P2=[1.0, 2.0]), run(P2=[1.0, np.nextafter(2.0, 3.0)]))
+    assert not result.equal
+    assert result.first == 1
+
+
+@given(st.lists(st.tuples(values, values), min_size=1, max_size=30), st.floats(0.0, 10.0))
+def test_first_and_largest_difference_against_a_plain_loop(pairs, tolerance):
+    a, b = zip(*pairs, strict=True)
+    found = compare(run(x=a), run(x=b), {"x": tolerance}).differences[0]
+
+    def distance(x, y):
+        if x == y or (np.isnan(x) and np.isnan(y)):
+            return 0.0
+        return np.inf if np.isnan(x) or np.isnan(y) else abs(x - y)
+
+    distances = [distance(x, y) for x, y in pairs]
+    assert found.maximum == max(distances)
+    assert distances[found.at] == max(distances)
+    beyond = [k for k, value in enumerate(distances) if value > tolerance]
+    assert found.first == (beyond[0] if beyond else None)
+
+
+def test_the_message_has_signal_step_both_values_and_units():
+    a = run(time=[0.0, 60.0, 120.0], P2=[49.0, 50.0, 51.0], T=[1.0, 1.0, 1.0])
+    b = run(time=[0.0, 60.0, 120.0], P2=[49.0, 50.5, 51.25], T=[1.0, 1.0, 2.0])
+    text = compare(a, b, {"P2": 0.1}).lines()
+    assert text == [
+        "first difference at sample 1 (time 60 s): P2 differs by up to 0.5 kPa "
+        "(sample 1: 50.0 against 50.5), tolerance 0.1 kPa"
+    ]
+
+
+def test_a_tolerance_is_in_the_signals_unit_and_holds_for_it_alone():
+    a, b = run(P2=[1.0, 2.0], X2=[1.0, 2.0]), run(P2=[1.0, 2.25], X2=[1.0, 2.25])
+    result = compare(a, b, {"P2": 0.25})
+    assert [d.first for d in result.differences] == [None, 1]
+
+
+def test_the_relative_tolerance_goes_with_the_largest_magnitude():
+    a, b = run(P2=[-200.0, 1.0], c=[1.0, 1.0]), run(P2=[-200.0, 2.0], c=[1.0, 1.1])
+    result = compare(a, b, relative=0.01)
+    assert [d.tolerance for d in result.differences] == [2.0, 0.01]
+    assert [d.first for d in result.differences] == [None, 1]
+
+
+def test_runs_of_unequal_length_differ_and_their_common_part_is_compared():
+    result = compare(run(P2=[1.0, 2.0, 3.0]), run(P2=[1.0, 2.0]))
+    assert not result.equal
+    assert result.first is None
+    assert result.lines() == ["3 samples against 2"]
+
+
+def test_signals_of_one_run_only_are_named():
+    result = compare(run(P2=[1.0], X2=[1.0]), run(P2=[1.0], F=[1.0]))
+    assert not result.equal
+    assert result.lines() == ["only the first has X2", "only the second has F"]
+
+
+def test_a_differing_status_is_a_difference():
+    a, b = run(("solved", "solved"), P2=[1.0, 2.0]), run(("solved", "fallback"), P2=[1.0, 2.0])
+    result = compare(a, b)
+    assert not result.equal
+    assert result.lines() == ["first difference at sample 1: status"]
+
+
+@pytest.mark.parametrize("tolerance", [-1.0, float("nan")])
+def test_a_tolerance_that_is_none_is_refused(tolerance):
+    with pytest.raises(ComparisonError, match="'P2' must not be negative"):
+        compare(run(P2=[1.0]), run(P2=[1.0]), {"P2": tolerance})
+
+
+def test_a_tolerance_for_no_signal_is_refused():
+    with pytest.raises(ComparisonError, match=r"unknown signal 'P3' \(did you mean 'P2'\?\)"):
+        compare(run(P2=[1.0]), run(P2=[1.0]), {"P3": 1.0})
+
+
+def test_the_document_is_json_even_with_nan_against_a_number():
+    document = as_document(compare(run(P2=[1.0]), run(P2=[np.nan])))
+    assert json.loads(dump(document))["equal"] is False
+    assert document["signals"]["P2"]["first"] == 0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    from cosim import Scenario
+
+    folder = tmp_path_factory.mktemp("run")
+    scenario = Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        recorder = RerunRecorder(folder / "run.rrd")
+        trajectory = simulate(plant, Proportional(scenario), 30, 1, recorder=recorder)
+    trajectory.write_csv(folder / "trajectory.csv")
+    return folder
+
+
+def test_folder_csv_and_recording_of_a_run_are_equal(folder):
+    csv = load_run(folder / "trajectory.csv")
+    assert len(csv) == 30
+    for other in (load_run(folder), load_run(folder / "run.rrd")):
+        result = compare(csv, other)
+        assert result.equal, result.lines()
+        assert len(result.differences) == len(csv.signals)
+
+
+def test_a_place_without_a_run_is_refused(tmp_path):
+    with pytest.raises(ComparisonError, match="there is no run at"):
+        load_run(tmp_path)
+
+
+def test_files_of_another_kind_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(TrajectoryError, match="not a trajectory"):
+        load_run(tmp_path / "a.csv")
+    (tmp_path / "a.rrd").write_text("x")
+    with pytest.raises(RecordingError, match="not a readable recording"):
+        load_run(tmp_path / "a.rrd")

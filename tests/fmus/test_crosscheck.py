@@ -1,0 +1,99 @@
+"""The stored reference signals: reproduced bit for bit, and right by an independent integration."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import fmus
+from fmus import crosscheck
+from fmus.checks.trajectory import relative_difference
+from fmus.errors import FmuError
+
+
+@pytest.mark.parametrize("name", fmus.NAMES)
+def test_stored_signals_are_reproduced_bit_for_bit(name: str) -> None:
+    assert [str(d) for d in crosscheck.deviations(fmus.path(name))] == []
+
+
+@pytest.mark.parametrize("case", crosscheck.CASES)
+def test_model_exchange_agrees_to_1e_6(version: int, case: str) -> None:
+    path = fmus.path(fmus.NAMES[version - 2])
+    result = crosscheck.simulate(path, case, "ModelExchange", relative_tolerance=1e-10)
+    expected = crosscheck.load(case)
+    # where an input jumps, fmpy records co-simulation before, and model exchange after the jump
+    expected = expected[expected["time"] % crosscheck.HOLD != 0.0]
+    last = np.searchsorted(result["time"], expected["time"] + 1e-3) - 1
+    columns = [
+        np.stack([rows[n] for n in crosscheck.OUTPUTS], axis=1) for rows in (result[last], expected)
+    ]
+    assert relative_difference(*columns) < 1e-6
+
+
+def test_stored_states_solve_the_differential_equations() -> None:
+    """Model of the evaporator with its numbers written out; time in minutes."""
+    for case in crosscheck.CASES:
+        stored = crosscheck.load(case)
+        for k in range(len(stored) - 1):
+            hold = int(stored["time"][k] // crosscheck.HOLD)
+            p100, f200 = crosscheck.P100[hold], crosscheck.F200[hold]
+            x1, f1, t1, t200 = (stored[n][k] for n in ("X1", "F1", "T1", "T200"))
+
+            def rates(_, y, p100=p100, f200=f200, x1=x1, f1=f1, t1=t1, t200=t200):
+                x2, p2 = y
+                t2, t3 = 0.5616 * p2 + 0.3126 * x2 + 48.43, 0.507 * p2 + 55
+                q100 = 0.16 * (f1 + 50) * (0.1538 * p100 + 90 - t2)
+                f4 = (q100 - f1 * 0.07 * (t2 - t1)) / 38.5
+                f5 = 6.84 * (t3 - t200) / (1 + 6.84 / (0.14 * f200)) / 38.5
+                return (f1 * x1 - (f1 - f4) * x2) / 20, (f4 - f5) / 4
+
+            start = stored["X2"][k], stored["P2"][k]
+            end = solve_ivp(rates, (0, 1), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+            np.testing.assert_allclose(end, (stored["X2"][k + 1], stored["P2"][k + 1]), rtol=1e-9)
+
+
+def test_nominal_case_has_nominal_disturbances_and_the_seeds_differ() -> None:
+    nominal, first, second = (crosscheck.load(case) for case in crosscheck.CASES)
+    assert set(nominal["X1"]) == {5.0}
+    assert not np.any(first["X1"] == second["X1"])
+
+
+@pytest.mark.parametrize("case", crosscheck.CASES)
+def test_files_follow_the_cross_check_format(case: str) -> None:
+    folder = crosscheck.FOLDER / case
+    assert len(crosscheck.load(case)) <= 500
+    assert crosscheck.load(case).dtype.names == ("time", *crosscheck.OUTPUTS)
+    assert np.array_equal(crosscheck.load(case, "in"), crosscheck.input_signals())
+    with (folder / "evaporator_ref.opt").open() as file:
+        options = {key: float(value) for key, value in csv.reader(file)}
+    assert set(options) == {"StartTime", "StopTime", "StepSize", "RelTol", "OutputIntervalLength"}
+    with (folder / "start_values.csv").open() as file:
+        assert dict(csv.reader(file)) == crosscheck.CASES[case]
+
+
+def test_deviation_names_signal_time_and_both_values(monkeypatch) -> None:
+    changed = crosscheck.load("seed1")
+    changed["P2"][7] = np.nextafter(changed["P2"][7], 100.0)
+    load = crosscheck.load
+    monkeypatch.setattr(crosscheck, "load", lambda c: changed if c == "seed1" else load(c))
+    (line,) = [str(d) for d in crosscheck.deviations(fmus.path())]
+    assert line.startswith("seed1: P2 at 420 s is ")
+    assert repr(float(changed["P2"][7])) in line
+
+
+def test_missing_reference_is_an_error_and_is_not_written(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(crosscheck, "FOLDER", tmp_path)
+    with pytest.raises(FmuError, match="is missing"):
+        crosscheck.deviations(fmus.path())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_update_writes_what_is_stored(monkeypatch, tmp_path: Path) -> None:
+    stored = crosscheck.FOLDER
+    monkeypatch.setattr(crosscheck, "FOLDER", tmp_path)
+    for path in crosscheck.update(fmus.path()):
+        assert path.read_bytes() == (stored / path.relative_to(tmp_path)).read_bytes()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import operator
-import struct
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
@@ -20,13 +19,12 @@ from cosim.plant.archive import SHIPPED, unpack
 from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
+from cosim.plant.snapshot import Snapshot, packed, unpacked
 from cosim.plant.wiring import Wirer
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
-_HEADER = struct.Struct("<8sq32s")
-_MAGIC = b"cosimfs1"
 _NOT_STARTED = -1
 
 
@@ -38,28 +36,6 @@ def _checked_seed(seed: int) -> int:
     if not 0 <= word < 1 << 64:
         raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
     return word
-
-
-class Snapshot:
-    """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
-
-    Its memory belongs to the FMU and is handed to a later snapshot when this one is dropped.
-    """
-
-    __slots__ = ("_plant", "handle", "k")
-
-    def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
-        self._plant = plant
-        self.handle = handle
-        self.k = k
-
-    def belongs_to(self, plant: FmuPlant) -> bool:
-        """Whether the plant made this snapshot."""
-        return self._plant is plant
-
-    def __del__(self) -> None:
-        """Give the memory back to the plant."""
-        self._plant.recycle(self.handle)
 
 
 class FmuPlant:
@@ -84,18 +60,18 @@ class FmuPlant:
         self._fmi: Instance | None = None
         self._handles: list[ctypes.c_void_p] = []
         self._free_handles: list[ctypes.c_void_p] = []
-        unpacked = unpack(self.scenario.plant.fmu if fmu is None else fmu)
-        version = str(unpacked.description.fmiVersion)
-        if unpacked.description.coSimulation is None:
-            raise PlantError(f"FMU '{unpacked.path}' has no co-simulation interface")
+        archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
+        version = str(archive.description.fmiVersion)
+        if archive.description.coSimulation is None:
+            raise PlantError(f"FMU '{archive.path}' has no co-simulation interface")
         if version[0] not in "23":
-            raise PlantError(f"FMU '{unpacked.path}' is FMI {version}; 2.0 and 3.0 are supported")
+            raise PlantError(f"FMU '{archive.path}' is FMI {version}; 2.0 and 3.0 are supported")
         interface = Fmi2Instance if version[0] == "2" else Fmi3Instance
-        wirer = Wirer(self.scenario, unpacked, interface)
-        self.unpacked = unpacked
+        wirer = Wirer(self.scenario, archive, interface)
+        self.unpacked = archive
         self.fmi_version = version
-        self.fmu_path = unpacked.path
-        self.fmu_sha256 = unpacked.sha256
+        self.fmu_path = archive.path
+        self.fmu_sha256 = archive.sha256
         wiring = wirer.wiring()
         self.units = wirer.units()
         lower, upper = wirer.state_range()
@@ -115,7 +91,7 @@ class FmuPlant:
         self._started = False
         self._penalty_now = 0.0
         self.is_shipped = str(self.scenario.plant.fmu if fmu is None else fmu) in SHIPPED
-        self._fmi = interface(unpacked, wiring, self._h)
+        self._fmi = interface(archive, wiring, self._h)
         self._advance = self._fmi.advance
         self._inputs = self._fmi.inputs
         self._outputs = self._fmi.outputs
@@ -204,23 +180,16 @@ class FmuPlant:
         fmi = self._instance
         if not snapshot.belongs_to(self):
             raise PlantError("this snapshot was taken from another plant")
-        digest = bytes.fromhex(self.fmu_sha256)
-        return _HEADER.pack(_MAGIC, snapshot.k, digest) + fmi.serialise(snapshot.handle)
+        return packed(snapshot.k, self.fmu_sha256, fmi.serialise(snapshot.handle))
 
     def deserialise(self, data: bytes) -> Snapshot:
         """Return the snapshot that `serialise` wrote, of any plant with the very same FMU file."""
         fmi = self._instance
-        if len(data) < _HEADER.size or data[:8] != _MAGIC:
-            raise PlantError("these bytes are not a serialised plant state")
-        _, k, digest = _HEADER.unpack_from(data)
-        if digest.hex() != self.fmu_sha256:
-            raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
-        if k < 0:
-            raise PlantError("these bytes are not a serialised plant state")
+        k, state = unpacked(data, self.fmu_sha256)
         if not self._started:
             self.reset(0)
         handle = self._handle()
-        fmi.deserialise(data[_HEADER.size :], handle)
+        fmi.deserialise(state, handle)
         return Snapshot(self, handle, k)
 
     def recycle(self, handle: ctypes.c_void_p) -> None:

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from cosim import errors
 from cosim.errors import CosimError, PlantError
-from cosim.plant.fmu_plant import FmuPlant, Snapshot
+from cosim.plant.fmu_plant import FmuPlant
+from cosim.plant.snapshot import Snapshot
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 

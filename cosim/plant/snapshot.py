@@ -1,0 +1,54 @@
+"""Saved states of a plant, in the FMU's memory and as bytes."""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from typing import TYPE_CHECKING
+
+from cosim.errors import PlantError
+
+if TYPE_CHECKING:
+    from cosim.plant.fmu_plant import FmuPlant
+
+_HEADER = struct.Struct("<8sq32s")
+_MAGIC = b"cosimfs1"
+
+
+class Snapshot:
+    """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
+
+    Its memory belongs to the FMU and is handed to a later snapshot when this one is dropped.
+    """
+
+    __slots__ = ("_plant", "handle", "k")
+
+    def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
+        self._plant = plant
+        self.handle = handle
+        self.k = k
+
+    def belongs_to(self, plant: FmuPlant) -> bool:
+        """Whether the plant made this snapshot."""
+        return self._plant is plant
+
+    def __del__(self) -> None:
+        """Give the memory back to the plant."""
+        self._plant.recycle(self.handle)
+
+
+def packed(k: int, sha256: str, state: bytes) -> bytes:
+    """Return an FMU's serialised state with its sample number and the FMU's hash before it."""
+    return _HEADER.pack(_MAGIC, k, bytes.fromhex(sha256)) + state
+
+
+def unpacked(data: bytes, sha256: str) -> tuple[int, bytes]:
+    """Return sample number and FMU state; raises PlantError unless `packed` made them so."""
+    if len(data) < _HEADER.size or data[:8] != _MAGIC:
+        raise PlantError("these bytes are not a serialised plant state")
+    _, k, digest = _HEADER.unpack_from(data)
+    if digest.hex() != sha256:
+        raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
+    if k < 0:
+        raise PlantError("these bytes are not a serialised plant state")
+    return k, data[_HEADER.size :]

@@ -7,24 +7,6 @@ from time import perf_counter
 import pytest
 from tank import build_tank, write_scenario
 
-from cosim.cli import main
-
-
-@pytest.fixture
-def cosim(monkeypatch, capfd, tmp_path):
-    """Run the command line in this process; returns exit code, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["cosim", *map(str, arguments)])
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        out, err = capfd.readouterr()
-        return exit_.value.code or 0, out, err
-
-    return run
-
 
 def test_demo_writes_all_that_it_names(cosim, tmp_path):
     code, out, err = cosim("demo", "--steps", 60)

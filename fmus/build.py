@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import uuid
 import zipfile
@@ -36,10 +37,15 @@ COMPILER_FLAGS = (
     "-Wall",
     "-Wextra",
 )
-LINKER_FLAGS = ("-shared", "-s", "-Wl,--build-id=none", "-lm")
+LINKER_FLAGS = {
+    "linux": ("-shared", "-s", "-Wl,--build-id=none", "-lm"),
+    "win32": ("-shared", "-s"),
+    "darwin": ("-dynamiclib",),
+}.get(sys.platform, ("-shared", "-lm"))
 
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
-_PLATFORM: dict[FmiVersion, str] = {2: "linux64", 3: "x86_64-linux"}
+_PLATFORM: dict[FmiVersion, str] = {2: fmpy.platform, 3: fmpy.platform_tuple}
+_LIBRARY = f"{MODEL_IDENTIFIER}{fmpy.sharedLibraryExtension}"
 
 
 def hand_written_sources() -> dict[str, bytes]:
@@ -81,15 +87,14 @@ def compile_library(version: FmiVersion) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         for name, data in sources(version).items():
             (Path(folder) / name).write_bytes(data)
-        output = f"{MODEL_IDENTIFIER}.so"
         command = [
             compiler(), *COMPILER_FLAGS, "-isystem", str(headers),
-            f"fmi{version}.c", "-o", output, *LINKER_FLAGS,
+            f"fmi{version}.c", "-o", _LIBRARY, *LINKER_FLAGS,
         ]  # fmt: skip
         result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if result.returncode != 0 or result.stderr:
             raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
-        return (Path(folder) / output).read_bytes()
+        return (Path(folder) / _LIBRARY).read_bytes()
 
 
 def build_record() -> bytes:
@@ -114,7 +119,7 @@ def contents(version: FmiVersion) -> dict[str, bytes]:
         "documentation/index.html": documentation_page(version, BUILD_FILE).encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
         BUILD_FILE: build_record(),
-        f"binaries/{_PLATFORM[version]}/{MODEL_IDENTIFIER}.so": compile_library(version),
+        f"binaries/{_PLATFORM[version]}/{_LIBRARY}": compile_library(version),
     }
     files |= {f"sources/{name}": data for name, data in sources(version).items()}
     if version == 2:

@@ -20,6 +20,15 @@ NamesArgument = Annotated[
 FolderOption = Annotated[
     Path, typer.Option("--results", help="Folder with experiments.toml and tolerances.toml.")
 ]
+StoredOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--results",
+        help="Folder with experiments.toml and tolerances.toml; default: ./results, else the "
+        "installed ones.",
+        show_default=False,
+    ),
+]
 WORK = ".work"
 
 
@@ -31,7 +40,7 @@ def results() -> None:
 @app.command()
 def check(
     names: NamesArgument = None,
-    folder: FolderOption = Path("results"),
+    folder: StoredOption = None,
     json: JsonOption = False,
 ) -> None:
     """Recompute the quick experiments and compare with the stored tables.
@@ -45,8 +54,10 @@ def check(
         from cosim.cli.inner import run_command
         from cosim.results.check import differences, stored_table
         from cosim.results.experiments import chosen, load_experiments, load_tolerances
+        from cosim.results.location import stored_results
         from cosim.results.making import compute
 
+        folder = folder or (Path("results") if Path("results").is_dir() else stored_results())
         experiments, tolerances = load_experiments(folder), load_tolerances(folder)
         wanted = chosen(experiments, names) if names else experiments
         stored = {name: stored_table(folder, name, item) for name, item in wanted.items()}

@@ -89,8 +89,9 @@ class Instance:
         if not library.is_file():
             found = sorted(entry.name for entry in platforms.glob("*")) or ["none"]
             raise PlantError(
-                f"FMU '{self.fmu.path}' has no binary for {binary_folder(version)} "
-                f"(it has: {', '.join(found)}); build one from its sources"
+                f"FMU '{self.fmu.path}' has no binary for {binary_folder(version)} (it has: "
+                f"{', '.join(found)}); build one from its sources, the shipped FMU's by `cosim fmu "
+                "build --out DIR` with a C compiler, and name that file"
             )
         with construction_lock:
             folder = Path.cwd()

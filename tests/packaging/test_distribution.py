@@ -1,0 +1,145 @@
+"""The sdist and the wheel made of it, in a virtual environment outside the checkout."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import fmus
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+PRESETS = {"paper", "nominal", "fast-sampling"}
+
+
+def run(*command, cwd, env=None):
+    result = subprocess.run(
+        [str(word) for word in command],
+        cwd=cwd,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory):
+    """The committed files alone, where a build leaves no trace in the work tree."""
+    folder = tmp_path_factory.mktemp("checkout")
+    archive = folder.with_suffix(".tar")
+    run("git", "archive", "-o", archive, "HEAD", cwd=ROOT)
+    with tarfile.open(archive) as tar:
+        tar.extractall(folder, filter="data")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory):
+    """Interpreter of an empty virtual environment."""
+    folder = tmp_path_factory.mktemp("venv")
+    run(sys.executable, "-m", "venv", folder, cwd=folder)
+    return folder / "bin" / "python"
+
+
+@pytest.fixture(scope="module")
+def sdist(checkout, python, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sdist")
+    run(python, "-m", "pip", "install", "--quiet", "setuptools>=77", cwd=folder)
+    code = f"from setuptools import build_meta; print(build_meta.build_sdist({str(folder)!r}))"
+    name = run(python, "-c", code, cwd=checkout).strip().splitlines()[-1]
+    return folder / name
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist, python):
+    folder = sdist.parent / "wheel"
+    run(python, "-m", "pip", "wheel", "--quiet", "--no-deps", "-w", folder, sdist, cwd=sdist.parent)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, python):
+    """Interpreter with the wheel and what it depends on, at the versions of the lock."""
+    lock = ROOT / "constraints.txt"
+    run(python, "-m", "pip", "install", "--quiet", "-c", lock, wheel, cwd=wheel.parent)
+    return python
+
+
+def bare_environment(python):
+    """A path on which there is no compiler, and nothing that leads back to the checkout."""
+    return {"PATH": str(python.parent), "HOME": os.environ.get("HOME", "/")}
+
+
+def test_the_sdist_holds_what_a_fork_needs(sdist):
+    with tarfile.open(sdist) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    expected = {"constraints.txt", "Makefile", "results/experiments.toml", "tests/faults"}
+    assert expected <= names
+    assert not {name for name in names if name.endswith((".rrd", ".pyc"))}
+
+
+def test_the_wheel_holds_the_committed_data_to_the_byte(wheel, checkout):
+    with zipfile.ZipFile(wheel) as archive:
+        stored = {name: archive.read(name) for name in archive.namelist()}
+    packages = ("fmus", "cosim", "controllers", "learning")
+    assert {f"{package}/py.typed" for package in packages} <= stored.keys()
+    patterns = ("fmus/*.fmu", "fmus/sources/*", "fmus/resources/*", "cosim/presets/*.toml")
+    files = [path for pattern in patterns for path in checkout.glob(pattern)]
+    assert len(files) > 20
+    for path in files:
+        assert stored[str(path.relative_to(checkout))] == path.read_bytes()
+    tables = [path.relative_to(checkout) for path in checkout.glob("results/**/*.csv")]
+    assert tables
+    for path in tables:
+        assert stored[f"cosim/{path}"] == (checkout / path).read_bytes()
+    sources = {
+        str(path.relative_to(checkout))
+        for package in packages
+        for path in (checkout / package).rglob("*.py")
+    }
+    assert sources == {name for name in stored if name.endswith(".py")}
+
+
+def test_the_command_works_outside_the_checkout(installed, tmp_path):
+    env = bare_environment(installed)
+    version = run(installed.parent / "cosim", "--version", cwd=tmp_path, env=env)
+    digest = hashlib.sha256(fmus.path().read_bytes()).hexdigest()
+    assert f"evaporator.fmu sha256 {digest}" in version
+    presets = run(installed, "-m", "cosim", "scenario", "--json", cwd=tmp_path, env=env)
+    assert set(json.loads(presets)["presets"]) == PRESETS
+
+
+def test_a_run_needs_no_compiler(installed, tmp_path):
+    env = bare_environment(installed)
+    words = ("simulate", "--steps", "30", "--record", "--json", "--out", "run")
+    summary = json.loads(run(installed, "-m", "cosim", *words, cwd=tmp_path, env=env))
+    assert summary["failures"] == 0
+    assert summary["samples"] == 30
+    assert (tmp_path / "run" / "run.rrd").stat().st_size > 10_000
+
+
+def test_the_installed_results_hold(installed, tmp_path):
+    env = bare_environment(installed)
+    words = ("results", "check", "closed-loop", "--json")
+    result = json.loads(run(installed, "-m", "cosim", *words, cwd=tmp_path, env=env))
+    assert result["same"] is True
+
+
+def test_importing_warns_of_nothing(installed, tmp_path):
+    code = "import fmus, cosim, controllers, learning, cosim.cli, cosim.recording, cosim.figures"
+    run(installed, "-W", "error", "-c", code, cwd=tmp_path, env=bare_environment(installed))
+
+
+def test_the_dependencies_agree(installed, tmp_path):
+    run(installed, "-m", "pip", "check", cwd=tmp_path)

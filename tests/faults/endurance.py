@@ -1,0 +1,97 @@
+"""Endurance: a long learning run on one plant; memory, time per sample and failures by tenths.
+
+    python tests/faults/endurance.py --samples 1000000
+
+Exit code 1 where memory grew by more than --megabytes after the first tenth, the last tenth cost
+more than --drift times the first one's CPU time, or a sample failed to be solved.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import sys
+import tempfile
+import time
+from itertools import pairwise
+from pathlib import Path
+
+from cosim import FmuPlant, Scenario
+from learning.q_learning import QLearning
+from learning.training import Run, Training
+
+TENTHS = 10
+PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+def resident() -> int:
+    """Resident memory of this process in bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+
+
+def endure(samples: int, folder: Path) -> dict[str, object]:
+    """Train for `samples` samples with checkpoints; figures of each tenth of the run."""
+    tenth = samples // TENTHS
+    scenario = Scenario.load("paper")
+    run = Run(
+        algorithm="q-learning",
+        scenario=scenario,
+        samples=tenth * TENTHS,
+        seed=0,
+        configuration=QLearning.Configuration(),
+        log_every=tenth,
+        evaluate_every=tenth * TENTHS,
+        checkpoint_every=tenth,
+    )
+    cpu, wall, memory, failures = [], [], [], []
+
+    def look(_: int, row: dict[str, float] | None) -> None:
+        gc.collect()
+        cpu.append(time.process_time())
+        wall.append(time.perf_counter())
+        memory.append(resident())
+        failures.append(0 if row is None else int(row["failures"]))
+
+    with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
+        training = Training(run, QLearning, plant, other, out=folder)
+        look(0, None)
+        result = training.go(progress=look)
+    per_sample = [1e6 * (b - a) / tenth for a, b in pairwise(cpu)]
+    per_wall = [1e6 * (b - a) / tenth for a, b in pairwise(wall)]
+    return {
+        "samples": run.samples,
+        "status": result.status,
+        "failures": failures[-1],
+        "J": [row["J"] for row in result.rows],
+        "greedy_J": result.evaluation["J"],
+        "cpu_us_per_sample": per_sample,
+        "wall_us_per_sample": per_wall,
+        "resident_mb": [value / 1e6 for value in memory[1:]],
+        "growth_mb": (memory[-1] - memory[1]) / 1e6,
+        "last_over_first": per_sample[-1] / per_sample[0],
+    }
+
+
+def main() -> int:
+    """Run, print the figures as JSON, judge them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--samples", type=int, default=1_000_000)
+    parser.add_argument("--megabytes", type=float, default=5.0)
+    parser.add_argument("--drift", type=float, default=1.25)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        figures = endure(options.samples, Path(folder))
+    print(json.dumps(figures, indent=2))
+    sound = (
+        figures["status"] == "finished"
+        and figures["failures"] == 0
+        and float(str(figures["growth_mb"])) < options.megabytes
+        and float(str(figures["last_over_first"])) < options.drift
+    )
+    return 0 if sound else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

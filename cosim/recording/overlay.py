@@ -29,7 +29,8 @@ def record_comparison(path: str | Path, a: Run, b: Run, comparison: Comparison) 
     overlaid = {name: _channels(name, (a, b)) for name in names}
     differences = {name: _difference(name, a, b) for name in names}
     duration = max(float(_time(run)[-1]) if len(run) else 0.0 for run in (a, b))
-    stream = Stream(path, _blueprint(duration, overlaid, differences), "comparison")
+    stream = Stream(path, "comparison")
+    stream.layout(_blueprint(duration, overlaid, differences), [])
     text = _text(a, b, comparison)
     stream.static("about", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
     for run, side in zip((a, b), _SIDES, strict=True):

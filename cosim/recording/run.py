@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
-from rerun.blueprint import Blueprint
 
 from cosim.penalty import Penalty
 from cosim.protocols import Block, Controller, controller_name
@@ -50,7 +49,7 @@ class RerunRecorder:
         steps: int,
         units: dict[str, str],
     ) -> None:
-        """Open the file and send what is known before the first sample."""
+        """Open the file and say what is known before the first sample."""
         name = controller_name(controller)
         theta = str(getattr(getattr(controller, "parameters", None), "hash", "none"))
         self._duration = steps * scenario.sampling_time
@@ -63,7 +62,7 @@ class RerunRecorder:
         ).violation
         self._horizon: Horizon | None = None
         self._status: str | None = None
-        stream = Stream(self.path, self._blueprint(), f"{name} on {scenario.name}, seed {seed}")
+        stream = Stream(self.path, f"{name} on {scenario.name}, seed {seed}")
         properties = {
             "scenario": scenario.name,
             "scenario_hash": scenario.hash,
@@ -89,10 +88,11 @@ class RerunRecorder:
             self._send()
 
     def close(self) -> None:
-        """Send the layout again with the ranges that the run needed, and give the file its name."""
+        """Send the rest, the layout again if the run has outgrown it, and name the file."""
         if self._stream is not None:
             self._send()
-            self._stream.blueprint(self._blueprint())
+            if self._stream.outgrown(self._in_view()):
+                self._lay_out(self._stream)
             self._stream.close()
             self._stream = None
 
@@ -117,10 +117,18 @@ class RerunRecorder:
         with np.errstate(divide="ignore", invalid="ignore"):
             stream.scalars("display/log_residual", times, np.log10(block.residual))
         self._changes_of_status(stream, samples, block)
+        predicted = self._horizon is not None
         self._predictions(stream, times, block)
+        if not stream.begun or predicted != (self._horizon is not None):
+            self._lay_out(stream)
 
-    def _blueprint(self) -> Blueprint:
-        return run_blueprint(self._duration, self._channels, predicts=self._horizon is not None)
+    def _lay_out(self, stream: Stream) -> None:
+        predicts = self._horizon is not None
+        blueprint = run_blueprint(self._duration, self._channels, predicts=predicts)
+        stream.layout(blueprint, self._in_view())
+
+    def _in_view(self) -> list[Channel]:
+        return [channel for channel in self._channels if channel.group != "unseen"]
 
     def _entities(self) -> dict[str, list[int]]:
         """Channels of each entity, by their numbers."""
@@ -141,8 +149,8 @@ class RerunRecorder:
             channels = [self._channels[i] for i in rows]
             labels, colors = [c.label for c in channels], [c.color for c in channels]
             style = lines(labels, colors, step=channels[0].step)
-            stream.static(entity, mark([c.name for c in channels], [c.unit for c in channels]))
-            stream.static(entity, style)
+            names, units = [c.name for c in channels], [c.unit for c in channels]
+            stream.static(entity, mark(names, units), style)
         for entity, _ in self._bounds():
             stream.static(entity, line(entity.rpartition("/")[2], BOUND, width=2.0))
         stream.static("display/log_residual", line("log10 residual", SERIES[2]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.errors import RecordingError
+from cosim.recording.channels import Channel, Range
 from cosim.recording.palette import packed_all
 from cosim.recording.text import drawable
 
@@ -25,16 +27,16 @@ SAMPLE = "sample"
 class Stream:
     """An open recording; use `static`, `scalars` and `columns`, then `close`.
 
-    The file is written beside `path` under a hidden name and renamed by `close`, so that `path`
-    never holds half a recording. What a killed process leaves there is repaired by
-    `rerun rrd optimize`.
+    What is sent before the first `layout` waits in memory, since a layout must stand first in the
+    file. The file is written beside `path` under a hidden name and renamed by `close`, so that
+    `path` never holds half a recording; `rerun rrd optimize` repairs what a killed process leaves.
 
     Raises
     ------
     RecordingError : the folder does not exist or cannot be written.
     """
 
-    def __init__(self, path: str | Path, blueprint: rrb.Blueprint, name: str) -> None:
+    def __init__(self, path: str | Path, name: str) -> None:
         self.path = Path(path)
         self._partial = self.path.with_name(f".{self.path.stem}.partial.rrd")
         try:
@@ -46,8 +48,9 @@ class Stream:
         # Without it a column of the wrong shape is dropped with no more than a warning.
         rr.set_strict_mode(True)
         self._stream = rr.RecordingStream(APPLICATION)
-        self._stream.save(self._partial, default_blueprint=blueprint)
         self._stream.send_recording_name(drawable(name))
+        self._shown: dict[str, Range] = {}
+        self.begun = False
 
     def properties(self, group: str, values: Mapping[str, object]) -> None:
         """Describe the run as a whole; shown in the viewer when the recording is selected."""
@@ -70,15 +73,28 @@ class Stream:
         """Send a block of one signal, (K,), or of K vectors, (K, m)."""
         self.columns(entity, times, rr.Scalars.columns(scalars=values))
 
-    def blueprint(self, blueprint: rrb.Blueprint) -> None:
-        """Replace the layout that was sent first."""
-        self._stream.send_blueprint(blueprint)
+    def layout(self, blueprint: rrb.Blueprint, channels: Sequence[Channel]) -> None:
+        """Give the views of these channels, with the ranges that they have by now."""
+        self._shown = {channel.entity + channel.name: channel.window() for channel in channels}
+        if self.begun:
+            self._stream.send_blueprint(blueprint)
+        else:
+            self._stream.save(self._partial, default_blueprint=blueprint)
+            self.begun = True
+
+    def outgrown(self, channels: Sequence[Channel]) -> bool:
+        """Whether a channel is not in the layout, or has values outside its range there."""
+        ranges = [self._shown.get(c.entity + c.name, (inf, -inf)) for c in channels]
+        pairs = zip(channels, ranges, strict=True)
+        return self.begun and any(c.seen[0] < low or c.seen[1] > high for c, (low, high) in pairs)
 
     def close(self) -> None:
-        """Finish the file and give it its name; later calls do nothing."""
-        if self._partial.exists():
+        """Finish the file and give it its name; without a layout there is none."""
+        if self.begun:
             self._stream.disconnect()
             self._partial.replace(self.path)
+        else:
+            self._partial.unlink()
 
 
 def line(label: str, color: str, *, step: bool = False, width: float = 1.5) -> rr.SeriesLines:

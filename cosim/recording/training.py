@@ -100,7 +100,7 @@ class TrainingRecorder:
         self._recent: list[tuple[float, float]] = []
         self._map: PolicyMap | None = None
         scenario, name = run.scenario, f"{run.algorithm} on {run.scenario.name}"
-        stream = self._stream = Stream(self.path, self._blueprint(), name)
+        stream = self._stream = Stream(self.path, name)
         properties = {
             "algorithm": run.algorithm,
             "scenario": scenario.name,
@@ -135,10 +135,12 @@ class TrainingRecorder:
             self._send()
 
     def close(self) -> None:
-        """Send the layout with the ranges that were needed, and give the file its name."""
+        """Send the rest, the layout again if the training has outgrown it, and name the file."""
         if self._stream is not None:
             self._send()
-            self._stream.blueprint(self._blueprint())
+            channels = [*self._blocks.values(), *self._scalars.values()]
+            if self._stream.outgrown(channels):
+                self._stream.layout(self._blueprint(), channels)
             self._stream.close()
             self._stream = None
 
@@ -169,6 +171,8 @@ class TrainingRecorder:
                 stream.static(channel.entity, mark([name], [""]), style)
             self._scalars[name] = self._scalars[name].with_values(values)
             stream.scalars(self._scalars[name].entity, times, values)
+        if not stream.begun:
+            stream.layout(self._blueprint(), [*self._blocks.values(), *self._scalars.values()])
         self._rows, self._thetas = [], []
 
     def _blueprint(self) -> rrb.Blueprint:

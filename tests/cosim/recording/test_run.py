@@ -1,4 +1,5 @@
 import hashlib
+from dataclasses import replace
 from time import perf_counter
 from types import SimpleNamespace
 
@@ -121,15 +122,33 @@ def test_names_and_units_of_any_spelling_come_back(tmp_path, foreign, rng):
     assert recording.units["der(x)/dt"] == "∇"
 
 
-def test_the_layout_comes_before_the_data_and_again_with_the_ranges_needed(tmp_path, paper, rng):
+def test_the_layout_comes_before_the_data(tmp_path, paper, rng):
     recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng)])
     reader = RrdReader(tmp_path / "run.rrd")
-    assert len(reader.blueprints()) == 2
-    application = reader.recordings()[0].application_id
-    assert {entry.application_id for entry in reader.blueprints()} == {application}
+    (layout,), (recording,) = reader.blueprints(), reader.recordings()
+    assert layout.application_id == recording.application_id
     content = (tmp_path / "run.rrd").read_bytes()
-    first_layout = min(content.find(entry.recording_id.encode()) for entry in reader.blueprints())
-    assert 0 < first_layout < content.find(reader.recordings()[0].recording_id.encode())
+    assert (
+        0
+        < content.find(layout.recording_id.encode())
+        < content.find(recording.recording_id.encode())
+    )
+
+
+def test_a_run_that_outgrows_the_layout_gets_another(tmp_path, paper, rng):
+    first = random_block(paper, rng, 0, 2000)
+    within = replace(first, first=2000, time=first.time + first.time[-1] + 60.0)
+    beyond = replace(within, states=first.states * 100.0)
+    for last, layouts in ((within, 1), (beyond, 2)):
+        recorded(tmp_path / "run.rrd", paper, [first, last], steps=4000)
+        assert len(RrdReader(tmp_path / "run.rrd").blueprints()) == layouts
+
+
+def test_a_run_without_a_sample_leaves_no_file(tmp_path, paper):
+    recorder = RerunRecorder(tmp_path / "run.rrd")
+    recorder.start(paper, CONTROLLER, 0, 10, {})
+    recorder.close()
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_file_is_whole_or_not_there(tmp_path, paper, rng):

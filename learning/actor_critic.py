@@ -10,7 +10,7 @@ from pydantic import Field
 
 from cosim.scenario import Scenario
 from learning.configuration import Configuration, Count, Positive
-from learning.critic import lstdq, lstdv
+from learning.critic import AdvantageRegression, lstdv
 from learning.exploration import Strategy
 from learning.fit import policy_gradient_fit
 from learning.protocols import LearnableController, Sample, Update
@@ -23,11 +23,14 @@ class ActorCriticConfiguration(Configuration):
     """Hyperparameters of the actor-critic."""
 
     batch_size: Count = Field(1000, description="samples per step of θ, all at one θ")
-    critic_discount: float | None = Field(
-        None,
+    critic_discount: float = Field(
+        1.0,
         gt=0,
         le=1,
-        description="discount of the critic: 1 for mean cost, the scenario's if not given",
+        description="discount of the critic; 1 is the mean cost, the benchmark's yardstick",
+    )
+    forgetting: float = Field(
+        0.8, ge=0, lt=1, description="weight of a batch in the advantage, relative to the next one"
     )
     natural: bool = Field(True, description="natural gradient, else the plain one")
     ridge: Positive = Field(
@@ -35,7 +38,7 @@ class ActorCriticConfiguration(Configuration):
     )
     step_size: Positive = Field(2.0, description="α of the fit, before the trust region")
     radius: Positive = Field(
-        5.0, description="trust region at the start: RMS change of the action, in its units"
+        2.0, description="trust region at the start: RMS change of the action, in its units"
     )
     radius_end: Positive = Field(
         0.2, description="trust region at the end, approached geometrically"
@@ -62,7 +65,7 @@ class ActorCritic:
         strategy: Strategy,
     ) -> None:
         self._configuration, self._strategy, self._samples = configuration, strategy, samples
-        self._discount = configuration.critic_discount or scenario.discount
+        self._discount = configuration.critic_discount
         self._step = ParameterStep(controller, configuration)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
         rows = configuration.batch_size
@@ -73,6 +76,7 @@ class ActorCritic:
             "deviation": np.empty((rows, m)),
             "jacobian": np.empty((rows, m, size)),
         }
+        self._advantage = AdvantageRegression(size, configuration.forgetting, configuration.ridge)
         self._filled = 0
         self.needs_action_value = False
         self.needs_points = False
@@ -102,7 +106,8 @@ class ActorCritic:
         errors = lstdv(batch["states"], batch["next_states"], batch["reward"], self._discount)
         jacobian = batch["jacobian"] * self._step.scale
         advantage = np.einsum("kmi,km->ki", jacobian, batch["deviation"])
-        weights = lstdq(advantage, errors, settings.ridge)
+        self._advantage.add(advantage, errors)
+        weights = self._advantage.weights()
         fisher = np.einsum("kmi,kmj->ij", jacobian, jacobian) / len(errors)
         gradient = fisher @ weights
         metric = None
@@ -117,11 +122,17 @@ class ActorCritic:
         return self._step.take(fit, float(np.sqrt(np.mean(errors * errors))))
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """The part of the batch that is filled."""
-        return {name: values[: self._filled] for name, values in self._batch.items()}
+        """The advantage's sums and the part of the batch that is filled."""
+        return {
+            "information": self._advantage.information,
+            "moment": self._advantage.moment,
+            **{name: values[: self._filled] for name, values in self._batch.items()},
+        }
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
+        self._advantage.information = state["information"]
+        self._advantage.moment = state["moment"]
         self._filled = len(state["reward"])
-        for name, values in state.items():
-            self._batch[name][: self._filled] = values
+        for name, values in self._batch.items():
+            values[: self._filled] = state[name]

@@ -14,6 +14,7 @@ from cosim.scenario import Scenario
 from learning.configuration import Configuration, Count, NonNegative, Positive
 from learning.exploration import Strategy
 from learning.fit import Fit, least_squares
+from learning.level import level
 from learning.protocols import LearnableController, Sample, Update
 from learning.replay import ReplayBuffer, Replayed
 from learning.step import ParameterStep
@@ -47,9 +48,12 @@ class BatchQLearningConfiguration(Configuration):
         "gauss-newton",
         description="normalised gradient; Gauss–Newton on Q's fit; or the projected Bellman error",
     )
+    discount: float | None = Field(
+        None, gt=0, le=1, description="of the TD error: the scenario's if not given; 1 is mean cost"
+    )
     batch_size: Count = Field(500, description="samples between two updates")
-    buffer_size: Count = Field(2000, description="transitions that are replayed, the latest ones")
-    iterations: Count = Field(2, description="replays and steps of θ per update")
+    buffer_size: Count = Field(1000, description="transitions that are replayed, the latest ones")
+    iterations: Count = Field(1, description="replays and steps of θ per update")
     gain: Positive = Field(0.5, le=1, description="share of the step taken, at the start")
     gain_end: Positive | None = Field(
         0.05, le=1, description="the same at the end, approached geometrically"
@@ -83,9 +87,10 @@ class BatchQLearning:
         strategy: Strategy,
     ) -> None:
         self._controller, self._configuration = controller, configuration
-        self._discount, self._samples = scenario.discount, samples
+        self._samples = samples
         self._moving = configuration.rule == "lstdq"
         self._step = ParameterStep(controller, configuration)
+        self._level = level(configuration.discount, scenario, self._step)
         self._buffer = ReplayBuffer(configuration.buffer_size)
         self._radius = configuration.radius
         self._trial: Trial | None = None
@@ -102,12 +107,12 @@ class BatchQLearning:
         gain = settings.gain * (end / settings.gain) ** min(sample.number / self._samples, 1.0)
         update: Update | None = None
         for _ in range(settings.iterations):
-            replayed = self._buffer.replay(self._controller, self._discount)
+            replayed = self._buffer.replay(self._controller, self._level)
             if not len(replayed.number):
                 return None
             if self._trial is not None and self._rose(self._trial, replayed):
                 self._controller.theta = self._trial.theta
-                replayed = self._buffer.replay(self._controller, self._discount)
+                replayed = self._buffer.replay(self._controller, self._level)
             update = self._iterate(replayed, gain)
         return update
 
@@ -115,14 +120,13 @@ class BatchQLearning:
         gradient = replayed.gradient * self._step.scale
         jacobian = gradient
         if self._moving:
-            jacobian = gradient - self._discount * replayed.next_gradient * self._step.scale
+            jacobian = gradient - self._level.discount * replayed.next_gradient * self._step.scale
         fit = RULES[self._configuration.rule](
             gradient, jacobian, replayed.td_error, self._configuration.ridge
         )
         before = self._controller.theta
-        update = self._step.take(
-            fit.shrunk(gain).clipped(self._radius), float(np.sqrt(np.mean(replayed.td_error**2)))
-        )
+        fit = self._level.take(fit.shrunk(gain).clipped(self._radius))
+        update = self._step.take(fit, float(np.sqrt(np.mean(replayed.td_error**2))))
         step = (self._controller.theta - before) / self._step.scale
         predicted = replayed.td_error - jacobian @ step
         self._trial = Trial(
@@ -152,6 +156,7 @@ class BatchQLearning:
         trial = {} if self._trial is None else self._trial._asdict()
         return {
             "radius": np.array(self._radius),
+            "mean_cost": np.array(self._level.mean_cost),
             **{f"buffer_{name}": values for name, values in self._buffer.state().items()},
             **{f"trial_{name}": values for name, values in trial.items()},
         }
@@ -159,6 +164,7 @@ class BatchQLearning:
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         self._radius = float(state["radius"])
+        self._level.mean_cost = float(state["mean_cost"])
         part = {
             prefix: {
                 name.removeprefix(f"{prefix}_"): values

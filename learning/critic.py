@@ -34,15 +34,29 @@ def lstdv(states: Matrix, next_states: Matrix, reward: Vector, discount: float) 
     return errors
 
 
-def lstdq(advantage_features: Matrix, td_errors: Vector, ridge: float) -> Vector:
-    """Weights w of the compatible advantage A = ψᵀw, (n_θ,), given LSTDV's TD errors.
+class AdvantageRegression:
+    """LSTDQ for the weights w (n_θ,) of the compatible advantage A = ψᵀw, given LSTDV's TD errors.
 
     The policy is greedy in s₊, where A vanishes, so LSTDQ with V held is a regression of the TD
-    errors on ψ (K, n_θ); its `ridge` is relative to the mean of the information's diagonal.
+    errors on ψ. Earlier batches count too, each `forgetting` times as much as the next one: θ
+    moves little from batch to batch, and the gradient's noise is what limits learning. `ridge` is
+    relative to the mean of the information's diagonal.
     """
-    information = advantage_features.T @ advantage_features
-    size = information.shape[0]
-    floor = max(float(np.trace(information)), np.finfo(float).tiny) / size
-    factor = cho_factor(information + ridge * floor * np.eye(size))
-    weights: Vector = cho_solve(factor, advantage_features.T @ td_errors)
-    return weights
+
+    def __init__(self, size: int, forgetting: float, ridge: float) -> None:
+        self._forgetting, self._ridge = forgetting, ridge
+        self.information: Matrix = np.zeros((size, size))
+        self.moment: Vector = np.zeros(size)
+
+    def add(self, features: Matrix, td_errors: Vector) -> None:
+        """Take a batch: ψ (K, n_θ) and TD errors (K,)."""
+        self.information = self._forgetting * self.information + features.T @ features
+        self.moment = self._forgetting * self.moment + features.T @ td_errors
+
+    def weights(self) -> Vector:
+        """Regression's w, (n_θ,)."""
+        size = self.moment.size
+        floor = max(float(np.trace(self.information)), np.finfo(float).tiny) / size
+        factor = cho_factor(self.information + self._ridge * floor * np.eye(size))
+        weights: Vector = cho_solve(factor, self.moment)
+        return weights

@@ -14,6 +14,7 @@ from cosim.scenario import Scenario
 from learning.configuration import Configuration, Count, NonNegative, Positive
 from learning.exploration import Strategy
 from learning.fit import Fit, least_squares, line_search, td_fit, td_step
+from learning.level import level
 from learning.protocols import LearnableController, Sample, Update
 from learning.step import ParameterStep
 
@@ -36,6 +37,9 @@ class QLearningConfiguration(Configuration):
     rule: Literal["td", "fit", "gauss-newton"] = Field(
         "gauss-newton",
         description="αδ∇Q; the fit's αδ∇Q/(1+α‖∇Q‖²); or recursive Gauss–Newton with forgetting",
+    )
+    discount: float | None = Field(
+        None, gt=0, le=1, description="of the TD error: the scenario's if not given; 1 is mean cost"
     )
     scaled: bool = Field(True, description="step in coordinates θ/scale, else in θ itself")
     update_every: Count = Field(20, description="samples per step of θ")
@@ -75,8 +79,9 @@ class QLearning:
         strategy: Strategy,
     ) -> None:
         self._controller, self._configuration = controller, configuration
-        self._discount, self._samples = scenario.discount, samples
+        self._samples = samples
         self._step = ParameterStep(controller, configuration, scaled=configuration.scaled)
+        self._level = level(configuration.discount, scenario, self._step)
         size = self._step.scale.size
         self._information = np.zeros((size, size))
         self._gradient = np.zeros(size)
@@ -86,7 +91,7 @@ class QLearning:
 
     def observe(self, sample: Sample) -> Update | None:
         """Take one sample; one in `update_every` moves θ (each one under the rules td and fit)."""
-        target = sample.cost + self._discount * sample.next_policy.value
+        target = self._level.target(sample.cost, sample.next_policy.value)
         td_error = target - sample.action_value.value
         gradient = sample.action_value.value_gradient * self._step.scale
         if self._configuration.rule == "gauss-newton":
@@ -95,7 +100,7 @@ class QLearning:
         fit = rule(td_error, gradient, self._configuration.step_size)
         if self._configuration.line_search:
             fit = fit.shrunk(line_search(self._error_along(sample, target, fit)))
-        return self._step.take(fit, abs(td_error))
+        return self._step.take(self._level.take(fit), abs(td_error))
 
     def _recursive(self, number: int, td_error: float, gradient: Vector) -> Update | None:
         settings = self._configuration
@@ -112,7 +117,8 @@ class QLearning:
         td_error = (self._squares / self._count) ** 0.5
         self._gradient[:] = 0.0
         self._squares, self._count = 0.0, 0
-        return self._step.take(fit.shrunk(gain).clipped(settings.largest_step), td_error)
+        fit = self._level.take(fit.shrunk(gain).clipped(settings.largest_step))
+        return self._step.take(fit, td_error)
 
     def _error_along(self, sample: Sample, target: float, fit: Fit) -> Callable[[float], float]:
         """TD error of a sample with the step scaled by t, its target and its QP's guess held."""
@@ -138,10 +144,11 @@ class QLearning:
         return {
             "information": self._information,
             "gradient": self._gradient,
-            "sums": np.array([self._squares, self._count]),
+            "sums": np.array([self._squares, self._count, self._level.mean_cost]),
         }
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         self._information, self._gradient = state["information"], state["gradient"]
-        self._squares, self._count = float(state["sums"][0]), int(state["sums"][1])
+        squares, count, self._level.mean_cost = (float(value) for value in state["sums"])
+        self._squares, self._count = squares, int(count)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from controllers.errors import QpError
 from controllers.solution import LinearisationPoint
+from learning.level import Level
 from learning.protocols import LearnableController, LearnableSolution, Sample
 
 Vector = NDArray[np.float64]
@@ -77,7 +78,7 @@ class ReplayBuffer:
             self._columns[name][position] = value
         self._added += 1
 
-    def replay(self, controller: LearnableController, discount: float) -> Replayed:
+    def replay(self, controller: LearnableController, level: Level) -> Replayed:
         """Solve for Q(s, a) and V(s₊) of every transition at the controller's θ, in time's order.
 
         A successor shares the linearisation, and where it was greedy the solution too: V(s₊) of one
@@ -103,7 +104,7 @@ class ReplayBuffer:
                 q[k], gradient[k] = value.value, value.value_gradient
                 controller.prepare_at(_point(columns, "next_point", row))
                 at, value = number + 1, controller.feedback(columns["next_s"][row])
-                target[k] = columns["cost"][row] + discount * value.value
+                target[k] = level.target(float(columns["cost"][row]), value.value)
                 next_gradient[k] = value.value_gradient
             except QpError:
                 at = None

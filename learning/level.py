@@ -1,0 +1,50 @@
+"""The level of the TD error: a discount, or the mean cost per sample in its place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from cosim.scenario import Scenario
+from learning.fit import Fit
+from learning.step import ParameterStep
+
+
+class Level:
+    """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
+
+    At γ = 1 the constant c_lambda cancels out of δ, and what the fit would have it do is to take
+    up the mean of δ. That is what g, the mean cost per sample, has to do: so the step of
+    c_lambda goes to g, and c_lambda stays. This is differential Q-learning; it serves the
+    yardstick J itself, which a discounted optimum need not.
+
+    `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
+    """
+
+    def __init__(self, discount: float, position: int, scale: float, start: float) -> None:
+        self.discount = discount
+        self.mean_cost = start if discount == 1.0 else 0.0
+        self._position, self._scale = position, scale
+
+    def target(self, cost: float, next_value: float) -> float:
+        """What Q(s, a) is fitted to."""
+        return cost - self.mean_cost + self.discount * next_value
+
+    def take(self, fit: Fit) -> Fit:
+        """Move g by its part of a fit's step; returns the rest, which is for θ."""
+        if self.discount != 1.0:
+            return fit
+        minimiser = fit.minimiser.copy()
+        self.mean_cost += float(minimiser[self._position]) * self._scale
+        minimiser[self._position] = 0.0
+        return replace(fit, gradient=fit.metric() @ minimiser, minimiser=minimiser)
+
+
+def level(discount: float | None, scenario: Scenario, step: ParameterStep) -> Level:
+    """Level for a scenario; `discount` None is the scenario's own."""
+    position = step.layout.slices["c_lambda"].start
+    return Level(
+        scenario.discount if discount is None else discount,
+        position,
+        float(step.scale[position]),
+        scenario.controller.reference_cost,
+    )

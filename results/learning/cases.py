@@ -1,0 +1,44 @@
+"""What the sweep trains: algorithm, samples and hyperparameters of each case, by name.
+
+The hyperparameters of the cases `*-paper` and `*-extended` are the algorithms' defaults, but for
+the parametrisation; `q-learning-literal` is the paper's rule as it is printed; the cases
+`*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+LITERAL = {
+    "rule": "fit",
+    "step_size": 1e-3,
+    "scaled": False,
+    "exploration": "scenario",
+    "value_offset": "stage-cost",
+    "parametrisation": "paper",
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One algorithm with its settings; `seeds` training seeds 0, 1, …"""
+
+    algorithm: str
+    samples: int
+    settings: dict[str, Any] = field(default_factory=dict)
+    seeds: int = 10
+    controller: str = "rti"
+
+
+CASES = {
+    "actor-critic-paper": Case("actor-critic", 40_000, {"parametrisation": "paper"}),
+    "actor-critic-extended": Case("actor-critic", 40_000, {"parametrisation": "extended"}),
+    "batch-q-learning-paper": Case("batch-q-learning", 30_000, {"parametrisation": "paper"}),
+    "batch-q-learning-extended": Case("batch-q-learning", 30_000, {"parametrisation": "extended"}),
+    "q-learning-paper": Case("q-learning", 40_000, {"parametrisation": "paper"}),
+    "q-learning-extended": Case("q-learning", 40_000, {"parametrisation": "extended"}),
+    "q-learning-literal": Case("q-learning", 100_000, LITERAL, seeds=5),
+    "q-learning-mean-cost": Case("q-learning", 40_000, {"discount": 1.0}),
+    "batch-q-learning-mean-cost": Case("batch-q-learning", 30_000, {"discount": 1.0}),
+}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import floor, log10
 
 import numpy as np
 import rerun as rr
@@ -75,11 +76,12 @@ class Horizon:
                 colors.append(color)
         self._stream.static(entity, rr.LineStrips2D(lines, colors=packed_all(colors), radii=0.008))
         low, high = strip.window
+        digits = max(0, 2 - floor(log10(high - low)))
         self._stream.static(
             f"{entity}/labels",
             rr.Points2D(
                 [[WIDTH / 2, top - 0.27], [-0.32, top - 0.1], [-0.32, top + HEIGHT - 0.12]],
-                labels=[drawable(strip.label), f"{high:.4g}", f"{low:.4g}"],
+                labels=[drawable(strip.label), f"{high:.{digits}f}", f"{low:.{digits}f}"],
                 radii=0.001,
                 colors=packed(FRAME),
                 show_labels=True,

@@ -16,6 +16,7 @@ from controllers.ocp import embedding, preparation
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend, SoftQp, Stages, make_backend
+from controllers.qp.kink import settle
 from controllers.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 
 Vector = NDArray[np.float64]
@@ -263,6 +264,8 @@ class RtiNmpc:
                 qp=qp.copy(),
             )
         multipliers = self._backend.solve(qp)
+        if a is not None:
+            multipliers = settle(qp, multipliers, self._action_lower[:m], self._action_upper[:m])
         inputs = self._readout.inputs
         inputs["s"][:], inputs["constant"][0] = s, self._constant
         inputs["v"][:], inputs["lam"][:] = multipliers.v, multipliers.lam

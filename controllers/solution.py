@@ -14,6 +14,7 @@ from controllers.errors import ControllerError
 from controllers.hessian import Spectrum
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.qp.active_set import kkt_solve
 from controllers.qp.problem import QpSolution, Residuals, SoftQp
 
 Vector = NDArray[np.float64]
@@ -217,26 +218,12 @@ class RtiSolution:
         """Solutions of the KKT system for unit right-hand sides in u_0, a row an action.
 
         The KKT matrix of the active set is symmetric, so these rows of its inverse are all that
-        dπ/dθ and dπ/ds need. A violated row adds its quadratic weight to the Hessian.
+        dπ/dθ and dπ/ds need.
         """
         qp, m = self.qp, self.action.size
-        held, at_limit, violated = self.multipliers.active(qp)
-        free = np.flatnonzero(~held)
-        active, outside = qp.rows[at_limit][:, free], qp.rows[violated][:, free]
-        hessian = qp.H[np.ix_(free, free)] + 2 * (outside.T * qp.W[violated]) @ outside
-        size, count = free.size, active.shape[0]
-        kkt = np.zeros((size + count, size + count))
-        kkt[:size, :size], kkt[:size, size:], kkt[size:, :size] = hessian, active.T, active
-        seeds = np.zeros((size + count, m))
-        seeds[:size] = free[:, None] == np.arange(m)
-        try:
-            answer = np.linalg.solve(kkt, seeds)
-        except np.linalg.LinAlgError:  # LICQ fails, which `licq` reports; take the least-norm row
-            answer = np.linalg.lstsq(kkt, seeds)[0]
-        dv, dlam = np.zeros((m, qp.f.size)), np.zeros((m, qp.w.size))
-        dv[:, free] = answer[:size].T
-        dlam[:, at_limit] = answer[size:].T
-        moved = dv @ qp.rows.T
+        active = self.multipliers.active(qp)
+        dv, dlam = kkt_solve(qp, active, np.eye(m, qp.f.size), np.zeros((m, qp.w.size)))
+        violated, moved = active[2], dv @ qp.rows.T
         dlam[:, violated] = 2 * qp.W[violated] * moved[:, violated]
         dt = np.where(violated, np.sign(self.multipliers.lam) * moved, 0.0)
         return dv, dt, dlam

@@ -51,7 +51,11 @@ class DaqpBackend:
         else:
             if not (np.array_equal(qp.w, self._w) and np.array_equal(qp.W, self._W)):
                 self._weights(qp)
-            self._factorised = self._model.update(H=qp.H, A=qp.rows, sense=self._free)
+            # The limits go along, since an update is refused while those of a failed QP stand.
+            self._write_limits(qp)
+            self._factorised = self._model.update(
+                H=qp.H, A=qp.rows, bupper=self._upper, blower=self._lower, sense=self._free
+            )
 
     def _weights(self, qp: SoftQp) -> None:
         self._w, self._W = qp.w.copy(), qp.W.copy()

@@ -153,8 +153,9 @@ class QpSolution(NamedTuple):
         """Whether some bound or row is about to change its activity.
 
         It is where a limit is reached (within `tolerance`, relative to 1 + |limit|) with a
-        multiplier below `tolerance`·max(1, ‖multipliers‖∞), or a row sits at its limit with a
-        multiplier as close to w. Derivatives of the solution are then one-sided.
+        multiplier below `tolerance`·max(1, ‖multipliers‖∞), a row sits at its limit with a
+        multiplier as close to w, or no free variable moves a row that sits at its limit.
+        Derivatives of the solution are then one-sided.
         """
         v, nu, lam = self
         small = tolerance * max(1.0, float(np.abs(nu).max()))
@@ -170,7 +171,8 @@ class QpSolution(NamedTuple):
         undecided = (size < tolerance * np.maximum(1.0, size.max())) | (
             np.abs(size - qp.w) < tolerance * qp.w
         )
-        return bool((at_limit & undecided).any())
+        moved = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0) > 0
+        return bool((at_limit & (undecided | ~moved)).any())
 
     def active(self, qp: SoftQp) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
         """Masks: variables held by a bound, rows held at a limit, rows violated.

@@ -53,7 +53,7 @@ def random_parameters(problem: Problem, layout: Layout, rng: np.random.Generator
     }
     if "w_sigma" in layout:
         values["w_sigma"] = 80 + 50 * rng.random(n)
-        values["W_sigma"] = 10 ** rng.uniform(0, 3, size=n)
+        values["W_sigma"] = 10 ** rng.uniform(-1, 3, size=n)
     parameters = Parameters.naive(problem, layout).replace(values)
     if "p" in layout:
         spread = 1 + 0.05 * rng.normal(size=layout.block("p").size)

@@ -1,0 +1,63 @@
+"""The linear system that an active set leaves of the QP: for sensitivities and for polishing."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.qp.problem import QpSolution, SoftQp
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def kkt_solve(
+    qp: SoftQp, active: tuple[Mask, Mask, Mask], seeds: Matrix, limits: Matrix
+) -> tuple[Matrix, Matrix]:
+    """Solve the KKT system of an active set for several right-hand sides, one a row.
+
+    `active` is what `QpSolution.active` returns. Held variables stay at zero, rows at their limit
+    take the values `limits` (k, rows), and a violated row adds its quadratic weight to the Hessian.
+    `seeds` (k, variables) are the right-hand sides of stationarity. Returns the variables
+    (k, variables) and the multipliers of the rows at their limit (k, rows), zero elsewhere. Where
+    the system is singular (LICQ fails) it is solved by least squares.
+    """
+    held, at_limit, violated = active
+    free = np.flatnonzero(~held)
+    equal, outside = qp.rows[at_limit][:, free], qp.rows[violated][:, free]
+    size, count = free.size, equal.shape[0]
+    kkt = np.zeros((size + count, size + count))
+    kkt[:size, :size] = qp.H[np.ix_(free, free)] + 2 * (outside.T * qp.W[violated]) @ outside
+    kkt[:size, size:], kkt[size:, :size] = equal.T, equal
+    right = np.concatenate([seeds[:, free], limits[:, at_limit]], axis=1).T
+    try:
+        answer = np.linalg.solve(kkt, right)
+    except np.linalg.LinAlgError:
+        answer = np.linalg.lstsq(kkt, right)[0]
+    v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)
+    v[:, free], lam[:, at_limit] = answer[:size].T, answer[size:].T
+    return v, lam
+
+
+def polish(qp: SoftQp, solution: QpSolution) -> QpSolution:
+    """Solution of the QP on the active set that `solution` shows, or `solution` if that is better.
+
+    An interior-point solver comes within its tolerance of the solution; one linear solve on the
+    active set comes within rounding, unless the set is not the right one.
+    """
+    held, _, violated = active = solution.active(qp)
+    upwards = solution.lam > 0
+    limit = np.where(upwards, qp.row_upper, qp.row_lower)
+    base = np.where(held, np.where(solution.nu > 0, qp.upper, qp.lower), 0.0)
+    push = np.where(violated, np.where(upwards, qp.w, -qp.w), 0.0)
+    weight = np.where(violated, 2 * qp.W, 0.0)
+    fixed = qp.rows @ base - limit
+    seed = -(qp.H @ base + qp.f + (push + weight * fixed) @ qp.rows)
+    moved, lam = kkt_solve(qp, active, seed[None], -fixed[None])
+    v = base + moved[0]
+    multipliers = lam[0] + push + weight * (qp.rows @ v - limit)
+    nu = np.where(held, -(qp.H @ v + qp.f + multipliers @ qp.rows), 0.0)
+    polished = QpSolution(v, nu, multipliers)
+    better = polished.residuals(qp).largest < solution.residuals(qp).largest
+    return polished if better else solution

@@ -1,0 +1,50 @@
+"""A QP in one variable with a closed-form solution, with its stages for full-space backends."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controllers.qp import QpSolution, SoftQp, Stages
+
+
+def scalar_qp(f: float, *, w: float = 1.0, W: float = 1.0, limit: float = 1.0) -> SoftQp:
+    """min ½v² + fv + wt + Wt², |v| ≤ 10, v ≤ limit + t, as a stage ξ_1 = v sharing the cost."""
+    stages = Stages(
+        A=np.zeros((1, 1, 1)),
+        B=np.ones((1, 1, 1)),
+        r=np.zeros((1, 1)),
+        L=np.diag([1.0, 0.5])[None],
+        q=np.array([[0.0, f]]),
+        L_N=np.array([[0.5]]),
+        q_N=np.zeros(1),
+        initial=np.zeros(1),
+        state_lower=np.array([-100.0]),
+        state_upper=np.array([limit]),
+    )
+    return SoftQp(
+        H=np.eye(1),
+        f=np.array([f]),
+        lower=np.array([-10.0]),
+        upper=np.array([10.0]),
+        rows=np.ones((1, 1)),
+        row_lower=np.array([-100.0]),
+        row_upper=np.array([limit]),
+        w=np.array([w]),
+        W=np.array([W]),
+        stages=stages,
+    )
+
+
+def solution(v: float, nu: float, lam: float) -> QpSolution:
+    return QpSolution(np.array([v]), np.array([nu]), np.array([lam]))
+
+
+# (f, w, W) → (v, ν, λ), by hand from v + f + ν + λ = 0 and λ = w + 2W(v − 1) where violated.
+CASES = {
+    "free": ((-0.5, 1.0, 1.0), (0.5, 0.0, 0.0)),
+    "at the limit": ((-1.5, 1.0, 1.0), (1.0, 0.0, 0.5)),
+    "violated": ((-3.0, 1.0, 1.0), (4 / 3, 0.0, 5 / 3)),
+    "violated, small weight": ((-3.1, 1.0, 0.1), (23 / 12, 0.0, 71 / 60)),
+    "saturated": ((-50.0, 1.0, 1.0), (10.0, 21.0, 19.0)),
+    "saturated below": ((50.0, 1.0, 1.0), (-10.0, -40.0, 0.0)),
+}

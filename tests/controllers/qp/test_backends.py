@@ -1,0 +1,160 @@
+"""All backends against closed-form solutions, and against each other on QPs of real runs."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scalar import CASES, scalar_qp
+from stored import qps, solve
+
+from controllers.errors import ControllerError, QpError
+from controllers.qp import make_backend
+
+PERSISTENT = ["daqp", "proxqp"]
+QPSOLVERS = [f"qpsolvers:{solver}" for solver in ("clarabel", "daqp", "proxqp", "quadprog", "piqp")]
+EVERY = PERSISTENT + QPSOLVERS
+
+
+def read_out(answer):
+    """z = (x, u, slack) and all multipliers of one solution."""
+    return {
+        "states": answer.predicted_states,
+        "controls": answer.predicted_actions,
+        "slack": answer.slack,
+        "multipliers of bounds": answer.multipliers.nu,
+        "multipliers of rows": answer.multipliers.lam,
+        "costates": answer.costates,
+    }
+
+
+@lru_cache(maxsize=1)
+def reference():
+    return [read_out(answer) for answer in solve("daqp")]
+
+
+def assert_agreement(backend, picked):
+    """To 1e-6 relative to max(1, |·|): multipliers reach 1e5, the slack's linear weight."""
+    for k, answer in zip(picked, solve(backend, picked), strict=True):
+        for name, value in read_out(answer).items():
+            expected = reference()[k][name]
+            error = np.abs(value - expected) / np.maximum(1, np.abs(expected))
+            assert error.max() <= 1e-6, f"QP {k}: {name} of {backend} differ by {error.max():.1e}"
+
+
+@pytest.mark.parametrize("backend", EVERY)
+@pytest.mark.parametrize("case", CASES)
+def test_a_closed_form_solution_is_found(backend, case):
+    (f, w, W), expected = CASES[case]
+    qp = scalar_qp(f, w=w, W=W)
+    solver = make_backend(backend)
+    solver.load(qp)
+    np.testing.assert_allclose(np.ravel(solver.solve(qp)), expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", EVERY)
+def test_a_fixed_variable_stays_and_has_its_multiplier(backend):
+    qp = scalar_qp(-3.0)
+    qp.lower[:] = qp.upper[:] = 2.0
+    solver = make_backend(backend)
+    solver.load(qp)
+    # v + f + ν + λ = 0 with λ = 1 + 2·1
+    np.testing.assert_allclose(np.ravel(solver.solve(qp)), [2.0, -2.0, 3.0], rtol=0, atol=1e-8)
+
+
+def test_proxqp_agrees_on_the_whole_stored_set():
+    assert_agreement("proxqp", range(len(qps())))
+
+
+@pytest.mark.parametrize("backend", QPSOLVERS)
+def test_qpsolvers_agrees_on_a_part_of_the_stored_set(backend):
+    assert_agreement(backend, range(0, len(qps()), 7))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", QPSOLVERS)
+def test_qpsolvers_agrees_on_the_whole_stored_set(backend):
+    assert_agreement(backend, range(len(qps())))
+
+
+@pytest.mark.parametrize("backend", EVERY)
+def test_the_stored_set_is_solved_to_small_residuals(backend):
+    picked = range(3, len(qps()), 40)
+    assert max(answer.residual for answer in solve(backend, picked)) < 2e-9
+
+
+@pytest.mark.parametrize("backend", PERSISTENT)
+def test_new_weights_are_taken_over(backend):
+    solver = make_backend(backend)
+    solver.load(scalar_qp(-3.0))
+    solver.solve(scalar_qp(-3.0))
+    changed = scalar_qp(-3.1, w=1.0, W=0.1)
+    solver.load(changed)
+    _, expected = CASES["violated, small weight"]
+    np.testing.assert_allclose(np.ravel(solver.solve(changed)), expected, rtol=0, atol=1e-8)
+
+
+def test_daqp_gives_the_same_bits_whatever_it_solved_before():
+    first = {k: answer for k, answer in enumerate(solve("daqp")) if k % 5 == 0}
+    shuffled = list(reversed(first))
+    for k, again in zip(shuffled, solve("daqp", shuffled), strict=True):
+        for before, after in zip(first[k].multipliers, again.multipliers, strict=True):
+            assert before.tobytes() == after.tobytes()
+
+
+# failures -------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("backend", EVERY)
+def test_an_infeasible_qp_raises_and_is_carried(backend):
+    qp = scalar_qp(-1.0)
+    qp.lower[:], qp.upper[:] = 2.0, 1.0
+    solver = make_backend(backend)
+    with pytest.raises(QpError, match="did not solve the QP") as caught:
+        solver.load(qp)
+        solver.solve(qp)
+    assert caught.value.status
+    assert caught.value.is_solver_failure
+    assert caught.value.qp is not qp
+    np.testing.assert_array_equal(caught.value.qp.lower, qp.lower)
+
+
+@pytest.mark.parametrize("backend", EVERY)
+def test_a_qp_that_is_not_convex_raises_and_is_carried(backend):
+    qp = scalar_qp(-1.0)
+    qp.H[:], qp.stages.L[0, 1, 1] = -1.0, -1.5
+    solver = make_backend(backend)
+    with pytest.raises(QpError, match="convex") as caught:
+        solver.load(qp)
+        solver.solve(qp)
+    assert caught.value.status == "not convex"
+    np.testing.assert_array_equal(caught.value.qp.H, qp.H)
+
+
+@pytest.mark.parametrize("backend", PERSISTENT)
+def test_a_backend_recovers_from_a_failure(backend):
+    solver = make_backend(backend)
+    bad, good = scalar_qp(-1.5), scalar_qp(-1.5)
+    bad.lower[:], bad.upper[:] = 2.0, 1.0
+    for qp in (good, bad):
+        try:
+            solver.load(qp)
+            solver.solve(qp)
+        except QpError:
+            assert qp is bad
+    solver.load(good)
+    _, expected = CASES["at the limit"]
+    np.testing.assert_allclose(np.ravel(solver.solve(good)), expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["osqp", "qpsolvers:nothing", ""])
+def test_an_unknown_backend_is_refused_with_the_choices(name):
+    with pytest.raises(ControllerError, match=r"(choose daqp, proxqp or|it has clarabel)"):
+        make_backend(name)
+
+
+def test_a_full_space_backend_says_that_it_needs_the_stages():
+    qp = scalar_qp(-1.0)
+    qp.stages = None
+    with pytest.raises(ControllerError, match="needs the QP's stages"):
+        make_backend("qpsolvers:daqp").solve(qp)

@@ -1,0 +1,203 @@
+import numpy as np
+import pytest
+from scalar import CASES, scalar_qp, solution
+from stored import qps, solve
+
+from controllers.errors import QpError
+from controllers.qp import QpSolution, SoftQp
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """Every ninth stored QP with its solution."""
+    return [answer for k, answer in enumerate(solve("daqp")) if k % 9 == 0]
+
+
+def moved(answer, name, index, step):
+    parts = {part: value.copy() for part, value in answer._asdict().items()}
+    parts[name][index] += step
+    return QpSolution(**parts)
+
+
+def rows_qp(rows):
+    rows = np.array(rows, dtype=float)
+    count, size = rows.shape
+    return SoftQp(
+        H=np.eye(size),
+        f=np.zeros(size),
+        lower=np.full(size, -10.0),
+        upper=np.full(size, 10.0),
+        rows=rows,
+        row_lower=np.full(count, -100.0),
+        row_upper=np.zeros(count),
+        w=np.ones(count),
+        W=np.ones(count),
+    )
+
+
+# objective and slack --------------------------------------------------------------------------
+
+
+def test_slack_is_the_least_that_makes_the_rows_feasible():
+    qp = scalar_qp(0.0)
+    assert qp.slack(np.array([0.5]))[0] == 0.0
+    assert qp.slack(np.array([3.0]))[0] == 2.0
+    assert qp.slack(np.array([-103.0]))[0] == 3.0
+
+
+def test_the_objective_charges_the_slack_linearly_and_quadratically():
+    assert scalar_qp(-1.0, w=5.0, W=7.0).objective(np.array([3.0])) == 4.5 - 3.0 + 10.0 + 28.0
+
+
+def test_a_copy_shares_no_memory():
+    qp = scalar_qp(-1.0)
+    copy = qp.copy()
+    for name in ("H", "f", "lower", "upper", "rows", "row_lower", "row_upper", "w", "W"):
+        assert not np.shares_memory(getattr(qp, name), getattr(copy, name))
+        np.testing.assert_array_equal(getattr(qp, name), getattr(copy, name))
+    assert not np.shares_memory(qp.stages.A, copy.stages.A)
+
+
+def test_a_qp_that_is_not_convex_is_refused_and_carried():
+    qp = scalar_qp(-1.0)
+    qp.H[0, 0] = -1.0
+    with pytest.raises(QpError, match="not strictly convex") as caught:
+        qp.require_convex()
+    assert caught.value.status == "not convex"
+    np.testing.assert_array_equal(caught.value.qp.H, qp.H)
+
+
+# residuals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_residuals_and_gap_vanish_at_the_solution(case):
+    (f, w, W), expected = CASES[case]
+    residuals = solution(*expected).residuals(scalar_qp(f, w=w, W=W))
+    assert max(residuals) < 1e-14
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", ["v", "nu", "lam"])
+@pytest.mark.parametrize("step", [-1e-3, 1e-3])
+def test_any_change_of_the_solution_shows(case, name, step):
+    (f, w, W), expected = CASES[case]
+    changed = moved(solution(*expected), name, 0, step)
+    assert changed.residuals(scalar_qp(f, w=w, W=W)).largest > 1e-5
+
+
+def test_residuals_vanish_at_the_solutions_of_real_qps(solved):
+    assert max(answer.residual for answer in solved) < 1e-9
+    assert max(answer.residuals.gap for answer in solved) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["v", "nu", "lam"])
+def test_a_change_of_real_solutions_shows(name, solved):
+    for answer in solved:
+        qp, before = answer.qp, answer.residual
+        for index in range(getattr(answer.multipliers, name).size):
+            for step in (-1e-2, 1e-2):
+                after = moved(answer.multipliers, name, index, step).residuals(qp).largest
+                assert after > 1e-9
+                assert after > 10 * before
+
+
+def test_the_duality_gap_bounds_the_distance_to_the_optimum():
+    # Any dual point gives a lower bound: here ν = λ = 0 with v = −f, whose dual value is −f²/2.
+    qp = scalar_qp(-3.0)
+    gap = solution(3.0, 0.0, 0.0).residuals(qp).gap
+    primal, dual = qp.objective(np.array([3.0])), -4.5
+    assert gap == pytest.approx((primal - dual) / max(1, abs(primal)))
+    assert primal - qp.objective(np.array([4 / 3])) < primal - dual
+
+
+def test_a_residual_that_is_not_finite_is_not_small():
+    assert not solution(np.nan, 0.0, 0.0).residuals(scalar_qp(-1.0)).largest < 1e-6
+
+
+# activity -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_active_names_the_branch(case):
+    (f, w, W), expected = CASES[case]
+    held, at_limit, violated = solution(*expected).active(scalar_qp(f, w=w, W=W))
+    assert held[0] == case.startswith("saturated")
+    assert at_limit[0] == (case == "at the limit")
+    assert violated[0] == (case.startswith("violated") or case == "saturated")
+
+
+def test_a_fixed_variable_is_held_whatever_its_multiplier():
+    qp = scalar_qp(-0.5)
+    qp.lower[:] = qp.upper[:] = 0.5
+    assert solution(0.5, 0.0, 0.0).active(qp)[0][0]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_strict_activity_is_not_flagged(case):
+    (f, w, W), expected = CASES[case]
+    assert not solution(*expected).weakly_active(scalar_qp(f, w=w, W=W))
+
+
+@pytest.mark.parametrize(
+    ("qp", "answer"),
+    [
+        (scalar_qp(-1.0), (1.0, 0.0, 0.0)),  # reaches the limit with λ = 0
+        (scalar_qp(-2.0), (1.0, 0.0, 1.0)),  # about to leave the limit: λ = w
+        (scalar_qp(-10.0, limit=50.0), (10.0, 0.0, 0.0)),  # reaches the bound with ν = 0
+    ],
+)
+def test_weak_activity_is_flagged(qp, answer):
+    assert solution(*answer).residuals(qp).largest == 0.0
+    assert solution(*answer).weakly_active(qp)
+
+
+def test_a_row_at_its_limit_that_nothing_moves_is_flagged():
+    qp = scalar_qp(-1.5)
+    qp.lower[:] = qp.upper[:] = 1.0
+    assert solution(1.0, 0.0, 0.5).weakly_active(qp)
+
+
+# licq -----------------------------------------------------------------------------------------
+
+
+def licq(rows, active):
+    lam = np.where(active, 0.5, 0.0)
+    size = len(rows[0])
+    return QpSolution(np.zeros(size), np.zeros(size), lam).licq_margin(rows_qp(rows))
+
+
+def test_without_active_rows_the_licq_margin_is_infinite():
+    assert licq([[1, 0], [0, 1]], [False, False]) == np.inf
+
+
+def test_orthogonal_rows_have_margin_one_whatever_their_length():
+    assert licq([[5, 0], [0, 0.1]], [True, True]) == pytest.approx(1.0)
+
+
+def test_the_margin_is_the_sine_of_half_the_angle_between_two_rows():
+    angle = 0.3
+    margin = licq([[1, 0], [np.cos(angle), np.sin(angle)]], [True, True])
+    assert margin == pytest.approx(np.sqrt(2) * np.sin(angle / 2))
+
+
+@pytest.mark.parametrize("rows", [[[1, 1], [2, 2]], [[0, 0], [1, 0]], [[1, 0], [0, 1], [1, 1]]])
+def test_dependent_rows_have_no_margin(rows):
+    assert licq(rows, [True] * len(rows)) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_held_variables_do_not_count():
+    qp = rows_qp([[1, 0]])
+    qp.lower[0] = qp.upper[0] = 0.0
+    assert QpSolution(np.zeros(2), np.zeros(2), np.array([0.5])).licq_margin(qp) == 0.0
+
+
+def test_the_stored_set_holds_what_it_is_for():
+    answers = list(solve("daqp"))
+    assert len(answers) == len(qps()) >= 300
+    assert sum(answer.enforced for answer in answers) >= 150
+    assert sum(bool((answer.slack > 1e-6).any()) for answer in answers) >= 80
+    free = [answer.multipliers.nu[2 if answer.enforced else 0 :] for answer in answers]
+    assert sum(bool((np.abs(nu) > 1e-6).any()) for nu in free) >= 80
+    assert max(float(np.abs(answer.multipliers.lam).max()) for answer in answers) > 9e4
+    assert {qp.hessian for qp in qps()} == {"gauss-newton", "exact"}

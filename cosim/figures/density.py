@@ -30,7 +30,9 @@ def plot_density(
     everything = np.concatenate(list(samples.values()))
     low, high = np.quantile(everything, (0.001, 0.999))
     low, high = min(float(low), bound), max(float(high), bound)
-    width = (high - low) / bins
+    # Not narrower than the smallest sample can fill (Freedman and Diaconis' rule).
+    width = max((high - low) / bins, *(_fitting_width(values) for values in samples.values()))
+    width = width or 1e-3 * max(abs(bound), 1.0)
     edges = bound + width * np.arange(
         -np.ceil((bound - low) / width) - 1, np.ceil((high - bound) / width) + 2
     )
@@ -57,3 +59,8 @@ def plot_density(
         axes.set_ylabel("density" if unit in ("", "1") else f"density [{inverse}]")
         legend_above(axes)
     return save(drawn, path)
+
+
+def _fitting_width(values: Array) -> float:
+    lower, upper = np.quantile(values, (0.25, 0.75))
+    return float(2.0 * (upper - lower) / np.cbrt(len(values)))

@@ -70,7 +70,7 @@ def plot_phase_portraits(
             axes.set_visible(False)
         for axes, portrait, field in zip(grid.flat, portraits, fields, strict=False):
             _density(axes, portrait.states, extent)
-            _arrows(axes, x, y, field / longest)
+            _arrows(axes, x, y, field / (longest or 1.0))
             axes.plot(*scenario.reference_state[:2], "+", color=BOUND, ms=9, mew=1.6, zorder=5)
             _bounds(axes, scenario)
             axes.set_title(plain(portrait.name))

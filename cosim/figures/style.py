@@ -27,7 +27,7 @@ LIGHT = "#C9D1D9"
 _KNOWN = {
     "naive": "#7F7F7F",
     "tuned": "#E69F00",
-    "converged": "#56B4E9",
+    "converged": "#CC79A7",
     "optimal": "#111111",
 }
 

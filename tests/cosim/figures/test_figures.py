@@ -115,3 +115,27 @@ def test_the_front_is_what_no_other_point_beats(rng):
         for i, p in enumerate(points)
     ]
     assert nondominated(points).tolist() == expected
+
+
+def test_a_densitys_bins_part_at_the_bound(rng, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("cosim.figures.density.save", lambda figure, path: drawn.append(figure))
+    samples = {"a": rng.normal(25.3, 1.0, size=4000), "b": rng.normal(26.0, 0.5, size=300)}
+    plot_density(samples, 25.0, "X2", "%", tmp_path / "a.png")
+    (axes,) = drawn[0].axes
+    for stairs, values in zip(axes.patches[1::2], samples.values(), strict=True):
+        heights, edges, _ = stairs.get_data()
+        assert np.abs(edges - 25.0).min() < 1e-12
+        below = float(np.sum(heights * np.diff(edges) * (edges[1:] <= 25.0 + 1e-9)))
+        shown = (values >= edges[0]) & (values <= edges[-1])
+        assert below == pytest.approx(np.mean((values < 25.0) & shown), abs=1e-12)
+        assert float(np.sum(heights * np.diff(edges))) == pytest.approx(np.mean(shown), abs=1e-12)
+
+
+def test_a_plant_at_rest_draws(tmp_path, paper):
+    rest = np.tile(paper.reference_state, (50, 1))
+    x, y = np.linspace(24.0, 26.0, 3), np.linspace(49.0, 51.0, 3)
+    actions = np.tile(paper.reference_action, (3, 3, 1))
+    plot_phase_portraits([Portrait("rest", rest, actions)], x, y, paper, tmp_path / "a.png")
+    plot_density({"rest": rest[:, 0]}, 25.0, "X2", "%", tmp_path / "b.png")
+    plot_pareto({"rest": (np.zeros(5), np.full(5, 6210.0))}, tmp_path / "c.png")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmus.errors import FmuError
+from fmus.information import description_of
 from fmus.variables import BY_NAME, DISTURBANCES
 
 FOLDER = Path(__file__).parent / "reference"
@@ -86,7 +87,11 @@ def load(case: str, kind: str = "ref") -> Signals:
 
 
 def deviations(fmu: Path) -> list[Deviation]:
-    """For each case and signal the first sample that differs in any bit."""
+    """For each case and signal the first sample that differs in any bit.
+
+    Raises FmuError when `fmu` is no evaporator.
+    """
+    _require_evaporator(fmu)
     found = []
     for case in CASES:
         expected, actual = load(case), simulate(fmu, case)
@@ -101,6 +106,7 @@ def deviations(fmu: Path) -> list[Deviation]:
 
 def update(fmu: Path) -> list[Path]:
     """Write the reference signals anew from `fmu`; returns the files."""
+    _require_evaporator(fmu)
     options = {
         "StartTime": 0.0, "StopTime": STOP_TIME, "StepSize": STEP_SIZE, "RelTol": 1e-6,
         "OutputIntervalLength": STEP_SIZE,
@@ -120,6 +126,13 @@ def update(fmu: Path) -> list[Path]:
                 csv.writer(file, lineterminator="\n").writerows(lines)
             files.append(folder / name)
     return files
+
+
+def _require_evaporator(fmu: Path) -> None:
+    names = {variable.name for variable in description_of(fmu).modelVariables}
+    missing = {"seed", "stochastic", "P100", "F200", *NOT_USED, *OUTPUTS} - names
+    if missing:
+        raise FmuError(f"{fmu} is no evaporator: it lacks {', '.join(sorted(missing))}")
 
 
 def _lines(signals: Signals) -> list[list[str]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from fmpy import read_model_description
-from fmpy.model_description import ScalarVariable
+from fmpy.model_description import ModelDescription, ScalarVariable
 
 from fmus.errors import FmuError
 
@@ -63,14 +63,19 @@ class Information:
     variables: tuple[VariableSummary, ...]
 
 
-def information(fmu: Path) -> Information:
-    """Read the FMU file `fmu`; raises FmuError when it is missing or is no FMU."""
+def description_of(fmu: Path) -> ModelDescription:
+    """The model description in the file `fmu`; FmuError when it is missing or is no FMU."""
     if not fmu.is_file():
         raise FmuError(f"there is no file {fmu}")
     try:
-        description = read_model_description(str(fmu), validate=False)
+        return read_model_description(str(fmu), validate=False)
     except Exception as error:
         raise FmuError(f"{fmu} is not an FMU: {error}") from error
+
+
+def information(fmu: Path) -> Information:
+    """Read the FMU file `fmu`; raises FmuError when it is missing or is no FMU."""
+    description = description_of(fmu)
     interfaces = _interfaces(fmu)
     experiment = description.defaultExperiment
     times = [getattr(experiment, n, None) for n in ("startTime", "stopTime", "stepSize")]

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from fmpy import read_model_description
-
 from fmus.checks import casadi_check, ecospy_check, fmpy_check, fmutool_check, libcosimpy_check
 from fmus.checks.outcome import NotInstalledError, NotOfferedError
-from fmus.errors import CheckError, FmuError
+from fmus.errors import FmuError
+from fmus.information import description_of
 
 TIMEOUT = 300.0  # s for one importer
 
@@ -53,14 +52,9 @@ CHECKS: dict[tuple[str, str], Callable[[Path], str]] = {
 def check(fmu: Path) -> list[Finding]:
     """Check the file `fmu` with every importer, in the order of `CHECKS`.
 
-    Raises CheckError when the file is missing or is no FMU.
+    Raises FmuError when the file is missing or is no FMU.
     """
-    if not fmu.is_file():
-        raise CheckError(f"there is no file {fmu}")
-    try:
-        read_model_description(str(fmu), validate=False)
-    except Exception as error:
-        raise CheckError(f"{fmu} is not an FMU: {error}") from error
+    description_of(fmu)
     return [_in_own_process(tool, subject, fmu) for tool, subject in CHECKS]
 
 

@@ -97,3 +97,9 @@ def test_update_writes_what_is_stored(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr(crosscheck, "FOLDER", tmp_path)
     for path in crosscheck.update(fmus.path()):
         assert path.read_bytes() == (stored / path.relative_to(tmp_path)).read_bytes()
+
+
+def test_another_model_is_an_error(monkeypatch) -> None:
+    monkeypatch.setattr(crosscheck, "OUTPUTS", ("X2", "level"))
+    with pytest.raises(FmuError, match="is no evaporator: it lacks level"):
+        crosscheck.deviations(fmus.path())

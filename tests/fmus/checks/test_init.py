@@ -11,7 +11,7 @@ import pytest
 import fmus
 from fmus import checks
 from fmus.checks import CHECKS, Status
-from fmus.errors import CheckError
+from fmus.errors import FmuError
 
 
 @pytest.mark.slow
@@ -24,10 +24,10 @@ def test_every_installed_importer_passes(name: str) -> None:
 
 
 def test_missing_and_corrupt_files_are_errors(tmp_path: Path) -> None:
-    with pytest.raises(CheckError, match="there is no file"):
+    with pytest.raises(FmuError, match="there is no file"):
         checks.check(tmp_path / "missing.fmu")
     (tmp_path / "corrupt.fmu").write_bytes(b"not a zip")
-    with pytest.raises(CheckError, match="is not an FMU"):
+    with pytest.raises(FmuError, match="is not an FMU"):
         checks.check(tmp_path / "corrupt.fmu")
 
 

@@ -1,0 +1,110 @@
+"""`cosim fmu`: exit codes, tables and JSON of its commands."""
+
+import json
+import os
+import shutil
+
+import pytest
+
+import fmus
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
+)
+
+
+def test_info_shows_variables_with_units(cosim):
+    code, out, err = cosim("fmu", "info")
+    assert code == 0
+    assert "economic_cost" in out
+    assert "kW.min/(kg.K)" in out
+    assert "FMI 2.0: co-simulation, model exchange" in err
+
+
+def test_info_as_json(cosim):
+    code, out, _ = cosim("fmu", "info", "evaporator_fmi3", "--json")
+    document = json.loads(out)
+    assert (code, document["fmi_version"]) == (0, "3.0")
+    assert {"name", "unit", "start", "min", "max"} <= set(document["variables"][0])
+
+
+def test_info_takes_a_file(cosim):
+    assert cosim("fmu", "info", fmus.path())[0] == 0
+
+
+@pytest.mark.slow
+def test_check_prints_a_table_and_ends_with_0(cosim):
+    code, out, _ = cosim("fmu", "check")
+    assert code == 0
+    for words in ("fmpy", "casadi", "ecospy", "libcosimpy", "fmutool", "bit-identical"):
+        assert words in out
+
+
+def test_failed_check_ends_with_1(cosim, monkeypatch):
+    from fmus import checks
+
+    failed = checks.Finding("tool", "subject", checks.Status.FAILED, "why")
+    monkeypatch.setattr(checks, "check", lambda path: [failed])
+    code, out, _ = cosim("fmu", "check", "--json")
+    assert code == 1
+    assert json.loads(out) == {
+        "passed": False,
+        "checks": [{"tool": "tool", "subject": "subject", "status": "failed", "detail": "why"}],
+    }
+
+
+@needs_compiler
+def test_build_writes_both_files_and_makes_the_folder(cosim, tmp_path):
+    code, out, _ = cosim("fmu", "build", "--out", "new/folder", "--json")
+    assert code == 0
+    names = [f"{name}.fmu" for name in fmus.NAMES]
+    assert sorted(p.name for p in (tmp_path / "new/folder").iterdir()) == names
+    assert json.loads(out)["built"] == [f"new/folder/{name}" for name in names]
+
+
+@needs_compiler
+def test_build_check_tells_what_differs(cosim, monkeypatch):
+    from fmus import build
+
+    found = {"evaporator.fmu": [], "evaporator_fmi3.fmu": ["model.png"]}
+    monkeypatch.setattr(build, "compare_with_shipped", lambda: found)
+    code, _, err = cosim("fmu", "build", "--check")
+    assert code == 1
+    assert "evaporator.fmu: identical to the one shipped" in err
+    assert "evaporator_fmi3.fmu: model.png" in err
+
+
+def test_reference_signals_are_reproduced(cosim):
+    code, _, err = cosim("fmu", "reference")
+    assert code == 0
+    assert "3 cases, identical" in err
+
+
+BAD_INPUT = {
+    "no such file": (["info", "none.fmu"], "there is no file none.fmu"),
+    "no FMU": (["info", "text.fmu"], "text.fmu is not an FMU"),
+    "nothing to check": (["check", "none.fmu"], "there is no file none.fmu"),
+    "check of no FMU": (["check", "text.fmu"], "text.fmu is not an FMU"),
+    "build without a target": (["build"], "give one of --out DIR, --check and --in-place"),
+    "build with two": (["build", "--check", "--out", "x"], "give one of --out DIR"),
+    "reference of no FMU": (["reference", "text.fmu"], "text.fmu is not an FMU"),
+    "build into a file": (["build", "--out", "text.fmu"], "text.fmu"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_INPUT.values(), ids=BAD_INPUT)
+def test_bad_input_is_one_line_and_exit_code_2(cosim, tmp_path, arguments, message):
+    (tmp_path / "text.fmu").write_text("text")
+    code, out, err = cosim("fmu", *arguments)
+    assert code == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_missing_compiler_is_told(cosim, monkeypatch):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    code, _, err = cosim("fmu", "build", "--out", "x")
+    assert code == 2
+    assert "install gcc or set CC" in err

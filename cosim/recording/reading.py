@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
+from rerun.error_utils import RerunWarning
 
 from cosim.errors import RecordingError
 from cosim.recording.stream import SAMPLE, SIGNAL, TIME
@@ -104,7 +106,10 @@ def _chunks(path: Path) -> list[Chunk]:
     if not path.is_file():
         raise RecordingError(f"there is no recording {path}")
     try:
-        return RrdReader(path).stream().to_chunks()
+        with warnings.catch_warnings():
+            # A file without its end is reported below, once.
+            warnings.simplefilter("ignore", RerunWarning)
+            return RrdReader(path).stream().to_chunks()
     except (ValueError, RuntimeError, OSError) as error:
         raise RecordingError(
             f"{path} is not a readable recording ({str(error).splitlines()[0]}); if its process "

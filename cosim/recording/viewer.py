@@ -33,7 +33,8 @@ def open_viewer(path: str | Path) -> None:
     command = [*_viewer(), "--port", "auto", str(_existing(path))]
     if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
         raise RecordingError(f"no display to show {path} on; draw it with --png FILE instead")
-    if subprocess.run(command, check=False).returncode not in (0, 130):
+    quiet = {"RUST_LOG": "warn"} | os.environ
+    if subprocess.run(command, check=False, env=quiet).returncode not in (0, 130):
         raise RecordingError(f"the viewer could not show {path}; its messages are above")
 
 

@@ -1,5 +1,6 @@
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def test_what_a_killed_process_leaves_is_repaired_as_the_message_says(tmp_path, 
     torn = tmp_path / "torn.rrd"
     torn.write_bytes((tmp_path / "run.rrd").read_bytes()[:-2000])
     with (
-        pytest.warns(Warning, match="no footer"),
+        warnings.catch_warnings(action="error"),
         pytest.raises(RecordingError, match="rerun rrd optimize FILE -o REPAIRED"),
     ):
         read_recording(torn)

@@ -58,7 +58,7 @@ def train(out: Path, scenario: Scenario, name: str, case: Case, seed: int) -> st
         seed=seed,
         configuration=algorithm.Configuration.from_dict(case.settings),
         controller=case.controller,
-        log_every=1000,
+        log_every=500,
         evaluate_every=case.samples // 20,
         checkpoint_every=case.samples // 5,
         evaluation_seeds=4,

@@ -10,11 +10,11 @@ from pathlib import Path
 from cosim.errors import CosimError
 
 
-def run_command(words: list[str], out: Path) -> None:
+def run_command(words: list[str], out: Path, accepted: tuple[int, ...] = (0,)) -> None:
     """Run `cosim WORDS --out OUT` in this process, silently.
 
     Raises what the command raises, and CosimError with its last words where it ends otherwise
-    than well.
+    than with an `accepted` exit code.
     """
     from cosim.cli.main import app
 
@@ -27,6 +27,6 @@ def run_command(words: list[str], out: Path) -> None:
         if not hasattr(error, "format_message"):
             raise
         raise CosimError(f"cosim {shlex.join(words)}: {error.format_message()}") from None
-    if code:
+    if (code or 0) not in accepted:
         last = said.getvalue().strip().rpartition("\n")[2]
         raise CosimError(f"cosim {shlex.join(words)} ended with code {code}: {last}")

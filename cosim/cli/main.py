@@ -7,7 +7,19 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli import benchmark, compare, demo, evaluate, fmu, results, scenario, simulate, train, view
+from cosim.cli import (
+    benchmark,
+    compare,
+    demo,
+    evaluate,
+    fmu,
+    reproduce,
+    results,
+    scenario,
+    simulate,
+    train,
+    view,
+)
 
 app = typer.Typer(
     name="cosim",
@@ -26,6 +38,7 @@ app.command("view")(view.view)
 app.command("compare")(compare.compare)
 app.command("scenario")(scenario.scenario)
 app.add_typer(benchmark.app, name="benchmark")
+app.command("reproduce")(reproduce.reproduce)
 app.add_typer(results.app, name="results")
 app.add_typer(fmu.app, name="fmu", no_args_is_help=True)
 

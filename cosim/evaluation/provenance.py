@@ -31,10 +31,10 @@ def versions() -> str:
 
 
 @cache
-def code_hash() -> str:
+def code_hash(packages: tuple[str, ...] = PACKAGES) -> str:
     """First 16 hex digits of the SHA-256 of the code that results depend on, FMUs included."""
     digest = hashlib.sha256()
-    for package in PACKAGES:
+    for package in packages:
         spec = find_spec(package)
         if spec is None or spec.origin is None:
             continue

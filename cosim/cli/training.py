@@ -1,0 +1,138 @@
+"""The trainings of a reproduction: tasks for workers, each a `cosim train` command done once."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from contextlib import chdir
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from cosim.reproduction.budget import Budget, Learner
+
+if TYPE_CHECKING:
+    from cosim.reproduction.readings import Reading
+
+DONE = "done.json"
+WINDOW = 10_000
+LOG_EVERY = 500
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training of a learner; `scenario` is what `--scenario` takes in the folder `root`."""
+
+    learner: Learner
+    scenario: str
+    seed: int
+    root: Path
+    name: str
+
+    @property
+    def folder(self) -> Path:
+        """Where the training's files are."""
+        return self.root / "training" / self.name
+
+    def command(self) -> str:
+        """The command, without `--out`, as typed in `root`."""
+        words = ["cosim", "train", "--algorithm", self.learner.algorithm]
+        words += ["--scenario", self.scenario, "--samples", str(self.learner.samples)]
+        words += ["--seed", str(self.seed), "--evaluate-every", str(self.learner.samples)]
+        words += ["--log-every", str(LOG_EVERY)]
+        for setting in self.learner.settings:
+            words += ["--set", setting]
+        return shlex.join(words)
+
+
+def train(task: Training) -> str:
+    """Run a training unless its folder holds it already; returns its status, `finished` or why not.
+
+    A training counts as there if the command and the hash of all code were the same. Raises what
+    `cosim train` raises, but takes divergence for a result: the last good θ is stored then.
+    """
+    from controllers.storage import write_atomically
+    from cosim.cli.inner import run_command
+    from cosim.evaluation.provenance import PACKAGES, code_hash
+
+    task.folder.mkdir(parents=True, exist_ok=True)
+    facts = {"command": task.command(), "code": code_hash((*PACKAGES, "learning"))}
+    done = task.folder / DONE
+    if not done.is_file() or json.loads(done.read_text("utf-8")) != facts:
+        with chdir(task.root):
+            run_command(shlex.split(task.command())[1:], task.folder, accepted=(0, 1))
+        write_atomically(done, json.dumps(facts))
+    summary = json.loads((task.folder / "summary.json").read_text("utf-8"))
+    return str(summary["status"])
+
+
+def trainings(sizes: Budget, folder: Path) -> dict[str, Training]:
+    """Every training of the reproduction, under the name of its controller."""
+    from controllers.storage import write_atomically
+    from cosim.reproduction.readings import Reading, readings
+    from cosim.scenario import Scenario
+
+    tasks = {
+        f"{learner.name}-{seed}": Training(learner, "paper", seed, folder, f"{learner.name}-{seed}")
+        for learner in sizes.learners
+        for seed in range(sizes.training_seeds)
+    }
+    paper = Scenario.load("paper")
+    for reading in readings(sizes.factorial):
+        source = "paper"
+        if reading != Reading():
+            path = folder / "map" / f"{reading.name}.toml"
+            path.parent.mkdir(exist_ok=True)
+            write_atomically(path, reading.scenario(paper).to_toml())
+            source = str(path.relative_to(folder))
+        for seed in range(sizes.map_seeds):
+            key = map_key(sizes, reading, seed)
+            tasks[key] = Training(sizes.mapper, source, seed, folder, key)
+    return tasks
+
+
+def map_key(sizes: Budget, reading: Reading, seed: int) -> str:
+    """Name of a training of the map."""
+    return f"map-{reading.name}-{sizes.mapper.name}-{seed}"
+
+
+def figure(task: Training, folder: Path) -> str:
+    """Draw the paper's figure for a training, PNG and SVG; returns the PNG's name."""
+    import numpy as np
+
+    from cosim.figures import plot_parameters_and_td_error
+    from cosim.reproduction.curves import increments, read_log, running_mean
+
+    log = read_log(task.folder / "learning.csv")
+    mean = running_mean(log["samples"], log["td_error"], log["updates"], WINDOW)
+    samples = np.concatenate([[0.0], log["samples"]])
+    moved = {
+        block: np.vstack([np.zeros(values.shape[1]), values])
+        for block, values in increments(log, _start(task)).items()
+    }
+    name = f"parameters-{task.learner.name}"
+    for suffix in ("png", "svg"):
+        plot_parameters_and_td_error(
+            samples,
+            moved,
+            log["samples"],
+            mean,
+            folder / f"{name}.{suffix}",
+            window=WINDOW,
+        )
+    return f"{name}.png"
+
+
+def _start(task: Training) -> dict[str, float]:
+    """Entries of θ₀ by label."""
+    from controllers.problem import Problem
+    from cosim.scenario import Scenario
+    from learning.registry import load_algorithm
+    from learning.starting_point import starting_parameters
+
+    configuration = load_algorithm(task.learner.algorithm).Configuration.from_assignments(
+        task.learner.settings
+    )
+    problem = Problem.from_scenario(cast("Any", Scenario.load(task.folder / "scenario.toml")))
+    start = starting_parameters(problem, configuration)
+    return dict(zip(start.layout.labels, start.theta.tolist(), strict=True))

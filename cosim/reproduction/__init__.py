@@ -1,0 +1,1 @@
+"""The paper's section Simulations, and what it leaves open, from one command."""

@@ -1,7 +1,6 @@
 import json
 
 import pytest
-from test_cli import cosim  # noqa: F401 (fixture)
 
 from cosim.plant.benchmark import measure
 
@@ -16,7 +15,7 @@ COMPARED = {
 }
 
 
-def test_the_command_prints_medians_and_ratios(cosim):  # noqa: F811
+def test_the_command_prints_medians_and_ratios(cosim):
     code, out, err = cosim("benchmark", "plant", "--steps", 200, "--json")
     assert code == 0, err
     result = json.loads(out)

@@ -14,7 +14,7 @@ from cosim.reproduction.budget import Budget, Learner
 if TYPE_CHECKING:
     from cosim.reproduction.readings import Reading
 
-DONE = "done.json"
+STATE = "state.json"
 WINDOW = 10_000
 LOG_EVERY = 500
 
@@ -48,8 +48,9 @@ class Training:
 def train(task: Training) -> str:
     """Run a training unless its folder holds it already; returns its status, `finished` or why not.
 
-    A training counts as there if the command and the hash of all code were the same. Raises what
-    `cosim train` raises, but takes divergence for a result: the last good θ is stored then.
+    A training counts as there, and one that was interrupted goes on from its checkpoint, if the
+    command and the hash of all code are the same. Raises what `cosim train` raises, but takes
+    divergence for a result: the last good θ is stored then.
     """
     from controllers.storage import write_atomically
     from cosim.cli.inner import run_command
@@ -57,11 +58,15 @@ def train(task: Training) -> str:
 
     task.folder.mkdir(parents=True, exist_ok=True)
     facts = {"command": task.command(), "code": code_hash((*PACKAGES, "learning"))}
-    done = task.folder / DONE
-    if not done.is_file() or json.loads(done.read_text("utf-8")) != facts:
+    state, words = task.folder / STATE, shlex.split(task.command())[1:]
+    known = json.loads(state.read_text("utf-8")) if state.is_file() else {}
+    if known != facts | {"done": True}:
+        if known == facts and (task.folder / "checkpoint.npz").is_file():
+            words.append("--resume")
+        write_atomically(state, json.dumps(facts))
         with chdir(task.root):
-            run_command(shlex.split(task.command())[1:], task.folder, accepted=(0, 1))
-        write_atomically(done, json.dumps(facts))
+            run_command(words, task.folder, accepted=(0, 1))
+        write_atomically(state, json.dumps(facts | {"done": True}))
     summary = json.loads((task.folder / "summary.json").read_text("utf-8"))
     return str(summary["status"])
 

@@ -29,8 +29,9 @@ def _outward(length: float, spacing: float, growth: float) -> Array:
     if length <= 1e-9 * spacing:
         return np.zeros(0)
     count = max(int(np.ceil(np.log1p(length * (growth - 1) / spacing) / np.log(growth))), 1)
-    offsets = np.cumsum(spacing * growth ** np.arange(1, count + 1))
-    return offsets * (length / offsets[-1])
+    offsets: Array = np.cumsum(spacing * growth ** np.arange(1, count + 1))
+    scaled: Array = offsets * (length / offsets[-1])
+    return scaled
 
 
 def support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:

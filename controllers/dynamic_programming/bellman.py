@@ -35,6 +35,14 @@ class Accuracy:
     nodes: tuple[int, ...]
     penalty_nodes: tuple[int, ...]
 
+    def draft(self) -> Accuracy:
+        """A quarter of the work, for a first grid whose only use is as a start."""
+        return Accuracy(
+            max(self.substeps // 2, 1),
+            tuple(min(count, 5) for count in self.nodes),
+            tuple(min(count, 10) for count in self.penalty_nodes),
+        )
+
 
 class BellmanOperator:
     """Q(s, a) = E[ℓ(s, a, d) + γ penalty(s₊) + γ W(s₊)] with V = penalty + W.

@@ -16,6 +16,9 @@ from controllers.dynamic_programming.minimisation import nelder_mead, scan
 from controllers.errors import OptimumError
 
 Array = NDArray[np.float64]
+# Each sample starts anew at the anchor with this probability, so that a plant without disturbance,
+# which may come to rest in several places, still has one gain; it shifts J* by 1e-10 of itself.
+_RESTART = 1e-9
 
 
 @dataclass(frozen=True)
@@ -51,21 +54,17 @@ def evaluate(
 
     For γ = 1: W + g = c + P W with W[anchor] = 0; for γ < 1: W = c + γ P W, and the gain from the
     stationary distribution. One sparse factorisation each. Raises OptimumError where the chain
-    has more than one recurrent class, so that its mean cost depends on where it starts.
+    cannot be evaluated.
     """
     matrix, cost = operator.chain(actions, grid)
     size = grid.size
     unit = sparse.csr_array(([1.0], ([0], [anchor])), shape=(1, size))
-    bordered = sparse.block_array(
-        [[sparse.eye_array(size) - matrix, np.ones((size, 1))], [unit, None]], format="csc"
-    )
+    flow = sparse.eye_array(size) - (1.0 - _RESTART) * matrix
+    bordered = sparse.block_array([[flow, np.ones((size, 1))], [unit, None]], format="csc")
     try:
         factors = splu(bordered)
     except RuntimeError as error:
-        raise OptimumError(
-            "policy evaluation: the Markov chain on the grid has more than one recurrent class; "
-            "take a finer grid or a disturbance that reaches every state"
-        ) from error
+        raise OptimumError(f"policy evaluation on a grid of {size} states: {error}") from error
     stationary = factors.solve(np.append(np.zeros(size), 1.0), trans="T")
     # The transposed system's last row makes the multipliers a distribution: they sum to 1.
     distribution = stationary[:size]
@@ -76,22 +75,23 @@ def evaluate(
     return W, float(distribution @ cost), distribution
 
 
-def begin(operator: BellmanOperator, grid: Grid, actions: Array, anchor: int) -> Iterate:
+def begin(operator: BellmanOperator, grid: Grid, actions: Array) -> Iterate:
     """Evaluate a first policy (G, m); its `step` is a tenth of the action box."""
     problem = operator.problem
+    anchor = grid.nearest(problem.reference_state)
     width = problem.action_upper - problem.action_lower
     W, gain, distribution = evaluate(operator, grid, actions, anchor)
     return Iterate(grid, actions, W, gain, distribution, np.tile(0.1 * width, (grid.size, 1)))
 
 
 def improve(
-    operator: BellmanOperator, iterate: Iterate, *, scan_points: int = 0, iterations: int = 25
+    operator: BellmanOperator, iterate: Iterate, scan_points: int, *, iterations: int = 25
 ) -> Iterate:
     """Improve the policy once and bound what is left to gain.
 
-    A local search from the present action of each state; with `scan_points` > 0 from the best of
-    that many actions per dimension over the whole box, which is what makes `lower` a bound.
-    Returns the improved actions with the value of the former ones and the bounds of that.
+    A local search in each state from its present action or, where one is better, from one of
+    `scan_points` actions per dimension over the box: `lower` is a bound as far as these find the
+    global minimum. Returns the improved actions with the value of the former ones and its bounds.
     """
     problem, grid = operator.problem, iterate.grid
     lower, upper = problem.action_lower, problem.action_upper
@@ -99,9 +99,7 @@ def improve(
     def objective(rows: NDArray[np.intp], actions: Array) -> Array:
         return operator.values(grid.points[rows], actions, grid, iterate.W)
 
-    start = iterate.actions
-    if scan_points:
-        start, _ = scan(objective, start, lower, upper, scan_points)
+    start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
     width = upper - lower
     size = np.clip(2.0 * np.abs(iterate.step), 2e-3 * width, 0.1 * width)
     actions, values = nelder_mead(objective, start, size, lower, upper, iterations)
@@ -118,28 +116,24 @@ def improve(
 def iterate_policy(
     operator: BellmanOperator,
     start: Iterate,
-    anchor: int,
     *,
     rounds: int,
-    tolerance: float,
-    scan_rounds: int = 0,
-    scan_points: int = 5,
-    progress: Callable[[Iterate, int], None] | None = None,
+    scan_points: int,
+    enough: Callable[[Iterate, Iterate], bool],
+    report: Callable[[Iterate, int], None],
 ) -> Iterate:
-    """Howard's policy iteration until the bounds are `tolerance`·|gain| apart.
+    """Howard's policy iteration until `enough(before, after)`, at most `rounds` rounds.
 
-    At most `rounds` rounds, the first `scan_rounds` of which search the whole action box.
-    `progress` is called with each improved iterate and its round's number.
+    Each round scans `scan_points` actions per dimension and ends with a call of `report`.
     """
     iterate = start
+    anchor = start.grid.nearest(operator.problem.reference_state)
     for k in range(rounds):
-        improved = improve(
-            operator, iterate, scan_points=scan_points if k < scan_rounds else 0
-        )
+        before = iterate
+        improved = improve(operator, before, scan_points)
         W, gain, distribution = evaluate(operator, improved.grid, improved.actions, anchor)
         iterate = replace(improved, W=W, gain=gain, distribution=distribution)
-        if progress is not None:
-            progress(iterate, k)
-        if k + 1 >= scan_rounds and iterate.spread <= tolerance * abs(gain):
+        report(iterate, k)
+        if enough(before, iterate):
             break
     return iterate

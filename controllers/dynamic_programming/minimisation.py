@@ -58,7 +58,8 @@ def _replace_worst(
     trial = np.clip(centre + factor[:, None] * (centre - worst), lower, upper)
     tried = np.flatnonzero(best | ~accepted)
     outcome = np.full(len(values), np.inf)
-    outcome[tried] = objective(tried, trial[tried])
+    if len(tried):
+        outcome[tried] = objective(tried, trial[tried])
     better = outcome < reflected
     candidate = np.where(better[:, None], trial, candidate)
     outcome = np.minimum(outcome, reflected)

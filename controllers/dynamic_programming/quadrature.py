@@ -43,6 +43,11 @@ class DisturbanceLaw:
                 "of one length, and no range negative"
             )
 
+    @property
+    def deterministic(self) -> bool:
+        """Whether the disturbances never leave their nominal values."""
+        return self.kind == "none" or not self.ranges.any()
+
     def draw(self, generator: np.random.Generator, count: int) -> Array:
         """Draw `count` independent disturbances, shape (count, n_d)."""
         size = (count, len(self.nominal))
@@ -123,7 +128,7 @@ class Refinement:
         # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
         while len(self._matrices) > 1 and self._matrices[-1].shape[1] < 4:
             last = self._matrices.pop()
-            self._matrices[-1] = np.kron(self._matrices[-1], last)
+            self._matrices[-1] = np.kron(self._matrices[-1], last).astype(np.float64)
 
     def __call__(self, values: Array) -> Array:
         """Carry values (B, q_coarse) to (B, q_fine)."""

@@ -13,7 +13,7 @@ from controllers.dynamic_programming.axes import graded_axis, support
 from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
 from controllers.dynamic_programming.elementwise import Elementwise
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.howard import Iterate, begin, improve, iterate_policy
+from controllers.dynamic_programming.howard import Iterate, begin, iterate_policy
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.errors import OptimumError
 from controllers.model import discretise
@@ -40,7 +40,7 @@ class Settings:
     tail: float = 1e-7
     nodes: tuple[int, ...] = ()
     penalty_nodes: tuple[int, ...] = ()
-    integration_tolerance: float = 1e-8
+    integration_tolerance: float = 1e-7
     tolerance: float = 1e-4
     rounds: int = 40
 
@@ -114,20 +114,20 @@ def solve(
     parameters = problem.model.nominal_parameters if parameters is None else parameters
     accuracy = settings.accuracy(problem, law, parameters)
     discount = 1.0 if settings.criterion == "average" else problem.discount
-    operator = BellmanOperator(
-        problem, law, parameters, accuracy, discount=discount, workers=workers
+    draft, operator = (
+        BellmanOperator(problem, law, parameters, how, discount=discount, workers=workers)
+        for how in (accuracy.draft(), accuracy)
     )
-    grid = first_grid(problem, operator, settings)
-    iterate = begin(
-        operator,
-        grid,
-        np.tile(problem.reference_action, (grid.size, 1)),
-        grid.nearest(problem.reference_state),
-    )
-    for level in range(settings.level + 1):
-        if level:
-            iterate = _transfer(operator, iterate, finer_grid(problem, iterate, settings, level))
-        iterate = _converge(operator, iterate, settings, level, progress)
+    grid = first_grid(problem, draft, settings)
+    actions = np.tile(problem.reference_action, (grid.size, 1))
+    iterate = begin(draft, grid, actions)
+    report = _Reporter(progress)
+    for level in range(settings.level):
+        iterate = _approach(operator if level else draft, iterate, settings, report)
+        grid = finer_grid(problem, law, iterate, settings, level + 1)
+        iterate = _transfer(operator, iterate, grid)
+        report.level = level + 1
+    iterate = _converge(operator, iterate, settings, report)
     optimum = Optimum(
         iterate.grid,
         iterate.actions,
@@ -152,40 +152,58 @@ def solve(
     return optimum
 
 
-def _converge(
-    operator: BellmanOperator,
-    iterate: Iterate,
-    settings: Settings,
-    level: int,
-    progress: Callable[[Progress], None] | None,
+class _Reporter:
+    """Passes iterates on to the caller's progress function."""
+
+    def __init__(self, progress: Callable[[Progress], None] | None) -> None:
+        self.level = 0
+        self._progress = progress
+
+    def __call__(self, iterate: Iterate, k: int) -> None:
+        if self._progress is not None:
+            size = iterate.grid.size
+            self._progress(
+                Progress(self.level, k, size, iterate.gain, iterate.lower, iterate.upper)
+            )
+
+
+def _approach(
+    operator: BellmanOperator, iterate: Iterate, settings: Settings, report: _Reporter
 ) -> Iterate:
-    anchor = iterate.grid.nearest(operator.problem.reference_state)
+    """Iterate until the gain falls no more: a start for the next grid needs no bounds."""
+    return iterate_policy(
+        operator,
+        iterate,
+        rounds=settings.rounds,
+        scan_points=5,
+        enough=lambda before, after: before.gain - after.gain <= 1e-4 * abs(after.gain),
+        report=report,
+    )
 
-    def report(current: Iterate, k: int) -> None:
-        if progress is not None:
-            size = current.grid.size
-            progress(Progress(level, k, size, current.gain, current.lower, current.upper))
 
-    for _ in range(3):
+def _converge(
+    operator: BellmanOperator, iterate: Iterate, settings: Settings, report: _Reporter
+) -> Iterate:
+    """Iterate until the bounds meet, and meet again with a scan of the whole action box."""
+
+    def close(_: Iterate, after: Iterate) -> bool:
+        return after.spread <= settings.tolerance * abs(after.gain)
+
+    for scan_points in (3, 9):
         iterate = iterate_policy(
             operator,
             iterate,
-            anchor,
             rounds=settings.rounds,
-            tolerance=settings.tolerance,
-            scan_rounds=3 if level == 0 else 0,
-            progress=report,
+            scan_points=scan_points,
+            enough=close,
+            report=report,
         )
-        iterate = improve(operator, iterate, scan_points=9)
-        if iterate.spread <= 2 * settings.tolerance * abs(iterate.gain):
-            break
     return iterate
 
 
 def _transfer(operator: BellmanOperator, iterate: Iterate, grid: Grid) -> Iterate:
-    problem = operator.problem
     actions = iterate.grid.resample(iterate.actions, grid)
-    start = begin(operator, grid, actions, grid.nearest(problem.reference_state))
+    start = begin(operator, grid, actions)
     return replace(start, step=0.1 * start.step)
 
 
@@ -214,15 +232,28 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
     return Grid(tuple(axes))
 
 
-def finer_grid(problem: Problem, iterate: Iterate, settings: Settings, level: int) -> Grid:
-    """Grid that resolves the support of the closed loop with cells·2^level cells a state."""
+def finer_grid(
+    problem: Problem, law: DisturbanceLaw, iterate: Iterate, settings: Settings, level: int
+) -> Grid:
+    """Grid that resolves the support of the closed loop with cells·2^level cells a state.
+
+    It reaches as far again beyond the support on either side, and at least a twentieth of the
+    bounds' span: farther states are so rare that the policy at the box's edge serves them.
+    Without disturbance the support is a point, which says nothing of that, and the box stays.
+    """
+    share = 1.0 if law.deterministic else 0.05
+    margin = share * (problem.state_upper - problem.state_lower)
     mass = np.maximum(iterate.distribution, 0.0).reshape(iterate.grid.shape)
     axes = []
     for i, axis in enumerate(iterate.grid.axes):
         others = tuple(j for j in range(mass.ndim) if j != i)
         first, last = support(axis, mass.sum(axis=others), settings.tail)
-        spacing = (last - first) / (settings.cells * 2**level)
-        axes.append(graded_axis(axis[0], axis[-1], first, last, spacing, settings.growth))
+        width = last - first
+        spacing = width / (settings.cells * 2**level)
+        beyond = max(width, margin[i])
+        low = max(axis[0], min(first, problem.reference_state[i]) - beyond)
+        high = min(axis[-1], max(last, problem.reference_state[i]) + beyond)
+        axes.append(graded_axis(low, high, first, last, spacing, settings.growth))
     return Grid(tuple(axes))
 
 

@@ -59,7 +59,7 @@ class RtiNmpc:
         self._prepare = preparation(problem, layout)
         self._embed = embedding(problem, layout, self._prepare)
         self._hessian = make_hessian(hessian, problem, layout, self._prepare)
-        gradient, policy = sensitivities(problem, layout, exact=hessian == "exact")
+        gradient, policy = sensitivities(problem, layout, exact=hessian != "gauss-newton")
         self._readout = readout(problem, layout, self._prepare)
         self._functions = Functions(
             problem, self._prepare, self._embed, self._readout, gradient, policy

@@ -191,7 +191,11 @@ class RtiSolution:
         if self.prepared.spectrum is not None:
             inputs["dM"][:] = self._curvature_directions(dv).reshape(-1)
         function()
-        return function.part("policy").copy(), function.part("state").copy()
+        m = self.action.size
+        return (
+            function.part("policy").reshape(m, -1).copy(),
+            function.part("state").reshape(m, -1).copy(),
+        )
 
     def _write_solution(self, function: StackedFunction) -> None:
         """Give a read-out function the solution and the point of linearisation."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 from fmus.variables import VARIABLES, Kind, Type, Variable
 
 _TYPES = {
@@ -34,6 +36,9 @@ def c_header(token: str) -> str:
 
 #define MODEL_TOKEN "{token}"
 
+/* Digest of the variables' names and order: marks the layout of a serialised state. */
+#define LAYOUT_DIGEST UINT64_C(0x{_layout_digest()})
+
 enum {{
 {references}
     N_VARIABLES = {len(VARIABLES)}
@@ -56,6 +61,11 @@ static const VariableInfo VARIABLES[N_VARIABLES] = {{
 
 #endif
 """
+
+
+def _layout_digest() -> str:
+    names = "\n".join(variable.name for variable in VARIABLES)
+    return hashlib.sha256(names.encode()).hexdigest()[:16]
 
 
 def _row(variable: Variable) -> str:

@@ -102,6 +102,11 @@ static double integer_value(unsigned vr, int32_t value) {
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,
                        fmi2Real value[]) {
     ENTER(READABLE);
+    TRY(check_arrays(instance, __func__, vr, nvr, value, nvr));
+    for (size_t i = 0; i < nvr; i++) /* the time is a variable in FMI 3.0 alone */
+        if (vr[i] == VR_time)
+            return (fmi2Status)report(instance, ERROR, "%s: unknown value reference %u.", __func__,
+                                      vr[i]);
     return (fmi2Status)get_values(instance, __func__, REAL, vr, nvr, value);
 }
 

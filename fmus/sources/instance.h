@@ -38,7 +38,7 @@ typedef enum { LOG_EVENTS, LOG_WARNING, LOG_DISCARD, LOG_ERROR, N_CATEGORIES } C
 static const char *const CATEGORY_NAMES[N_CATEGORIES] = {
     "logEvents", "logStatusWarning", "logStatusDiscard", "logStatusError"};
 
-#define STATE_MAGIC UINT64_C(0x4556415045524154)
+#define STATE_MAGIC LAYOUT_DIGEST
 #define STATE_VERSION 1
 
 typedef struct {

@@ -2,7 +2,10 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{a14efd48-e075-5614-b846-17ec8f330912}"
+#define MODEL_TOKEN "{8a308340-3ec6-5eaf-ac0c-dd2747bdb87d}"
+
+/* Digest of the variables' names and order: marks the layout of a serialised state. */
+#define LAYOUT_DIGEST UINT64_C(0x4c5c8a2cae0d9624)
 
 enum {
     VR_time = 0,

@@ -82,16 +82,23 @@ def test_outputs_and_derivatives_at_random_points(open_fmu, version: int) -> Non
         )
 
 
-def test_step_is_within_1e_9_of_a_tight_integration(open_fmu, version: int) -> None:
+WORST_CORNER = (
+    np.array([100.0, 90.0]),
+    np.array([100.0, 100.0]),
+    np.array([4.0, 12.0, 32.0, 30.0]),
+)
+
+
+def test_step_is_within_the_documented_5e_10_of_a_tight_integration(open_fmu, version: int) -> None:
     p = defaults()
-    for x, u, d in random_points(40, seed=2):
+    for x, u, d in [*random_points(40, seed=2), WORST_CORNER]:
         plant = start(open_fmu(version), x, u, d, p)
         plant.step(0.0, 60.0)
         exact = solve_ivp(
             lambda t, y, u=u, d=d: outputs(y, u, d, p)["rates"],
             (0.0, 1.0), x, method="DOP853", rtol=1e-13, atol=1e-13,
         ).y[:, -1]  # fmt: skip
-        np.testing.assert_allclose(plant.get("X2", "P2"), exact, rtol=1e-9, atol=0)
+        np.testing.assert_allclose(plant.get("X2", "P2"), exact, rtol=5e-10, atol=0)
 
 
 @pytest.mark.parametrize("sampling_time", [6.0, 60.0, 3600.0])

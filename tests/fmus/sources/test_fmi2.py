@@ -133,3 +133,10 @@ def test_interpolation_is_refused_with_a_message(open_fmu, function: str) -> Non
 def test_versions_are_told(open_fmu) -> None:
     fmu = open_fmu(2).fmu
     assert (fmu.getVersion(), fmu.getTypesPlatform()) == ("2.0", "default")
+
+
+def test_time_is_no_variable(open_fmu) -> None:
+    instance = open_fmu(2).initialise()
+    with pytest.raises(FMICallException):
+        instance.get("time")
+    assert "unknown value reference 0" in instance.messages[-1][2]

@@ -96,3 +96,13 @@ def test_inputs_act_from_the_communication_point_on(plant) -> None:
     assert plant.get("economic_cost")[0] > cost
     plant.step(0.0, 60.0)
     assert plant.get("X2")[0] > states[0]
+
+
+def test_parameters_that_make_the_integration_diverge_are_an_error(plant) -> None:
+    """All in range, but so stiff that steps of 1 s are unstable."""
+    plant.initialise(h=10.0, F3=1000.0, lambda_=1.0, C=0.1, M=1.0)
+    before = plant.run(0)
+    status, text = refused(plant, lambda: plant.step(0.0, 600.0))
+    assert status == ERROR
+    assert "left the finite numbers" in text
+    assert plant.run(0) == before

@@ -184,3 +184,13 @@ def test_a_hundred_thousand_instances_leave_memory_flat(open_fmu, version: int) 
     for _ in range(100_000):
         cycle()
     assert psutil.Process().memory_info().rss - before < 2**20
+
+
+def test_state_of_one_fmi_version_continues_in_the_other(open_fmu) -> None:
+    two, three = stepped(open_fmu(2), seed=4), open_fmu(3)
+    state = two.save()
+    copy = three.deserialise(two.serialise(state))
+    three.restore(copy)
+    assert three.run(10, start=420.0) == two.run(10, start=420.0)
+    two.free(state)
+    three.free(copy)

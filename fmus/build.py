@@ -11,6 +11,7 @@ import sys
 import tempfile
 import uuid
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import fmpy
@@ -34,9 +35,8 @@ COMPILER_FLAGS = (
     "-fPIC",
     "-fno-ident",
     "-fvisibility=hidden",
-    "-Wall",
-    "-Wextra",
 )
+WARNINGS = ("-Wall", "-Wextra")
 LINKER_FLAGS = {
     "linux": ("-shared", "-s", "-Wl,--build-id=none", "-lm"),
     "win32": ("-shared", "-s"),
@@ -81,20 +81,27 @@ def compiler() -> str:
     return name
 
 
-def compile_library(version: FmiVersion) -> bytes:
-    """Compile the shared library of FMI `version`; raises BuildError with the compiler's words."""
+def compile_library(
+    files: Mapping[str, bytes], library: str, warnings: tuple[str, ...] = WARNINGS
+) -> bytes:
+    """Compile C sources, by file name, into one shared library and return its bytes.
+
+    The FMI headers are fmpy's. Raises BuildError with the compiler's words on anything that it
+    says; `warnings` chooses what it warns of.
+    """
     headers = Path(fmpy.__file__).parent / "c-code"
     with tempfile.TemporaryDirectory() as folder:
-        for name, data in sources(version).items():
+        for name, data in files.items():
             (Path(folder) / name).write_bytes(data)
+        units = sorted(name for name in files if name.endswith(".c"))
         command = [
-            compiler(), *COMPILER_FLAGS, "-isystem", str(headers),
-            f"fmi{version}.c", "-o", _LIBRARY, *LINKER_FLAGS,
+            compiler(), *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
+            *units, "-o", library, *LINKER_FLAGS,
         ]  # fmt: skip
         result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
         if result.returncode != 0 or result.stderr:
             raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
-        return (Path(folder) / _LIBRARY).read_bytes()
+        return (Path(folder) / library).read_bytes()
 
 
 def build_record() -> bytes:
@@ -104,7 +111,7 @@ def build_record() -> bytes:
     ).stdout.splitlines()[0]
     record = {
         "compiler": version,
-        "compiler_flags": list(COMPILER_FLAGS),
+        "compiler_flags": [*COMPILER_FLAGS, *WARNINGS],
         "linker_flags": list(LINKER_FLAGS),
         "model_token": model_token(),
     }
@@ -119,7 +126,7 @@ def contents(version: FmiVersion) -> dict[str, bytes]:
         "documentation/index.html": documentation_page(version, BUILD_FILE).encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
         BUILD_FILE: build_record(),
-        f"binaries/{_PLATFORM[version]}/{_LIBRARY}": compile_library(version),
+        f"binaries/{_PLATFORM[version]}/{_LIBRARY}": compile_library(sources(version), _LIBRARY),
     }
     files |= {f"sources/{name}": data for name, data in sources(version).items()}
     if version == 2:

@@ -78,8 +78,8 @@ class Wirer:
             starts += self._start("ranges", mapping.ranges, law.ranges)
         for name, value in scenario.plant.parameters.items():
             starts.append(self._start_value(name, float(value), "plant.parameters"))
-        for reference, width in self.seeds():
-            starts.append(StartValue(reference, self._seed_type(width, reference), 0.0))
+        for (reference, width), name in zip(self.seeds(), mapping.seed, strict=False):
+            starts.append(StartValue(reference, self._seed_type(width, name), 0.0))
         return starts
 
     def _start(
@@ -102,11 +102,11 @@ class Wirer:
             raise self._misfit(name, table, "is a constant")
         return StartValue(int(variable.valueReference), variable.type, value)
 
-    def _seed_type(self, width: int, reference: int) -> str:
-        variables = self._fmu.description.modelVariables
-        variable = next(v for v in variables if v.valueReference == reference)
+    def _seed_type(self, width: int, name: str) -> str:
+        # By name: FMI 2 counts value references anew for each type.
+        variable = self._variables[name]
         if width == 32 and variable.type not in ("Integer", "Int32", "UInt32"):
-            raise self._misfit(variable.name, "plant.mapping.seed", f"is a {variable.type}")
+            raise self._misfit(name, "plant.mapping.seed", f"is a {variable.type}")
         return str(variable.type)
 
     def _input(self, name: str) -> int:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.storage import write_atomically
+from cosim.errors import CapabilityError
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
@@ -58,7 +59,8 @@ class Run:
     """What identifies a training run; a checkpoint goes on only in the very same one.
 
     `log_every`, `evaluate_every`, `checkpoint_every` in samples; `evaluation_seeds` held-out runs
-    of `evaluation_steps` samples. A greedy J above `divergence` times the start's ends the run.
+    of `evaluation_steps` samples. A greedy J that is worse than the naive one's by more than
+    (`divergence` − 1) of its magnitude ends the run.
     """
 
     algorithm: str
@@ -125,7 +127,8 @@ class Training:
 
     `plant` and `evaluation_plant` are two plants of the run's scenario. `optimum` is a controller
     whose J on the held-out runs is J*, for the gap closed; without it the gap is NaN. With `out`,
-    learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on.
+    learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on; a plant
+    that cannot serialise its state leaves no checkpoint, and `obstacle` says so.
     """
 
     def __init__(
@@ -162,6 +165,8 @@ class Training:
         self._rows: list[Row] = []
         self._good = parameters
         self._totals = _Totals()
+        self.obstacle: str | None = None
+        """Why this run leaves no checkpoint, if it does not."""
         self._references = {"naive": float("nan"), "optimum": float("nan")}
 
     def go(
@@ -252,7 +257,9 @@ class Training:
 
     def _trouble(self, row: Row) -> str | None:
         """Why the run must stop, or None."""
-        limit = self._run.divergence * self._references["naive"]
+        naive = self._references["naive"]
+        # A cost may be negative, a profit say: the margin counts in its magnitude.
+        limit = naive + (self._run.divergence - 1) * abs(naive)
         where = f"at sample {int(row['samples'])}; the θ kept is the last one that evaluated well"
         if not np.isfinite(self._controller.theta).all():
             return f"diverged: θ is not finite {where}"
@@ -275,8 +282,13 @@ class Training:
         self._interaction.restart()
         if self._out is None:
             return
+        self.write(self._good)
+        try:
+            plant = self._plant.serialise(self._plant.snapshot())
+        except CapabilityError as error:
+            self.obstacle = str(error)
+            return
         numbers, arrays = self._interaction.state()
-        plant = self._plant.serialise(self._plant.snapshot())
         columns = list(self._rows[0]) if self._rows else []
         stored = {f"interaction {name}": value for name, value in arrays.items()}
         stored |= {f"algorithm {name}": value for name, value in self._algorithm.state().items()}
@@ -292,7 +304,6 @@ class Training:
             "generator": checkpoint.generator_state(self._rng),
             "columns": columns,
         }
-        self.write(self._good)
         checkpoint.save(
             self._out / "checkpoint.npz", Checkpoint(self._run.identity(), state, stored)
         )

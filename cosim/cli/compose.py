@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from cosim.errors import ControllerLookupError
 
 if TYPE_CHECKING:
+    from cosim.cli.output import Output
     from cosim.plant import FmuPlant
     from cosim.protocols import Controller
     from cosim.scenario import Scenario
@@ -19,11 +20,23 @@ if TYPE_CHECKING:
 GROUP = "cosim.controllers"
 
 
-def build_plant(scenario: Scenario) -> FmuPlant:
-    """Build the scenario's plant; raises PlantError."""
+def build_plant(scenario: Scenario, output: Output | None = None) -> FmuPlant:
+    """Build the scenario's plant, announced on `output` if it is foreign; raises PlantError."""
     from cosim.plant import FmuPlant
 
+    import_from_here()
+    if output is not None:
+        announce(scenario, output)
     return FmuPlant(scenario)
+
+
+def announce(scenario: Scenario, output: Output) -> None:
+    """Say which native code is about to run, unless it is the package's own."""
+    from cosim.plant.archive import SHIPPED, unpack
+
+    if scenario.plant.fmu not in SHIPPED:
+        fmu = unpack(scenario.plant.fmu)
+        output.note(f"native code of {fmu.path}, sha256 {fmu.sha256}")
 
 
 def build_controller(name: str, scenario: Scenario) -> Controller:
@@ -33,6 +46,7 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     RTI-NMPC, or a `module:factory` with factory(scenario) -> Controller, importable from the
     Python path or the working directory.
     """
+    import_from_here()
     known = {point.name: point for point in entry_points(group=GROUP)}
     if name in known:
         return _made(name, known[name].value, scenario)
@@ -50,12 +64,16 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     )
 
 
+def import_from_here() -> None:
+    """Let `module:factory` name a module of the working directory too, after all others."""
+    if (folder := str(Path.cwd())) not in sys.path:
+        sys.path.append(folder)
+
+
 def _made(name: str, target: str, scenario: Scenario) -> Controller:
     from cosim.protocols import Controller
 
     module, _, attribute = target.partition(":")
-    if (folder := str(Path.cwd())) not in sys.path:
-        sys.path.append(folder)
     try:
         factory = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:

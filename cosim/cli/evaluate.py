@@ -46,7 +46,7 @@ def evaluate(
     """
     with output(json) as out_:
         from controllers.storage import write_atomically
-        from cosim.cli.compose import build_controller
+        from cosim.cli.compose import announce, build_controller
         from cosim.evaluation import evaluate as run
         from cosim.evaluation.parallel import cores
         from cosim.scenario import Scenario
@@ -56,6 +56,7 @@ def evaluate(
         options = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
         options |= {"first-seed": first_seed} if first_seed else {}
         folder = open_folder(out)
+        announce(task, out_)
         units = len(named) * (seeds + 1)
         with out_.progress(f"{', '.join(named)} on {task.name}", units) as progress:
             evaluation = run(

@@ -32,16 +32,15 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     the summary's `timing`; all other bytes are the same for the same command and seed.
     """
     from controllers.storage import write_atomically
-    from cosim.cli.compose import build_controller
+    from cosim.cli.compose import announce, build_controller
     from cosim.plant import FmuPlant, IsolatedPlant
     from cosim.scenario import Scenario
     from cosim.simulation import simulate
 
     scenario = Scenario.load(run.scenario)
     folder = open_folder(run.out)
+    announce(scenario, output)
     with IsolatedPlant(scenario) if run.isolate else FmuPlant(scenario) as plant:
-        if not plant.is_shipped:
-            output.note(f"native code of {plant.fmu_path}, sha256 {plant.fmu_sha256}")
         controller = build_controller(run.controller, scenario)
         recorder = None
         if run.record:

@@ -113,7 +113,7 @@ def _execute(
 
         recorder = TrainingRecorder(folder / "training.rrd")
     with (
-        build_plant(run.scenario) as plant,
+        build_plant(run.scenario, output) as plant,
         build_plant(run.scenario) as evaluation_plant,
         _progress(run, output) as progress,
     ):
@@ -126,7 +126,10 @@ def _execute(
             out=folder,
             recorder=recorder,
         )
-        return training.go(resume=resume, progress=progress)
+        result = training.go(resume=resume, progress=progress)
+    if training.obstacle:
+        output.note(f"left no checkpoint, --resume is not possible: {training.obstacle}")
+    return result
 
 
 def _progress(run: Run, output: Output) -> Any:
@@ -220,9 +223,7 @@ def _show(summary: dict[str, Any], output: Output) -> None:
 
 
 def _explain(algorithm: str, documentation: list[tuple[str, str, str]], output: Output) -> None:
-    output.table(
-        f"hyperparameters of {algorithm}", ("name", "default", "meaning"), documentation
-    )
+    output.table(f"hyperparameters of {algorithm}", ("name", "default", "meaning"), documentation)
     output.json(
         {name: {"default": default, "meaning": text} for name, default, text in documentation}
     )

@@ -41,3 +41,40 @@ def plant(
         header = ("per step", "median µs", "minimum µs", "ratio")
         out_.table(f"plant {result['fmu']}, {steps} steps a repetition", header, rows)
         out_.json(result)
+
+
+@app.command()
+def evaluation(
+    scenario: ScenarioOption = "paper",
+    controllers: Annotated[
+        str, typer.Option("--controllers", "-c", help="Comma-separated, as for evaluate.")
+    ] = "naive",
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of seeds.")] = 100,
+    steps: Annotated[int, typer.Option("--steps", "-n", min=1, help="Samples per run.")] = 2000,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=2, help="Workers to compare.")] = 2,
+    json: JsonOption = False,
+) -> None:
+    """Time of an evaluation by several workers against one, starting them included."""
+    with output(json) as out_:
+        from functools import partial
+
+        from cosim.cli.compose import build_controller
+        from cosim.cli.evaluate import named_controllers
+        from cosim.evaluation.benchmark import measure
+        from cosim.scenario import Scenario
+
+        factories = {
+            name: partial(build_controller, spec)
+            for name, spec in named_controllers(controllers).items()
+        }
+        result = measure(Scenario.load(scenario), factories, seeds, steps, jobs)
+        rows = [
+            (f"{workers} workers", *(f"{value:.2f}" for value in sorted(values)))
+            for workers, values in result["timing"]["seconds_by_jobs"].items()
+        ]
+        out_.table(f"{seeds} seeds × {steps} samples", ("wall time", "s", "s", "s"), rows)
+        out_.note(f"speed-up {result['timing']['speed_up']:.2f}")
+        out_.note("same bytes" if result["same_bytes"] else "the bytes DIFFER")
+        out_.json(result)
+    if not result["same_bytes"]:
+        raise typer.Exit(1)

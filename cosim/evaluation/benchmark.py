@@ -1,0 +1,46 @@
+"""How much faster several workers are than one, and that they give the same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from time import perf_counter
+from typing import Any
+
+from cosim.evaluation.paired import evaluate
+from cosim.evaluation.unit import Factory
+from cosim.scenario import Scenario
+
+
+def measure(
+    scenario: Scenario,
+    controllers: Mapping[str, Factory],
+    seeds: int,
+    steps: int,
+    jobs: int,
+    repetitions: int = 3,
+) -> dict[str, Any]:
+    """Wall times in s of one evaluation by 1 and by `jobs` workers in turn, and their ratio.
+
+    Starting the workers and building the controllers counts. `speed_up` is the ratio of the least
+    times; `same_bytes` whether every repetition gave the same table.
+    """
+    times: dict[int, list[float]] = {1: [], jobs: []}
+    tables = set()
+    for _ in range(repetitions):
+        for workers, spent in times.items():
+            begin = perf_counter()
+            evaluation = evaluate(scenario, controllers, seeds, steps, jobs=workers)
+            spent.append(perf_counter() - begin)
+            tables.add((evaluation.to_csv(), evaluation.to_parquet()))
+    return {
+        "scenario": scenario.name,
+        "controllers": list(controllers),
+        "seeds": seeds,
+        "steps": steps,
+        "jobs": jobs,
+        "same_bytes": len(tables) == 1,
+        "timing": {
+            "seconds_by_jobs": {str(workers): values for workers, values in times.items()},
+            "speed_up": min(times[1]) / min(times[jobs]),
+        },
+    }

@@ -69,7 +69,8 @@ static void adjoint(const State *state, double s[N_VARIABLES]) {
     s[VR_c] += y;
     for (int i = 0; i < N_DISTURBANCES; i++) {
         const DisturbancePartials p = disturbance_partials(state, i);
-        for (int j = 0; j < 2; j++) s[p.source[j]] += p.factor[j] * s[REALISED[i]];
+        for (int j = 0; j < 2; j++)
+            s[p.source[j]] += p.factor[j] * s[DISTURBANCES[i].realised];
     }
     if (states_are_parameters(state)) {
         s[VR_X2_start] += s[VR_X2];

@@ -4,22 +4,17 @@
 
 #include "instance.h"
 
-static const int REALISED[N_DISTURBANCES] = {VR_X1, VR_F1, VR_T1, VR_T200};
-
 typedef struct {
     int source[2];    /* value references that the realised disturbance depends on */
     double factor[2]; /* and its partial derivatives */
 } DisturbancePartials;
 
 static DisturbancePartials disturbance_partials(const State *state, int i) {
-    static const int given[] = {VR_X1_in, VR_F1_in, VR_T1_in, VR_T200_in};
-    static const int nominal[] = {VR_X1_nominal, VR_F1_nominal, VR_T1_nominal, VR_T200_nominal};
-    static const int range[] = {VR_X1_range, VR_F1_range, VR_T1_range, VR_T200_range};
     const int override = state->v[VR_override] != 0.0;
     const int stochastic = !override && state->v[VR_stochastic] != 0.0;
     DisturbancePartials partials;
-    partials.source[0] = override ? given[i] : nominal[i];
-    partials.source[1] = range[i];
+    partials.source[0] = override ? DISTURBANCES[i].given : DISTURBANCES[i].nominal;
+    partials.source[1] = DISTURBANCES[i].range;
     partials.factor[0] = 1.0;
     partials.factor[1] = stochastic ? state->draws[i] : 0.0;
     return partials;
@@ -57,7 +52,8 @@ static void tangent(const State *state, double d[N_VARIABLES]) {
     }
     for (int i = 0; i < N_DISTURBANCES; i++) {
         const DisturbancePartials p = disturbance_partials(state, i);
-        d[REALISED[i]] = p.factor[0] * d[p.source[0]] + p.factor[1] * d[p.source[1]];
+        d[DISTURBANCES[i].realised] =
+            p.factor[0] * d[p.source[0]] + p.factor[1] * d[p.source[1]];
     }
     d[VR_T2] = v[VR_a] * d[VR_P2] + d[VR_a] * v[VR_P2] + v[VR_b] * d[VR_X2] +
                d[VR_b] * v[VR_X2] + d[VR_c];

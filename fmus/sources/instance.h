@@ -172,19 +172,26 @@ static Status set_logging(Instance *instance, const char *function, int on, size
     return OK;
 }
 
+static const struct {
+    int realised, given, nominal, range;
+} DISTURBANCES[N_DISTURBANCES] = {
+    {VR_X1, VR_X1_in, VR_X1_nominal, VR_X1_range},
+    {VR_F1, VR_F1_in, VR_F1_nominal, VR_F1_range},
+    {VR_T1, VR_T1_in, VR_T1_nominal, VR_T1_range},
+    {VR_T200, VR_T200_in, VR_T200_nominal, VR_T200_range},
+};
+
 /* The realised disturbances at the current time and inputs. */
 static void realise_disturbances(State *state) {
-    static const int realised[] = {VR_X1, VR_F1, VR_T1, VR_T200};
-    static const int given[] = {VR_X1_in, VR_F1_in, VR_T1_in, VR_T200_in};
-    static const int nominal[] = {VR_X1_nominal, VR_F1_nominal, VR_T1_nominal, VR_T200_nominal};
-    static const int range[] = {VR_X1_range, VR_F1_range, VR_T1_range, VR_T200_range};
     double *v = state->v;
     if (v[VR_override] != 0.0) {
-        for (int i = 0; i < N_DISTURBANCES; i++) v[realised[i]] = v[given[i]];
+        for (int i = 0; i < N_DISTURBANCES; i++)
+            v[DISTURBANCES[i].realised] = v[DISTURBANCES[i].given];
         return;
     }
     if (v[VR_stochastic] == 0.0) {
-        for (int i = 0; i < N_DISTURBANCES; i++) v[realised[i]] = v[nominal[i]];
+        for (int i = 0; i < N_DISTURBANCES; i++)
+            v[DISTURBANCES[i].realised] = v[DISTURBANCES[i].nominal];
         return;
     }
     if (!state->drawn) {
@@ -193,7 +200,8 @@ static void realise_disturbances(State *state) {
         state->drawn = 1;
     }
     for (int i = 0; i < N_DISTURBANCES; i++)
-        v[realised[i]] = v[nominal[i]] + v[range[i]] * state->draws[i];
+        v[DISTURBANCES[i].realised] =
+            v[DISTURBANCES[i].nominal] + v[DISTURBANCES[i].range] * state->draws[i];
 }
 
 static void move_to_sample(State *state, int64_t sample) {

@@ -103,19 +103,43 @@ static void check_state(const Instance *instance) {
     assert(isfinite(state->v[VR_time]));
 }
 
-typedef void (*Call)(void);
+/* The face's part: a new instance, and one random call that may use or change a state handle. */
+static Instance *instantiate(void);
+static int any_call(Instance *instance, void **state);
+
+static void fuzz_once(Instance *instances[POOL], void *states[POOL]) {
+    Instance **slot = &instances[below(POOL)];
+    Instance *instance = rarely() && rarely() ? NULL : *slot;
+    const int logged = messages;
+    State before;
+    int status;
+    if (!*slot || (rarely() && rarely())) {
+        free_instance(*slot);
+        *slot = instantiate();
+        return;
+    }
+    if (instance) before = instance->state;
+    status = any_call(instance, &states[below(POOL)]);
+    check_call(instance, &before, status, messages - logged);
+    if (instance) check_state(instance);
+}
 
 /* Arguments: random seed, number of calls, seconds; ends at whichever comes first. */
-static int fuzz(int count, char **arguments, Call call, Call finish) {
+int main(int count, char **arguments) {
+    Instance *instances[POOL] = {NULL};
+    void *states[POOL] = {NULL};
     const time_t end = time(NULL) + (count > 3 ? atol(arguments[3]) : 10);
     const long calls = count > 2 ? atol(arguments[2]) : 100000;
     long done = 0;
     random_state = count > 1 ? strtoull(arguments[1], NULL, 10) : 1;
     while (done < calls && (done % 256 || time(NULL) < end)) {
-        call();
+        fuzz_once(instances, states);
         done++;
     }
-    finish();
+    for (int k = 0; k < POOL; k++) {
+        free(states[k]);
+        free_instance(instances[k]);
+    }
     printf("%ld calls, %d messages\n", done, messages);
     return 0;
 }

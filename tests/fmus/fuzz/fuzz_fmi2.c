@@ -3,8 +3,6 @@
 
 #include "fuzz.h"
 
-static Instance *instances[POOL];
-static fmi2FMUstate states[POOL];
 static fmi2Byte bytes[sizeof(State) + 8];
 
 static void logger(fmi2ComponentEnvironment environment, fmi2String name, fmi2Status status,
@@ -38,7 +36,7 @@ static fmi2Status walk(Instance *c) {
     }
 }
 
-static fmi2Status any_call(Instance *c, fmi2FMUstate *state) {
+static int any_call(Instance *c, void **state) {
     unsigned vr[MAX_VALUES], known[MAX_VALUES];
     double value[MAX_VALUES], seed[MAX_VALUES];
     int number[MAX_VALUES];
@@ -104,32 +102,3 @@ static fmi2Status any_call(Instance *c, fmi2FMUstate *state) {
         default: return fmi2SetRealInputDerivatives(c, r, n, number, x);
     }
 }
-
-static void call(void) {
-    Instance **slot = &instances[below(POOL)];
-    Instance *c = rarely() && rarely() ? NULL : *slot;
-    fmi2FMUstate *state = &states[below(POOL)];
-    State before;
-    const int logged = messages;
-    fmi2Status status;
-    if (!*slot || (rarely() && rarely())) {
-        fmi2FreeInstance(*slot);
-        *slot = instantiate();
-        return;
-    }
-    if (c) before = c->state;
-    status = any_call(c, state);
-    check_call(c, &before, (int)status, messages - logged);
-    if (c) check_state(c);
-}
-
-static void finish(void) {
-    Instance *c = fmi2Instantiate("fuzz", fmi2CoSimulation, MODEL_TOKEN, NULL, &functions, 0, 0);
-    for (int k = 0; k < POOL; k++) {
-        fmi2FreeFMUstate(c, &states[k]);
-        fmi2FreeInstance(instances[k]);
-    }
-    fmi2FreeInstance(c);
-}
-
-int main(int count, char **arguments) { return fuzz(count, arguments, call, finish); }

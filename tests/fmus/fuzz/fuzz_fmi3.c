@@ -3,8 +3,6 @@
 
 #include "fuzz.h"
 
-static Instance *instances[POOL];
-static fmi3FMUState states[POOL];
 static fmi3Byte bytes[sizeof(State) + 8];
 
 static void logger(fmi3InstanceEnvironment environment, fmi3Status status, fmi3String category,
@@ -38,7 +36,7 @@ static fmi3Status walk(Instance *c) {
     }
 }
 
-static fmi3Status any_call(Instance *c, fmi3FMUState *state) {
+static int any_call(Instance *c, void **state) {
     unsigned vr[MAX_VALUES], known[MAX_VALUES];
     double value[MAX_VALUES], seed[MAX_VALUES];
     int64_t number[MAX_VALUES];
@@ -111,32 +109,3 @@ static fmi3Status any_call(Instance *c, fmi3FMUState *state) {
         default: return fmi3GetIntervalDecimal(c, r, n, x, NULL);
     }
 }
-
-static void call(void) {
-    Instance **slot = &instances[below(POOL)];
-    Instance *c = rarely() && rarely() ? NULL : *slot;
-    fmi3FMUState *state = &states[below(POOL)];
-    State before;
-    const int logged = messages;
-    fmi3Status status;
-    if (!*slot || (rarely() && rarely())) {
-        fmi3FreeInstance(*slot);
-        *slot = instantiate();
-        return;
-    }
-    if (c) before = c->state;
-    status = any_call(c, state);
-    check_call(c, &before, (int)status, messages - logged);
-    if (c) check_state(c);
-}
-
-static void finish(void) {
-    Instance *c = fmi3InstantiateModelExchange("fuzz", MODEL_TOKEN, NULL, false, false, NULL, NULL);
-    for (int k = 0; k < POOL; k++) {
-        fmi3FreeFMUState(c, &states[k]);
-        fmi3FreeInstance(instances[k]);
-    }
-    fmi3FreeInstance(c);
-}
-
-int main(int count, char **arguments) { return fuzz(count, arguments, call, finish); }

@@ -1,0 +1,54 @@
+"""Instances in every state of the standards' state machines, and the check of one call there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+ERROR = 3
+# (state, whether the instance is for model exchange)
+STATES = [
+    ("instantiated", False), ("initialization", False), ("step", False), ("terminated", False),
+    ("instantiated", True), ("initialization", True), ("event", True), ("continuous", True),
+    ("terminated", True),
+]  # fmt: skip
+
+
+@pytest.fixture(params=STATES, ids=lambda p: p[0] + (" exchange" if p[1] else ""))
+def state(request: pytest.FixtureRequest) -> tuple[str, bool]:
+    return request.param
+
+
+@pytest.fixture
+def check_call(open_fmu) -> Callable[..., None]:
+    """Call a function in a state: success without a message, or one logged error."""
+
+    def bring_to(version: int, name: str, exchange: bool):
+        instance = open_fmu(version, exchange=exchange)
+        if name == "instantiated":
+            if version == 2:
+                instance.fmu.setupExperiment()
+            return instance
+        instance.enter_initialisation()
+        if name == "initialization":
+            return instance
+        instance.fmu.exitInitializationMode()
+        if name == "continuous":
+            instance.start_continuous_time()
+        if name == "terminated":
+            instance.fmu.terminate()
+        return instance
+
+    def check(version: int, function: str, state: tuple[str, bool], arguments, allowed: bool):
+        instance = bring_to(version, *state)
+        status = getattr(instance.fmu.dll, function)(instance.handle, *arguments)
+        if allowed:
+            assert status == 0
+            assert instance.messages == []
+        else:
+            assert status == ERROR
+            assert [message[0] for message in instance.messages] == [ERROR]
+            assert function in instance.messages[0][2]
+
+    return check

@@ -31,14 +31,14 @@ class TuningError(ControllerError):
 class QpError(ControllerError):
     """A QP was not solved; it carries the problem for diagnosis.
 
-    `qp` is a copy of the `SoftQp` that failed; `status` is the backend's own word for the failure.
-    A closed loop recognises the class by `is_solver_failure`, applies its fallback action and
-    counts the failure.
+    `qp` is a copy of the `SoftQp` that failed, None for a controller that solves none; `status` is
+    the backend's own word for the failure. A closed loop recognises the class by
+    `is_solver_failure`, applies its fallback action and counts the failure.
     """
 
     is_solver_failure: ClassVar[bool] = True
 
-    def __init__(self, message: str, *, status: str, qp: SoftQp) -> None:
+    def __init__(self, message: str, *, status: str, qp: SoftQp | None = None) -> None:
         super().__init__(message)
         self.status = status
         self.qp = qp

@@ -50,6 +50,7 @@ class ProxQpBackend:
             settings.check_duality_gap = True
             settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = GAP, 0.0
             settings.max_iter = 1000
+            settings.bcl_update = False
             settings.initial_guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
             self._qp.init(
                 self._hessian,

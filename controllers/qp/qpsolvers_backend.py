@@ -12,21 +12,24 @@ from controllers.errors import ControllerError, QpError
 from controllers.qp.active_set import polish
 from controllers.qp.problem import QpSolution, SoftQp, Stages
 
-TIGHT: dict[str, dict[str, Any]] = {
-    # Without the switch it takes some feasible QPs for infeasible (proxsuite 0.8.0).
-    "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0, "primal_infeasibility_solving": True},
-    "piqp": {"eps_abs": 1e-10, "eps_rel": 1e-12},
-    "clarabel": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-13, "tol_feas": 1e-12},
-    "daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12},
+# Options of each attempt. ProxQP 0.8.0 takes some feasible QPs for infeasible, others with and
+# without the switch.
+ATTEMPTS: dict[str, list[dict[str, Any]]] = {
+    "proxqp": [
+        {"eps_abs": 1e-9, "eps_rel": 0.0},
+        {"eps_abs": 1e-9, "eps_rel": 0.0, "primal_infeasibility_solving": True},
+    ],
+    "piqp": [{"eps_abs": 1e-10, "eps_rel": 1e-12}],
+    "clarabel": [{"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}],
+    "daqp": [{"primal_tol": 1e-10, "dual_tol": 1e-12}],
 }
-EXACT = 1e-10
 
 
 class QpsolversBackend:
     """Builds `qpsolvers.Problem` in z = (ξ_1 … ξ_N, v_0 … v_{N−1}, t) anew for each solve.
 
-    A solution with a residual above `EXACT` is polished on its active set, so that interior-point
-    solvers give multipliers of 1e5 to the same digits as active-set ones.
+    Its solutions are polished, so that interior-point solvers, asked for what they can reach, give
+    multipliers of 1e5 to the same digits as active-set ones.
     """
 
     def __init__(self, solver: str) -> None:
@@ -44,23 +47,27 @@ class QpsolversBackend:
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the matrices and vectors of `qp`; raises QpError where the solver does not."""
         problem, fixed = full_space(qp, dense=self._solver in qpsolvers.dense_solvers)
-        try:
-            solution = qpsolvers.solve_problem(
-                problem, solver=self._solver, **TIGHT.get(self._solver, {})
-            )
-        except qpsolvers.QPError as error:
-            raise QpError(
-                f"{self._solver} did not solve the QP: {error}", status="refused", qp=qp.copy()
-            ) from error
-        if not solution.found or solution.x is None or solution.z is None or solution.y is None:
-            raise QpError(f"{self._solver} did not solve the QP", status="not solved", qp=qp.copy())
-        rows, n = qp.w.size, qp.f.size
-        y, z, z_box = (np.asarray(part) for part in (solution.y, solution.z, solution.z_box))
-        nu = z_box[rows : rows + n].copy()
-        nu[fixed] = y[y.size - fixed.size :]
-        lam = z[rows:] - z[:rows]
-        answer = QpSolution(solution.x[rows : rows + n], nu, lam)
-        return answer if answer.residuals(qp).largest < EXACT else polish(qp, answer)
+        reason = "not solved"
+        for options in ATTEMPTS.get(self._solver, [{}]):
+            try:
+                solution = qpsolvers.solve_problem(problem, solver=self._solver, **options)
+            except qpsolvers.QPError as error:
+                reason = str(error)
+                continue
+            if solution.found:
+                return polish(qp, _condensed(solution, qp, fixed))
+        raise QpError(
+            f"{self._solver} did not solve the QP: {reason}", status="not solved", qp=qp.copy()
+        )
+
+
+def _condensed(solution: qpsolvers.Solution, qp: SoftQp, fixed: np.ndarray) -> QpSolution:
+    """The part of a full-space solution that the condensed QP asks for."""
+    rows, n = qp.w.size, qp.f.size
+    x, y, z, z_box = map(np.asarray, (solution.x, solution.y, solution.z, solution.z_box))
+    nu = z_box[rows : rows + n].copy()
+    nu[fixed] = y[y.size - fixed.size :]
+    return QpSolution(x[rows : rows + n], nu, z[rows:] - z[:rows])
 
 
 def full_space(qp: SoftQp, *, dense: bool) -> tuple[qpsolvers.Problem, np.ndarray]:

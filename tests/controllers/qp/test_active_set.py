@@ -48,3 +48,10 @@ def test_dependent_rows_get_the_least_multipliers():
     v, lam = kkt_solve(qp, active, np.array([[1.5]]), np.array([[1.0, 1.0]]))
     np.testing.assert_allclose(v, [[1.0]], atol=1e-12)
     np.testing.assert_allclose(lam, [[0.25, 0.25]], atol=1e-12)
+
+
+def test_a_wrong_active_set_is_mended_in_a_few_steps(rng):
+    for answer in list(solve("daqp"))[::17]:
+        exact = answer.multipliers
+        rough = QpSolution(*(part + 1e-5 * rng.normal(size=part.size) for part in exact))
+        assert polish(answer.qp, rough).residuals(answer.qp).largest < 1e-9

@@ -29,6 +29,11 @@ class Spectrum:
     vectors: Vector
     floor: Vector
 
+    def undecided(self, tolerance: float = 1e-6) -> bool:
+        """Whether an eigenvalue is so close to the floor that the lift has a kink there."""
+        distance = np.abs(self.values - self.floor)
+        return bool((distance < tolerance * np.maximum(1.0, np.abs(self.values))).any())
+
     def contract(self, seed: Vector) -> Vector:
         """Adjoint of the derivative of L = P(·): M with ⟨seed, dL⟩ = ⟨M, dX⟩, shapes (N, s, s).
 

@@ -122,7 +122,10 @@ class RtiSolution:
 
     @property
     def value_state_gradient(self) -> Vector:
-        """dV/ds or dQ/ds, shape (n,): the multiplier χ_0 of the initial value."""
+        """dV/ds or dQ/ds, shape (n,): the multiplier χ_0 of the initial value.
+
+        At a true bound the penalty of s itself has a kink, and half of its slope is taken.
+        """
         gradient: Vector = self.costates[0]
         return gradient
 
@@ -146,8 +149,13 @@ class RtiSolution:
 
     @cached_property
     def weakly_active(self) -> bool:
-        """Whether a limit is about to change its activity, so that derivatives are one-sided."""
-        return self.multipliers.weakly_active(self.qp)
+        """Whether a limit is about to change its activity, so that derivatives are one-sided.
+
+        So it is too where an eigenvalue of the exact Hessian is about to be lifted.
+        """
+        spectrum = self.prepared.spectrum
+        lifting = spectrum is not None and spectrum.undecided()
+        return lifting or self.multipliers.weakly_active(self.qp)
 
     @cached_property
     def licq(self) -> bool:

@@ -1,0 +1,38 @@
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from linear_quadratic import LinearQuadratic
+
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from cosim.scenario import Scenario
+
+
+@pytest.fixture(scope="session")
+def scenario():
+    return Scenario.load("paper")
+
+
+@pytest.fixture(scope="session")
+def problem(scenario):
+    return Problem.from_scenario(scenario)
+
+
+@pytest.fixture(scope="session")
+def parameters(problem):
+    return Parameters.naive(problem)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20200513)
+
+
+@pytest.fixture(scope="session")
+def linear_quadratic():
+    return LinearQuadratic()

@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+
+from controllers.parameters import Parameters
+from learning import ActorCritic
+from learning.protocols import Sample
+from learning.starting_point import build_strategy
+
+
+class Solution:
+    def __init__(self, action, jacobian):
+        self.action, self.policy_jacobian = action, jacobian
+
+
+class Carrier:
+    """Carries θ and nothing else."""
+
+    def __init__(self, parameters):
+        self.parameters = parameters
+
+    @property
+    def theta(self):
+        return self.parameters.theta
+
+    @theta.setter
+    def theta(self, theta):
+        self.parameters = self.parameters.with_theta(theta)
+
+
+def algorithm(problem, scenario, **settings):
+    configuration = ActorCritic.Configuration(
+        batch_size=400, forgetting=0.0, parametrisation="paper", **settings
+    )
+    carrier = Carrier(Parameters.naive(problem))
+    strategy = build_strategy(configuration, scenario, 4000)
+    return carrier, ActorCritic(carrier, scenario, configuration, 4000, strategy)
+
+
+def feed(actor, carrier, rng, slope, action, *, noise=0.0, clip=None):
+    """Samples whose cost is linear in the applied action; only b_l's actions move the policy."""
+    size, where = carrier.theta.size, carrier.parameters.layout.slices["b_l"]
+    jacobian = np.zeros((2, size))
+    jacobian[0, where.stop - 2], jacobian[1, where.stop - 1] = -0.5, -0.5
+    solution = Solution(action, jacobian)
+    update = None
+    for number in range(400):
+        a = action + 5.0 * rng.normal(size=2)
+        a = a if clip is None else np.minimum(a, clip)
+        s = rng.normal(size=2)
+        cost = 6000.0 + slope @ (a - action) + noise * rng.normal()
+        update = actor.observe(
+            Sample(
+                number,
+                s,
+                a,
+                True,
+                solution,
+                solution,
+                cost,
+                cost,
+                rng.normal(size=2),
+                0.0,
+                solution,
+                None,
+                None,
+            )
+        )
+    return update
+
+
+@pytest.mark.parametrize("natural", [True, False])
+def test_the_step_moves_the_policy_down_the_costs_slope(problem, scenario, rng, natural):
+    carrier, actor = algorithm(problem, scenario, natural=natural)
+    where = carrier.parameters.layout.slices["b_l"]
+    before = carrier.theta[where].copy()
+    update = feed(actor, carrier, rng, np.array([3.0, -1.0]), np.array([200.0, 200.0]))
+    change = (carrier.theta[where] - before)[2:] * -0.5
+    assert change[0] < 0 < change[1]
+    assert change[0] / change[1] == pytest.approx(-3.0, rel=0.1)
+    assert update is not None
+
+
+def test_the_trust_region_bounds_the_rms_change_of_the_action(problem, scenario, rng):
+    carrier, actor = algorithm(problem, scenario, radius=0.4, radius_end=0.4)
+    where = carrier.parameters.layout.slices["b_l"]
+    before = carrier.theta[where].copy()
+    feed(actor, carrier, rng, np.array([30.0, -10.0]), np.array([200.0, 200.0]))
+    assert np.linalg.norm((carrier.theta[where] - before)[2:] * -0.5) == pytest.approx(0.4)
+
+
+def test_saturation_does_not_bias_the_gradient(problem, scenario, rng):
+    """At a saturated action the noise has a mean; a level of cost must not look like a slope."""
+    action = np.array([399.0, 200.0])
+    carrier, actor = algorithm(problem, scenario)
+    batch = actor._batch
+    feed(actor, carrier, rng, np.zeros(2), action, noise=1.0, clip=scenario.action_upper)
+    raw_mean = -5.0 * 0.3  # what the noise would average to, roughly
+    assert abs(batch["deviation"][:, 0].mean()) < 0.25 * abs(raw_mean)
+
+
+def test_only_a_full_batch_moves_theta(problem, scenario, rng):
+    carrier, actor = algorithm(problem, scenario)
+    before = carrier.theta.copy()
+    action = np.array([200.0, 200.0])
+    solution = Solution(action, np.zeros((2, before.size)))
+    sample = Sample(
+        0,
+        np.ones(2),
+        action,
+        False,
+        solution,
+        solution,
+        1.0,
+        1.0,
+        np.ones(2),
+        0.0,
+        solution,
+        None,
+        None,
+    )
+    assert all(actor.observe(sample) is None for _ in range(399))
+    assert np.array_equal(carrier.theta, before)

@@ -1,0 +1,144 @@
+import numpy as np
+import pytest
+
+from controllers.layout import Layout
+from controllers.parameters import Parameters
+from learning.definiteness import (
+    LinearMatrixInequality,
+    certificate,
+    clip_eigenvalues,
+    enforcement,
+    matrix_of,
+)
+from learning.errors import DefinitenessError
+from learning.fit import Fit, td_fit
+
+SMALLEST = 1e-2
+KINDS = ("lmi", "projection", "cholesky")
+
+
+@pytest.fixture(scope="module")
+def layout(problem):
+    return Layout.of(problem)
+
+
+def fit_towards(target, metric):
+    return Fit(metric @ target, target, lambda: metric)
+
+
+def random_fit(layout, rng, size=5.0):
+    root = rng.normal(size=(layout.size, layout.size))
+    return fit_towards(size * rng.normal(size=layout.size), root @ root.T + np.eye(layout.size))
+
+
+def projected_gradient(layout, theta, fit, rounds=2000):
+    """The constrained fit by Frobenius projections: slow, and nothing in common with Clarabel."""
+    weight = 1.0 / layout.scale
+    for name in ("B_l", "B_Vf"):
+        size = layout.block(name).dimension
+        rows, columns = np.triu_indices(size)
+        weight[layout.slices[name]] = np.where(rows == columns, 1.0, np.sqrt(2.0))
+    # In y = weight · scale · d a block's norm is Frobenius's, so clipping is the projection.
+    unit = weight * layout.scale
+    metric = fit.metric() / np.outer(unit, unit)
+    gradient = fit.gradient / unit
+    y = np.zeros(layout.size)
+    z, momentum = y.copy(), 1.0
+    length = 1.0 / np.linalg.eigvalsh(metric)[-1]
+    for _ in range(rounds):
+        moved = theta + (z - length * (metric @ z - gradient)) / weight
+        new = (clip_eigenvalues(layout, moved, SMALLEST) - theta) * weight
+        following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
+        z, y, momentum = new + (momentum - 1) / following * (new - y), new, following
+    return theta + y / weight
+
+
+def objective(layout, theta, new, fit):
+    d = (new - theta) / layout.scale
+    return d @ fit.metric() @ d - 2 * fit.gradient @ d
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_step_is_definite_and_certified(layout, parameters, rng, kind):
+    enforce = enforcement(kind, layout, SMALLEST)
+    theta = parameters.theta
+    corrected = 0
+    for _ in range(30):
+        new, vouched = enforce(theta, random_fit(layout, rng))
+        assert vouched.smallest >= SMALLEST * (1 - 1e-9)
+        assert vouched.smallest == pytest.approx(certificate(layout, new).smallest)
+        assert not vouched.refused
+        corrected += vouched.corrected
+    assert corrected > 20
+
+
+@pytest.mark.parametrize("kind", ["lmi", "projection"])
+def test_a_free_step_that_is_definite_is_taken_as_it_is(layout, parameters, rng, kind):
+    fit = random_fit(layout, rng, size=1e-3)
+    new, vouched = enforcement(kind, layout, SMALLEST)(parameters.theta, fit)
+    assert np.array_equal(new, parameters.theta + layout.scale * fit.minimiser)
+    assert not vouched.corrected
+
+
+def test_cholesky_takes_a_small_step_to_first_order(layout, parameters, rng):
+    enforce = enforcement("cholesky", layout, SMALLEST)
+    errors = []
+    for size in (1e-2, 1e-3):
+        fit = random_fit(layout, np.random.default_rng(1), size)
+        new, _ = enforce(parameters.theta, fit)
+        free = parameters.theta + layout.scale * fit.minimiser
+        errors.append(np.abs(new - free).max())
+    # Second order: a tenth of the step leaves a hundredth of the error (and the tiny floor).
+    assert errors[1] < 0.012 * errors[0] + 1e-8
+
+
+def test_lmi_step_equals_a_generic_conic_solution(layout, parameters, rng):
+    theta = parameters.theta
+    for _ in range(3):
+        root = rng.normal(size=(layout.size, layout.size)) / np.sqrt(layout.size)
+        metric = root @ root.T + 0.3 * np.eye(layout.size)
+        fit = fit_towards(2.0 * rng.normal(size=layout.size), metric)
+        new, vouched = LinearMatrixInequality(layout, SMALLEST)(theta, fit)
+        assert vouched.corrected
+        reference = projected_gradient(layout, theta, fit)
+        assert objective(layout, theta, new, fit) == pytest.approx(
+            objective(layout, theta, reference, fit), rel=1e-6
+        )
+        assert (new - reference) / layout.scale == pytest.approx(0.0, abs=1e-4)
+
+
+def test_lmi_is_never_worse_than_projection(layout, parameters, rng):
+    theta = parameters.theta
+    for _ in range(10):
+        fit = random_fit(layout, rng)
+        lmi, _ = enforcement("lmi", layout, SMALLEST)(theta, fit)
+        clipped, _ = enforcement("projection", layout, SMALLEST)(theta, fit)
+        best = objective(layout, theta, lmi, fit)
+        assert best <= objective(layout, theta, clipped, fit) + 1e-6 * abs(best)
+
+
+def test_lmi_step_of_the_papers_fit_keeps_its_scale(layout, parameters, rng):
+    gradient = 1e4 * rng.normal(size=layout.size)
+    fit = td_fit(-1e6, gradient, 10.0)
+    new, vouched = enforcement("lmi", layout, SMALLEST)(parameters.theta, fit)
+    assert vouched.corrected and not vouched.refused
+    assert np.isfinite(new).all()
+    assert objective(layout, parameters.theta, new, fit) <= 0.0
+
+
+def test_projection_is_the_nearest_definite_matrix(layout, parameters):
+    matrix = np.diag([1.0, -1.0, 2.0, 0.5])
+    theta = parameters.replace({"B_l": matrix}).theta
+    clipped = matrix_of(layout, clip_eigenvalues(layout, theta, SMALLEST), "B_l")
+    assert clipped == pytest.approx(np.diag([1.0, SMALLEST, 2.0, 0.5]))
+
+
+def test_cholesky_refuses_an_indefinite_start(layout, problem, rng):
+    theta = Parameters.naive(problem).replace({"B_Vf": np.diag([1.0, -1.0])}).theta
+    with pytest.raises(DefinitenessError, match="B_Vf"):
+        enforcement("cholesky", layout, SMALLEST)(theta, random_fit(layout, rng))
+
+
+def test_unknown_enforcement_is_named():
+    with pytest.raises(DefinitenessError, match=r"'barrier'.*lmi, projection, cholesky"):
+        enforcement("barrier", None, SMALLEST)

@@ -1,0 +1,154 @@
+"""Theory as the oracle: with the exact model class, each rule finds the Riccati solution."""
+
+import numpy as np
+import pytest
+
+from controllers.converged import ConvergedNmpc
+from controllers.rti import RtiNmpc
+from learning import ActorCritic, BatchQLearning, QLearning
+from learning.interaction import Interaction
+from learning.starting_point import build_strategy
+
+
+def learn(task, cls, samples, noise, controller=None, **settings):
+    configuration = cls.Configuration.from_dict(
+        {"parametrisation": "paper", "value_offset": "stage-cost", **settings}
+    )
+    controller = controller or RtiNmpc(task.problem, task.wrong())
+    strategy = build_strategy(configuration, task.scenario, samples)
+    algorithm = cls(controller, task.scenario, configuration, samples, strategy)
+    interaction = Interaction(
+        task.plant(noise), controller, algorithm, strategy, np.random.default_rng(1)
+    )
+    interaction.start(7)
+    for _ in range(samples):
+        sample, _ = interaction.next()
+        if algorithm.observe(sample) is not None:
+            interaction.renew()
+    return controller
+
+
+def gain(controller):
+    """−dπ/ds at the origin, (m, n)."""
+    controller.reset()
+    return -controller.feedback(np.zeros(2)).policy_state_jacobian
+
+
+def value_hessian(controller):
+    """P of V(s) = sᵀPs + …, by exact differences of a quadratic function."""
+    e = np.eye(2)
+
+    def at(s):
+        controller.reset()
+        return controller.value(s)
+
+    zero = at(np.zeros(2))
+    diagonal = [(at(v) + at(-v)) / 2 - zero for v in e]
+    cross = (at(e[0] + e[1]) + at(-e[0] - e[1])) / 2 - zero - sum(diagonal)
+    return np.array([[diagonal[0], cross / 2], [cross / 2, diagonal[1]]])
+
+
+def test_exact_parameters_give_the_riccati_value_and_gain(linear_quadratic):
+    controller = RtiNmpc(linear_quadratic.problem, linear_quadratic.exact())
+    assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-7)
+    assert value_hessian(controller) == pytest.approx(linear_quadratic.P, abs=1e-6)
+
+
+def test_wrong_parameters_do_not(linear_quadratic):
+    controller = RtiNmpc(linear_quadratic.problem, linear_quadratic.wrong())
+    assert np.abs(gain(controller) - linear_quadratic.K).max() > 0.05
+    assert np.abs(value_hessian(controller) - linear_quadratic.P).max() > 0.5
+
+
+EXPLORATION = {"exploration_probability": 0.5, "exploration_deviation": (1.0,)}
+
+
+def test_online_q_learning_finds_the_riccati_solution(linear_quadratic):
+    controller = learn(
+        linear_quadratic,
+        QLearning,
+        8000,
+        0.0,
+        gain=1.0,
+        gain_end=1.0,
+        memory=100.0,
+        ridge=1e-6,
+        warm_up=50,
+        **EXPLORATION,
+    )
+    assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-3)
+    assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
+
+
+@pytest.mark.parametrize("rule", ["gauss-newton", "lstdq"])
+def test_batch_q_learning_finds_the_riccati_solution(linear_quadratic, rule):
+    controller = learn(
+        linear_quadratic,
+        BatchQLearning,
+        2000,
+        0.0,
+        rule=rule,
+        batch_size=50,
+        buffer_size=100,
+        gain=1.0,
+        gain_end=1.0,
+        ridge=1e-6,
+        **EXPLORATION,
+    )
+    assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-3)
+    assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
+
+
+def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
+    controller = learn(
+        linear_quadratic,
+        QLearning,
+        20_000,
+        0.1,
+        gain=1.0,
+        gain_end=0.02,
+        memory=1000.0,
+        ridge=1e-6,
+        warm_up=50,
+        **EXPLORATION,
+    )
+    assert gain(controller) == pytest.approx(linear_quadratic.K, abs=0.03)
+
+
+ACTOR = {"forgetting": 0.0, "step_size": 0.2, "exploration_deviation": (1.0,), "radius": 0.3}
+
+
+def test_actor_critic_nears_the_riccati_gain_of_the_mean_cost(linear_quadratic):
+    exact = linear_quadratic.riccati(1.0)[1]
+    start = gain(RtiNmpc(linear_quadratic.problem, linear_quadratic.wrong()))
+    controller = learn(
+        linear_quadratic, ActorCritic, 20_000, 0.5, batch_size=2000, radius_end=0.05, **ACTOR
+    )
+    assert np.abs(gain(controller) - exact).max() < 0.25 * np.abs(start - exact).max()
+
+
+@pytest.mark.slow
+def test_actor_critic_finds_the_riccati_gain_of_the_mean_cost(linear_quadratic):
+    exact = linear_quadratic.riccati(1.0)[1]
+    assert np.abs(exact - linear_quadratic.K).max() > 0.04
+    controller = learn(
+        linear_quadratic, ActorCritic, 200_000, 0.5, batch_size=10_000, radius_end=0.01, **ACTOR
+    )
+    assert gain(controller) == pytest.approx(exact, abs=0.02)
+
+
+def test_converged_nmpc_learns_the_same_on_a_linear_plant(linear_quadratic):
+    controller = learn(
+        linear_quadratic,
+        BatchQLearning,
+        1000,
+        0.0,
+        controller=ConvergedNmpc(linear_quadratic.problem, linear_quadratic.wrong()),
+        batch_size=50,
+        buffer_size=100,
+        gain=1.0,
+        gain_end=1.0,
+        ridge=1e-6,
+        **EXPLORATION,
+    )
+    assert gain(controller) == pytest.approx(linear_quadratic.K, abs=2e-3)

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import fmpy
 
-from fmus.description import MODEL_IDENTIFIER, FmiVersion, build_description, model_description
+from fmus.description import MODEL_IDENTIFIER, build_description, model_description
 from fmus.documentation import RESOURCES, documentation_page
 from fmus.errors import BuildError
 from fmus.header import c_header
+from fmus.variables import FmiVersion
 
 PACKAGE = Path(__file__).parent
 SOURCES = PACKAGE / "sources"

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Literal
 from xml.etree import ElementTree
 
-from fmus.dependencies import continuous_dependencies, initial_dependencies
-from fmus.variables import LAWS, UNITS, VARIABLES, Kind, Type, Variable, value_reference
-
-FmiVersion = Literal[2, 3]
+from fmus.structure import add_structure, index
+from fmus.variables import (
+    LAWS,
+    UNITS,
+    FmiVersion,
+    Kind,
+    Type,
+    Variable,
+    exported,
+    value_reference,
+)
 
 MODEL_NAME = "Evaporator"
 MODEL_IDENTIFIER = "evaporator"
@@ -36,16 +41,6 @@ _INT32 = ("-2147483648", "2147483647")
 _COMMON_CAPABILITIES = {"canBeInstantiatedOnlyOncePerProcess": "false"}
 
 
-def exported(version: FmiVersion) -> list[Variable]:
-    """The variables of the table that FMI `version` shows.
-
-    FMI 3.0 has the whole seed in one variable; FMI 2.0 shows no time, which FMI Library refuses.
-    """
-    if version == 2:
-        return [v for v in VARIABLES if v.kind is not Kind.INDEPENDENT]
-    return [v for v in VARIABLES if v.type is not Type.SEED_HIGH]
-
-
 def model_description(version: FmiVersion, token: str) -> str:
     """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
     root = _root(version, token)
@@ -61,7 +56,7 @@ def model_description(version: FmiVersion, token: str) -> str:
     variables = ElementTree.SubElement(root, "ModelVariables")
     for variable in exported(version):
         (_variable2 if version == 2 else _variable3)(variables, variable)
-    (_structure2 if version == 2 else _structure3)(root)
+    add_structure(root, version)
     return _text(root)
 
 
@@ -183,10 +178,6 @@ def _state_of(variable: Variable) -> str:
     return variable.name.removeprefix("der(").removesuffix(")")
 
 
-def _index2(name: str) -> int:
-    return [v.name for v in exported(2)].index(name) + 1
-
-
 def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
     scalar = ElementTree.SubElement(parent, "ScalarVariable", _common(variable))
     if variable.type is Type.BOOLEAN:
@@ -200,7 +191,7 @@ def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
     else:
         attributes = _real(variable)
         if variable.kind is Kind.DERIVATIVE:
-            attributes["derivative"] = str(_index2(_state_of(variable)))
+            attributes["derivative"] = str(index(_state_of(variable)))
         ElementTree.SubElement(scalar, "Real", attributes)
 
 
@@ -219,51 +210,3 @@ def _variable3(parent: ElementTree.Element, variable: Variable) -> None:
         if variable.kind is Kind.DERIVATIVE:
             attributes["derivative"] = str(value_reference(_state_of(variable)))
         ElementTree.SubElement(parent, "Float64", attributes)
-
-
-def _names(*kinds: Kind) -> list[str]:
-    return [v.name for v in VARIABLES if v.kind in kinds]
-
-
-_UNKNOWNS = (
-    ("Output", "Outputs", (Kind.STATE, Kind.OUTPUT), False),
-    ("ContinuousStateDerivative", "Derivatives", (Kind.DERIVATIVE,), False),
-    ("InitialUnknown", "InitialUnknowns", (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT), True),
-)
-
-
-def _kinds_text(name: str, dependencies: Iterable[str]) -> str:
-    """The states depend on themselves or on their start with constant factor 1."""
-    is_state = name in _names(Kind.STATE)
-    return " ".join("constant" if is_state else "dependent" for _ in dependencies)
-
-
-def _structure2(root: ElementTree.Element) -> None:
-    structure = ElementTree.SubElement(root, "ModelStructure")
-    for _, tag, kinds, initial in _UNKNOWNS:
-        group = ElementTree.SubElement(structure, tag)
-        for name in _names(*kinds):
-            names = initial_dependencies(name) if initial else continuous_dependencies(name)
-            ElementTree.SubElement(
-                group,
-                "Unknown",
-                index=str(_index2(name)),
-                dependencies=" ".join(str(_index2(n)) for n in names),
-                dependenciesKind=_kinds_text(name, names),
-            )
-
-
-def _structure3(root: ElementTree.Element) -> None:
-    structure = ElementTree.SubElement(root, "ModelStructure")
-    shown = {v.name for v in exported(3)}
-    for tag, _, kinds, initial in _UNKNOWNS:
-        for name in _names(*kinds):
-            names = initial_dependencies(name) if initial else continuous_dependencies(name)
-            names = tuple(n for n in names if n in shown)
-            ElementTree.SubElement(
-                structure,
-                tag,
-                valueReference=str(value_reference(name)),
-                dependencies=" ".join(str(value_reference(n)) for n in names),
-                dependenciesKind=_kinds_text(name, names),
-            )

@@ -6,14 +6,8 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from fmus.description import (
-    DESCRIPTION,
-    LICENSE,
-    MODEL_VERSION,
-    FmiVersion,
-    exported,
-)
-from fmus.variables import Variable, value_reference
+from fmus.description import DESCRIPTION, LICENSE, MODEL_VERSION
+from fmus.variables import FmiVersion, Variable, exported, value_reference
 
 RESOURCES = Path(__file__).parent / "resources"
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
 
 
 class Kind(StrEnum):
@@ -220,9 +221,21 @@ VARIABLES: tuple[Variable, ...] = (
     _tunable("F3", "kg/min", 50.0, 0.0, 1e3, "circulating flow"),
 )  # fmt: skip
 
+FmiVersion = Literal[2, 3]
+
 BY_NAME = {variable.name: variable for variable in VARIABLES}
 
 
 def value_reference(name: str) -> int:
     """The value reference of variable `name`; KeyError when there is none."""
     return VARIABLES.index(BY_NAME[name])
+
+
+def exported(version: FmiVersion) -> list[Variable]:
+    """The variables of the table that FMI `version` shows.
+
+    FMI 3.0 has the whole seed in one variable; FMI 2.0 shows no time, which FMI Library refuses.
+    """
+    if version == 2:
+        return [v for v in VARIABLES if v.kind is not Kind.INDEPENDENT]
+    return [v for v in VARIABLES if v.type is not Type.SEED_HIGH]

@@ -2,7 +2,7 @@
 #ifndef DERIVATIVES_H
 #define DERIVATIVES_H
 
-#include "instance.h"
+#include "access.h"
 
 typedef struct {
     int source[2];    /* value references that the realised disturbance depends on */

@@ -6,6 +6,7 @@
 #ifndef EVENTS_H
 #define EVENTS_H
 
+#include "access.h"
 #include "simulation.h"
 
 enum { N_STATES = 2 };

@@ -2,7 +2,7 @@
 #ifndef SIMULATION_H
 #define SIMULATION_H
 
-#include "instance.h"
+#include "outputs.h"
 
 /* Integration steps in one call: half a year of seconds, at most about two seconds of computing. */
 #define MAX_STEPS_PER_CALL 16777216

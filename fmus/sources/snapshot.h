@@ -4,6 +4,7 @@
 
 #include <stddef.h>
 
+#include "grid.h"
 #include "instance.h"
 
 /* FNV-1a over all bytes before the checksum itself. */

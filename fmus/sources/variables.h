@@ -2,7 +2,7 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{07cc6cf1-2e79-590e-82b7-d49c7a2e2dd9}"
+#define MODEL_TOKEN "{0180995d-634d-5156-9930-7d3c128ab7c8}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
 #define LAYOUT_DIGEST UINT64_C(0x4c5c8a2cae0d9624)

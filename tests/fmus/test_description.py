@@ -57,16 +57,6 @@ def test_there_are_no_integer_outputs(description) -> None:
     assert {v.type for v in outputs} <= {"Real", "Float64"}
 
 
-def test_every_initial_unknown_has_explicit_dependencies(description) -> None:
-    for unknown in (*description.initialUnknowns, *description.outputs, *description.derivatives):
-        assert unknown.dependencies is not None
-        assert len(unknown.dependencies) == len(unknown.dependenciesKind)
-
-
-def test_states_are_the_two_of_the_model(description) -> None:
-    assert [u.variable.derivative.name for u in description.derivatives] == ["X2", "P2"]
-
-
 def test_versions_differ_only_in_time_and_seed() -> None:
     two, three = (
         {v.name for v in fmpy.read_model_description(str(fmus.path(n))).modelVariables}

@@ -7,8 +7,8 @@ import pytest
 
 import fmus
 from fmus.build import BUILD_FILE
-from fmus.description import exported
 from fmus.documentation import documentation_page
+from fmus.variables import exported
 
 
 class Page(HTMLParser):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import pytest
+from fmpy.fmi1 import FMICallException
 
-ERROR = 3
+DISCARD, ERROR = 2, 3
 # (state, whether the instance is for model exchange)
 STATES = [
     ("instantiated", False), ("initialization", False), ("step", False), ("terminated", False),
@@ -52,3 +54,21 @@ def check_call(open_fmu) -> Callable[..., None]:
             assert function in instance.messages[0][2]
 
     return check
+
+
+@pytest.fixture
+def refused() -> Callable[..., tuple[int, str]]:
+    """Make a call that must fail; returns its status and the one message that it logs."""
+
+    def call_refused(instance, call: Callable[[], object]) -> tuple[int, str]:
+        before = len(instance.messages)
+        with pytest.raises(FMICallException) as caught:
+            call()
+        (status, category, text), *more = instance.messages[before:]
+        assert not more
+        assert status == caught.value.status
+        assert category == {DISCARD: "logStatusDiscard", ERROR: "logStatusError"}[status]
+        assert not re.search("[%#]", text)
+        return status, text
+
+    return call_refused

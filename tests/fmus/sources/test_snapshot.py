@@ -7,16 +7,8 @@ import sys
 from ctypes import c_void_p
 
 import pytest
-from fmpy.fmi1 import FMICallException
 
 ERROR = 3
-
-
-def refused(plant, call) -> str:
-    with pytest.raises(FMICallException) as caught:
-        call()
-    assert caught.value.status == plant.messages[-1][0] == ERROR
-    return plant.messages[-1][2]
 
 
 def stepped(plant, steps: int = 7, **values: float):
@@ -88,7 +80,7 @@ print(repr(plant.run(10, start=420.0)))
 
 
 @pytest.mark.parametrize("position", ["magic", "version", "value", "checksum", "any"])
-def test_flipped_bit_in_a_serialised_state_is_an_error(plant, position: str) -> None:
+def test_flipped_bit_in_a_serialised_state_is_an_error(refused, plant, position: str) -> None:
     plant.initialise()
     state = plant.save()
     data = bytearray(plant.serialise(state))
@@ -97,19 +89,19 @@ def test_flipped_bit_in_a_serialised_state_is_an_error(plant, position: str) -> 
                "any": range(0, len(data), 37)}[position]  # fmt: skip
     for offset in offsets:
         data[offset] ^= 0x10
-        text = refused(plant, lambda: plant.deserialise(bytes(data)))
+        text = refused(plant, lambda: plant.deserialise(bytes(data)))[1]
         assert "corrupt" in text or "not a state of this FMU" in text
         data[offset] ^= 0x10
     plant.free(plant.deserialise(bytes(data)))
 
 
 @pytest.mark.parametrize("size", [0, 1, 100])
-def test_serialised_state_of_another_length_is_an_error(plant, size: int) -> None:
+def test_serialised_state_of_another_length_is_an_error(refused, plant, size: int) -> None:
     plant.initialise()
-    assert "bytes" in refused(plant, lambda: plant.deserialise(b"\x00" * size))
+    assert "bytes" in refused(plant, lambda: plant.deserialise(b"\x00" * size))[1]
 
 
-def test_implausible_state_with_a_right_checksum_is_an_error(plant) -> None:
+def test_implausible_state_with_a_right_checksum_is_an_error(refused, plant) -> None:
     """A forged state must not bring in what the setters refuse."""
     plant.initialise(P100=321.0)
     state = plant.save()
@@ -121,7 +113,7 @@ def test_implausible_state_with_a_right_checksum_is_an_error(plant) -> None:
     for value in (float("nan"), 1e9):
         data[at : at + 8] = struct.pack("<d", value)
         data[-8:] = struct.pack("<Q", fnv1a(data[:-8]))
-        assert "corrupt" in refused(plant, lambda: plant.deserialise(bytes(data)))
+        assert "corrupt" in refused(plant, lambda: plant.deserialise(bytes(data)))[1]
     data[at : at + 8] = struct.pack("<d", 123.0)
     data[-8:] = struct.pack("<Q", fnv1a(data[:-8]))
     plant.restore(handle := plant.deserialise(bytes(data)))
@@ -136,15 +128,15 @@ def fnv1a(data: bytes) -> int:
     return value
 
 
-def test_state_of_the_other_interface_is_an_error(open_fmu, version: int) -> None:
+def test_state_of_the_other_interface_is_an_error(refused, open_fmu, version: int) -> None:
     plant, model = open_fmu(version), open_fmu(version, exchange=True)
     state = plant.save()
-    assert "other interface" in refused(model, lambda: model.restore(state))
+    assert "other interface" in refused(model, lambda: model.restore(state))[1]
     plant.free(state)
 
 
-def test_null_state_is_an_error_and_freeing_it_is_not(plant) -> None:
-    assert "null state" in refused(plant, lambda: plant.restore(c_void_p()))
+def test_null_state_is_an_error_and_freeing_it_is_not(refused, plant) -> None:
+    assert "null state" in refused(plant, lambda: plant.restore(c_void_p()))[1]
     plant.free(c_void_p())
 
 

@@ -1,0 +1,118 @@
+"""Fenced code blocks of a Markdown page, and how each kind is executed."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+FENCE = re.compile(r"^```(\w*)[ ]*([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+TITLE = re.compile(r'title="([^"]+)"')
+# Not typed by a test of its page, because another check does it or a person has to be there.
+COVERED = {
+    "make demo": "the target is run by .ci/run",
+    "make test": "the target is run by .ci/run",
+    "python3 -m venv .venv": "tests/packaging installs into an empty environment",
+    ". .venv/bin/activate": "tests/packaging installs into an empty environment",
+    "pip install .": "tests/packaging installs the wheel into an empty environment",
+    "cosim view demo/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
+}
+CHECKER = doctest.OutputChecker()
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block's language, options after it, text, and its line on the page."""
+
+    language: str
+    options: str
+    text: str
+    line: int
+
+
+def pages() -> list[Path]:
+    """README and every page of docs/."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(page: Path) -> list[Block]:
+    """The fenced blocks of a page, in order."""
+    text = page.read_text()
+    return [
+        Block(match[1], match[2], match[3], text[: match.start()].count("\n") + 1)
+        for match in FENCE.finditer(text)
+    ]
+
+
+def is_slow(page: Path) -> bool:
+    """Whether the page says that it takes long."""
+    return page.read_text().startswith("<!-- slow -->")
+
+
+class Session:
+    """One reader who follows a page from top to bottom in a folder."""
+
+    def __init__(self, page: Path, folder: Path) -> None:
+        self.page, self.folder = page, folder
+        self.namespace: dict[str, object] = {"__name__": "page"}
+        self.commands = 0
+        for needed in re.findall(r"<!-- needs (\S+) -->", page.read_text()):
+            (folder / needed).parent.mkdir(parents=True, exist_ok=True)
+            (folder / needed).symlink_to(ROOT / needed)
+
+    def follow(self, block: Block) -> None:
+        """Execute a block as its language asks; raises AssertionError where it does not hold."""
+        kind = block.language
+        where = f"{self.page.relative_to(ROOT)}:{block.line}"
+        if title := TITLE.search(block.options):
+            (self.folder / title[1]).write_text(block.text)
+        if kind == "python" and title:
+            importlib.import_module(title[1].removesuffix(".py"))
+        elif kind == "python":
+            code = compile("\n" * block.line + block.text, where, "exec", dont_inherit=True)
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                exec(code, self.namespace)
+        elif kind == "console":
+            self._type(block.text, where)
+        elif kind == "toml":
+            tomllib.loads(block.text)
+        elif kind == "json":
+            json.loads(block.text)
+        elif kind not in ("text", "bibtex"):
+            raise AssertionError(f"{where}: nothing here executes a block of '{kind}'")
+
+    def _type(self, text: str, where: str) -> None:
+        """Run each `$ ` line in a shell; the lines below it are what it must print."""
+        for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
+            line, _, expected = part.partition("\n")
+            command, _, comment = line.partition(" # ")
+            command = command.strip()
+            if command in COVERED:
+                continue
+            code = re.search(r"exit code (\d+)", comment)
+            result = subprocess.run(
+                command,
+                shell=True,
+                cwd=self.folder,
+                env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            said = result.stdout + result.stderr
+            assert result.returncode == (int(code[1]) if code else 0), f"{where}: {line}\n{said}"
+            self.commands += 1
+            if expected.strip():
+                fits = CHECKER.check_output(expected, said, FLAGS)
+                assert fits, f"{where}: {line}\nexpected\n{expected}\ngot\n{said}"

@@ -36,6 +36,9 @@ def evaluate(
     A seed means the same disturbances to all controllers (common random numbers), so differences
     are to be taken seed by seed.
 
+    Raises EvaluationError on a malformed request or failed workers, and whatever building or
+    running a controller raises.
+
     Parameters
     ----------
     controllers : factory(scenario) -> Controller by name, importable where the workers run. The
@@ -47,9 +50,6 @@ def evaluate(
     scheduler : address of a Dask scheduler, used in place of `jobs`.
     progress : called with the number of units done, of controllers × (seeds + 1) in all.
     command : the text of the column `command`.
-
-    Raises EvaluationError on a malformed request or failed workers, and whatever building or
-    running a controller raises.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)

@@ -45,14 +45,14 @@ class FmuPlant:
     by the sampling time h, and x_{k+1} is read. Use it as a context manager, or call `close`.
     An FMU is native code: name only files that you trust.
 
+    Raises PlantError if the FMU is missing, corrupt, has no co-simulation binary for this
+    platform or lacks a variable that the scenario names; CapabilityError when a capability that
+    the FMU lacks is asked for, not before.
+
     Parameters
     ----------
     scenario : a `Scenario`, or what `Scenario.load` takes.
     fmu : FMU to use in place of the scenario's, a shipped one's name or a path.
-
-    Raises PlantError if the FMU is missing, corrupt, has no co-simulation binary for this
-    platform or lacks a variable that the scenario names; CapabilityError when a capability that
-    the FMU lacks is asked for, not before.
     """
 
     def __init__(self, scenario: Scenario | str | Path, fmu: str | Path | None = None) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+import re
+from importlib.metadata import EntryPoint, entry_points
 
 from cosim.validation import suggestion
 from learning.errors import AlgorithmLookupError
@@ -17,15 +18,17 @@ def algorithms() -> list[str]:
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
-    """Class of an algorithm; raises AlgorithmLookupError."""
+    """Class of an algorithm by registered name or `module:Class`; raises AlgorithmLookupError."""
     known = {point.name: point for point in entry_points(group=GROUP)}
-    if name not in known:
+    is_target = re.fullmatch(r"[\w.]+:[\w.]+", name)
+    point = EntryPoint(name, name, GROUP) if is_target else known.get(name)
+    if point is None:
         raise AlgorithmLookupError(
             f"unknown algorithm '{name}'{suggestion(name, known)}; registered are "
-            f"{', '.join(sorted(known))}"
+            f"{', '.join(sorted(known))}, or give module:Class"
         )
     try:
-        found = known[name].load()
+        found = point.load()
     except (ImportError, AttributeError) as error:
         raise AlgorithmLookupError(f"algorithm '{name}' cannot be imported: {error}") from error
     missing = [

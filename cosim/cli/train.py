@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 AlgorithmOption = Annotated[
     str,
     typer.Option(
-        "--algorithm", "-a", help="actor-critic, batch-q-learning, q-learning or a registered one."
+        "--algorithm",
+        "-a",
+        help="actor-critic, batch-q-learning, q-learning, another registered one or module:Class.",
     ),
 ]
 
@@ -64,10 +66,12 @@ def train(
     Exit code 1: learning diverged; the files then hold the last good θ and the summary says why.
     """
     with output(json) as out_:
+        from cosim.cli.compose import import_from_here
         from cosim.scenario import Scenario
         from learning.registry import load_algorithm
         from learning.training import Run
 
+        import_from_here()
         found = load_algorithm(algorithm)
         if explain:
             _explain(algorithm, found.Configuration.documentation(), out_)

@@ -78,3 +78,32 @@ def evaluation(
         out_.json(result)
     if not result["same_bytes"]:
         raise typer.Exit(1)
+
+
+@app.command()
+def learning(
+    scenario: ScenarioOption = "paper",
+    samples: Annotated[
+        int, typer.Option("--samples", "-n", min=100, help="Samples per repetition.")
+    ] = 2000,
+    json: JsonOption = False,
+) -> None:
+    """Samples per second of each learning rule on one core, the FMU included."""
+    with output(json) as out_:
+        from cosim.scenario import Scenario
+        from learning.benchmark import measure
+
+        result = measure(Scenario.load(scenario), samples)
+        rows = [
+            (
+                row["algorithm"],
+                f"{row['median_samples_per_second']:.0f}",
+                f"{row['lowest_samples_per_second']:.0f}",
+                f"{row['highest_samples_per_second']:.0f}",
+                ", ".join(f"{k} {v:.0f}" for k, v in row["microseconds_per_sample"].items()),
+            )
+            for row in result["rows"]
+        ]
+        header = ("samples per second", "median", "lowest", "highest", "µs per sample")
+        out_.table(f"learning on {result['scenario']}, one core", header, rows)
+        out_.json(result)

@@ -16,6 +16,7 @@ from fmus.errors import FmuError
 from fmus.information import description_of
 
 TIMEOUT = 300.0  # s for one importer
+WORDS = 200  # last characters of what a crashed importer said
 
 
 class Status(StrEnum):
@@ -84,8 +85,8 @@ def _in_own_process(tool: str, subject: str, fmu: Path) -> Finding:
         return Finding(tool, subject, Status.FAILED, f"no result after {TIMEOUT:.0f} s")
     lines = result.stdout.splitlines()
     if result.returncode != 0 or not lines:
-        words = result.stderr.strip().splitlines()[-1:] or [""]
-        detail = f"the process ended with code {result.returncode}. {words[0]}"
+        words = " ".join(result.stderr.split())[-WORDS:]
+        detail = f"the process ended with code {result.returncode}: {words}"
         return Finding(tool, subject, Status.FAILED, detail)
     status, detail = json.loads(lines[-1])
     return Finding(tool, subject, Status(status), detail)

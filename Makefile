@@ -11,12 +11,17 @@ demo: $(VENV)/installed
 test: $(VENV)/installed
 	$(BIN)/python -m pytest
 
-# What CI runs after `make test`: lint, types, the slow tests, the main job on a small budget.
+# What CI runs after `make test`: lint, types, the FMUs in every importer, the slow tests, the stored
+# results and the main job on a small budget.
 check: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/cosim fmu check evaporator
+	$(BIN)/cosim fmu check evaporator_fmi3
 	$(BIN)/python -m pytest -m slow
+	$(BIN)/cosim results check
+	$(BIN)/cosim demo --steps 200 --out build/demo
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
@@ -26,7 +31,7 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,fmi-check]'
 	touch $@
 
 clean:

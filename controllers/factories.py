@@ -6,8 +6,11 @@ These are the package's entry points of the group `cosim.controllers`.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 from controllers.converged import ConvergedNmpc
+from controllers.dynamic_programming.plant import StochasticScenario
+from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem, ScenarioLike
 from controllers.rti import RtiNmpc
@@ -49,3 +52,8 @@ def converged(scenario: ScenarioLike) -> ConvergedNmpc:
     return ConvergedNmpc(
         problem, naive_parameters(scenario, problem), backend=scenario.controller.backend
     )
+
+
+def optimal(scenario: ScenarioLike) -> OptimalPolicy:
+    """Policy of least mean cost on the scenario's stochastic plant, solved once and then stored."""
+    return OptimalPolicy.from_scenario(cast(StochasticScenario, scenario))

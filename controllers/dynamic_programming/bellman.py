@@ -43,6 +43,17 @@ class Accuracy:
             tuple(min(count, 10) for count in self.penalty_nodes),
         )
 
+    def finer(self) -> Accuracy:
+        """Half the integration step, two more nodes a disturbance, half as many again for the kink.
+
+        A disturbance that is integrated with one node keeps it.
+        """
+        return Accuracy(
+            2 * self.substeps,
+            tuple(count + 2 if count > 1 else 1 for count in self.nodes),
+            tuple(count + (count + 1) // 2 if count > 1 else 1 for count in self.penalty_nodes),
+        )
+
 
 class BellmanOperator:
     """Q(s, a) = E[ℓ(s, a, d) + γ penalty(s₊) + γ W(s₊)] with V = penalty + W.

@@ -85,7 +85,7 @@ def begin(operator: BellmanOperator, grid: Grid, actions: Array) -> Iterate:
 
 
 def improve(
-    operator: BellmanOperator, iterate: Iterate, scan_points: int, *, iterations: int = 25
+    operator: BellmanOperator, iterate: Iterate, scan_points: int, *, iterations: int = 30
 ) -> Iterate:
     """Improve the policy once and bound what is left to gain.
 
@@ -102,7 +102,15 @@ def improve(
     start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
     width = upper - lower
     size = np.clip(2.0 * np.abs(iterate.step), 2e-3 * width, 0.1 * width)
-    actions, values = nelder_mead(objective, start, size, lower, upper, iterations)
+    actions, values = nelder_mead(
+        objective,
+        start,
+        size,
+        lower,
+        upper,
+        iterations=iterations,
+        precision=1e-8 * abs(iterate.gain),
+    )
     residual = values - iterate.W
     return replace(
         iterate,

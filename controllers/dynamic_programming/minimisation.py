@@ -14,13 +14,21 @@ Objective = Callable[[Rows, Array], Array]
 
 
 def nelder_mead(
-    objective: Objective, start: Array, size: Array, lower: Array, upper: Array, iterations: int
+    objective: Objective,
+    start: Array,
+    size: Array,
+    lower: Array,
+    upper: Array,
+    *,
+    iterations: int,
+    precision: float,
 ) -> tuple[Array, Array]:
     """Minimise B functions of m variables in a box, each from its own start.
 
     `objective(rows, points)` evaluates functions `rows` (r,) at points (r, m); `start` (B, m);
-    `size` (B, m) is the first simplex's edge. Returns minimisers (B, m) and values (B,), never
-    worse than the start. The simplex method of Nelder and Mead (1965) with its standard
+    `size` (B, m) is the first simplex's edge; a function is done when its simplex's values lie
+    within `precision` of each other. Returns minimisers (B, m) and values (B,), never worse than
+    the start. The simplex method of Nelder and Mead (1965) with its standard
     coefficients and projection on the box: it needs no derivative, which the expected penalty
     of a nearly deterministic plant lacks, and it follows the penalty's narrow, skew valley, where
     a search along the coordinates stalls. SciPy's one runs one problem at a time.
@@ -37,20 +45,24 @@ def nelder_mead(
         order = np.argsort(values, axis=1, kind="stable")
         values = np.take_along_axis(values, order, axis=1)
         vertices = np.take_along_axis(vertices, order[:, :, None], axis=1)
-        _replace_worst(objective, vertices, values, lower, upper)
+        rows = np.flatnonzero(values[:, -1] - values[:, 0] > precision)
+        if not len(rows):
+            break
+        vertices[rows], values[rows] = _replace_worst(
+            objective, rows, vertices[rows], values[rows], lower, upper
+        )
     best = values.argmin(axis=1)
     return vertices[everyone, best], values[everyone, best]
 
 
 def _replace_worst(
-    objective: Objective, vertices: Array, values: Array, lower: Array, upper: Array
-) -> None:
-    """One step of the simplex method on sorted simplices, in place."""
-    everyone = np.arange(len(values))
+    objective: Objective, rows: Rows, vertices: Array, values: Array, lower: Array, upper: Array
+) -> tuple[Array, Array]:
+    """One step of the simplex method on the sorted simplices of functions `rows`."""
     centre = vertices[:, :-1].mean(axis=1)
-    worst = vertices[:, -1]
+    worst = vertices[:, -1].copy()
     candidate = np.clip(2.0 * centre - worst, lower, upper)
-    reflected = objective(everyone, candidate)
+    reflected = objective(rows, candidate)
     best = reflected < values[:, 0]
     accepted = reflected < values[:, -2]
     # Expansion, outside contraction and inside contraction as multiples of centre − worst.
@@ -59,9 +71,8 @@ def _replace_worst(
     tried = np.flatnonzero(best | ~accepted)
     outcome = np.full(len(values), np.inf)
     if len(tried):
-        outcome[tried] = objective(tried, trial[tried])
-    better = outcome < reflected
-    candidate = np.where(better[:, None], trial, candidate)
+        outcome[tried] = objective(rows[tried], trial[tried])
+    candidate = np.where((outcome < reflected)[:, None], trial, candidate)
     outcome = np.minimum(outcome, reflected)
     improved = outcome < values[:, -1]
     vertices[:, -1] = np.where(improved[:, None], candidate, worst)
@@ -70,7 +81,8 @@ def _replace_worst(
     for i in range(1, vertices.shape[1]):
         if len(shrinking):
             vertices[shrinking, i] = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
-            values[shrinking, i] = objective(shrinking, vertices[shrinking, i])
+            values[shrinking, i] = objective(rows[shrinking], vertices[shrinking, i])
+    return vertices, values
 
 
 def scan(

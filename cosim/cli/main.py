@@ -13,6 +13,7 @@ from cosim.cli import (
     demo,
     evaluate,
     fmu,
+    optimum,
     reproduce,
     results,
     scenario,
@@ -36,6 +37,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("train")(train.train)
 app.command("view")(view.view)
 app.command("compare")(compare.compare)
+app.command("optimum")(optimum.optimum)
 app.command("scenario")(scenario.scenario)
 app.add_typer(benchmark.app, name="benchmark")
 app.command("reproduce")(reproduce.reproduce)

@@ -1,0 +1,77 @@
+"""How far J* depends on the grid and on the quadrature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.dynamic_programming.quadrature import DisturbanceLaw
+from controllers.dynamic_programming.settings import Settings
+from controllers.dynamic_programming.solution import Optimum, Progress, refine
+from controllers.problem import Problem
+
+Array = NDArray[np.float64]
+STABLE = 1e-3
+_MOST_GRIDS = 3
+
+
+@dataclass(frozen=True)
+class Row:
+    """A solution of the study; `change` is that of J* against what it refines, relative."""
+
+    what: str
+    optimum: Optimum
+    change: float | None = None
+
+    @property
+    def stable(self) -> bool:
+        """Whether refining changed J* by no more than 0.1 %."""
+        return self.change is None or self.change <= STABLE
+
+
+def study(
+    problem: Problem,
+    law: DisturbanceLaw,
+    settings: Settings,
+    optimum: Optimum,
+    *,
+    parameters: Array | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> list[Row]:
+    """Refine a solution of `settings` until J* is stable to 0.1 %, then its quadrature once.
+
+    The grid is halved at least once and at most three times; the last row has the finer
+    quadrature and integrator on the first grid. `stable` of the last two rows is the verdict.
+    """
+    rows = [Row("solution", optimum)]
+    for level in range(settings.level + 1, settings.level + 1 + _MOST_GRIDS):
+        before = rows[-1].optimum
+        after = refine(
+            problem,
+            law,
+            replace(settings, level=level),
+            before,
+            optimum.accuracy,
+            parameters=parameters,
+            progress=progress,
+        )
+        rows.append(Row("grid twice as fine", after, _change(before, after)))
+        if rows[-1].stable:
+            break
+    after = refine(
+        problem,
+        law,
+        settings,
+        optimum,
+        optimum.accuracy.finer(),
+        parameters=parameters,
+        progress=progress,
+    )
+    return [*rows, Row("quadrature finer", after, _change(optimum, after))]
+
+
+def _change(before: Optimum, after: Optimum) -> float:
+    return abs(after.gain - before.gain) / abs(after.gain)

@@ -2,7 +2,8 @@
 
 The hyperparameters of the cases `*-paper` and `*-extended` are the algorithms' defaults, but for
 the parametrisation; `q-learning-literal` is the paper's rule as it is printed; the cases
-`*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one.
+`*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one;
+`q-learning-rti` and `q-learning-converged` differ in the controller only.
 """
 
 from __future__ import annotations
@@ -41,4 +42,6 @@ CASES = {
     "q-learning-literal": Case("q-learning", 100_000, LITERAL, seeds=5),
     "q-learning-mean-cost": Case("q-learning", 40_000, {"discount": 1.0}),
     "batch-q-learning-mean-cost": Case("batch-q-learning", 30_000, {"discount": 1.0}),
+    "q-learning-rti": Case("q-learning", 20_000, seeds=5),
+    "q-learning-converged": Case("q-learning", 20_000, seeds=5, controller="converged"),
 }

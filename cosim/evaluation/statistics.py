@@ -33,7 +33,9 @@ class Estimate:
 
 
 def mean(values: Array) -> Estimate:
-    """Mean of S independent values, (S,)."""
+    """Mean of S independent values, (S,); without intervals where one is not finite."""
+    if not np.all(np.isfinite(values)):
+        return Estimate(float(np.mean(values)), None, None)
     return Estimate(
         float(np.mean(values)),
         _t_interval(values, float(np.mean(values))),
@@ -47,10 +49,9 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     The t interval is that of the linearised ratio (delta method): residuals (aₛ − r bₛ)/mean(b).
     NaN without intervals where the denominator's mean is zero.
     """
-    below = float(np.mean(denominator))
-    if below == 0.0:
-        return Estimate(float("nan"), None, None)
-    value = float(np.mean(numerator)) / below
+    below, value = float(np.mean(denominator)), quotient(numerator, denominator)
+    if not np.isfinite(value):
+        return Estimate(value, None, None)
     return Estimate(
         value,
         _t_interval((numerator - value * denominator) / below, value),
@@ -59,6 +60,12 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
             lambda a, b, axis: np.mean(a, axis=axis) / np.mean(b, axis=axis),
         ),
     )
+
+
+def quotient(numerator: Array, denominator: Array) -> float:
+    """Ratio of the means alone; NaN where the denominator's is zero."""
+    below = float(np.mean(denominator))
+    return float(np.mean(numerator)) / below if below else float("nan")
 
 
 def _t_interval(residuals: Array, value: float) -> tuple[float, float] | None:

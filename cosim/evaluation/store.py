@@ -33,7 +33,7 @@ class Store:
             return None
         try:
             return from_document(json.loads(path.read_text("utf-8")))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             raise EvaluationError(
                 f"the finished work unit '{path}' is damaged; delete it to compute it again"
             ) from None

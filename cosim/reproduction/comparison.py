@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.evaluation import Evaluation
-from cosim.evaluation.statistics import Estimate, mean, ratio
+from cosim.evaluation.statistics import Estimate, mean, quotient, ratio
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def _learner(evaluation: Evaluation, name: str, group: Sequence[str]) -> Row:
     shares: dict[str, list[float]] = {}
     for one in group:
         for label, (above, below) in _relative(evaluation, evaluation.column(one, "J")).items():
-            shares.setdefault(label, []).append(float(np.mean(above) / np.mean(below)))
+            shares.setdefault(label, []).append(quotient(above, below))
     estimates |= {label: mean(np.array(values)) for label, values in shares.items()}
     return Row(name, len(group), estimates, min(shares.get("gap_closed", [float("nan")])))
 

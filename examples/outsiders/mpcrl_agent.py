@@ -85,8 +85,7 @@ def main():
     }
     mpc = NaiveNmpc(problem, start)
     learnable = LearnableParametersDict[ca.SX](
-        LearnableParameter(name, value.shape, value)
-        for name, value in start.items()
+        LearnableParameter(name, value.shape, value) for name, value in start.items()
     )
     agent = LstdQLearningAgent(
         mpc=mpc,

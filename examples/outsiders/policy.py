@@ -1,6 +1,6 @@
-"""A neural policy in the benchmark's table: a small network in NumPy that evaluates weights from a file.
+"""A neural policy in the benchmark's table: a small network in NumPy, its weights from a file.
 
-`cosim evaluate --controllers naive,sac=examples.outsiders.policy:sac,ppo=examples.outsiders.policy:ppo`
+cosim evaluate --controllers naive,sac=examples.outsiders.policy:sac
 """
 
 import hashlib
@@ -44,13 +44,15 @@ class Weights:
 
 
 class NeuralPolicy:
-    """A multilayer perceptron: layers W, b in order, `tanh` or `relu` between, `tanh` or nothing last."""
+    """A multilayer perceptron: layers W, b; `tanh` or `relu` between, `tanh` or nothing last."""
 
     def __init__(self, scenario, path):
         data = np.load(path, allow_pickle=False)
         self._scenario = scenario
         self._layers = [(data[f"W{i}"], data[f"b{i}"]) for i in range(int(data["layers"]))]
-        self._between = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0.0)}[str(data["between"])]
+        self._between = {"tanh": np.tanh, "relu": lambda x: np.maximum(x, 0.0)}[
+            str(data["between"])
+        ]
         self._last = np.tanh if str(data["last"]) == "tanh" else lambda x: x
         self.parameters = Weights(hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16])
 

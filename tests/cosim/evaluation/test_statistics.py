@@ -57,3 +57,9 @@ def test_a_ratio_to_zero_is_undefined():
 def test_the_bootstrap_repeats_its_bits():
     values = np.random.default_rng(3).normal(size=12)
     assert mean(values) == mean(values)
+
+
+def test_a_value_that_is_not_finite_leaves_no_interval():
+    estimate = mean(np.array([1.0, np.nan, 2.0]))
+    assert np.isnan(estimate.value)
+    assert (estimate.t, estimate.bootstrap) == (None, None)

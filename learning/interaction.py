@@ -79,7 +79,11 @@ class Interaction:
         if policy is None:
             a = self._applied
         else:
-            a = self._strategy(policy.action, self._rng, number, self._perturbed)
+            try:
+                a = self._strategy(policy.action, self._rng, number, self._perturbed)
+            except QpError:  # of the perturbed cost; the policy itself was solved for
+                self.failures += 1
+                a = policy.action
             explored = a is not policy.action
             # The QP keeps bounds to its tolerance, the actuator exactly.
             a = np.minimum(np.maximum(a, self._lower), self._upper)
@@ -184,7 +188,7 @@ class Interaction:
     def _perturbed(self, gradient: Vector) -> Vector:
         """π(s) of the cost with a linear term on the actions added to b_l."""
         controller, theta, point = self._controller, self._controller.theta, self._point
-        assert point is not None and self._policy is not None
+        assert point is not None
         where = controller.parameters.layout.slices["b_l"]
         moved = theta.copy()
         moved[where.stop - gradient.size : where.stop] += gradient
@@ -192,9 +196,6 @@ class Interaction:
             controller.theta = moved
             controller.prepare_at(point)
             return controller.feedback(self.s).action
-        except QpError:
-            self.failures += 1
-            return self._policy.action
         finally:
             controller.theta = theta
             controller.prepare_at(point)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from controllers.errors import QpError
 from cosim.scenario import Scenario
@@ -57,8 +57,14 @@ class QLearningConfiguration(Configuration):
     largest_step: Positive = Field(1.0, description="cap on each scaled entry of a step")
     warm_up: int = Field(200, ge=0, description="samples before the first Gauss–Newton step")
     line_search: bool = Field(
-        False, description="shorten each step until the sample's TD error does not rise"
+        False, description="rules td and fit: shorten a step until its TD error does not rise"
     )
+
+    @model_validator(mode="after")
+    def _line_search_needs_one_sample(self) -> Self:
+        if self.line_search and self.rule == "gauss-newton":
+            raise ValueError("line_search: is for the rules td and fit, which step on one sample")
+        return self
 
 
 class QLearning:

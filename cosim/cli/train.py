@@ -55,6 +55,12 @@ def train(
     checkpoint_every: Annotated[
         int, typer.Option("--checkpoint-every", min=1, help="Samples per checkpoint.")
     ] = 5000,
+    evaluation_seeds: Annotated[
+        int, typer.Option("--evaluation-seeds", min=1, help="Held-out runs per evaluation.")
+    ] = 4,
+    evaluation_steps: Annotated[
+        int, typer.Option("--evaluation-steps", min=1, help="Samples of each of them.")
+    ] = 500,
     explain: Annotated[
         bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")
     ] = False,
@@ -86,6 +92,8 @@ def train(
             log_every=log_every,
             evaluate_every=evaluate_every,
             checkpoint_every=checkpoint_every,
+            evaluation_seeds=evaluation_seeds,
+            evaluation_steps=evaluation_steps,
         )
         folder = open_folder(out)
         begin = time.perf_counter()

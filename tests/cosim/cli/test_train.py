@@ -1,0 +1,82 @@
+import json
+
+import pytest
+
+SHORT = (
+    "train", "-a", "q-learning", "-n", 200, "--log-every", 50, "--evaluate-every", 100,
+    "--checkpoint-every", 100, "--evaluation-seeds", 1, "--evaluation-steps", 30,
+    "--set", "warm_up=20",
+)  # fmt: skip
+
+
+def test_train_writes_theta_log_and_summary(cosim, tmp_path):
+    code, out, _ = cosim(*SHORT, "--out", "run", "--seed", 5, "--json")
+    assert code == 0
+    summary = json.loads(out)
+    assert summary == json.loads((tmp_path / "run/summary.json").read_text())
+    assert {"economic_cost", "mean_violation", "violating_share", "J", "failures"} <= set(summary)
+    assert summary["hyperparameters"]["warm_up"] == 20
+    assert (summary["status"], summary["samples"], summary["seed"]) == ("finished", 200, 5)
+    log = (tmp_path / "run/learning.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in log] == ["samples", "50", "100", "150", "200"]
+
+
+def test_what_was_learned_is_a_controller(cosim):
+    _, out, _ = cosim(*SHORT, "--out", "run", "--json")
+    learned = json.loads(out)["parameters_hash"]
+    code, out, _ = cosim("simulate", "-c", "run/parameters.toml", "-n", 20, "--json")
+    assert code == 0
+    assert json.loads(out)["parameters_hash"] == learned
+
+
+def test_the_same_command_and_seed_give_the_same_bytes(cosim, tmp_path):
+    for folder in ("one", "two"):
+        assert cosim(*SHORT, "--out", folder)[0] == 0
+    for file in ("learning.csv", "parameters.toml"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+
+
+def test_the_gap_closed_is_known_where_the_optimum_is(cosim, tmp_path):
+    code, out, _ = cosim(*SHORT, "--out", "run", "--optimum", "converged", "--json")
+    assert code == 0
+    assert json.loads(out)["gap_closed"] is not None
+
+
+def test_a_recording_is_written(cosim, tmp_path):
+    assert cosim(*SHORT, "--out", "run", "--record")[0] == 0
+    assert (tmp_path / "run/training.rrd").stat().st_size > 10_000
+
+
+def test_explain_lists_every_hyperparameter(cosim):
+    code, out, _ = cosim("train", "-a", "actor-critic", "--explain", "--json")
+    assert code == 0
+    assert json.loads(out)["radius"]["meaning"].startswith("trust region")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-a", "q-lerning"), "did you mean 'q-learning'"),
+        (("-a", "q-learning", "--set", "gian=1"), "did you mean 'gain'"),
+        (("-a", "q-learning", "--set", "gain=2"), "gain"),
+        (("-a", "q-learning", "--resume"), "there is no checkpoint to resume from"),
+        (("-a", "q-learning", "--controller", "mpc"), "no learnable controller 'mpc'"),
+        (("-a", "q-learning", "--evaluate-every", "70"), "multiple of log_every"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(cosim, arguments, message):
+    code, _, err = cosim("train", *arguments, "--out", "run")
+    assert code == 2
+    assert err.startswith("error: ") and len(err.strip().splitlines()) == 1
+    assert message in err
+
+
+def test_divergence_ends_with_exit_code_1_and_says_why(cosim, tmp_path):
+    code, out, _ = cosim(
+        "train", "-a", "q-learning", "-n", 6000, "--log-every", 500, "--evaluate-every", 1000,
+        "--set", "rule=td", "--set", "step_size=1e-3", "--set", "scaled=false", "--out", "run",
+        "--json", "--evaluation-seeds", 1, "--evaluation-steps", 200,
+    )  # fmt: skip
+    assert code == 1
+    assert json.loads(out)["status"].startswith("diverged: ")
+    assert (tmp_path / "run/parameters.toml").exists()

@@ -56,7 +56,7 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
 def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Run an FMU through every independent importer that is installed.
 
-    Exit code 1 if one of them fails. The optional ones: pip install 'rti-cosim[fmi-check]'.
+    Exit code 1 if one of them fails. The optional ones: pip install 'rti-cosim\\[fmi-check]'.
     """
     with output(json) as out_:
         from dataclasses import asdict

@@ -1,7 +1,8 @@
 """What the sweep trains: algorithm, samples and hyperparameters of each case, by name.
 
 The hyperparameters of the cases `*-paper` and `*-extended` are the algorithms' defaults, but for
-the parametrisation; `q-learning-literal` is the paper's rule as it is printed; the cases
+the parametrisation; `q-learning-literal` is the paper's rule as it is printed, and
+`q-learning-line-search` that with the line search that the paper names as an option; the cases
 `*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one;
 `q-learning-rti` and `q-learning-converged` differ in the controller only.
 """
@@ -40,6 +41,7 @@ CASES = {
     "q-learning-paper": Case("q-learning", 40_000, {"parametrisation": "paper"}),
     "q-learning-extended": Case("q-learning", 40_000, {"parametrisation": "extended"}),
     "q-learning-literal": Case("q-learning", 100_000, LITERAL, seeds=5),
+    "q-learning-line-search": Case("q-learning", 20_000, {**LITERAL, "line_search": True}, seeds=5),
     "q-learning-mean-cost": Case("q-learning", 40_000, {"discount": 1.0}),
     "batch-q-learning-mean-cost": Case("batch-q-learning", 30_000, {"discount": 1.0}),
     "q-learning-rti": Case("q-learning", 20_000, seeds=5),

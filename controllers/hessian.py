@@ -132,6 +132,10 @@ class Exact:
         size = self._reference.size
         cost = 2 * self._discounts[:, None, None] * self._B
         raw = cost + call.part("D").reshape(-1, size, size)
+        if not np.isfinite(raw).all():
+            # The controller finds the QP not finite; an eigenvalue solver would raise its own error.
+            self._L[:] = np.nan
+            return np.nan
         values, vectors = np.linalg.eigh(raw)
         floor = np.asarray(self._floor * self._discounts[:, None], dtype=np.float64)
         self.spectrum = Spectrum(values, vectors, floor)

@@ -1,0 +1,334 @@
+import numpy as np
+import pytest
+from sampling import (
+    evaporator_problem,
+    random_action,
+    random_parameters,
+    random_point,
+    random_state,
+)
+
+from controllers import Layout, LinearisationPoint, Parameters, RtiNmpc
+from controllers.errors import ControllerError, ParameterError, QpError
+
+EXTENDED = {"slack_weights": True}
+
+
+@pytest.fixture(scope="module")
+def shared():
+    problem = evaporator_problem()
+    theta = Parameters.naive(problem, Layout.of(problem, **EXTENDED))
+    return {hessian: RtiNmpc(problem, theta, hessian=hessian) for hessian in HESSIANS}
+
+
+HESSIANS = ("gauss-newton", "exact")
+
+
+@pytest.fixture(params=HESSIANS)
+def nmpc(request, shared, problem):
+    controller = shared[request.param]
+    controller.parameters = Parameters.naive(problem, controller.parameters.layout)
+    controller.reset()
+    return controller
+
+
+def bits(solution):
+    return (
+        solution.value,
+        solution.action.tobytes(),
+        solution.value_gradient.tobytes(),
+        b"".join(part.tobytes() for part in solution.multipliers),
+    )
+
+
+def unsettled(nmpc, rng, count=5):
+    """Run a few samples, so that the guess is neither the reference nor converged."""
+    for _ in range(count):
+        nmpc.prepare()
+        solution = nmpc.feedback(random_state(nmpc.problem, rng))
+    return solution
+
+
+# the two phases -------------------------------------------------------------------------------
+
+
+def test_a_new_controller_is_prepared_at_the_reference(nmpc, problem):
+    point = nmpc.linearisation_point
+    np.testing.assert_array_equal(point.x, np.tile(problem.reference_state, (10, 1)))
+    np.testing.assert_array_equal(point.u, np.tile(problem.reference_action, (10, 1)))
+    np.testing.assert_array_equal(point.costates, np.zeros((10, 2)))
+
+
+def test_a_second_preparation_changes_nothing(nmpc, problem, rng):
+    unsettled(nmpc, rng)
+    s = random_state(problem, rng)
+    nmpc.prepare()
+    point, first = nmpc.linearisation_point, nmpc.feedback(s)
+    nmpc.prepare_at(point)
+    nmpc.prepare()
+    nmpc.prepare()
+    assert bits(nmpc.feedback(s)) == bits(first)
+
+
+def test_feedback_without_prepare_prepares(nmpc, problem, rng):
+    s = random_state(problem, rng)
+    first = nmpc.feedback(s)
+    nmpc.reset()
+    nmpc.prepare()
+    assert bits(nmpc.feedback(s)) == bits(first)
+
+
+def test_prepare_shifts_the_last_solution(nmpc, rng):
+    last = unsettled(nmpc, rng)
+    nmpc.prepare()
+    x, u, costates = nmpc.linearisation_point
+    np.testing.assert_array_equal(x, last.predicted_states[1:])
+    np.testing.assert_array_equal(u[:-1], last.predicted_actions[1:])
+    np.testing.assert_array_equal(u[-1], last.predicted_actions[-1])
+    np.testing.assert_allclose(costates[:-1], last.costates[2:] / 0.99, rtol=1e-15)
+
+
+def test_prepare_shifts_the_last_feedback_with_its_action(nmpc, problem, rng):
+    unsettled(nmpc, rng)
+    s, a = random_state(problem, rng), random_action(problem, rng)
+    nmpc.prepare()
+    nmpc.feedback(s)
+    last = nmpc.feedback(s, a)
+    nmpc.prepare()
+    np.testing.assert_array_equal(nmpc.linearisation_point.x, last.predicted_states[1:])
+
+
+def test_two_feedbacks_use_the_same_linearisation(nmpc, problem, rng):
+    unsettled(nmpc, rng)
+    nmpc.prepare()
+    s, point = random_state(problem, rng), nmpc.linearisation_point
+    first = nmpc.feedback(s)
+    nmpc.feedback(random_state(problem, rng), random_action(problem, rng))
+    assert bits(nmpc.feedback(s)) == bits(first)
+    assert nmpc.linearisation_point is point
+
+
+def test_read_outs_leave_the_guess_alone(nmpc, problem, rng):
+    last = unsettled(nmpc, rng)
+    s, a = random_state(problem, rng), random_action(problem, rng)
+    assert nmpc.value(s) <= nmpc.action_value(s, a)
+    assert nmpc.action_value(s, nmpc.policy(s)) == pytest.approx(nmpc.value(s), rel=1e-9)
+    nmpc.prepare()
+    np.testing.assert_array_equal(nmpc.linearisation_point.x, last.predicted_states[1:])
+
+
+def test_repeated_iterations_at_one_state_converge(nmpc, problem):
+    s = np.array([27.0, 52.0])
+    for _ in range(40):
+        solution = nmpc.feedback(s)
+        nmpc.prepare_at(
+            LinearisationPoint(
+                solution.predicted_states[:-1], solution.predicted_actions, solution.costates[1:]
+            )
+        )
+    again = nmpc.feedback(s).predicted_actions
+    np.testing.assert_allclose(again, solution.predicted_actions, rtol=1e-9)
+
+
+def test_an_action_outside_the_bounds_is_enforced_as_it_is(nmpc):
+    assert nmpc.feedback([26.0, 50.0], [90.0, 500.0]).action == pytest.approx([90.0, 500.0])
+
+
+def test_the_policy_keeps_the_bounds(nmpc, problem, rng):
+    theta = nmpc.parameters.replace({"b_l": [0, 0, -600, 900]})
+    nmpc.parameters = theta
+    np.testing.assert_allclose(nmpc.policy([26.0, 50.0]), [400.0, 100.0], rtol=1e-14)
+
+
+# replay and reset -----------------------------------------------------------------------------
+
+
+def test_replay_gives_the_same_bits_whatever_was_solved_before(nmpc, problem, rng):
+    layout = nmpc.parameters.layout
+    theta, other = (random_parameters(problem, layout, rng) for _ in range(2))
+    nmpc.parameters = theta
+    stored = []
+    for number in range(20):
+        nmpc.prepare()
+        s, a = random_state(problem, rng), random_action(problem, rng) if number % 2 else None
+        stored.append((nmpc.linearisation_point, s, a, bits(nmpc.feedback(s, a))))
+    nmpc.parameters = other
+    unsettled(nmpc, rng)
+    nmpc.parameters = theta
+    for k in rng.permutation(20):
+        point, s, a, expected = stored[k]
+        nmpc.prepare_at(point)
+        assert bits(nmpc.feedback(s, a)) == expected
+
+
+def test_replay_in_a_new_controller_gives_the_same_bits(nmpc, problem, rng):
+    unsettled(nmpc, rng)
+    nmpc.prepare()
+    s, point = random_state(problem, rng), nmpc.linearisation_point
+    expected = bits(nmpc.feedback(s))
+    hessian = "exact" if nmpc._hessian.spectrum is not None else "gauss-newton"
+    other = RtiNmpc(problem, nmpc.parameters, hessian=hessian)
+    other.prepare_at(point)
+    assert bits(other.feedback(s)) == expected
+
+
+def test_reset_makes_a_run_repeat_itself(nmpc, problem, rng):
+    states = [random_state(problem, rng) for _ in range(10)]
+
+    def run():
+        nmpc.reset()
+        found = []
+        for s in states:
+            nmpc.prepare()
+            found.append(bits(nmpc.feedback(s)))
+        return found
+
+    assert run() == run()
+
+
+def test_a_point_is_a_copy_of_its_own(nmpc, problem, rng):
+    point = random_point(problem, rng)
+    nmpc.prepare_at(point)
+    kept = nmpc.linearisation_point
+    point.x[:] = 0.0
+    unsettled(nmpc, rng)
+    assert kept.x.any()
+    assert not np.shares_memory(kept.x, nmpc.linearisation_point.x)
+
+
+# θ --------------------------------------------------------------------------------------------
+
+
+def test_setting_theta_acts_on_the_next_feedback_at_the_same_point(nmpc, problem, rng):
+    s, point = random_state(problem, rng), random_point(problem, rng)
+    theta = random_parameters(problem, nmpc.parameters.layout, rng)
+    nmpc.prepare_at(point)
+    before = nmpc.feedback(s).value
+    nmpc.prepare_at(point)
+    nmpc.theta = theta.theta
+    np.testing.assert_array_equal(nmpc.theta, theta.theta)
+    after = nmpc.feedback(s)
+    assert after.value != before
+    nmpc.parameters = theta
+    nmpc.prepare_at(point)
+    assert bits(nmpc.feedback(s)) == bits(after)
+
+
+BAD = {
+    "length": (lambda t: t.theta[:-1], r"shape \(34,\); it must have \(35,\)"),
+    "nan": (lambda t: t.theta * np.nan, "not finite at B_lambda"),
+    "crossed bounds": (lambda t: t.replace({"x_l": [25, 80]}).theta, "must stay below x_u"),
+    "no linear weight": (lambda t: t.replace({"w_sigma": [0, 1]}).theta, "w_sigma = .* positive"),
+    "no quadratic weight": (
+        lambda t: t.replace({"W_sigma": [1, -1]}).theta,
+        "W_sigma = .*positive",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_theta_is_refused_and_the_old_one_stays(case, nmpc):
+    change, message = BAD[case]
+    before = nmpc.feedback([26.0, 50.0]).value
+    nmpc.prepare_at(nmpc.linearisation_point)
+    with pytest.raises(ParameterError, match=message):
+        nmpc.theta = change(nmpc.parameters)
+    assert nmpc.feedback([26.0, 50.0]).value == before
+
+
+def test_another_layout_is_refused(nmpc, problem):
+    with pytest.raises(ParameterError, match="another layout .* build a new controller"):
+        nmpc.parameters = Parameters.naive(problem)
+
+
+# failures -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("s", [[np.nan, 50.0], [25.0, np.inf]])
+def test_a_state_that_is_not_finite_raises_and_the_qp_is_carried(s, nmpc):
+    with pytest.raises(QpError, match="not finite: state") as caught:
+        nmpc.feedback(s)
+    assert caught.value.is_solver_failure
+    assert not np.isfinite(caught.value.qp.f).all()
+
+
+def test_an_action_that_is_not_finite_raises(nmpc):
+    with pytest.raises(QpError, match="not finite") as caught:
+        nmpc.feedback([25.0, 50.0], [np.nan, 200.0])
+    assert np.isnan(caught.value.qp.lower[0])
+
+
+def test_the_next_sample_after_a_failed_one_is_solved(nmpc):
+    expected = bits(nmpc.feedback([26.0, 50.0]))
+    nmpc.reset()
+    with pytest.raises(QpError):
+        nmpc.feedback([np.nan, 50.0])
+    assert bits(nmpc.feedback([26.0, 50.0])) == expected
+
+
+@pytest.mark.parametrize(
+    ("s", "a"), [([25.0], None), (25.0, None), ([25.0, 50.0], [1.0, 2.0, 3.0])]
+)
+def test_a_wrong_shape_is_refused(s, a, nmpc):
+    with pytest.raises(ControllerError, match="must have 2 entries"):
+        nmpc.feedback(s, a)
+
+
+def test_a_cost_that_is_not_convex_raises_and_the_qp_is_carried(shared, problem):
+    nmpc = shared["gauss-newton"]
+    nmpc.parameters = nmpc.parameters.replace({"B_l": -np.eye(4)})
+    with pytest.raises(QpError, match="not convex") as caught:
+        nmpc.feedback([26.0, 50.0])
+    assert np.linalg.eigvalsh(caught.value.qp.H)[0] < 0
+
+
+def test_the_exact_hessian_makes_such_a_cost_convex(shared):
+    nmpc = shared["exact"]
+    nmpc.parameters = nmpc.parameters.replace({"B_l": -np.eye(4)})
+    assert nmpc.feedback([26.0, 50.0]).residual < 1e-8
+
+
+@pytest.mark.parametrize("name", ["x", "u", "costates"])
+def test_a_point_that_does_not_fit_is_refused_and_changes_nothing(name, nmpc, problem, rng):
+    nmpc.prepare_at(random_point(problem, rng))
+    expected = bits(nmpc.feedback([26.0, 50.0]))
+    for bad in (np.zeros((3, 2)), np.full((10, 2), np.nan)):
+        with pytest.raises(ControllerError, match=f"linearisation point: {name} must be finite"):
+            nmpc.prepare_at(random_point(problem, rng)._replace(**{name: bad}))
+        assert bits(nmpc.feedback([26.0, 50.0])) == expected
+
+
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
+def test_a_model_that_blows_up_raises_and_the_qp_is_carried(nmpc, problem, rng):
+    point = random_point(problem, rng)
+    point.x[:] = 1e200
+    point.u[:] = 1e200
+    with pytest.raises(QpError, match="no finite value or derivative") as caught:
+        nmpc.prepare_at(point)
+    assert caught.value.qp is not None
+    nmpc.reset()
+    assert nmpc.feedback([26.0, 50.0]).residual < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [({"hessian": "bfgs"}, "no Hessian 'bfgs'"), ({"backend": "osqp"}, "no QP backend 'osqp'")],
+)
+def test_an_unknown_option_is_refused(option, message, problem):
+    with pytest.raises(ControllerError, match=message):
+        RtiNmpc(problem, Parameters.naive(problem), **option)
+
+
+# other problems -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+@pytest.mark.parametrize("backend", ["daqp", "proxqp", "qpsolvers:clarabel"])
+def test_short_horizons_are_problems_too(horizon, backend):
+    problem = evaporator_problem(horizon=horizon, discount=1.0)
+    nmpc = RtiNmpc(problem, Parameters.naive(problem), backend=backend)
+    solution = nmpc.feedback([26.0, 50.0])
+    assert solution.predicted_states.shape == (horizon + 1, 2)
+    assert solution.residual < 1e-8
+    nmpc.prepare()
+    assert nmpc.feedback([26.0, 50.0], [190.0, 210.0]).value >= nmpc.value([26.0, 50.0])

@@ -1,0 +1,318 @@
+"""Bad values for every field of every schema and for every option of every command.
+
+The fields come from the pydantic models and the options from Typer, so a new one is tested at once.
+"""
+
+import copy
+import json
+import sys
+import types
+import typing
+
+import pytest
+import typer
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from cosim import Scenario
+from cosim.cli import main
+from cosim.cli.main import app
+from cosim.errors import ScenarioError
+from learning.errors import ConfigurationError
+from learning.registry import algorithms, load_algorithm
+
+PAPER = Scenario.load("paper").to_dict()
+OPTIONS = settings(
+    max_examples=150,
+    deadline=None,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+
+numbers = st.one_of(st.integers(-(2**70), 2**70), st.floats(), st.booleans())
+values = st.recursive(
+    st.one_of(numbers, st.text(max_size=8), st.none()),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=5), st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+
+
+def table_of(annotation):
+    """The pydantic model in an annotation, if there is one."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return next(filter(None, map(table_of, typing.get_args(annotation))), None)
+    return None
+
+
+def fields(model, prefix=()):
+    """Path of every field, tables included, as in the TOML document."""
+    for name, info in model.model_fields.items():
+        path = (*prefix, info.alias or name)
+        yield path
+        if inner := table_of(info.annotation):
+            yield from fields(inner, path)
+
+
+FIELDS = sorted(set(fields(Scenario)))
+TABLES = [path for path in FIELDS if path in {longer[:-1] for longer in FIELDS}]
+
+
+def changed(path, value):
+    document = copy.deepcopy(PAPER)
+    table = document
+    for name in path[:-1]:
+        table = table.setdefault(name, {})
+    table[path[-1]] = value
+    return document
+
+
+def at(document, path):
+    for name in path:
+        document = document[name]
+    return document
+
+
+def same(given_value, kept):
+    """Whether a value was kept as given; whole numbers may stand for floats, lists for tuples."""
+    if isinstance(given_value, list):
+        return len(given_value) == len(kept) and all(map(same, given_value, kept))
+    if isinstance(given_value, dict):
+        return all(same(item, kept[key]) for key, item in given_value.items())
+    return given_value == kept and isinstance(given_value, bool) == isinstance(kept, bool)
+
+
+def one_line(error, origin):
+    message = str(error)
+    assert message.startswith(origin), message
+    assert "\n" not in message
+    assert "Traceback" not in message
+
+
+def test_the_schema_is_seen():
+    assert ("plant", "mapping", "law_codes") in FIELDS
+    assert len(FIELDS) > 45
+
+
+@OPTIONS
+@given(st.sampled_from(FIELDS), values)
+def test_any_value_of_any_field_is_kept_or_refused_by_name(path, value):
+    try:
+        scenario = Scenario.from_dict(changed(path, value), "the file")
+    except ScenarioError as error:
+        one_line(error, "the file: ")
+    else:
+        if value is not None:
+            assert same(value, at(scenario.to_dict(), path))
+
+
+@pytest.mark.parametrize("path", [p for p in FIELDS if len(p) < 3], ids=".".join)
+def test_a_field_left_out_is_named_or_its_default_is_written_out(path):
+    document = copy.deepcopy(PAPER)
+    table = at(document, path[:-1])
+    table.pop(path[-1], None)
+    try:
+        scenario = Scenario.from_dict(document, "the file")
+    except ScenarioError as error:
+        one_line(error, "the file: ")
+        assert path[-1] in str(error) or path[0] in str(error)
+    else:
+        written = at(scenario.to_dict(), path[:-1])
+        # None means absent; every other default is there for a reader to see.
+        optional = {"model", "sampling_time", "stochastic", "law"}
+        assert path[-1] in written or path[-1] in optional
+
+
+@pytest.mark.parametrize("table", [(), *TABLES], ids=lambda p: ".".join(p) or "document")
+def test_an_unknown_field_is_refused_everywhere(table):
+    if table[-1:] in (("parameters",), ("law_codes",)):
+        pytest.skip("a table of names that the FMU chooses")
+    with pytest.raises(ScenarioError, match=r"surprise.*unknown field"):
+        Scenario.from_dict(changed((*table, "surprise"), 1), "the file")
+
+
+@pytest.mark.parametrize("name", algorithms())
+def test_any_value_of_any_hyperparameter_is_kept_or_refused(name):
+    configuration = load_algorithm(name).Configuration
+
+    @settings(OPTIONS, max_examples=100)
+    @given(st.sampled_from(sorted(configuration.model_fields)), values)
+    def attack(field, value):
+        try:
+            kept = getattr(configuration.from_dict({field: value}), field)
+        except ConfigurationError as error:
+            one_line(error, "hyperparameters: ")
+            assert field in str(error)
+        else:
+            assert kept is not None or value is None
+
+    attack()
+
+
+@OPTIONS
+@given(st.sampled_from(algorithms()), st.text(max_size=30))
+def test_any_assignment_is_taken_or_refused(name, text):
+    try:
+        load_algorithm(name).Configuration.from_assignments([text])
+    except ConfigurationError as error:
+        assert str(error).strip()
+
+
+# The command line ------------------------------------------------------------------------------
+
+BAD = {
+    int: ["x", "1.5", "", "1e3", "nan", "-1", "1" * 30],
+    float: ["x", "", "1,5", "nan", "inf", "-1"],
+}
+
+
+def commands(command=None, words=()):
+    """Every command of the application with the words that call it."""
+    command = command or typer.main.get_command(app)
+    inner = getattr(command, "commands", None)
+    if inner is None:
+        yield words, command
+        return
+    for name, each in inner.items():
+        yield from commands(each, (*words, name))
+
+
+def numeric_options():
+    for words, command in commands():
+        needed = ["a" for p in command.params if p.required and p.param_type_name == "argument"] + [
+            word
+            for p in command.params
+            if p.required and p.param_type_name == "option"
+            for word in (p.opts[0], "q-learning")
+        ]
+        for parameter in command.params:
+            for bad in BAD.get(parameter.type_descriptor.annotation, ()):
+                if parameter.param_type_name != "option":
+                    continue
+                is_seed = bad.isdigit() and parameter.opts[0] in ("--seed", "--first-seed")
+                # These two are numbers to a parser; what they mean is tested with a file.
+                odd = bad in ("nan", "inf") and parameter.opts[0] in ("--relative", "--at")
+                if is_seed or odd or (bad == "-1" and parameter.min is None):
+                    continue
+                yield [*words, *needed, parameter.opts[0], bad]
+
+
+def run(monkeypatch, capfd, words):
+    monkeypatch.setattr(sys, "argv", ["cosim", *words])
+    with pytest.raises(SystemExit) as end:
+        main()
+    out, err = capfd.readouterr()
+    return end.value.code or 0, out, err
+
+
+def test_there_are_options_to_attack():
+    assert len(list(numeric_options())) > 80
+
+
+def test_a_bad_number_is_refused_by_every_option(monkeypatch, capfd, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for words in numeric_options():
+        code, out, err = run(monkeypatch, capfd, words)
+        assert code == 2, words
+        assert words[-2] in err, words
+        assert "Traceback" not in err
+        assert not out
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "compare trajectory.csv trajectory.csv --relative nan",
+        "compare trajectory.csv trajectory.csv --tolerance X2=nan",
+        "compare trajectory.csv trajectory.csv --tolerance X2=-1",
+        "compare trajectory.csv trajectory.csv --tolerance X3=1",
+        "view run.rrd --png run.png --at nan",
+        "view run.rrd --png run.png --at inf",
+    ],
+)
+def test_a_number_without_meaning_is_refused(monkeypatch, capfd, tmp_path, files, line):
+    monkeypatch.chdir(tmp_path)
+    for reader in files.values():
+        if "/" not in reader.file:
+            (tmp_path / reader.file).write_bytes(reader.good)
+    code, _, err = run(monkeypatch, capfd, line.split())
+    assert code == 2, err
+    assert "error" in err.lower()
+    assert "Traceback" not in err
+
+
+WRONG = [
+    "simulate --scenario nowhere",
+    "simulate --scenario missing.toml",
+    "simulate --controller nobody",
+    "simulate --controller missing.toml",
+    "simulate --controller no.module:factory",
+    "simulate --controller controllers.errors:QpError",
+    "simulate --out blocked/inside --steps 3",
+    "evaluate --controllers ,",
+    "evaluate --controllers naive,naive --steps 3",
+    "evaluate --scheduler nonsense --steps 3 --seeds 1",
+    "train --algorithm nothing",
+    "train --algorithm a:b",
+    "train --algorithm q-learning --resume",
+    "train --algorithm q-learning --controller pid",
+    "train --algorithm q-learning --set nothing",
+    "train --algorithm q-learning --set step_size=zero",
+    "train --algorithm q-learning --samples 100 --log-every 100 --evaluate-every 150",
+    "view missing.rrd --json",
+    "view blocked --json",
+    "compare missing missing",
+    "compare blocked blocked",
+    "scenario missing.toml",
+    "scenario blocked",
+    "fmu info missing.fmu",
+    "fmu info blocked",
+    "fmu check missing.fmu",
+    "fmu build",
+    "benchmark plant --fmu missing.fmu",
+    "results check nothing",
+    "results check --results nowhere",
+    "results update --results nowhere",
+]
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_a_wrong_name_is_one_line_and_exit_code_2(monkeypatch, capfd, tmp_path, line):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "blocked").write_text("this is no folder, and no file of any known kind\n")
+    code, out, err = run(monkeypatch, capfd, line.split())
+    assert code == 2, err
+    assert "Traceback" not in err
+    last = [text for text in err.splitlines() if text.strip()]
+    assert last[-1].startswith("error: ")
+    assert not out.strip()
+
+
+@pytest.mark.parametrize("line", ["scenario", "fmu info", "train -a q-learning --explain"])
+def test_json_is_all_that_comes_out(monkeypatch, capfd, line):
+    code, out, _ = run(monkeypatch, capfd, [*line.split(), "--json"])
+    assert code == 0
+    assert json.loads(out)
+
+
+def test_without_a_compiler_the_build_says_so(monkeypatch, capfd, tmp_path):
+    monkeypatch.setenv("CC", "no-such-compiler")
+    code, _, err = run(monkeypatch, capfd, ["fmu", "build", "--out", str(tmp_path)])
+    assert code == 2
+    assert "no-such-compiler" in err
+    assert "CC" in err
+
+
+def test_without_a_display_the_viewer_says_so(monkeypatch, capfd, files, tmp_path):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    path = tmp_path / "run.rrd"
+    path.write_bytes(files["recording"].good)
+    code, _, err = run(monkeypatch, capfd, ["view", str(path)])
+    assert code == 2
+    assert "--png" in err

@@ -151,7 +151,7 @@ def _read_document(path: Path) -> dict[str, Any]:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ParameterError(f"{path}: there is no such parameters file") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise ParameterError(f"{path}: not a readable TOML file ({error})") from error
     if document.get("schema") != SCHEMA:
         raise ParameterError(

@@ -114,6 +114,8 @@ def compare(
     ------
     ComparisonError : a tolerance for a signal that neither run has, or a negative one.
     """
+    if not relative >= 0:
+        raise ComparisonError(f"relative (--relative) must not be negative, not {relative}")
     tolerances = tolerances or {}
     known = {**a.signals, **b.signals}
     for name, value in tolerances.items():

@@ -232,7 +232,8 @@ def _read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any
         )
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    # A document nested without end exhausts the parser's stack.
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
     if folder is not None:
         _anchor_fmu(document, folder)

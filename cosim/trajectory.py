@@ -196,7 +196,7 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
             rows = list(csv.reader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise TrajectoryError(f"trajectory '{path}' cannot be read: {error}") from None
-    if len(rows) < 2 or rows[0][-1] != STATUS:
+    if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
     header, body = rows[0], rows[1:]
     values = np.empty((len(body), len(header) - 1))

@@ -23,7 +23,9 @@ def plant(
     fmu: Annotated[
         str | None, typer.Option("--fmu", help="FMU in place of the scenario's, name or path.")
     ] = None,
-    steps: Annotated[int, typer.Option("--steps", min=100, help="Steps per repetition.")] = 5000,
+    steps: Annotated[
+        int, typer.Option("--steps", min=100, max=100_000_000, help="Steps per repetition.")
+    ] = 5000,
     json: JsonOption = False,
 ) -> None:
     """Time per plant step against fmpy's convenience methods and simulate_fmu.
@@ -49,9 +51,15 @@ def evaluation(
     controllers: Annotated[
         str, typer.Option("--controllers", "-c", help="Comma-separated, as for evaluate.")
     ] = "naive",
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of seeds.")] = 100,
-    steps: Annotated[int, typer.Option("--steps", "-n", min=1, help="Samples per run.")] = 2000,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=2, help="Workers to compare.")] = 2,
+    seeds: Annotated[
+        int, typer.Option("--seeds", min=1, max=1_000_000, help="Number of seeds.")
+    ] = 100,
+    steps: Annotated[
+        int, typer.Option("--steps", "-n", min=1, max=100_000_000, help="Samples per run.")
+    ] = 2000,
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", min=2, max=1024, help="Workers to compare.")
+    ] = 2,
     json: JsonOption = False,
 ) -> None:
     """Time of an evaluation by several workers against one, starting them included."""
@@ -84,7 +92,8 @@ def evaluation(
 def learning(
     scenario: ScenarioOption = "paper",
     samples: Annotated[
-        int, typer.Option("--samples", "-n", min=100, help="Samples per repetition.")
+        int,
+        typer.Option("--samples", "-n", min=100, max=100_000_000, help="Samples per repetition."),
     ] = 2000,
     json: JsonOption = False,
 ) -> None:

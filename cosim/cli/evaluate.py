@@ -24,14 +24,17 @@ def evaluate(
         ),
     ] = "naive",
     scenario: ScenarioOption = "paper",
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of seeds.")] = 10,
+    seeds: Annotated[
+        int, typer.Option("--seeds", min=1, max=1_000_000, help="Number of seeds.")
+    ] = 10,
     first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
     steps: StepsOption = 1000,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
         "cosim-evaluation"
     ),
     jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; default: one per core.")
+        int | None,
+        typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
     ] = None,
     scheduler: Annotated[
         str | None,

@@ -96,6 +96,8 @@ def main() -> None:
     except OSError as error:
         name = f"'{error.filename}': " if error.filename else ""
         _fail(f"{name}{error.strerror or error}")
+    except MemoryError as error:
+        _fail(f"not enough memory ({error}); ask for fewer samples")
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)

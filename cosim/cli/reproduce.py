@@ -36,7 +36,8 @@ def reproduce(
         "cosim-reproduction"
     ),
     jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; default: one per core.")
+        int | None,
+        typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
     ] = None,
     json: JsonOption = False,
 ) -> None:

@@ -14,7 +14,9 @@ ScenarioOption = Annotated[
     str,
     typer.Option("--scenario", "-s", help="Preset (paper, nominal, fast-sampling) or TOML file."),
 ]
-StepsOption = Annotated[int, typer.Option("--steps", "-n", min=1, help="Number of samples.")]
+StepsOption = Annotated[
+    int, typer.Option("--steps", "-n", min=1, max=100_000_000, help="Number of samples.")
+]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the disturbances.")]
 
 

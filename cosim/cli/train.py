@@ -27,7 +27,9 @@ AlgorithmOption = Annotated[
 def train(
     algorithm: AlgorithmOption,
     scenario: ScenarioOption = "paper",
-    samples: Annotated[int, typer.Option("--samples", "-n", min=1, help="Plant samples.")] = 50_000,
+    samples: Annotated[
+        int, typer.Option("--samples", "-n", min=1, max=100_000_000, help="Plant samples.")
+    ] = 50_000,
     seed: Annotated[
         int, typer.Option("--seed", min=0, max=999_999, help="Seed of noise and exploration.")
     ] = 0,
@@ -48,18 +50,28 @@ def train(
         str | None,
         typer.Option("--optimum", help="Controller whose J is J* of the gap closed: optimal."),
     ] = None,
-    log_every: Annotated[int, typer.Option("--log-every", min=1, help="Samples per row.")] = 1000,
+    log_every: Annotated[
+        int, typer.Option("--log-every", min=1, max=100_000_000, help="Samples per row.")
+    ] = 1000,
     evaluate_every: Annotated[
-        int, typer.Option("--evaluate-every", min=1, help="Samples per greedy evaluation.")
+        int,
+        typer.Option(
+            "--evaluate-every", min=1, max=100_000_000, help="Samples per greedy evaluation."
+        ),
     ] = 5000,
     checkpoint_every: Annotated[
-        int, typer.Option("--checkpoint-every", min=1, help="Samples per checkpoint.")
+        int,
+        typer.Option("--checkpoint-every", min=1, max=100_000_000, help="Samples per checkpoint."),
     ] = 5000,
     evaluation_seeds: Annotated[
-        int, typer.Option("--evaluation-seeds", min=1, help="Held-out runs per evaluation.")
+        int,
+        typer.Option(
+            "--evaluation-seeds", min=1, max=1_000_000, help="Held-out runs per evaluation."
+        ),
     ] = 4,
     evaluation_steps: Annotated[
-        int, typer.Option("--evaluation-steps", min=1, help="Samples of each of them.")
+        int,
+        typer.Option("--evaluation-steps", min=1, max=100_000_000, help="Samples of each of them."),
     ] = 500,
     explain: Annotated[
         bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")

@@ -65,7 +65,11 @@ def _locate(fmu: str | Path) -> Path:
         raise PlantError(
             f"unknown FMU '{fmu}'; shipped are {', '.join(SHIPPED)}, or give the path of an .fmu"
         )
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except OSError as error:
+        raise PlantError(f"FMU '{path}' cannot be read: {error.strerror}") from None
+    if not found:
         raise PlantError(f"FMU '{path}' does not exist or is not a file")
     return path
 

@@ -103,9 +103,9 @@ def summarise(path: str | Path) -> dict[str, Any]:
 
 
 def _chunks(path: Path) -> list[Chunk]:
-    if not path.is_file():
-        raise RecordingError(f"there is no recording {path}")
     try:
+        if not path.is_file():
+            raise RecordingError(f"there is no recording {path}")
         with warnings.catch_warnings():
             # A file without its end is reported below, once.
             warnings.simplefilter("ignore", RerunWarning)

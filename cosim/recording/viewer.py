@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import isfinite
 from pathlib import Path
 
 from rerun.experimental import ViewerClient
@@ -54,6 +55,8 @@ def render(
     ------
     RecordingError : no such file, no graphics driver, a view that failed, or `timeout` s passed.
     """
+    if at is not None and not isfinite(at):
+        raise RecordingError(f"the time of the cursor (--at) must be finite, not {at}")
     path = _existing(path)
     deadline = time.monotonic() + timeout
     with _headless(size, deadline) as client:

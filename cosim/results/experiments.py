@@ -94,7 +94,7 @@ def _validated(path: Path, model: type[Any]) -> Any:
         raise ResultsError(
             f"'{path}' does not exist; name the folder of the results with --results"
         ) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise ResultsError(f"'{path}' cannot be read: {error}") from None
     except ValidationError as error:
         raise ResultsError(f"'{path}': {describe(error, model)}") from None

@@ -10,6 +10,7 @@ from typing import cast
 
 from controllers.converged import ConvergedNmpc
 from controllers.dynamic_programming.plant import StochasticScenario
+from controllers.economic import tune
 from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem, ScenarioLike
@@ -27,13 +28,16 @@ def rti(scenario: ScenarioLike, parameters: Parameters) -> RtiNmpc:
     )
 
 
+def value_offset(scenario: ScenarioLike, problem: Problem) -> float:
+    """c_λ at the start, as the scenario says: ℓ_s or ℓ_s/(1−γ)."""
+    if scenario.controller.value_offset == "discounted" and problem.discount < 1:
+        return problem.reference_cost / (1 - problem.discount)
+    return problem.reference_cost
+
+
 def naive_parameters(scenario: ScenarioLike, problem: Problem) -> Parameters:
     """The paper's naive θ, with c_λ as the scenario says."""
-    if scenario.controller.value_offset == "discounted" and problem.discount < 1:
-        return Parameters.naive(
-            problem, value_offset=problem.reference_cost / (1 - problem.discount)
-        )
-    return Parameters.naive(problem)
+    return Parameters.naive(problem, value_offset=value_offset(scenario, problem))
 
 
 def naive(scenario: ScenarioLike) -> RtiNmpc:
@@ -44,6 +48,12 @@ def naive(scenario: ScenarioLike) -> RtiNmpc:
 def from_file(scenario: ScenarioLike, path: str | Path) -> RtiNmpc:
     """RTI-NMPC with θ from a parameters file."""
     return rti(scenario, Parameters.load(path, Problem.from_scenario(scenario)))
+
+
+def tuned(scenario: ScenarioLike) -> RtiNmpc:
+    """RTI-NMPC with the cost tuned by economics: baseline (b)."""
+    problem = Problem.from_scenario(scenario)
+    return rti(scenario, tune(problem, value_offset=value_offset(scenario, problem)).parameters)
 
 
 def converged(scenario: ScenarioLike) -> ConvergedNmpc:

@@ -1,0 +1,116 @@
+"""Baseline (b): the NMPC cost tuned by economics, after Zanon, Gros and Diehl (2016)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.convexification import Convexification, convexify
+from controllers.layout import Layout
+from controllers.local_feedback import LocalFeedback, local_feedback
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.steady_state import SteadyState, optimal_steady_state
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EconomicTuning:
+    """Tuned θ with its certificate.
+
+    `economic` is the local optimum of the economic cost itself (γ = 1, active constraints kept),
+    `tuned` that of the convexified one; `stage_hessian` (n+m, n+m) is the tuned ℓ_θ's and
+    `terminal_hessian` (n, n) that of V^f_θ.
+    """
+
+    parameters: Parameters
+    steady_state: SteadyState
+    convexification: Convexification
+    economic: LocalFeedback
+    tuned: LocalFeedback
+    stage_hessian: Array
+    terminal_hessian: Array
+
+    @property
+    def gain_error(self) -> float:
+        """Largest difference between the tuned local feedback gain and the economic one."""
+        return float(np.abs(self.tuned.gain - self.economic.gain).max())
+
+    def __str__(self) -> str:
+        """The certificate in six lines."""
+        steady, convex = self.steady_state, self.convexification
+        active = ", ".join(
+            f"{name} (multiplier {multiplier:.4g})"
+            for name, multiplier in zip(steady.active, steady.C @ steady.multipliers, strict=True)
+        )
+        return "\n".join(
+            [
+                f"optimal steady state  x = {steady.x}, u = {steady.u}, cost {steady.cost:.6g}",
+                f"strictly active       {active or 'none'}",
+                f"economic Hessian      eigenvalues {np.linalg.eigvalsh(steady.hessian)}",
+                f"convexified Hessian   eigenvalues {convex.eigenvalues}, α = {convex.alpha:.4g}, "
+                f"β = {convex.beta:.4g}, F = {convex.F.tolist()}",
+                f"economic gain         {self.economic.gain.tolist()}",
+                f"tuned gain differs by {self.gain_error:.2g}",
+            ]
+        )
+
+
+def tune(
+    problem: Problem,
+    layout: Layout | None = None,
+    *,
+    value_offset: float | None = None,
+    weight: float = 1e-2,
+) -> EconomicTuning:
+    """Tune the NMPC so that its local feedback is that of the economic optimum.
+
+    The economic cost is rotated by the costate λ of the optimal steady state, which leaves its
+    gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = `weight`).
+    Then ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B], V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx with P
+    the value of H̃ under γ = 1: the term in 1−γ makes P and its feedback those of the
+    discounted problem as well, for any γ and horizon. λ_θ undoes both rotations, so that V_θ is
+    to second order the economic value. `value_offset` is c_λ where it shall not be ℓ_s. Raises
+    TuningError where steady state, local optimum or convexification do not exist.
+    """
+    steady = optimal_steady_state(problem)
+    n, A, B = problem.n_states, steady.A, steady.B
+    economic = local_feedback(A, B, steady.hessian, steady.C)
+    convex = convexify(A, B, steady.hessian, steady.C, weight)
+    tuned = local_feedback(A, B, convex.hessian, steady.C)
+    P, dynamics = tuned.value, np.hstack([A, B])
+    M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
+    q, C_x = steady.gradient, steady.C[:, :n]
+    # θ's quadratics are about the reference, the tuning's about the optimal steady state.
+    shift = np.concatenate(
+        [problem.reference_state - steady.x, problem.reference_action - steady.u]
+    )
+    initial = convex.delta_P - C_x.T @ convex.F @ C_x
+    parameters = Parameters.naive(problem, layout, value_offset=value_offset).replace(
+        {
+            "B_l": _symmetric(0.5 * M),
+            "b_l": q + M @ shift,
+            "B_Vf": _symmetric(0.5 * P),
+            "b_Vf": q[:n] + P @ shift[:n],
+            "B_lambda": _symmetric(0.5 * initial),
+            "b_lambda": steady.costate + initial @ shift[:n],
+        }
+    )
+    return EconomicTuning(
+        parameters=parameters,
+        steady_state=steady,
+        convexification=convex,
+        economic=economic,
+        tuned=tuned,
+        stage_hessian=M,
+        terminal_hessian=P,
+    )
+
+
+def _symmetric(matrix: Array) -> Array:
+    """Rounding made symmetric, as θ's packing demands."""
+    symmetric: Array = 0.5 * (matrix + matrix.T)
+    return symmetric

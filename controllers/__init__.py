@@ -4,6 +4,7 @@ from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
 from controllers.layout import Layout
 from controllers.model import Model, Quantity
+from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
@@ -15,6 +16,7 @@ __all__ = [
     "Layout",
     "LinearisationPoint",
     "Model",
+    "OptimalPolicy",
     "Parameters",
     "Problem",
     "QpError",

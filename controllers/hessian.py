@@ -133,7 +133,7 @@ class Exact:
         cost = 2 * self._discounts[:, None, None] * self._B
         raw = cost + call.part("D").reshape(-1, size, size)
         if not np.isfinite(raw).all():
-            # The controller finds the QP not finite; an eigenvalue solver would raise its own error.
+            # The controller refuses the QP; an eigenvalue solver would raise its own error.
             self._L[:] = np.nan
             return np.nan
         values, vectors = np.linalg.eigh(raw)

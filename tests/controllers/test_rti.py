@@ -237,7 +237,7 @@ def test_a_bad_theta_is_refused_and_the_old_one_stays(case, nmpc):
 
 
 def test_another_layout_is_refused(nmpc, problem):
-    with pytest.raises(ParameterError, match="another layout .* build a new controller"):
+    with pytest.raises(ParameterError, match=r"another layout .* build a new controller"):
         nmpc.parameters = Parameters.naive(problem)
 
 
@@ -298,6 +298,7 @@ def test_a_point_that_does_not_fit_is_refused_and_changes_nothing(name, nmpc, pr
         assert bits(nmpc.feedback([26.0, 50.0])) == expected
 
 
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
 def test_a_model_that_blows_up_raises_and_the_qp_is_carried(nmpc, problem, rng):
     point = random_point(problem, rng)

@@ -1,0 +1,181 @@
+"""The converged NMPC against IPOPT and against finite differences of the converged programme."""
+
+import numpy as np
+import pytest
+from differences import assert_close, natural_scale
+from sampling import evaporator_problem, random_action, random_parameters, random_state
+
+from controllers import ConvergedNmpc, Layout, LinearisationPoint, Parameters, RtiNmpc
+from controllers.errors import QpError
+from controllers.nlp import IpoptNmpc
+
+WHOLE = {"all": slice(None)}
+STEP = 1e-3
+
+
+@pytest.fixture(scope="module")
+def layout():
+    return Layout.of(evaporator_problem(), slack_weights=True)
+
+
+@pytest.fixture(scope="module")
+def converged(layout):
+    problem = evaporator_problem()
+    return ConvergedNmpc(problem, Parameters.naive(problem, layout), tolerance=1e-10)
+
+
+@pytest.fixture(scope="module")
+def physical():
+    problem = evaporator_problem()
+    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
+    return ConvergedNmpc(problem, Parameters.naive(problem, layout), tolerance=1e-10)
+
+
+@pytest.fixture(scope="module")
+def ipopt(layout):
+    return IpoptNmpc(evaporator_problem(), layout)
+
+
+@pytest.fixture(scope="module")
+def rtis(layout):
+    problem = evaporator_problem()
+    theta = Parameters.naive(problem, layout)
+    return {name: RtiNmpc(problem, theta, hessian=name) for name in ("gauss-newton", "exact")}
+
+
+def sample(problem, layout, number):
+    """The naive θ with the true penalty first, then random ones; every other with an action."""
+    rng = np.random.default_rng(number)
+    theta = random_parameters(problem, layout, rng)
+    theta = theta if number > 3 else Parameters.naive(problem, layout)
+    a = random_action(problem, rng) if number % 2 else None
+    return theta, random_state(problem, rng), a
+
+
+def solved(converged, theta, s, a=None):
+    converged.parameters = theta
+    converged.reset()
+    return converged.feedback(s, a)
+
+
+@pytest.mark.parametrize("number", range(24))
+def test_it_equals_ipopt(number, converged, ipopt, problem, layout):
+    theta, s, a = sample(problem, layout, number)
+    ours, theirs = solved(converged, theta, s, a), ipopt.solve(theta, s, a)
+    assert theirs.success
+    assert ours.value == pytest.approx(theirs.value, rel=1e-6)
+    np.testing.assert_allclose(ours.predicted_states, theirs.states, rtol=1e-6)
+    np.testing.assert_allclose(ours.predicted_actions, theirs.controls, rtol=1e-6)
+    np.testing.assert_allclose(ours.action, theirs.action, rtol=1e-6)
+
+
+@pytest.mark.parametrize("number", range(0, 24, 4))
+def test_a_warm_start_leads_to_the_same_solution(number, converged, problem, layout):
+    theta, s, a = sample(problem, layout, number)
+    cold = solved(converged, theta, s, a)
+    converged.prepare()
+    warm = converged.feedback(s, a)
+    assert warm.value == pytest.approx(cold.value, rel=1e-9)
+    np.testing.assert_allclose(warm.predicted_actions, cold.predicted_actions, rtol=1e-7)
+
+
+def differences(read, at, scale):
+    """Romberg's extrapolation of central differences, as (…, size)."""
+    columns = []
+    for i in range(at.size):
+
+        def slope(h, i=i):
+            step = np.zeros(at.size)
+            step[i] = h * scale[i]
+            return (read(at + step) - read(at - step)) / (2 * h * scale[i])
+
+        columns.append((4 * slope(STEP / 2) - slope(STEP)) / 3)
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("number", [4, 5, 8, 11])
+def test_its_derivatives_are_those_of_the_programme(number, converged, problem, layout):
+    check_derivatives(number, converged, problem, layout)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(4, 24))
+def test_so_are_those_by_model_parameters(number, physical, problem):
+    check_derivatives(number, physical, problem, physical.parameters.layout)
+
+
+def check_derivatives(number, converged, problem, layout):
+    theta, s, a = sample(problem, layout, number)
+    base = solved(converged, theta, s, a)
+    assert not base.weakly_active
+
+    def at(x=None, state=None):
+        changed = theta if x is None else theta.with_theta(x)
+        found = solved(converged, changed, s if state is None else state, a)
+        return np.concatenate([[found.value], found.action])
+
+    scale, noise = natural_scale(theta) / 10, 1e-9 * abs(base.value)
+    fd = differences(lambda x: at(x=x), theta.theta, scale)
+    noise_of = 1e-13 * abs(base.value) / (STEP * scale)
+    assert_close(base.value_gradient, fd[0], layout.slices, "dV/dθ", noise_of)
+    by_state = differences(lambda x: at(state=x), s, np.ones(2))
+    assert_close(base.value_state_gradient, by_state[0], WHOLE, "dV/ds", noise)
+    if a is None:
+        # The programme is solved to 1e-10 in an action, which a difference of step h divides by h.
+        assert_close(base.policy_jacobian, fd[1:], layout.slices, "dπ/dθ", 1e-10 / (STEP * scale))
+        assert_close(base.policy_state_jacobian, by_state[1:], WHOLE, "dπ/ds", 1e-10 / STEP)
+
+
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+@pytest.mark.parametrize("number", [4, 5, 6, 7])
+def test_value_gradients_are_those_of_the_rti_in_the_limit(
+    hessian, number, converged, rtis, problem, layout
+):
+    theta, s, a = sample(problem, layout, number)
+    expected = solved(converged, theta, s, a)
+    rti = rtis[hessian]
+    rti.parameters = theta
+    rti.reset()
+    solution = rti.feedback(s, a)
+    for _ in range(60):
+        rti.prepare_at(
+            LinearisationPoint(
+                solution.predicted_states[:-1], solution.predicted_actions, solution.costates[1:]
+            )
+        )
+        solution = rti.feedback(s, a)
+    assert solution.value == pytest.approx(expected.value, rel=1e-9)
+    assert_close(solution.value_gradient, expected.value_gradient, layout.slices, "dV/dθ", 1e-8)
+    assert_close(solution.value_state_gradient, expected.value_state_gradient, WHOLE, "dV/ds", 1e-8)
+
+
+def test_its_predictions_follow_the_nonlinear_model(converged, problem, layout):
+    theta, s, _ = sample(problem, layout, 6)
+    solution = solved(converged, theta, s)
+    # Linearised at its own solution, the QP's model touches the nonlinear one there.
+    point = solution.prepared.point
+    np.testing.assert_allclose(solution.predicted_states[:-1], point.x, rtol=1e-9)
+    np.testing.assert_allclose(solution.predicted_actions, point.u, rtol=1e-9)
+    assert solution.residual < 1e-9
+
+
+def test_value_and_action_value_agree_at_the_policy(converged, problem, layout):
+    for number in (4, 6, 8):
+        theta, s, _ = sample(problem, layout, number)
+        value = solved(converged, theta, s)
+        action_value = converged.feedback(s, value.action)
+        assert action_value.value == pytest.approx(value.value, rel=1e-8)
+        assert_close(action_value.value_gradient, value.value_gradient, layout.slices, "", 1e-6)
+
+
+def test_too_few_iterations_raise_and_the_qp_is_carried(problem):
+    converged = ConvergedNmpc(problem, Parameters.naive(problem), iterations=1)
+    with pytest.raises(QpError, match="did not converge in 1 iterations") as caught:
+        converged.feedback([32.0, 60.0])
+    assert caught.value.status == "not converged"
+    assert caught.value.qp is not None
+
+
+def test_a_state_that_is_not_finite_raises(converged):
+    with pytest.raises(QpError, match="not finite"):
+        converged.feedback([np.nan, 50.0])

@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from math import isnan
+from math import inf, isnan
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -236,7 +236,10 @@ class Training:
         row |= self._totals.means(number - (self._rows[-1]["samples"] if self._rows else 0))
         row |= {
             "samples": number,
-            "smallest_eigenvalue": certificate(layout, theta).smallest,
+            # The least certificate of the updates since the last row, whichever step gave it.
+            "smallest_eigenvalue": min(
+                self._totals.smallest_eigenvalue, certificate(layout, theta).smallest
+            ),
             "failures": interaction.failures,
             "explored": interaction.explored,
             "saturated": interaction.saturated,
@@ -342,6 +345,7 @@ class _Totals:
     step: float = 0.0
     corrected: int = 0
     refused: int = 0
+    smallest_eigenvalue: float = inf
 
     def add(self, update: Update) -> None:
         self.updates += 1
@@ -349,6 +353,7 @@ class _Totals:
         self.step += update.step
         self.corrected += update.corrected
         self.refused += update.refused
+        self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
 
     def means(self, samples: float) -> Row:
         count = self.updates or float("nan")

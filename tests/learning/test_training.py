@@ -86,6 +86,23 @@ def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(
     assert all(row["smallest_eigenvalue"] >= 1e-3 for row in result.rows)
 
 
+def test_the_log_keeps_the_least_certificate_of_all_updates(scenario):
+    run, algorithm = make_run(scenario, "q-learning")
+    seen = []
+
+    class Watched(algorithm):
+        def observe(self, sample):
+            update = super().observe(sample)
+            if update is not None:
+                seen.append((sample.number, update.smallest_eigenvalue))
+            return update
+
+    for row in train(run, Watched).rows:
+        part = [v for number, v in seen if row["samples"] - 50 <= number < row["samples"]]
+        if part:
+            assert row["smallest_eigenvalue"] == min(part)
+
+
 def test_divergence_stops_early_and_keeps_the_last_good_theta(scenario, tmp_path):
     run, algorithm = make_run(scenario, "actor-critic", divergence=1e-3)
     result = train(run, algorithm, tmp_path)

@@ -55,13 +55,13 @@ BUDGETS = {
     "quick": Budget(
         learners=(
             Learner("q-learning-literal", "q-learning", 20_000, LITERAL),
-            Learner("actor-critic", "actor-critic", 30_000),
+            Learner("actor-critic", "actor-critic", 20_000),
             Learner("q-learning", "q-learning", 20_000),
         ),
         training_seeds=3,
         noise_seeds=10,
         steps=500,
-        mapper=Learner("q-learning", "q-learning", 15_000),
+        mapper=Learner("q-learning", "q-learning", 10_000),
         map_seeds=1,
         map_noise_seeds=8,
         map_steps=500,

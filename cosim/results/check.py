@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from cosim.comparison import Run, compare
@@ -48,10 +49,11 @@ def differences(
         return [f"{name}: the row {_row(stored, missing[0])} is stored but not computed any more"]
     if extra := [row for row in now.rows if row not in set(stored.rows)]:
         return [f"{name}: the row {_row(now, extra[0])} is computed but not stored"]
+    allowed = {signal: _tolerance(signal, stored, tolerances) for signal in stored.signals}
     found = compare(
         Run("stored", stored.signals),
         Run("now", now.signals),
-        {signal: _tolerance(signal, stored, tolerances) for signal in stored.signals},
+        {signal: tolerance.absolute for signal, tolerance in allowed.items()},
     )
     lines = []
     if found.first is not None:
@@ -62,7 +64,7 @@ def differences(
                 lines.append(
                     f"{name}: row {_row(stored, stored.rows[found.first])}: signal {item.name} is "
                     f"{value!r} now, {was!r} stored: {abs(value - was):.3g} apart, tolerance "
-                    f"{item.tolerance:g}{_unit(tolerances[item.name].unit)}"
+                    f"{item.tolerance:g}{_unit(allowed[item.name].unit)}"
                 )
         for item in found.differences:
             if item.first is not None and item.first > found.first:
@@ -74,15 +76,18 @@ def differences(
     return lines
 
 
-def _tolerance(signal: str, table: Tidy, tolerances: Mapping[str, Tolerance]) -> float:
-    if signal not in tolerances:
+def _tolerance(signal: str, table: Tidy, tolerances: Mapping[str, Tolerance]) -> Tolerance:
+    """The signal's own tolerance, else that of the first pattern (`theta *`) that fits it."""
+    fitting = (name for name in tolerances if fnmatchcase(signal, name))
+    name = signal if signal in tolerances else next(fitting, None)
+    if name is None:
         raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
-    tolerance, unit = tolerances[signal], table.signals[signal].unit
+    tolerance, unit = tolerances[name], table.signals[signal].unit
     if unit and unit != tolerance.unit:
         raise ResultsError(
             f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in '{tolerance.unit}'"
         )
-    return tolerance.absolute
+    return tolerance
 
 
 def _row(table: Tidy, row: tuple[str, ...]) -> str:

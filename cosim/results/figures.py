@@ -102,7 +102,7 @@ def _learning(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
         evaluated = np.array([cell != "" for cell in table["greedy_J"]])
         samples = np.array(table["samples"], float)[evaluated]
         curves[label] = (samples, np.array(table["greedy_J"])[evaluated].astype(float)[None])
-    plot_learning_curves(curves, path, ylabel="J per sample, greedy", logarithmic=True)
+    plot_learning_curves(curves, path, ylabel="J per sample, greedy")
 
 
 _FIGURES: dict[str, Callable[[Mapping[str, Path], Path, Policy], None]] = {

@@ -62,6 +62,14 @@ def test_a_signal_without_tolerance_is_refused():
         differences("e", table(), table(), {"X2": TOLERANCES["X2"]})
 
 
+def test_a_pattern_covers_the_signals_it_fits():
+    stored, now = (read(f"run,theta B\na,{v}\n", ("run",), (), "t") for v in (1.0, 1.2))
+    wide = {"theta *": Tolerance(absolute=0.5, unit="")}
+    assert differences("e", stored, now, wide) == []
+    exact = wide | {"theta B": Tolerance(absolute=0.1, unit="")}
+    assert differences("e", stored, now, exact) != []
+
+
 def test_a_tolerance_in_another_unit_is_refused():
     wrong = TOLERANCES | {"P2": Tolerance(absolute=1.0, unit="bar")}
     with pytest.raises(ResultsError, match=r"'P2' is in kPa, its tolerance .* in 'bar'"):

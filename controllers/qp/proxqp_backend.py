@@ -6,22 +6,27 @@ import numpy as np
 from proxsuite import proxqp
 
 from controllers.errors import QpError
+from controllers.qp.active_set import polish
 from controllers.qp.problem import QpSolution, SoftQp
 
 TOLERANCE = 1e-9
 GAP = 1e-7
 INFINITE = 1e20
+MAXIMUM, PATIENCE = 60, 5000
+SOLVED = proxqp.QPSolverOutput.PROXQP_SOLVED
 
 
 class ProxQpBackend:
     """Solves the condensed QP with one explicit slack a row and box constraints.
 
     Each solve starts from the previous solution, so it is reproducible to the tolerance only. The
-    preconditioner is that of the first QP: computing it anew costs more than it saves.
+    preconditioner is that of the first QP: computing it anew costs more than it saves. Where the
+    warm start stalls, what it reached is polished, and if that fails the QP is solved from scratch.
     """
 
     def __init__(self) -> None:
         self._qp: proxqp.dense.QP | None = None
+        self._patient = False
 
     def load(self, qp: SoftQp) -> None:
         """Hand over the matrices; the first call allocates the workspace.
@@ -46,11 +51,12 @@ class ProxQpBackend:
             self._qp = proxqp.dense.QP(n + rows, 0, 2 * rows, True)
             settings = self._qp.settings
             settings.eps_abs, settings.eps_rel = TOLERANCE, 0.0
+            # With w = 1e5 its certificates of infeasibility hold for feasible QPs too.
+            settings.eps_primal_inf = settings.eps_dual_inf = 1e-14
             # Without the gap ProxQP stops at multipliers that do not fit the rows' slack.
             settings.check_duality_gap = True
             settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = GAP, 0.0
-            settings.max_iter = 1000
-            settings.bcl_update = False
+            settings.bcl_update, settings.max_iter = not self._patient, PATIENCE
             settings.initial_guess = proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
             self._qp.init(
                 self._hessian,
@@ -65,6 +71,7 @@ class ProxQpBackend:
             )
             # An update before the first solve crashes the process (proxsuite 0.8.0).
             self._qp.solve()
+            settings.bcl_update, settings.max_iter = True, MAXIMUM
         else:
             self._qp.update(
                 H=self._hessian,
@@ -94,13 +101,30 @@ class ProxQpBackend:
             update_preconditioner=False,
         )
         self._qp.solve()
+        answer, status = self._read(n, rows)
+        if status != SOLVED:
+            answer = polish(qp, answer)
+            if not max(answer.residuals(qp)) < TOLERANCE:
+                answer, status = self._start_anew(qp)
+                if status != SOLVED:
+                    name = status.name.removeprefix("PROXQP_").lower().replace("_", " ")
+                    raise QpError(f"ProxQP did not solve the QP: {name}", status=name, qp=qp.copy())
+        return answer
+
+    def _start_anew(self, qp: SoftQp) -> tuple[QpSolution, proxqp.QPSolverOutput]:
+        """Solve in a new workspace by the rule of step sizes that is slow but does not stall."""
+        self._qp, self._patient = None, True
+        self.load(qp)
+        self._patient = False
+        return self._read(qp.f.size, qp.w.size)
+
+    def _read(self, n: int, rows: int) -> tuple[QpSolution, proxqp.QPSolverOutput]:
+        assert self._qp is not None, "load comes before solve"
         results = self._qp.results
-        if results.info.status != proxqp.QPSolverOutput.PROXQP_SOLVED:
-            status = results.info.status.name.removeprefix("PROXQP_").lower().replace("_", " ")
-            raise QpError(f"ProxQP did not solve the QP: {status}", status=status, qp=qp.copy())
         z = results.z
-        return QpSolution(
+        solution = QpSolution(
             results.x[:n].copy(),
             z[2 * rows : 2 * rows + n].copy(),
             z[:rows] + z[rows : 2 * rows],
         )
+        return solution, results.info.status

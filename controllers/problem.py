@@ -18,16 +18,45 @@ Vector = NDArray[np.float64]
 class ScenarioLike(Protocol):
     """The part of a scenario that a controller reads (`cosim.Scenario` has it)."""
 
-    sampling_time: float
-    discount: float
-    state_lower: Vector
-    state_upper: Vector
-    action_lower: Vector
-    action_upper: Vector
-    penalty_linear: Vector
-    penalty_quadratic: Vector
-    controller: Any
-    hash: str
+    @property
+    def sampling_time(self) -> float:
+        """Sampling time [s]."""
+
+    @property
+    def discount(self) -> float:
+        """Discount γ."""
+
+    @property
+    def state_lower(self) -> Vector:
+        """Lower bounds of the states, (n,)."""
+
+    @property
+    def state_upper(self) -> Vector:
+        """Upper bounds of the states, (n,)."""
+
+    @property
+    def action_lower(self) -> Vector:
+        """Lower bounds of the actions, (m,)."""
+
+    @property
+    def action_upper(self) -> Vector:
+        """Upper bounds of the actions, (m,)."""
+
+    @property
+    def penalty_linear(self) -> Vector:
+        """Linear weight of a violation, (n,)."""
+
+    @property
+    def penalty_quadratic(self) -> Vector:
+        """Quadratic weight of a violation, (n,)."""
+
+    @property
+    def controller(self) -> Any:
+        """Settings of the controller."""
+
+    @property
+    def hash(self) -> str:
+        """Hash of the scenario."""
 
 
 def _frozen(name: str, values: ArrayLike, size: int) -> Vector:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -86,6 +86,52 @@ def evaluation(
         out_.json(result)
     if not result["same_bytes"]:
         raise typer.Exit(1)
+
+
+@app.command()
+def controllers(
+    scenario: ScenarioOption = "paper",
+    steps: Annotated[
+        int, typer.Option("--steps", "-n", min=50, max=1_000_000, help="Samples of each run.")
+    ] = 2000,
+    every: Annotated[
+        int, typer.Option("--every", min=1, help="Compare every so many samples with the others.")
+    ] = 10,
+    json: JsonOption = False,
+) -> None:
+    """Time of each phase of an RTI-NMPC sample per QP backend, along closed-loop runs.
+
+    In the same run: ProxQP called cold through qpsolvers on the same QPs, and IPOPT on the
+    nonlinear programme at the same states.
+    """
+    with output(json) as out_:
+        from cosim.cli.benchmark_controllers import BACKENDS, measure
+        from cosim.scenario import Scenario
+
+        with out_.progress("controllers", len(BACKENDS) * steps) as progress:
+            result = measure(Scenario.load(scenario), steps, every, progress)
+        rows = [
+            (
+                f"{row['solver']}: {row['phase']}",
+                f"{row['median_us']:.1f}",
+                f"{row['minimum_us']:.1f}",
+                f"{row['p95_us']:.1f}",
+                _verdict(row),
+            )
+            for row in result["rows"]
+        ]
+        header = ("per sample", "median µs", "minimum µs", "95 % µs", "ratio or target")
+        out_.table(f"controllers on {result['scenario']}, {steps} samples", header, rows)
+        out_.json(result)
+
+
+def _verdict(row: dict[str, Any]) -> str:
+    """How a row stands to its target, or to what it is compared with."""
+    if row["target_us"] is not None:
+        return f"≤ {row['target_us']:g} µs: {'met' if row['met'] else 'MISSED'}"
+    if row["ratio"] is None:
+        return ""
+    return f"{row['ratio']:.1f} × {row['ratio_to']}; {100 * row['solved_share']:.0f} % solved"
 
 
 @app.command()

@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+from linear import PLANE, SCALAR, LinearPlant
+
+from controllers.dynamic_programming.quadrature import DisturbanceLaw
+from controllers.dynamic_programming.settings import Settings
+from controllers.dynamic_programming.solution import refine, solve
+from controllers.errors import OptimumError
+
+
+def solved(plant, level, criterion="average", **settings):
+    return solve(plant.problem, plant.law, Settings(level=level, criterion=criterion, **settings))
+
+
+@pytest.fixture(scope="module")
+def scalar_levels():
+    return [solved(SCALAR, level) for level in (2, 3, 4)]
+
+
+def test_mean_cost_converges_to_riccati_with_the_square_of_the_cell(scalar_levels):
+    exact = np.trace(SCALAR.riccati()[0] @ SCALAR.covariance)
+    errors = [optimum.gain - exact for optimum in scalar_levels]
+    # Multilinear interpolation of a convex W errs upwards, by O(h²).
+    assert errors[0] > errors[1] > errors[2] > 0
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.15)
+    assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.15)
+    assert errors[2] < 2e-3 * exact
+    extrapolated = scalar_levels[2].gain + (scalar_levels[2].gain - scalar_levels[1].gain) / 3
+    assert extrapolated == pytest.approx(exact, rel=2e-4)
+
+
+def test_policy_is_the_linear_quadratic_regulator(scalar_levels):
+    P, K = SCALAR.riccati()
+    optimum = scalar_levels[-1]
+    x = optimum.grid.points
+    near = np.abs(x[:, 0]) < 0.4
+    assert near.sum() > 50
+    np.testing.assert_allclose(optimum.actions[near], x[near] @ K.T, atol=4e-3)
+    W = optimum.W - optimum.W[np.abs(x[:, 0]).argmin()]
+    np.testing.assert_allclose(W[near], P[0, 0] * x[near, 0] ** 2, atol=1e-3)
+
+
+def test_discounted_value_and_its_mean_cost_are_riccatis():
+    P, K = SCALAR.riccati(SCALAR.discount)
+    coarse, fine = (solved(SCALAR, level, "discounted") for level in (3, 4))
+    gamma = SCALAR.discount
+    x = np.array([-0.3, 0.0, 0.2])
+    exact = P[0, 0] * x**2 + gamma / (1 - gamma) * np.trace(P @ SCALAR.covariance)
+    values = [optimum.grid.interpolate(optimum.W, [x]) for optimum in (coarse, fine)]
+    np.testing.assert_allclose(values[1], exact, rtol=5e-3)
+    np.testing.assert_allclose(values[1] + (values[1] - values[0]) / 3, exact, rtol=2e-3)
+    # The gain is the policy's own mean cost, not the least one.
+    extrapolated = fine.gain + (fine.gain - coarse.gain) / 3
+    assert extrapolated == pytest.approx(SCALAR.mean_cost(K), rel=2e-3)
+    assert SCALAR.mean_cost(K) > 1.001 * SCALAR.mean_cost(SCALAR.riccati()[1])
+
+
+@pytest.mark.slow
+def test_two_states_and_two_disturbances_agree_with_riccati():
+    P, K = PLANE.riccati()
+    exact = np.trace(P @ PLANE.covariance)
+    coarse, fine = (
+        solved(PLANE, level, nodes=(3, 3), tail=1e-3, growth=1.6, tolerance=1e-3)
+        for level in (1, 2)
+    )
+    assert exact < fine.gain < coarse.gain
+    assert fine.gain + (fine.gain - coarse.gain) / 3 == pytest.approx(exact, rel=1e-2)
+    x = fine.grid.points
+    near = np.abs(x).max(axis=1) < 0.2
+    np.testing.assert_allclose(fine.actions[near], x[near] @ K.T, atol=0.02)
+
+
+def test_bounds_enclose_the_optimum_in_every_round_and_the_gain_falls():
+    rounds = []
+    settings = Settings(level=2, tolerance=1e-7)
+    optimum = solve(SCALAR.problem, SCALAR.law, settings, progress=rounds.append)
+    final = [progress for progress in rounds if progress.level == 2]
+    assert len(final) >= 3
+    slack = 1e-6 * optimum.gain
+    for progress in final:
+        assert progress.lower <= optimum.gain + slack
+        assert progress.upper >= optimum.gain - slack
+    gains = [progress.gain for progress in final]
+    assert (np.diff(gains) <= slack).all()
+    assert optimum.upper - optimum.lower <= 1e-7 * optimum.gain
+
+
+def test_number_of_workers_changes_no_bit():
+    one, three = (
+        solve(SCALAR.problem, SCALAR.law, Settings(level=4), workers=workers)
+        for workers in (1, 3)
+    )
+    assert one.grid.size > 128
+    np.testing.assert_array_equal(one.actions, three.actions)
+    assert one.gain == three.gain
+
+
+def test_refining_a_solution_equals_solving_finely(scalar_levels):
+    settings = Settings(level=3)
+    refined = refine(
+        SCALAR.problem, SCALAR.law, settings, scalar_levels[0], scalar_levels[0].accuracy
+    )
+    assert refined.gain == pytest.approx(scalar_levels[1].gain, rel=2e-3)
+
+
+def test_unstable_plant_that_leaves_its_box_is_refused():
+    plant = LinearPlant(
+        F=[[1.5]], G=[[0.01]], E=[[1.0]], Q=[[1.0]], R=[[1.0]], sigma=[0.5], bound=1.0
+    )
+    with pytest.raises(OptimumError, match="on the edge of the grid's box"):
+        solved(plant, 1)
+
+
+def test_law_of_another_size_is_refused():
+    with pytest.raises(OptimumError, match=r"the law has 2 disturbances, model 'linear' 1"):
+        solve(SCALAR.problem, DisturbanceLaw("none", np.zeros(2), np.zeros(2)))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import PlantError
 from cosim.plant import FmuPlant
+from cosim.plant.closing import Closing
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 
@@ -27,7 +27,7 @@ class Steps(NamedTuple):
     disturbance: Array
 
 
-class PlantPool:
+class PlantPool(Closing):
     """A fixed number of independent plants over one unpacked FMU, stepped together.
 
     The instances live in this process: a call costs a few µs, less than handing it to a thread.
@@ -84,16 +84,3 @@ class PlantPool:
         """Close every plant."""
         for plant in self._plants:
             plant.close()
-
-    def __enter__(self) -> Self:
-        """Return the pool itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the pool."""
-        self.close()

@@ -7,8 +7,7 @@ import operator
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
-from types import TracebackType
-from typing import NoReturn, Self
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from cosim.errors import CapabilityError, PlantError
 from cosim.penalty import Penalty
 from cosim.plant.archive import SHIPPED, unpack
+from cosim.plant.closing import Closing
 from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
@@ -38,7 +38,7 @@ def _checked_seed(seed: int) -> int:
     return word
 
 
-class FmuPlant:
+class FmuPlant(Closing):
     """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
 
     At sample k, time k·h: the action is written, ℓ(x_k, u_k, d_k) and d_k are read, the FMU steps
@@ -206,19 +206,6 @@ class FmuPlant:
         for handle in self._handles:
             fmi.free(handle)
         fmi.close()
-
-    def __enter__(self) -> Self:
-        """Return the plant itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the plant."""
-        self.close()
 
     def __del__(self) -> None:
         """Free the instance of a plant that nobody closed."""

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +29,7 @@ from controllers.storage import write_atomically
 Array = NDArray[np.float64]
 # Part of every key: raise it when the solver changes what it finds.
 VERSION = 1
+_DAMAGE = (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 SHIPPED = Path(__file__).parent.parent / "optima"
 
 
@@ -138,7 +140,7 @@ def read(path: Path, name: str) -> Optimum:
                 tuple(accuracy["penalty_nodes"]),
             ),
         )
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         raise OptimumError(f"{path}: not a readable optimal policy ({error}); {mend}") from error
     size = optimum.grid.size
     shapes_fit = (

@@ -85,13 +85,15 @@ def accurate_substeps(
     )
     u = generator.uniform(problem.action_lower, problem.action_upper, (2000, problem.n_actions))
     d = law.draw(generator, 2000)
-    before = None
+    before: Array | None = None
     for substeps in 2 ** np.arange(9):
         step = Elementwise(discretise(problem.model, problem.sampling_time, int(substeps)))
-        x_next = np.stack(
-            [np.broadcast_to(e, 2000) for e in step(x.T, u.T, d.T, parameters)], axis=1
-        )
-        if before is not None and np.all(np.abs(x_next - before) <= tolerance * (1 + np.abs(x))):
+        # A step that is too long may overflow; then the next one is tried.
+        with np.errstate(all="ignore"):
+            entries = step(x.T, u.T, d.T, parameters)
+            x_next = np.stack([np.broadcast_to(entry, 2000) for entry in entries], axis=1)
+            moved = np.inf if before is None else np.abs(x_next - before)
+        if np.all(moved <= tolerance * (1 + np.abs(x))):
             return int(substeps)
         before = x_next
     raise OptimumError(

@@ -87,8 +87,7 @@ def test_bounds_enclose_the_optimum_in_every_round_and_the_gain_falls():
 
 def test_number_of_workers_changes_no_bit():
     one, three = (
-        solve(SCALAR.problem, SCALAR.law, Settings(level=4), workers=workers)
-        for workers in (1, 3)
+        solve(SCALAR.problem, SCALAR.law, Settings(level=4), workers=workers) for workers in (1, 3)
     )
     assert one.grid.size > 128
     np.testing.assert_array_equal(one.actions, three.actions)

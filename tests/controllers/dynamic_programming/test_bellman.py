@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+from sampling import evaporator_problem
+from scipy.integrate import solve_ivp
+
+from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
+from controllers.dynamic_programming.grid import Grid
+from controllers.dynamic_programming.quadrature import DisturbanceLaw
+from controllers.dynamic_programming.settings import Settings, accurate_substeps
+from controllers.errors import OptimumError
+from controllers.model import discretise, economic_cost
+
+PROBLEM = evaporator_problem()
+P = PROBLEM.model.nominal_parameters
+LAW = DisturbanceLaw("uniform", PROBLEM.model.nominal_disturbance, np.array([1.0, 2.0, 8.0, 5.0]))
+GRID = Grid((np.linspace(20, 32, 13), np.linspace(40, 60, 5)))
+STATE, ACTION = np.array([[25.8, 50.0]]), np.array([[226.0, 217.0]])
+
+
+def operator(substeps=8, nodes=(7, 7, 2, 2), penalty_nodes=(20, 20, 4, 2), **options):
+    return BellmanOperator(PROBLEM, LAW, P, Accuracy(substeps, nodes, penalty_nodes), **options)
+
+
+def test_expected_cost_and_penalty_agree_with_monte_carlo():
+    count = 200_000
+    d = LAW.draw(np.random.default_rng(11), count)
+    x, u = np.tile(STATE.T, (1, count)), np.tile(ACTION.T, (1, count))
+    p = np.tile(P[:, None], (1, count))
+    x_next = discretise(PROBLEM.model, 60.0, 8).map(count)(x, u, d.T, p).full()
+    cost = economic_cost(PROBLEM.model).map(count)(x, u, d.T, p).full()[0]
+    violation = np.maximum(25.0 - x_next[0], 0.0)
+    penalty = 1e5 * violation + violation**2
+    sampled = cost + penalty
+    assert 3e-4 < (violation > 0).mean() < 0.1
+    value = operator().values(STATE, ACTION, GRID, np.zeros(GRID.size))[0]
+    assert value == pytest.approx(sampled.mean(), abs=4 * sampled.std() / np.sqrt(count))
+
+
+def test_penalty_needs_and_has_more_nodes_than_the_smooth_part():
+    def value(nodes):
+        return operator(penalty_nodes=nodes).values(STATE, ACTION, GRID, np.zeros(GRID.size))[0]
+
+    dense = value((64, 64, 16, 6))
+    assert value((20, 20, 4, 2)) == pytest.approx(dense, abs=0.2)
+    assert abs(value((7, 7, 2, 2)) - dense) > 1.0
+
+
+def test_smooth_nodes_suffice_for_smooth_values():
+    W = GRID.points[:, 0] ** 2 + 3 * GRID.points[:, 1]
+    far = np.array([[29.0, 50.0]])
+    coarse = operator().values(far, ACTION, GRID, W)
+    fine = operator(nodes=(15, 15, 6, 6)).values(far, ACTION, GRID, W)
+    assert coarse == pytest.approx(fine, rel=2e-6)
+
+
+def test_next_state_is_scipys_integration_of_the_model():
+    symbols = PROBLEM.model.symbols()
+    import casadi as ca
+
+    ode = ca.Function("ode", list(symbols), [PROBLEM.model.ode(*symbols)])
+    nominal = DisturbanceLaw("none", PROBLEM.model.nominal_disturbance, np.zeros(4))
+    exact = solve_ivp(
+        lambda t, x: ode(x, ACTION[0], nominal.nominal, P).full()[:, 0],
+        (0.0, 1.0),
+        STATE[0],
+        rtol=1e-12,
+        atol=1e-12,
+    ).y[:, -1]
+    substeps = accurate_substeps(PROBLEM, LAW, P, 1e-7)
+    plant = BellmanOperator(PROBLEM, nominal, P, Accuracy(substeps, (1,) * 4, (1,) * 4))
+    fine = Grid(tuple(np.array([x - 1e-3, x + 1e-3]) for x in exact))
+    for i in range(2):
+        cost = plant.values(STATE, ACTION, fine, np.zeros(fine.size))
+        found = plant.values(STATE, ACTION, fine, fine.points[:, i]) - cost
+        assert found == pytest.approx(exact[i], abs=2e-7)
+
+
+def test_chain_is_stochastic_and_agrees_with_values():
+    generator = np.random.default_rng(4)
+    actions = generator.uniform(150, 300, (GRID.size, 2))
+    W = generator.normal(size=GRID.size)
+    bellman = operator(discount=0.9)
+    matrix, cost = bellman.chain(actions, GRID)
+    np.testing.assert_allclose(matrix.sum(axis=1), 1.0, rtol=1e-12)
+    assert matrix.min() >= 0
+    np.testing.assert_allclose(
+        cost + 0.9 * matrix @ W, bellman.values(GRID.points, actions, GRID, W), rtol=1e-12
+    )
+
+
+def test_model_that_no_step_integrates_is_refused():
+    with pytest.raises(OptimumError, match="256 RK4 substeps a sample do not integrate"):
+        accurate_substeps(evaporator_problem(sampling_time=1e5), LAW, P, 1e-7)
+
+
+BAD_SETTINGS = {
+    "criterion": {"criterion": "total"},
+    "level": {"level": -1},
+    "growth": {"growth": 1.0},
+    "tolerance": {"tolerance": 0.0},
+    "rounds": {"rounds": 0},
+}
+
+
+@pytest.mark.parametrize("case", BAD_SETTINGS)
+def test_bad_settings_are_refused(case):
+    with pytest.raises(OptimumError, match="criterion must be average or discounted"):
+        Settings(**BAD_SETTINGS[case])

@@ -1,0 +1,161 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from controllers import OptimalPolicy, QpError, factories
+from controllers.dynamic_programming import archive
+from controllers.dynamic_programming.plant import plant_law, plant_parameters
+from controllers.dynamic_programming.settings import Settings
+from controllers.dynamic_programming.study import study
+from controllers.errors import OptimumError
+from controllers.problem import Problem
+from cosim import FmuPlant, Scenario, simulate
+
+PRESETS = ("paper", "fast-sampling", "nominal")
+
+
+@pytest.fixture(scope="module")
+def policies():
+    return {name: OptimalPolicy.from_scenario(Scenario.load(name)) for name in PRESETS}
+
+
+@pytest.fixture(scope="module")
+def policy(policies):
+    return policies["paper"]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_policies_are_shipped(name):
+    scenario = Scenario.load(name)
+    problem = Problem.from_scenario(scenario)
+    law, parameters = plant_law(scenario, problem), plant_parameters(scenario, problem)
+    key = archive.key(problem, law, parameters, Settings())
+    path = archive.SHIPPED / f"{key}.npz"
+    assert path.is_file(), "equations or solver changed: solve anew with `cosim optimum`"
+    assert path.stat().st_size < 200_000
+    archive.read(path, key)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_bounds_enclose_the_mean_cost_within_a_thousandth(policies, name):
+    optimum = policies[name].optimum
+    slack = 1e-9 * optimum.gain
+    assert optimum.lower - slack <= optimum.gain <= optimum.upper + slack
+    assert optimum.upper - optimum.lower < 1e-3 * optimum.gain
+    assert optimum.edge_mass < 1e-6
+
+
+def test_without_disturbance_the_optimum_is_the_steady_state(policies):
+    assert policies["nominal"].gain == pytest.approx(6210.384509575885, rel=1e-9)
+
+
+def test_feedback_on_a_grid_state_is_the_table(policy):
+    grid = policy.optimum.grid
+    for index in np.random.default_rng(0).integers(grid.size, size=20):
+        s = grid.points[index]
+        solution = policy.feedback(s)
+        np.testing.assert_allclose(solution.action, policy.optimum.actions[index], rtol=1e-14)
+        expected = policy.optimum.W[index] + policy.problem.penalty(s)
+        assert solution.value == pytest.approx(expected, rel=1e-12, abs=1e-9)
+        assert solution.status == "solved"
+
+
+def test_feedback_between_grid_states_is_the_grids_interpolation(policy):
+    optimum = policy.optimum
+    s = np.random.default_rng(1).uniform([20, 40], [35, 70], (50, 2))
+    W = optimum.grid.interpolate(optimum.W, list(s.T))
+    for state, value in zip(s, W, strict=True):
+        assert policy.value(state) == pytest.approx(value + policy.problem.penalty(state), rel=1e-9)
+
+
+def test_no_action_is_better_than_the_policys(policy):
+    generator = np.random.default_rng(2)
+    for s in generator.uniform([25, 46], [29, 56], (20, 2)):
+        best = policy.action_value(s, policy.policy(s))
+        # Interpolation between grid states: a fraction of a cost unit out of 6338 a sample.
+        assert best == pytest.approx(policy.value(s), abs=0.5)
+        for a in generator.uniform([100, 100], [400, 400], (20, 2)):
+            assert policy.action_value(s, a) > best - 0.05
+
+
+def test_outside_the_grid_the_nearest_state_serves(policy):
+    far = policy.feedback([500.0, 50.0])
+    near = policy.feedback([policy.optimum.grid.axes[0][-1], 50.0])
+    np.testing.assert_array_equal(far.action, near.action)
+    assert (far.status, near.status) == ("clamped", "solved")
+
+
+@pytest.mark.parametrize("state", [[np.nan, 50.0], [25.0], [25.0, np.inf]])
+def test_a_bad_state_is_a_failure_that_the_loop_counts(policy, state):
+    with pytest.raises(QpError, match="2 finite numbers"):
+        policy.feedback(state)
+
+
+def test_actions_stay_in_their_box(policies):
+    for policy in policies.values():
+        lower, upper = policy.problem.action_lower, policy.problem.action_upper
+        assert ((policy.optimum.actions >= lower) & (policy.optimum.actions <= upper)).all()
+
+
+def paired(scenario, controllers, seeds, steps):
+    """J per controller and seed, (controllers, seeds); samples before the 50th are left out."""
+    J = np.zeros((len(controllers), seeds))
+    with FmuPlant(scenario) as plant:
+        for row, name in zip(J, controllers, strict=True):
+            controller = getattr(factories, name)(scenario)
+            for seed in range(seeds):
+                trajectory = simulate(plant, controller, steps, 1000 + seed)
+                row[seed] = (trajectory["stage_cost"] + trajectory["penalty"])[50:].mean()
+    return J
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "fast-sampling"])
+def test_the_fmus_mean_cost_is_the_gain(policies, name):
+    (J,) = paired(Scenario.load(name), ["optimal"], seeds=20, steps=3000)
+    half_width = scipy.stats.t.ppf(0.9995, 19) * J.std(ddof=1) / np.sqrt(20)
+    assert half_width < 0.002 * policies[name].gain
+    assert abs(J.mean() - policies[name].gain) < half_width
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "fast-sampling"])
+def test_no_other_controller_has_a_lower_cost(name):
+    J = paired(Scenario.load(name), ["optimal", "naive", "tuned"], seeds=20, steps=1000)
+    for other in J[1:]:
+        difference = other - J[0]
+        half_width = scipy.stats.t.ppf(0.975, 19) * difference.std(ddof=1) / np.sqrt(20)
+        assert difference.mean() > half_width
+
+
+@pytest.mark.slow
+def test_refinement_leaves_the_optimum_where_it_is():
+    scenario = Scenario.load("fast-sampling")
+    problem = Problem.from_scenario(scenario)
+    rows = study(
+        problem,
+        plant_law(scenario, problem),
+        Settings(),
+        OptimalPolicy.from_scenario(scenario).optimum,
+    )
+    sizes = [row.optimum.grid.size for row in rows]
+    assert all(fine > 2 * coarse for coarse, fine in pairwise(sizes[:-1]))
+    assert all(row.stable for row in rows)
+
+
+def test_a_plant_that_the_model_cannot_describe_is_refused():
+    paper = Scenario.load("paper")
+    with pytest.raises(OptimumError, match=r"plant\.parameters sets 'h2', which model"):
+        factories.optimal(paper.replace({"plant": {"parameters": {"h2": 1.0}}}))
+    swapped = {"plant": {"states": ["P2", "X2"], "mapping": {"initial_state": []}}}
+    with pytest.raises(OptimumError, match="the states X2, P2, the plant P2, X2"):
+        factories.optimal(paper.replace(swapped))
+
+
+def test_plant_parameters_of_the_scenario_reach_the_model():
+    scenario = Scenario.load("paper").replace({"plant": {"parameters": {"UA2": 7.0}}})
+    problem = Problem.from_scenario(scenario)
+    names = [quantity.name for quantity in problem.model.parameters]
+    assert plant_parameters(scenario, problem)[names.index("UA2")] == 7.0

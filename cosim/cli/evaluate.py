@@ -151,7 +151,7 @@ def show(summary: dict[str, Any], output: Output) -> None:
         [
             (
                 f"{row['controller']} − {row['reference']}",
-                interval(row["differences"]["J"], 1.0),
+                interval(row["differences"]["J"]),
                 percent(row["economic_gain"]),
             )
             for row in summary["comparisons"]
@@ -163,13 +163,11 @@ def _step_time(timing: dict[str, float]) -> float:
     return timing["prepare_median_us"] + timing["feedback_median_us"]
 
 
-def interval(estimate: dict[str, Any], scale: float, digits: int = 2) -> str:
-    """`value [low, high]` of an estimate."""
-    text = f"{scale * estimate['value']:.{digits}f}"
-    if estimate["t"] is None:
-        return text
-    low, high = (scale * end for end in estimate["t"])
-    return f"{text} [{low:.{digits}f}, {high:.{digits}f}]"
+def interval(estimate: dict[str, Any], scale: float = 1.0) -> str:
+    """An estimate of a summary with its t interval."""
+    from cosim.evaluation.statistics import shown
+
+    return shown(estimate["value"], estimate["t"], scale)
 
 
 def percent(estimate: dict[str, Any]) -> str:

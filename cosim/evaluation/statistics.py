@@ -62,6 +62,15 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     )
 
 
+def shown(value: float, ends: Sequence[float] | None, scale: float = 1.0, digits: int = 2) -> str:
+    """`value [low, high]` for tables, scaled and rounded; `value` where there is no interval."""
+    text = f"{scale * value:.{digits}f}"
+    if ends is None:
+        return text
+    low, high = (f"{scale * end:.{digits}f}" for end in ends)
+    return f"{text} [{low}, {high}]"
+
+
 def quotient(numerator: Array, denominator: Array) -> float:
     """Ratio of the means alone; NaN where the denominator's is zero."""
     below = float(np.mean(denominator))

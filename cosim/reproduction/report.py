@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from cosim.evaluation.statistics import shown
+
 Lines = list[list[str]]
 
 PAPER = {"naive": 21.0, "tuned": 15.0}
@@ -137,10 +139,10 @@ def markdown(lines: Lines) -> str:
 
 def cell(row: Mapping[str, str], name: str, scale: float, digits: int = 2) -> str:
     """`value [low, high]` of a figure, `value` where it has no interval, else nothing."""
-    if not row[f"{name}_low"]:
-        return number(row[name], scale, digits)
-    low, high = (number(row[f"{name}_{end}"], scale, digits) for end in ("low", "high"))
-    return f"{number(row[name], scale, digits)} [{low}, {high}]"
+    if not row[name]:
+        return ""
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return shown(float(row[name]), (float(low), float(high)) if low else None, scale, digits)
 
 
 def number(text: str, scale: float, digits: int = 2) -> str:

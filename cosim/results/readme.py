@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from controllers.storage import write_atomically
+from cosim.evaluation.statistics import shown
 from cosim.results.experiments import Experiment
 from cosim.results.making import MADE, SUMMARY
 
@@ -80,25 +81,17 @@ def _evaluation(summary: dict[str, Any]) -> list[str]:
             f"{row['economic_cost']:.1f}",
             f"{row['mean_violation']:.5f}",
             f"{100 * row['violating_share']:.2f}",
-            _estimate(row["J"], row["intervals"]["J"]["t"], 1.0, 1),
+            shown(row["J"], row["intervals"]["J"]["t"], 1.0, 1),
         ]
         for reference in references:
             gain = gains.get((name, reference))
-            cells.append(_estimate(gain["value"], gain["t"], 100.0, 2) if gain else "")
+            cells.append(shown(gain["value"], gain["t"], 100.0, 2) if gain else "")
         gap = row.get("gap_closed")
-        cells.append(_estimate(gap["value"], gap["t"], 100.0, 2) if gap else "")
+        cells.append(shown(gap["value"], gap["t"], 100.0, 2) if gap else "")
         lines.append(_line(cells))
     seeds = summary["seeds"]
-    shown = f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}) × {summary['steps']} samples"
-    return [f"Scenario `{summary['scenario']}`, {shown}:", "", *lines]
-
-
-def _estimate(value: float, ends: list[float] | None, scale: float, digits: int) -> str:
-    text = f"{scale * value:.{digits}f}"
-    if ends is None:
-        return text
-    low, high = (f"{scale * end:.{digits}f}" for end in ends)
-    return f"{text} [{low}, {high}]"
+    runs = f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}) × {summary['steps']} samples"
+    return [f"Scenario `{summary['scenario']}`, {runs}:", "", *lines]
 
 
 def _line(cells: list[str]) -> str:

@@ -1,6 +1,6 @@
 """Train an mpcrl agent (second-order LSTD Q-learning on an NMPC solved by IPOPT) and store its θ.
 
-    pip install mpcrl
+    pip install 'rti-cosim[outsiders]'
     python examples/outsiders/mpcrl_agent.py --steps 3000 --seed 0
 
 The NMPC is the benchmark's naive one, written down again in mpcrl's own terms; what it learns, the

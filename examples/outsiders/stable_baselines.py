@@ -1,6 +1,6 @@
 """Train SAC or PPO of Stable-Baselines3 on the benchmark's environment and export the actor.
 
-    pip install stable-baselines3
+    pip install 'rti-cosim[outsiders]'
     python examples/outsiders/stable_baselines.py sac --steps 30000 --seed 0
 
 The budgets behind the stored results: SAC 30 000 plant samples, PPO 200 000. The reward is shifted

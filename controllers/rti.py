@@ -171,8 +171,7 @@ class RtiNmpc:
         if self._pending is not None:
             last, self._pending = self._pending, None
             self._x[:] = last.predicted_states[1:]
-            self._u[:-1] = last.predicted_actions[1:]
-            self._u[-1] = last.predicted_actions[-1]
+            self._u[:-1], self._u[-1] = last.predicted_actions[1:], last.predicted_actions[-1]
             # Stage k + 1 becomes stage k, whose costs weigh 1/γ as much.
             self._costates[:-1] = last.costates[2:] / self.problem.discount
             self._costates[-1] = last.costates[-1]

@@ -45,8 +45,7 @@ class Functions:
     policy: StackedFunction
 
 
-@dataclass(frozen=True)
-class Prepared:
+class Prepared(NamedTuple):
     """What the preparation phase fixed, kept for read-outs after the next one has begun."""
 
     point: LinearisationPoint

@@ -49,7 +49,7 @@ class DaqpBackend:
             )
             self._weights(qp)
         else:
-            if not (np.array_equal(qp.w, self._w) and np.array_equal(qp.W, self._W)):
+            if self._written != qp.w.tobytes() + qp.W.tobytes():
                 self._weights(qp)
             # The limits go along, since an update is refused while those of a failed QP stand.
             self._write_limits(qp)
@@ -58,9 +58,9 @@ class DaqpBackend:
             )
 
     def _weights(self, qp: SoftQp) -> None:
-        self._w, self._W = qp.w.copy(), qp.W.copy()
+        self._written = qp.w.tobytes() + qp.W.tobytes()
         unused = np.ones(qp.f.size)
-        linear, compliance = np.r_[unused, self._w], np.r_[unused, 0.5 / self._W]
+        linear, compliance = np.r_[unused, qp.w], np.r_[unused, 0.5 / qp.W]
         self._model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
 
     def _write_limits(self, qp: SoftQp) -> None:

@@ -133,9 +133,17 @@ class QpSolution(NamedTuple):
         """Measure the solution against the QP that it is meant to solve."""
         v, nu, lam = self
         curvature, pull, y = qp.H @ v, lam @ qp.rows, qp.rows @ v
-        scale = max(1.0, *(float(np.abs(part).max()) for part in (qp.f, curvature, pull)))
-        stationarity = float(np.abs(curvature + qp.f + nu + pull).max()) / scale
-        bounds = float(np.abs(v - np.minimum(np.maximum(v + nu, qp.lower), qp.upper)).max())
+        parts = np.array(
+            [
+                curvature + qp.f + nu + pull,
+                v - np.minimum(np.maximum(v + nu, qp.lower), qp.upper),
+                qp.f,
+                curvature,
+                pull,
+            ]
+        )
+        sizes = np.abs(parts).max(axis=1).tolist()
+        stationarity, bounds = sizes[0] / max(1.0, *sizes[2:]), sizes[1]
         rows = float(np.abs(y - _proximal(y + lam, qp)).max())
         return Residuals(stationarity, bounds, rows, self._gap(qp, curvature))
 
@@ -205,7 +213,8 @@ class QpSolution(NamedTuple):
 
 def _proximal(z: Vector, qp: SoftQp) -> Vector:
     """prox_φ(z) of φ(y) = Σ w t + W t², t the violation of the row limits."""
-    result = np.minimum(np.maximum(z, qp.row_lower), qp.row_upper)
-    above, below = z - qp.row_upper - qp.w, qp.row_lower - z - qp.w
-    result = np.where(above > 0, qp.row_upper + above / (1 + 2 * qp.W), result)
-    return np.where(below > 0, qp.row_lower - below / (1 + 2 * qp.W), result)
+    nearest = np.minimum(np.maximum(z, qp.row_lower), qp.row_upper)
+    beyond = z - nearest
+    shrunk = np.maximum(np.abs(beyond) - qp.w, 0.0) / (1 + 2 * qp.W)
+    proximal: Vector = nearest + np.copysign(shrunk, beyond)
+    return proximal

@@ -1,0 +1,122 @@
+"""The RTI-NMPC on the FMU: it settles where it should, and never fails over a long run."""
+
+import numpy as np
+import pytest
+
+from controllers import ConvergedNmpc, Parameters, Problem, RtiNmpc
+from controllers.errors import QpError
+from controllers.factories import naive
+from controllers.qp import make_backend
+from cosim import FmuPlant, simulate
+
+STARTS = [
+    [concentration, pressure]
+    for concentration in (25.0, 30.0, 45.0, 70.0, 100.0)
+    for pressure in (40.0, 49.743, 60.0, 80.0)
+]
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    with FmuPlant("nominal") as plant:
+        yield plant
+
+
+@pytest.fixture(scope="module")
+def paper():
+    with FmuPlant("paper") as plant:
+        yield plant
+
+
+class Counting:
+    """A backend that counts the QPs it is given."""
+
+    solved = 0
+
+    def __init__(self, name):
+        self._backend = make_backend(name)
+        self.load = self._backend.load
+
+    def solve(self, qp):
+        Counting.solved += 1
+        return self._backend.solve(qp)
+
+
+def settle(plant, controller, start, steps=700):
+    """The naive cost is slow: from the far corner its error halves every 37 samples."""
+    problem = controller.problem
+    controller.reset()
+    s = plant.reset(0, start)
+    for _ in range(steps):
+        controller.prepare()
+        solution = controller.feedback(s)
+        s = plant.step(solution.action).s
+    np.testing.assert_allclose(s, problem.reference_state, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(solution.action, problem.reference_action, rtol=0, atol=1e-3)
+
+
+def test_from_any_feasible_start_it_settles_at_the_economic_steady_state(nominal):
+    controller = naive(nominal.scenario)
+    for start in STARTS:
+        settle(nominal, controller, start)
+
+
+def test_with_the_exact_hessian_it_settles_too(nominal):
+    problem = Problem.from_scenario(nominal.scenario)
+    controller = RtiNmpc(problem, Parameters.naive(problem), hessian="exact")
+    for start in STARTS[1:8:4]:
+        settle(nominal, controller, start)
+
+
+def test_solved_to_convergence_it_settles_too(nominal):
+    problem = Problem.from_scenario(nominal.scenario)
+    controller = ConvergedNmpc(problem, Parameters.naive(problem))
+    settle(nominal, controller, STARTS[5], steps=400)
+
+
+def long_run(plant, backend, steps):
+    """One QP a sample, each solved to a residual of 1e-6, none failed."""
+    problem = Problem.from_scenario(plant.scenario)
+    controller = RtiNmpc(problem, Parameters.naive(problem), backend=lambda: Counting(backend))
+    Counting.solved = 0
+    trajectory = simulate(plant, controller, steps, 1)
+    assert Counting.solved == steps
+    assert trajectory.summary()["failures"] == 0
+    assert trajectory["residual"].max() <= 1e-6
+    assert set(trajectory.status) == {"solved"}
+    assert trajectory["violation"].max() > 0.1
+
+
+@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
+def test_a_thousand_samples_take_one_solved_qp_each(backend, paper):
+    long_run(paper, backend, 1000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
+def test_ten_thousand_samples_take_one_solved_qp_each(backend, paper):
+    long_run(paper, backend, 10_000)
+
+
+def test_the_same_seed_gives_the_same_bits(paper):
+    runs = [simulate(paper, naive(paper.scenario), 200, 4) for _ in range(2)]
+    for name in ("X2", "P2", "P100", "F200", "value"):
+        assert runs[0][name].tobytes() == runs[1][name].tobytes()
+
+
+def test_a_failed_sample_gets_the_fallback_and_is_counted(paper):
+    class Failing(RtiNmpc):
+        count = 0
+
+        def feedback(self, s, a=None):
+            self.count += 1
+            if self.count % 10 == 0:
+                raise QpError("made to fail", status="made to fail")
+            return super().feedback(s, a)
+
+    problem = Problem.from_scenario(paper.scenario)
+    trajectory = simulate(paper, Failing(problem, Parameters.naive(problem)), 100, 0)
+    assert trajectory.summary()["failures"] == 10
+    failed = np.flatnonzero(trajectory["failed"])
+    np.testing.assert_array_equal(failed, np.arange(9, 100, 10))
+    np.testing.assert_array_equal(trajectory["P100"][failed], trajectory["P100"][failed - 1])

@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-from blocks import COVERED, FENCE, ROOT, Session, blocks, is_slow, pages
+from code_blocks import COVERED, FENCE, ROOT, Session, blocks, is_slow, pages
 
 
 def parameters():

@@ -11,10 +11,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from loop import Proportional, hold, proportional
-from workers import LEDGER, mortal, noting
+from workers import LEDGER, die, mortal, noting
 
 from cosim import FmuPlant, evaluate, simulate
 from cosim.errors import EvaluationError
+from cosim.evaluation.parallel import run_all
 
 BOTH = {"proportional": proportional, "hold": hold}
 
@@ -81,15 +82,33 @@ def test_two_workers_give_the_bytes_of_one(paper):
     assert contents(evaluate(paper, BOTH, 4, 40, jobs=2)) == contents(evaluate(paper, BOTH, 4, 40))
 
 
-@pytest.mark.slow
-def test_a_dask_cluster_of_two_processes_gives_the_bytes_of_one(paper):
+@pytest.fixture
+def cluster(ledger):
     from distributed import LocalCluster
 
     with LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
-        there = evaluate(paper, BOTH, 4, 40, scheduler=cluster.scheduler_address)
+        yield cluster.scheduler_address
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_of_two_processes_gives_the_bytes_of_one(paper, cluster):
+    there = evaluate(paper, BOTH, 4, 40, scheduler=cluster)
     assert contents(there) == contents(evaluate(paper, BOTH, 4, 40))
+
+
+@pytest.mark.slow
+def test_a_killed_dask_worker_loses_nothing(paper, cluster, ledger):
+    broken = evaluate(paper, {"mortal": mortal}, 5, 20, scheduler=cluster)
+    assert len(ledger()) > 6, "no run was begun twice, so none was killed"
+    assert contents(broken) == contents(evaluate(paper, {"mortal": mortal}, 5, 20))
+
+
+@pytest.mark.slow
+def test_a_cluster_whose_workers_always_die_ends_in_an_error(cluster):
+    with pytest.raises(EvaluationError, match="workers of the cluster died again and again"):
+        run_all(die, {"a": 1}, print, scheduler=cluster)
 
 
 def test_a_finished_evaluation_is_read_not_run_again(paper, tmp_path, ledger):
@@ -124,7 +143,7 @@ def test_a_damaged_unit_is_named(paper, tmp_path):
 
 def test_a_killed_worker_loses_nothing(paper, tmp_path, ledger):
     broken = evaluate(paper, {"mortal": mortal}, 5, 20, folder=tmp_path / "out", jobs=2)
-    assert len(set(ledger())) > 2, "no worker was replaced"
+    assert len(ledger()) > 6, "no run was begun twice, so none was killed"
     whole = evaluate(paper, {"mortal": mortal}, 5, 20)
     assert contents(broken) == contents(whole)
 

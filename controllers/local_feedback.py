@@ -35,19 +35,24 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
     on_action = np.abs(C[:, n:]).max(axis=1, initial=0.0) > 0
     rows = np.vstack([C[on_action], C[~on_action, :n] @ np.hstack([A, B])])
     # Actions that keep the constraints: u = particular x + free v.
-    particular, free = np.zeros((m, n)), np.eye(m)
+    gain, free = np.zeros((m, n)), np.eye(m)
     if len(rows):
         if np.linalg.matrix_rank(rows[:, n:]) < len(rows):
             raise TuningError(
                 f"the {len(rows)} active constraints cannot all be kept by the {m} actions within "
                 "one sample: local feedback is not defined by them"
             )
-        particular = -np.linalg.pinv(rows[:, n:]) @ rows[:, :n]
+        gain = -np.linalg.pinv(rows[:, n:]) @ rows[:, :n]
         free = null_space(rows[:, n:])
-    if free.shape[1] == 0:
-        closed = A + B @ particular
-        stage = np.vstack([np.eye(n), particular])
-        return LocalFeedback(particular, _lyapunov(closed, stage.T @ H @ stage))
+    if free.shape[1]:
+        gain = gain + free @ _reduced_gain(A, B, H, gain, free)
+    closed, stage = A + B @ gain, np.vstack([np.eye(n), gain])
+    return LocalFeedback(gain, _lyapunov(closed, stage.T @ H @ stage))
+
+
+def _reduced_gain(A: Array, B: Array, H: Array, particular: Array, free: Array) -> Array:
+    """Gain of v in u = particular x + free v, from the Riccati equation."""
+    n = len(A)
     change = np.block([[np.eye(n), np.zeros((n, free.shape[1]))], [particular, free]])
     reduced = change.T @ H @ change
     a, b = A + B @ particular, B @ free
@@ -58,18 +63,21 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
         raise TuningError(
             f"the steady state has no stabilising local feedback of finite cost ({error})"
         ) from error
-    P = 0.5 * (P + P.T)
-    v = -np.linalg.solve(r + b.T @ P @ b, b.T @ P @ a + s.T)
-    if np.linalg.eigvalsh(r + b.T @ P @ b).min() <= 0:
+    curvature = r + b.T @ P @ b
+    if np.linalg.eigvalsh(0.5 * (curvature + curvature.T)).min() <= 0:
         raise TuningError("the steady state is no local minimum of the economic cost")
-    return LocalFeedback(particular + free @ v, P)
+    gain: Array = -np.linalg.solve(curvature, b.T @ P @ a + s.T)
+    return gain
 
 
 def _lyapunov(closed: Array, stage: Array) -> Array:
-    """P = stage + closedᵀ P closed; raises TuningError where the closed loop is unstable."""
+    """P = stage + closedᵀ P closed; raises TuningError where the closed loop is unstable.
+
+    More accurate than the Riccati solver's P, of which only the gain's part is well conditioned.
+    """
     n = len(closed)
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
-        raise TuningError("keeping the active constraints makes the closed loop unstable")
+        raise TuningError("the active constraints, once kept, make the closed loop unstable")
     system = np.eye(n * n) - np.kron(closed.T, closed.T)
     P = np.linalg.solve(system, stage.reshape(-1)).reshape(n, n)
     symmetric: Array = 0.5 * (P + P.T)

@@ -114,8 +114,8 @@ def paired(scenario, controllers, seeds, steps):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "fast-sampling"])
 def test_the_fmus_mean_cost_is_the_gain(policies, name):
-    (J,) = paired(Scenario.load(name), ["optimal"], seeds=20, steps=3000)
-    half_width = scipy.stats.t.ppf(0.9995, 19) * J.std(ddof=1) / np.sqrt(20)
+    (J,) = paired(Scenario.load(name), ["optimal"], seeds=20, steps=5000)
+    half_width = scipy.stats.t.ppf(0.995, 19) * J.std(ddof=1) / np.sqrt(20)
     assert half_width < 0.002 * policies[name].gain
     assert abs(J.mean() - policies[name].gain) < half_width
 

@@ -22,7 +22,7 @@ def operator(substeps=8, nodes=(7, 7, 2, 2), penalty_nodes=(20, 20, 4, 2), **opt
 
 
 def test_expected_cost_and_penalty_agree_with_monte_carlo():
-    count = 200_000
+    count = 50_000
     d = LAW.draw(np.random.default_rng(11), count)
     x, u = np.tile(STATE.T, (1, count)), np.tile(ACTION.T, (1, count))
     p = np.tile(P[:, None], (1, count))
@@ -31,7 +31,7 @@ def test_expected_cost_and_penalty_agree_with_monte_carlo():
     violation = np.maximum(25.0 - x_next[0], 0.0)
     penalty = 1e5 * violation + violation**2
     sampled = cost + penalty
-    assert 3e-4 < (violation > 0).mean() < 0.1
+    assert 2e-4 < (violation > 0).mean() < 0.1
     value = operator().values(STATE, ACTION, GRID, np.zeros(GRID.size))[0]
     assert value == pytest.approx(sampled.mean(), abs=4 * sampled.std() / np.sqrt(count))
 
@@ -89,7 +89,7 @@ def test_chain_is_stochastic_and_agrees_with_values():
 
 
 def test_model_that_no_step_integrates_is_refused():
-    with pytest.raises(OptimumError, match="256 RK4 substeps a sample do not integrate"):
+    with pytest.raises(OptimumError, match="64 RK4 substeps a sample do not integrate"):
         accurate_substeps(evaporator_problem(sampling_time=1e5), LAW, P, 1e-7)
 
 

@@ -1,0 +1,271 @@
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+from sampling import evaporator_problem
+
+from controllers import Layout, LinearisationPoint, Model, Quantity, RtiNmpc
+from controllers.convexification import convexify, rotation
+from controllers.economic import tune
+from controllers.errors import TuningError
+from controllers.local_feedback import local_feedback
+from controllers.model import discretise, economic_cost
+from controllers.steady_state import optimal_steady_state
+
+PROBLEMS = {
+    "paper": evaporator_problem(),
+    "fast-sampling": evaporator_problem(sampling_time=6.0),
+    "undiscounted": evaporator_problem(discount=1.0),
+    "short-sighted": evaporator_problem(discount=0.7),
+}
+
+
+@pytest.fixture(scope="module", params=PROBLEMS)
+def tuning(request):
+    return PROBLEMS[request.param], tune(PROBLEMS[request.param])
+
+
+def long_economic_problem(problem, horizon=400):
+    """The economic problem itself over a long horizon, by IPOPT: s -> first action and cost."""
+    model = problem.model
+    steady = optimal_steady_state(problem)
+    x, u = ca.MX.sym("x", 2, horizon + 1), ca.MX.sym("u", 2, horizon)
+    s = ca.MX.sym("s", 2)
+    d = ca.repmat(ca.DM(model.nominal_disturbance), 1, horizon)
+    p = ca.repmat(ca.DM(model.nominal_parameters), 1, horizon)
+    step = discretise(model, problem.sampling_time, problem.substeps).map(horizon)
+    costs = economic_cost(model).map(horizon)(x[:, :-1], u, d, p)
+    w = ca.vertcat(ca.vec(x), ca.vec(u))
+    gaps = ca.vec(step(x[:, :-1], u, d, p) - x[:, 1:])
+    nlp = {
+        "x": w,
+        "f": ca.sum2(costs) - horizon * steady.cost,
+        "g": ca.vertcat(x[:, 0] - s, gaps, x[:, -1] - steady.x),
+        "p": s,
+    }
+    options = {"print_level": 0, "sb": "yes", "tol": 1e-11, "bound_relax_factor": 0.0}
+    solver = ca.nlpsol("long", "ipopt", nlp, {"ipopt": options, "print_time": False})
+    lower = np.tile(problem.state_lower, horizon + 1)
+    lower[:2] = -np.inf
+    lower = np.concatenate([lower, np.tile(problem.action_lower, horizon)])
+    guess = np.concatenate([np.tile(steady.x, horizon + 1), np.tile(steady.u, horizon)])
+
+    def solve(state):
+        found = solver(x0=guess, lbx=lower, lbg=0, ubg=0, p=state)
+        assert solver.stats()["success"]
+        return found["x"].full()[2 * (horizon + 1) :, 0][:2], float(found["f"])
+
+    return solve
+
+
+def test_steady_state_is_the_papers():
+    steady = optimal_steady_state(PROBLEMS["paper"])
+    np.testing.assert_allclose(steady.x, [25.0, 49.74297], atol=1e-5)
+    np.testing.assert_allclose(steady.u, [191.71322, 215.88844], atol=1e-5)
+    assert steady.cost == pytest.approx(6210.3845, abs=1e-4)
+    assert steady.active == ("X2 ≥ 25 %",)
+    np.testing.assert_allclose(steady.multipliers, [60.29, 0, 0, 0], atol=2e-3)
+    np.testing.assert_allclose(steady.gradient, steady.multipliers, atol=1e-6)
+
+
+def test_jacobians_are_those_of_the_sampled_model():
+    problem = PROBLEMS["paper"]
+    steady = optimal_steady_state(problem)
+    model = problem.model
+    x, u, d, p = model.symbols()
+    ode = ca.Function("ode", [x, u, d, p], [ca.jacobian(model.ode(x, u, d, p), ca.vertcat(x, u))])
+    F = ode(steady.x, steady.u, model.nominal_disturbance, model.nominal_parameters).full()
+    block = np.zeros((4, 4))
+    block[:2] = F
+    exact = scipy.linalg.expm(block)[:2]
+    np.testing.assert_allclose(np.hstack([steady.A, steady.B]), exact, rtol=2e-3, atol=1e-6)
+
+
+def test_certificate_holds(tuning):
+    _, result = tuning
+    steady, convex = result.steady_state, result.convexification
+    rebuilt = (
+        steady.hessian
+        + rotation(steady.A, steady.B, convex.delta_P)
+        + steady.C.T @ convex.F @ steady.C
+    )
+    np.testing.assert_allclose(convex.hessian, rebuilt, atol=1e-9)
+    assert convex.eigenvalues[0] >= (1 - 1e-5) / convex.alpha
+    assert convex.eigenvalues[-1] <= (1 + 1e-5) * convex.beta / convex.alpha
+    assert np.linalg.eigvalsh(steady.hessian)[0] < -1.0
+    assert np.linalg.eigvalsh(result.terminal_hessian)[0] > 0
+    assert result.gain_error < 1e-8
+    assert "X2 ≥ 25 %" in str(result)
+
+
+def test_without_the_active_constraint_there_is_no_solution():
+    steady = optimal_steady_state(PROBLEMS["paper"])
+    none = np.zeros((0, 4))
+    with pytest.raises(TuningError, match=r"PrimalInfeasible.* with 0 active constraints"):
+        convexify(steady.A, steady.B, steady.hessian, none)
+
+
+def test_economic_gain_is_that_of_the_nonlinear_economic_problem():
+    problem = PROBLEMS["paper"]
+    gain, solve = tune(problem).economic.gain, long_economic_problem(problem)
+    s = problem.reference_state
+    np.testing.assert_allclose(solve(s)[0], problem.reference_action, atol=1e-5)
+    for i in range(2):
+        above, below = (solve(s + step * np.eye(2)[i])[0] for step in (1e-2, -1e-2))
+        np.testing.assert_allclose((above - below) / 2e-2, gain[:, i], rtol=1e-5, atol=1e-5)
+
+
+def test_rtis_local_feedback_is_the_economic_one_for_any_discount(tuning):
+    problem, result = tuning
+    controller = RtiNmpc(problem, result.parameters)
+    controller.prepare()
+    solution = controller.feedback(problem.reference_state)
+    np.testing.assert_allclose(solution.action, problem.reference_action, atol=1e-5)
+    gain = result.economic.gain
+    tolerance = 1e-5 * np.abs(gain).max()
+    np.testing.assert_allclose(solution.policy_state_jacobian, gain, atol=tolerance)
+    for i in range(2):
+        above, below = (
+            controller.policy(problem.reference_state + step * np.eye(2)[i])
+            for step in (1e-4, -1e-4)
+        )
+        np.testing.assert_allclose((above - below) / 2e-4, gain[:, i], atol=tolerance)
+
+
+def test_value_is_the_economic_one_to_second_order():
+    problem = PROBLEMS["undiscounted"]
+    controller = RtiNmpc(problem, tune(problem, value_offset=0.0).parameters)
+    controller.prepare()
+    solve, direction = long_economic_problem(problem), np.array([0.6, -0.8])
+    errors = []
+    for step in (0.8, 0.4):
+        s = problem.reference_state + step * direction
+        value, (_, cost) = controller.value(s), solve(s)
+        errors.append(abs(value - cost))
+    # The value is about −460 and −230 there; the error of third order falls to an eighth.
+    assert errors[0] < 0.2
+    assert errors[1] < 0.2 * errors[0]
+
+
+def test_nominal_closed_loop_reaches_the_economic_steady_state():
+    problem = PROBLEMS["paper"]
+    model = problem.model
+    plant = discretise(model, problem.sampling_time, 16)
+    controller = RtiNmpc(problem, tune(problem).parameters)
+    s = np.array([28.0, 45.0])
+    for _ in range(600):
+        controller.prepare()
+        a = controller.feedback(s).action
+        s = plant(s, a, model.nominal_disturbance, model.nominal_parameters).full()[:, 0]
+    np.testing.assert_allclose(s, problem.reference_state, atol=1e-3)
+    np.testing.assert_allclose(a, problem.reference_action, atol=5e-3)
+
+
+def test_another_reference_changes_nothing_but_the_coordinates():
+    problem = PROBLEMS["paper"]
+    moved = replace(
+        problem,
+        reference_state=problem.reference_state + np.array([0.5, 1.0]),
+        reference_action=problem.reference_action + np.array([2.0, -3.0]),
+    )
+    actions = []
+    for case in (problem, moved):
+        controller = RtiNmpc(case, tune(case).parameters)
+        controller.prepare_at(
+            LinearisationPoint(
+                np.tile(problem.reference_state, (10, 1)),
+                np.tile(problem.reference_action, (10, 1)),
+                np.zeros((10, 2)),
+            )
+        )
+        actions.append(controller.policy([25.3, 50.5]))
+    np.testing.assert_allclose(actions[0], actions[1], atol=1e-5)
+
+
+def test_extended_layouts_are_tuned_too():
+    problem = PROBLEMS["paper"]
+    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2",))
+    parameters = tune(problem, layout).parameters
+    np.testing.assert_array_equal(parameters["w_sigma"], problem.penalty_linear)
+    np.testing.assert_array_equal(parameters["B_l"], tune(problem).parameters["B_l"])
+
+
+def economic_problem(cost, ode=None, **changes):
+    """A scalar plant x' = −x + u with a given cost."""
+    model = Model(
+        name="scalar",
+        states=(Quantity("x", "1"),),
+        actions=(Quantity("u", "1"),),
+        disturbances=(),
+        parameters=(),
+        ode=ode or (lambda x, u, d, p: u - x),
+        economic_cost=cost,
+    )
+    settings = {
+        "model": model,
+        "sampling_time": 0.5,
+        "horizon": 5,
+        "discount": 0.95,
+        "state_lower": [-10],
+        "state_upper": [10],
+        "action_lower": [-10],
+        "action_upper": [10],
+        "penalty_linear": [100],
+        "penalty_quadratic": [1],
+        "reference_state": [0.2],
+        "reference_action": [0.2],
+        "reference_cost": 0.0,
+    }
+    return type(evaporator_problem())(**(settings | changes))
+
+
+def test_unconstrained_indefinite_cost_has_the_riccati_gain():
+    # −0.3 x² + u²: indefinite, yet dissipative since the plant is stable.
+    problem = economic_problem(lambda x, u, d, p: -0.3 * x**2 + u**2 + u)
+    result = tune(problem)
+    steady = result.steady_state
+    assert steady.active == ()
+    P = scipy.linalg.solve_discrete_are(
+        steady.A, steady.B, steady.hessian[:1, :1], steady.hessian[1:, 1:], s=steady.hessian[:1, 1:]
+    )
+    S = steady.hessian[1:, 1:] + steady.B.T @ P @ steady.B
+    K = -np.linalg.solve(S, steady.B.T @ P @ steady.A + steady.hessian[1:, :1])
+    np.testing.assert_allclose(result.tuned.gain, K, atol=1e-8)
+    controller = RtiNmpc(problem, result.parameters)
+    controller.prepare()
+    x = steady.x
+    slope = (controller.policy(x + 1e-3) - controller.policy(x - 1e-3)) / 2e-3
+    np.testing.assert_allclose(slope, K[0], atol=1e-6)
+
+
+def test_active_actuator_bound_enters():
+    problem = economic_problem(lambda x, u, d, p: (x - 5) ** 2, action_upper=[3])
+    result = tune(problem)
+    assert result.steady_state.active == ("u ≤ 3 1",)
+    np.testing.assert_allclose(result.economic.gain, [[0.0]], atol=1e-12)
+
+
+def test_penalty_below_the_multiplier_is_refused():
+    with pytest.raises(TuningError, match=r"penalty of X2 is too small.* 60\.29"):
+        tune(evaporator_problem(penalty_linear=[50, 1e5]))
+
+
+def test_problem_without_steady_state_is_refused():
+    problem = economic_problem(lambda x, u, d, p: u**2, ode=lambda x, u, d, p: 1 + u**2)
+    with pytest.raises(TuningError, match="steady state of model 'scalar' was not found"):
+        tune(problem)
+
+
+def test_constraints_that_the_actions_cannot_keep_are_refused():
+    A, B = np.diag([0.5, 0.4]), np.array([[1.0], [0.0]])
+    C = np.array([[0.0, 1.0, 0.0]])
+    with pytest.raises(TuningError, match="cannot all be kept"):
+        local_feedback(A, B, np.eye(3), C)
+
+
+def test_keeping_a_constraint_that_destabilises_is_refused():
+    A, B = np.array([[0.5, 0.0], [1.0, 1.2]]), np.array([[1.0], [0.0]])
+    with pytest.raises(TuningError, match="make the closed loop unstable"):
+        local_feedback(A, B, np.eye(3), np.array([[1.0, 0.0, 0.0]]))

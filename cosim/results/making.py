@@ -66,7 +66,7 @@ def store(
         for file in experiment.files:
             if not (run / file).is_file():
                 raise ResultsError(f"'{experiment.runs[label]}' wrote no {file}")
-            write_atomically(target / f"{label}-{file}", (run / file).read_bytes())
+            write_atomically(target / f"{label}-{file}", _copied(run / file, label, experiment))
     summaries = {label: _summary(run) for label, run in runs.items()}
     write_atomically(target / SUMMARY, _json(summaries))
     draw(experiment, runs, target, policy)
@@ -74,6 +74,16 @@ def store(
     write_atomically(target / MADE, _json(made))
     # Last: a table is there only if all that belongs to it is.
     write_atomically(table_path(folder, name, experiment), text)
+
+
+def _copied(path: Path, label: str, experiment: Experiment) -> bytes:
+    """A run's file; in Markdown the links to its other files follow them to their stored names."""
+    if path.suffix != ".md":
+        return path.read_bytes()
+    text = path.read_text("utf-8")
+    for file in experiment.files:
+        text = text.replace(f"]({file})", f"]({label}-{file})")
+    return text.encode()
 
 
 def _summary(run: Path) -> dict[str, Any]:

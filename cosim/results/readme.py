@@ -44,7 +44,7 @@ def section(folder: Path, name: str, experiment: Experiment) -> str:
         lines += [experiment.description, ""]
     lines += ["```sh", *made["runs"].values(), "```", ""]
     for label, summary in summaries.items():
-        table = _evaluation(summary) if "controllers" in summary else _run(label, summary)
+        table = _evaluation(summary) if "comparisons" in summary else _run(label, summary)
         lines += [*table, ""] if table else []
     lines += [f"![{path.stem}]({name}/{path.name})" for path in sorted(folder.glob("*.png"))]
     others = [

@@ -1,0 +1,61 @@
+"""`cosim optimum`: J*, bounds, files and errors."""
+
+import json
+import time
+
+import pytest
+
+from controllers.dynamic_programming import archive
+
+
+def test_stored_optimum_as_json(cosim):
+    code, out, _ = cosim("optimum", "--scenario", "paper", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["J"] == pytest.approx(6337.87, abs=0.01)
+    assert document["lower"] <= document["J"] <= document["upper"]
+    assert document["upper"] - document["lower"] < 1e-3 * document["J"]
+    assert document["stable"] is True
+    assert document["file"].endswith(".npz")
+
+
+def test_table_shows_value_and_bounds(cosim):
+    code, out, _ = cosim("optimum", "--scenario", "fast-sampling")
+    assert code == 0
+    assert "J* above" in out
+    assert "6224.99" in out
+
+
+def test_unknown_scenario_is_one_line_of_error(cosim):
+    code, out, err = cosim("optimum", "--scenario", "papper")
+    assert (code, out) == (2, "")
+    assert err.startswith("error: unknown scenario 'papper'")
+    assert err.count("\n") == 1
+
+
+def test_unknown_criterion_is_refused(cosim):
+    code, _, err = cosim("optimum", "--criterion", "total")
+    assert code == 2
+    assert "'average', 'discounted'" in err
+
+
+def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
+    for shipped in archive.SHIPPED.glob("*.npz"):
+        (tmp_path / shipped.name).write_bytes(b"damaged")
+    code, out, err = cosim("optimum", "--scenario", "paper")
+    assert (code, out) == (2, "")
+    assert "not a readable optimal policy" in err
+    assert "delete it to have the policy computed anew" in err
+
+
+@pytest.mark.slow
+def test_solving_anew_takes_two_minutes_of_two_cores_at_most(cosim, tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
+    started = time.process_time()
+    code, out, _ = cosim("optimum", "--scenario", "paper", "--recompute", "--json")
+    # Processor time of all threads: other work on the machine does not count.
+    assert time.process_time() - started < 2 * 120
+    assert code == 0
+    assert json.loads(out)["J"] == pytest.approx(6337.868736630078, rel=1e-6)
+    assert len(list(tmp_path.glob("**/*.npz"))) == 1

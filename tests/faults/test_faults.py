@@ -1,0 +1,283 @@
+"""Kills, full disks, locked folders, clocks that jump, plants and solvers that fail."""
+
+import csv
+import ctypes
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kill import JOBS, campaign
+
+from controllers import Parameters, Problem, QpError, RtiNmpc
+from controllers.factories import naive
+from controllers.qp.daqp_backend import DaqpBackend
+from cosim import FmuPlant, Scenario, evaluate, simulate
+from cosim.errors import RecordingError
+from cosim.recording.reading import read_recording
+from learning.q_learning import QLearning
+from learning.training import Run, Training
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "cosim"))
+from tank import build_tank, write_scenario
+
+PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2
+COSIM = (sys.executable, "-m", "cosim")
+TRAIN = "train --algorithm q-learning --samples 600 --log-every 200 --evaluate-every 600"
+
+
+def command_line(folder, *words, limit=None):
+    """Run `cosim` in a process of its own that obeys file permissions, as root else does not.
+
+    `limit` is the largest size in bytes of a file that it may write.
+    """
+
+    def confine():
+        for capability in (CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH):
+            ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    return subprocess.run(
+        [*COSIM, *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=confine,
+    )
+
+
+def refused(result):
+    assert result.returncode == 2, result.stderr
+    assert "Traceback" not in result.stderr
+    return [line for line in result.stderr.splitlines() if line.startswith("error: ")][-1]
+
+
+# Kills -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("job", [job.name for job in JOBS])
+def test_a_kill_loses_nothing_that_was_written(job):
+    seen = campaign(1, seed=os.getpid(), names=(job,))
+    assert seen[job]["equal to the byte afterwards"] == 1
+
+
+# Disks -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ["simulate --steps 400 --out out", TRAIN + " --out out"])
+def test_a_full_disk_is_one_line_and_old_files_stay(tmp_path, words):
+    assert command_line(tmp_path, *words.split()).returncode == 0
+    before = {path: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}
+    assert "File too large" in refused(
+        command_line(tmp_path, *words.split(), "--seed", "1", limit=8000)
+    )
+    after = {path: path.read_bytes() for path in (tmp_path / "out").iterdir() if path.is_file()}
+    assert after.keys() == before.keys()
+    big = [path for path, data in before.items() if len(data) > 8000]
+    assert big
+    for path in big:
+        assert after[path] == before[path]
+
+
+@pytest.mark.slow
+def test_a_recording_that_does_not_fit_is_no_recording(tmp_path):
+    words = ["simulate", "--steps", "2000", "--record", "--out", "out"]
+    said = refused(command_line(tmp_path, *words, limit=60_000))
+    assert "recording" in said
+    assert not (tmp_path / "out" / "run.rrd").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ["demo --steps 3", "evaluate --seeds 1", TRAIN])
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, words):
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o555)
+    said = refused(command_line(tmp_path, *words.split(), "--out", "locked"))
+    assert "cannot write to folder 'locked': Permission denied" in said
+    assert not list(folder.iterdir())
+
+
+def test_a_folder_that_was_locked_in_mid_run_is_one_line(tmp_path):
+    (tmp_path / "lock.py").write_text(LOCKING + STILL)
+    words = ["simulate", "-c", "lock:make", "-n", "20", "--out", "out"]
+    said = refused(command_line(tmp_path, *words))
+    assert "Permission denied" in said
+    assert not list((tmp_path / "out").iterdir())
+
+
+LOCKING = """
+from pathlib import Path
+Path("out").chmod(0o555)
+"""
+
+
+# Clocks ----------------------------------------------------------------------------------------
+
+
+def test_a_clock_that_jumps_changes_no_result(monkeypatch, tmp_path):
+    scenario = Scenario.load("paper")
+    rng = np.random.default_rng(0)
+
+    def run(name):
+        with FmuPlant(scenario) as plant:
+            simulate(plant, naive(scenario), 60, 0).write_csv(tmp_path / name)
+        return (tmp_path / name).read_bytes()
+
+    steady = run("steady.csv")
+    jumps = lambda: float(rng.uniform(-1e9, 1e9))  # noqa: E731
+    monkeypatch.setattr("cosim.simulation.perf_counter", jumps)
+    monkeypatch.setattr("time.time", jumps)
+    assert run("jumping.csv") == steady
+
+
+# Plants ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory):
+    return build_tank(tmp_path_factory.mktemp("tank"), saves=True)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "isolate"),
+    [
+        (1, "returned x = nan at step 0", False),
+        (2, "out of water", False),
+        (3, "burst", False),
+        (5, "SIGABRT", True),
+    ],
+)
+def test_a_failing_plant_ends_the_run_in_one_line(tmp_path, tank, fault, words, isolate):
+    scenario = write_scenario(tmp_path, tank, fault=fault)
+    (tmp_path / "still.py").write_text(STILL)
+    command = ["simulate", "-s", str(scenario), "-c", "still:make", "-n", "5", "--out", "out"]
+    said = refused(command_line(tmp_path, *command, *(["--isolate"] if isolate else [])))
+    assert words in said
+    assert not list((tmp_path / "out").glob("*"))
+
+
+STILL = """
+from types import SimpleNamespace
+import numpy as np
+
+class Still:
+    def __init__(self, u): self.u = np.array(u)
+    def reset(self): pass
+    def prepare(self): pass
+    def feedback(self, s, a=None):
+        return SimpleNamespace(action=self.u, value=0.0, status="solved", residual=0.0,
+                               predicted_states=None, predicted_actions=None)
+
+def make(scenario):
+    return Still(scenario.reference_action)
+"""
+
+
+@pytest.mark.slow
+def test_a_plant_that_crashes_in_workers_ends_the_evaluation_in_one_line(tmp_path, tank):
+    scenario = write_scenario(tmp_path, tank, fault=5)
+    (tmp_path / "still.py").write_text(STILL)
+    command = ["evaluate", "-s", str(scenario), "-c", "still:make", "--seeds", "2", "-n", "5"]
+    assert "died" in refused(command_line(tmp_path, *command, "--jobs", "2", "--out", "out"))
+
+
+# Solvers ---------------------------------------------------------------------------------------
+
+SHARE = 0.01
+
+
+class Unreliable(DaqpBackend):
+    """DAQP that fails to solve 1 % of its problems, and counts."""
+
+    injected = 0
+    rng = np.random.default_rng(5)
+
+    def solve(self, qp):
+        if Unreliable.rng.random() < SHARE:
+            Unreliable.injected += 1
+            raise QpError("injected", status="injected", qp=qp.copy())
+        return super().solve(qp)
+
+
+@pytest.fixture
+def unreliable(monkeypatch):
+    monkeypatch.setattr(Unreliable, "injected", 0)
+    monkeypatch.setattr(Unreliable, "rng", np.random.default_rng(5))
+    return Unreliable
+
+
+def test_a_run_goes_on_through_solver_failures_and_counts_each(unreliable, tmp_path):
+    scenario = Scenario.load("paper")
+    problem = Problem.from_scenario(scenario)
+    controller = RtiNmpc(problem, Parameters.naive(problem), backend=unreliable)
+    with FmuPlant(scenario) as plant:
+        run = simulate(plant, controller, 3000, 0)
+    failures = run.summary()["failures"]
+    assert failures == unreliable.injected
+    assert 10 < failures < 60
+    # Where the solver failed, the action before was applied once more.
+    failed = np.flatnonzero(run["failed"])
+    np.testing.assert_array_equal(run.actions[failed], run.actions[failed - 1])
+    run.write_csv(tmp_path / "trajectory.csv")
+    with (tmp_path / "trajectory.csv").open(newline="") as stream:
+        assert sum(row["status"] == "fallback" for row in csv.DictReader(stream)) == failures
+
+
+def flaky(scenario):
+    problem = Problem.from_scenario(scenario)
+    return RtiNmpc(problem, Parameters.naive(problem), backend=Unreliable)
+
+
+def test_an_evaluation_says_how_many_samples_failed(unreliable):
+    table = evaluate("paper", {"flaky": flaky}, 2, 600)
+    counted = sum(int(row["failures"]) for row in table.rows)
+    # The settling run, which no row shows, has failures of its own.
+    assert 0 < counted <= unreliable.injected
+
+
+def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, monkeypatch):
+    monkeypatch.setattr("controllers.rti.make_backend", lambda name: unreliable())
+    scenario = Scenario.load("paper")
+    run = Run(
+        algorithm="q-learning",
+        scenario=scenario,
+        samples=2000,
+        seed=0,
+        configuration=QLearning.Configuration(),
+        log_every=1000,
+        evaluate_every=2000,
+        checkpoint_every=2000,
+        evaluation_seeds=1,
+        evaluation_steps=1,
+    )
+    with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
+        result = Training(run, QLearning, plant, other).go()
+    assert result.status == "finished"
+    failures = result.rows[-1]["failures"]
+    # One-sample evaluations may fail too, and are not counted among the samples.
+    assert unreliable.injected - 3 <= failures <= unreliable.injected
+    assert failures > 5
+
+
+def test_a_recording_that_was_cut_says_how_to_repair_it(files, tmp_path):
+    path = tmp_path / "cut.rrd"
+    path.write_bytes(files["recording"].good[:-500])
+    try:
+        found = read_recording(path)
+    except RecordingError as error:
+        assert "rerun rrd optimize" in str(error)
+    else:
+        assert len(found.samples) <= 20
+
+
+def test_the_summary_of_a_run_says_how_many_failed(tmp_path):
+    result = command_line(tmp_path, "simulate", "--steps", "20", "--json", "--out", "out")
+    assert json.loads(result.stdout)["failures"] == 0

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import atexit
+import os
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from math import inf
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import rerun as rr
@@ -19,6 +24,12 @@ from cosim.recording.text import drawable
 APPLICATION = "rti-cosim"
 SIGNAL = "cosim.Signal"
 """Archetype of the static mark (name, unit) on every entity that holds a signal."""
+
+FOOTER = b"RRF2FOOT"
+"""Near the end of every file that Rerun finished."""
+
+WRITE_SECONDS = 30.0
+_ABANDONED: list[rr.RecordingStream] = []
 
 TIME = "time"
 SAMPLE = "sample"
@@ -79,7 +90,7 @@ class Stream:
         if self.begun:
             self._stream.send_blueprint(blueprint)
         else:
-            self._stream.save(self._partial, default_blueprint=blueprint)
+            self._bounded(partial(self._stream.save, self._partial, default_blueprint=blueprint))
             self.begun = True
 
     def outgrown(self, channels: Sequence[Channel]) -> bool:
@@ -89,12 +100,39 @@ class Stream:
         return self.begun and any(c.seen[0] < low or c.seen[1] > high for c, (low, high) in pairs)
 
     def close(self) -> None:
-        """Finish the file and give it its name; without a layout there is none."""
-        if self.begun:
-            self._stream.disconnect()
-            self._partial.replace(self.path)
-        else:
+        """Finish the file and give it its name; without a layout there is none.
+
+        Raises RecordingError where not all of it could be written.
+        """
+        if self._stream in _ABANDONED:
+            return
+        if not self.begun:
             self._partial.unlink()
+            return
+        self._bounded(self._stream.disconnect)
+        with self._partial.open("rb") as written:
+            written.seek(-min(len(FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
+            if FOOTER not in written.read():
+                self._give_up("its end is missing")
+        self._partial.replace(self.path)
+
+    def _bounded(self, call: Callable[[], None]) -> None:
+        """Let Rerun write, for a time: once its writer has ended, it waits for it for ever."""
+        writing = threading.Thread(target=call, daemon=True)
+        writing.start()
+        writing.join(WRITE_SECONDS)
+        if writing.is_alive():
+            # To drop the stream, or to let Rerun shut down, would wait for ever too.
+            _ABANDONED.append(self._stream)
+            atexit.unregister(rr.rerun_shutdown)
+            self.begun = False
+            self._give_up("its writer does not answer")
+
+    def _give_up(self, reason: str) -> NoReturn:
+        raise RecordingError(
+            f"the recording {self.path} could not be written ({reason}): is the disk full? What "
+            f"was written can be repaired: rerun rrd optimize {self._partial} -o REPAIRED.rrd"
+        ) from None
 
 
 def line(label: str, color: str, *, step: bool = False, width: float = 1.5) -> rr.SeriesLines:

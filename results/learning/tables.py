@@ -234,7 +234,7 @@ def converged_page(cases: dict[str, Runs]) -> str:
                     f"{test.pvalue:.3f}",
                 ]
             )
-    rows.sort(key=lambda row: float(row[-1]))
+    rows.sort(key=lambda row: float(row[-1]) if row[-1] != "nan" else 1.0)
     text = (
         "## RTI and converged NMPC learn different θ\n\n"
         "Same rule, samples and seeds; mean ± standard deviation over training seeds, the ten "

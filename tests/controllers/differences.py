@@ -55,6 +55,7 @@ def derivative(
     `value_noise` and `action_noise` (size,).
     """
     base = evaluate(at)
+    active = activity(base)
     values, actions, steps, errors = [], [], [], []
     for i in range(at.size):
         for relative in STEPS:
@@ -64,7 +65,7 @@ def derivative(
                 moved = at.copy()
                 moved[i] += multiple * h
                 ends[multiple] = evaluate(moved)
-                if activity(ends[multiple]) != activity(base):
+                if activity(ends[multiple]) != active:
                     break
             else:
                 break

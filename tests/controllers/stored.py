@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -71,18 +71,31 @@ def qps() -> tuple[StoredQp, ...]:
     )
 
 
-def solve(backend: str, picked: Iterable[int] | None = None) -> Iterator[RtiSolution]:
-    """Solve the set, or those picked, with one backend that keeps its workspace as a run does."""
-    controllers = {
-        hessian: RtiNmpc(
-            evaporator_problem(), qps()[0].parameters, hessian=hessian, backend=backend
-        )
-        for hessian in HESSIANS
-    }
+@cache
+def _controllers(backend: str) -> dict[str, RtiNmpc]:
+    problem, theta = evaporator_problem(), qps()[0].parameters
+    return {name: RtiNmpc(problem, theta, hessian=name, backend=backend) for name in HESSIANS}
+
+
+def prepared(
+    backend: str, picked: Iterable[int] | None = None
+) -> Iterator[tuple[RtiNmpc, StoredQp]]:
+    """The QPs of the set, or those picked, each with a controller prepared for it.
+
+    The controllers start with a new workspace and keep it from QP to QP, as a run does.
+    """
+    for controller in _controllers(backend).values():
+        controller.reset()
     for k in range(len(qps())) if picked is None else picked:
         qp = qps()[k]
-        controller = controllers[qp.hessian]
+        controller = _controllers(backend)[qp.hessian]
         if controller.parameters is not qp.parameters:
             controller.parameters = qp.parameters
         controller.prepare_at(qp.point)
+        yield controller, qp
+
+
+def solve(backend: str, picked: Iterable[int] | None = None) -> Iterator[RtiSolution]:
+    """Solutions of the set, or of the QPs picked."""
+    for controller, qp in prepared(backend, picked):
         yield controller.feedback(qp.s, qp.a)

@@ -126,7 +126,7 @@ def test_the_samples_hold_every_kind_of_activity(count):
 def random_cases(backend="daqp"):
     for layout, hessian in KINDS if backend == "daqp" else KINDS[:2]:
         nmpc = controller(layout, hessian, backend)
-        for number in range(30):
+        for number in range(20):
             theta, point, s, a = sample(layout, hessian, number)
             nmpc.parameters = theta
             nmpc.prepare_at(point)
@@ -135,16 +135,7 @@ def random_cases(backend="daqp"):
 
 def stored_cases(backend="daqp"):
     """The QPs of real runs, where the policy keeps the next state on its bound."""
-    rtis = {
-        hessian: RtiNmpc(
-            evaporator_problem(), stored.qps()[0].parameters, hessian=hessian, backend=backend
-        )
-        for hessian in HESSIANS
-    }
-    for qp in stored.qps()[::5]:
-        nmpc = rtis[qp.hessian]
-        nmpc.parameters = qp.parameters
-        nmpc.prepare_at(qp.point)
+    for nmpc, qp in stored.prepared(backend, range(0, len(stored.qps()), 5)):
         yield nmpc, qp.s, nmpc.policy(qp.s) + np.array([3.0, -2.0])
 
 

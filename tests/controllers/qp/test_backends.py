@@ -35,6 +35,7 @@ def reference():
 def assert_agreement(backend, picked):
     """To 1e-6 relative to max(1, |·|): multipliers reach 1e5, the slack's linear weight."""
     for k, answer in zip(picked, solve(backend, picked), strict=True):
+        assert answer.residual < 2e-9
         for name, value in read_out(answer).items():
             expected = reference()[k][name]
             error = np.abs(value - expected) / np.maximum(1, np.abs(expected))
@@ -67,19 +68,13 @@ def test_proxqp_agrees_on_the_whole_stored_set():
 
 @pytest.mark.parametrize("backend", QPSOLVERS)
 def test_qpsolvers_agrees_on_a_part_of_the_stored_set(backend):
-    assert_agreement(backend, range(0, len(qps()), 7))
+    assert_agreement(backend, range(0, len(qps()), 11))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", QPSOLVERS)
 def test_qpsolvers_agrees_on_the_whole_stored_set(backend):
     assert_agreement(backend, range(len(qps())))
-
-
-@pytest.mark.parametrize("backend", EVERY)
-def test_the_stored_set_is_solved_to_small_residuals(backend):
-    picked = range(3, len(qps()), 40)
-    assert max(answer.residual for answer in solve(backend, picked)) < 2e-9
 
 
 @pytest.mark.parametrize("backend", PERSISTENT)
@@ -94,7 +89,8 @@ def test_new_weights_are_taken_over(backend):
 
 
 def test_daqp_gives_the_same_bits_whatever_it_solved_before():
-    first = {k: answer for k, answer in enumerate(solve("daqp")) if k % 5 == 0}
+    picked = range(0, len(qps()), 5)
+    first = dict(zip(picked, solve("daqp", picked), strict=True))
     shuffled = list(reversed(first))
     for k, again in zip(shuffled, solve("daqp", shuffled), strict=True):
         for before, after in zip(first[k].multipliers, again.multipliers, strict=True):

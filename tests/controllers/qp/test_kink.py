@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from sampling import evaporator_problem
 from scalar import scalar_qp, solution
-from stored import HESSIANS, qps
+from stored import prepared
 
-from controllers import RtiNmpc
 from controllers.qp.kink import settle
 
 FREE = np.array([-10.0]), np.array([10.0])
@@ -52,12 +50,8 @@ def test_a_saturated_action_keeps_its_own_multiplier():
 
 
 def test_the_action_gradient_lies_between_the_one_sided_derivatives():
-    problem, theta, checked = evaporator_problem(), qps()[0].parameters, 0
-    controllers = {name: RtiNmpc(problem, theta, hessian=name) for name in HESSIANS}
-    for qp in qps()[::8]:
-        nmpc = controllers[qp.hessian]
-        nmpc.parameters = qp.parameters
-        nmpc.prepare_at(qp.point)
+    checked = 0
+    for nmpc, qp in prepared("daqp", range(0, 480, 8)):
         policy = nmpc.feedback(qp.s)
         at = nmpc.feedback(qp.s, policy.action)
         if at.licq:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from math import inf, isnan
+from dataclasses import asdict
+from math import isnan
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,107 +17,17 @@ from controllers.storage import write_atomically
 from cosim.errors import CapabilityError
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller
-from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 from learning import checkpoint
 from learning.checkpoint import Checkpoint
-from learning.configuration import Configuration
 from learning.definiteness import certificate
 from learning.errors import ConfigurationError, DivergenceError
 from learning.evaluation import Evaluation, gap_closed, held_out
 from learning.interaction import Interaction
-from learning.protocols import Algorithm, Update
+from learning.log import COLUMNS, Row, Totals, to_csv
+from learning.protocols import Algorithm
+from learning.run import Result, Run, TrainingRecorder
 from learning.starting_point import build_controller, build_strategy, starting_parameters
-
-Vector = NDArray[np.float64]
-Row = dict[str, float]
-COLUMNS = (
-    "samples",
-    "updates",
-    "J",
-    "td_error",
-    "step",
-    "smallest_eigenvalue",
-    "corrected",
-    "refused",
-    "failures",
-    "explored",
-    "saturated",
-    "greedy_J",
-    "greedy_economic_cost",
-    "greedy_mean_violation",
-    "greedy_violating_share",
-    "greedy_failures",
-    "gap_closed",
-)
-
-
-@dataclass(frozen=True)
-class Run:
-    """What identifies a training run; a checkpoint goes on only in the very same one.
-
-    `log_every`, `evaluate_every`, `checkpoint_every` in samples; `evaluation_seeds` held-out runs
-    of `evaluation_steps` samples. A greedy J that is worse than the naive one's by more than
-    (`divergence` − 1) of its magnitude ends the run.
-    """
-
-    algorithm: str
-    scenario: Scenario
-    samples: int
-    seed: int
-    configuration: Configuration
-    controller: str = "rti"
-    log_every: int = 1000
-    evaluate_every: int = 5000
-    checkpoint_every: int = 5000
-    evaluation_seeds: int = 4
-    evaluation_steps: int = 500
-    divergence: float = 1.5
-
-    def __post_init__(self) -> None:
-        """Raise ConfigurationError on counts that make no run."""
-        for name in ("samples", "log_every", "evaluate_every", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ConfigurationError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("evaluate_every", "checkpoint_every"):
-            if getattr(self, name) % self.log_every:
-                raise ConfigurationError(
-                    f"{name} = {getattr(self, name)} must be a multiple of log_every = "
-                    f"{self.log_every}"
-                )
-
-    def identity(self) -> dict[str, Any]:
-        """The run as JSON-ready values."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        values["scenario"] = self.scenario.hash
-        values["configuration"] = self.configuration.model_dump(mode="json")
-        return values
-
-
-class TrainingRecorder(Protocol):
-    """Takes a training run row by row; `cosim.recording.TrainingRecorder` is one."""
-
-    def start(self, run: Run, parameters: Parameters) -> None:
-        """Open the record."""
-
-    def record(self, row: Row, parameters: Parameters, controller: Controller) -> None:
-        """Append a row of the log with θ as it is."""
-
-    def close(self) -> None:
-        """Finish the record."""
-
-
-@dataclass(frozen=True)
-class Result:
-    """What came of a run: θ, the log, the greedy evaluation of θ, and how it ended.
-
-    `status` is `finished` or `diverged: …`; then `parameters` is the last θ that evaluated well.
-    """
-
-    parameters: Parameters
-    rows: list[Row]
-    evaluation: dict[str, float]
-    status: str
 
 
 class Training:
@@ -164,7 +72,7 @@ class Training:
         self._naive = build_controller(run.controller, scenario, problem, Parameters.naive(problem))
         self._rows: list[Row] = []
         self._good = parameters
-        self._totals = _Totals()
+        self._totals = Totals()
         self.obstacle: str | None = None
         """Why this run leaves no checkpoint, if it does not."""
         self._references = {"naive": float("nan"), "optimum": float("nan")}
@@ -321,7 +229,7 @@ class Training:
             dict(zip(state["columns"], (float(v) for v in row), strict=True))
             for row in arrays["rows"]
         ]
-        self._totals = _Totals(**state["totals"])
+        self._totals = Totals(**state["totals"])
         self._controller.theta = arrays["theta"]
         self._good = self._good.with_theta(arrays["good"])
         self._plant.restore(self._plant.deserialise(arrays["plant"].tobytes()))
@@ -335,41 +243,6 @@ class Training:
         parameters.save(self._out / "parameters.toml")
 
 
-@dataclass
-class _Totals:
-    """Sums since the last line of the log."""
-
-    cost: float = 0.0
-    updates: int = 0
-    squares: float = 0.0
-    step: float = 0.0
-    corrected: int = 0
-    refused: int = 0
-    smallest_eigenvalue: float = inf
-
-    def add(self, update: Update) -> None:
-        self.updates += 1
-        self.squares += update.td_error**2
-        self.step += update.step
-        self.corrected += update.corrected
-        self.refused += update.refused
-        self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
-
-    def means(self, samples: float) -> Row:
-        count = self.updates or float("nan")
-        return {
-            "J": self.cost / samples,
-            "updates": self.updates,
-            "td_error": (self.squares / count) ** 0.5,
-            "step": self.step / count,
-            "corrected": self.corrected,
-            "refused": self.refused,
-        }
-
-    def clear(self) -> None:
-        self.__init__()  # type: ignore[misc]
-
-
 def _group(arrays: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
     start = f"{prefix} "
     return {
@@ -377,17 +250,3 @@ def _group(arrays: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[An
         for name, values in arrays.items()
         if name.startswith(start)
     }
-
-
-def to_csv(rows: list[Row]) -> str:
-    """The log as CSV with exact decimals; what was not measured is left empty."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    if rows:
-        writer.writerow(rows[0])
-    for row in rows:
-        writer.writerow(
-            "" if isnan(value) else repr(int(value) if value == int(value) else value)
-            for value in row.values()
-        )
-    return stream.getvalue()

@@ -12,7 +12,7 @@ from cosim.cli.output import JsonOption, Output, dump, open_folder, output
 from cosim.cli.simulate import ScenarioOption
 
 if TYPE_CHECKING:
-    from learning.training import Result, Run
+    from learning.run import Result, Run
 
 AlgorithmOption = Annotated[
     str,
@@ -87,7 +87,7 @@ def train(
         from cosim.cli.compose import import_from_here
         from cosim.scenario import Scenario
         from learning.registry import load_algorithm
-        from learning.training import Run
+        from learning.run import Run
 
         import_from_here()
         found = load_algorithm(algorithm)
@@ -223,7 +223,7 @@ def summarise(run: Run, result: Result) -> dict[str, Any]:
 
 def _write(folder: Path, run: Run, result: Result, summary: dict[str, Any]) -> None:
     from controllers.storage import write_atomically
-    from learning.training import to_csv
+    from learning.log import to_csv
 
     write_atomically(folder / "learning.csv", to_csv(result.rows))
     result.parameters.save(folder / "parameters.toml")

@@ -25,9 +25,11 @@ from controllers.storage import write_atomically
 from cosim import FmuPlant, Scenario
 from cosim.cli.train import summarise
 from learning.evaluation import Evaluation, held_out
+from learning.log import to_csv
 from learning.registry import load_algorithm
+from learning.run import Run
 from learning.starting_point import build_controller
-from learning.training import Run, Training, to_csv
+from learning.training import Training
 
 SEEDS, STEPS = 50, 1000
 FIGURES = ("J", "economic_cost", "mean_violation", "violating_share", "failures")

@@ -20,7 +20,8 @@ from pathlib import Path
 
 from cosim import FmuPlant, Scenario
 from learning.q_learning import QLearning
-from learning.training import Run, Training
+from learning.run import Run
+from learning.training import Training
 
 TENTHS = 10
 PAGE = os.sysconf("SC_PAGE_SIZE")

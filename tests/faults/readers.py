@@ -24,7 +24,8 @@ from learning.checkpoint import Checkpoint
 from learning.checkpoint import load as load_checkpoint
 from learning.errors import CheckpointError
 from learning.q_learning import QLearning
-from learning.training import Run, Training
+from learning.run import Run
+from learning.training import Training
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.errors import RecordingError
 from cosim.recording.reading import read_recording
 from learning.q_learning import QLearning
-from learning.training import Run, Training
+from learning.run import Run
+from learning.training import Training
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "cosim"))
 from tank import build_tank, write_scenario

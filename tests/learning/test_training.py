@@ -7,8 +7,10 @@ import pytest
 
 from cosim import FmuPlant
 from learning.errors import CheckpointError, ConfigurationError
+from learning.log import to_csv
 from learning.registry import load_algorithm
-from learning.training import Run, Training, to_csv
+from learning.run import Run
+from learning.training import Training
 
 SETTINGS = {
     "q-learning": {"warm_up": 20},

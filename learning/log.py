@@ -1,0 +1,83 @@
+"""The training log: rows of named figures, sums between rows, CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from math import inf, isnan
+
+from learning.protocols import Update
+
+Row = dict[str, float]
+COLUMNS = (
+    "samples",
+    "updates",
+    "J",
+    "td_error",
+    "step",
+    "smallest_eigenvalue",
+    "corrected",
+    "refused",
+    "failures",
+    "explored",
+    "saturated",
+    "greedy_J",
+    "greedy_economic_cost",
+    "greedy_mean_violation",
+    "greedy_violating_share",
+    "greedy_failures",
+    "gap_closed",
+)
+
+
+@dataclass
+class Totals:
+    """Sums since the last line of the log."""
+
+    cost: float = 0.0
+    updates: int = 0
+    squares: float = 0.0
+    step: float = 0.0
+    corrected: int = 0
+    refused: int = 0
+    smallest_eigenvalue: float = inf
+
+    def add(self, update: Update) -> None:
+        """Take an update."""
+        self.updates += 1
+        self.squares += update.td_error**2
+        self.step += update.step
+        self.corrected += update.corrected
+        self.refused += update.refused
+        self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
+
+    def means(self, samples: float) -> Row:
+        """Means over `samples` samples and their updates, NaN where there was none."""
+        count = self.updates or float("nan")
+        return {
+            "J": self.cost / samples,
+            "updates": self.updates,
+            "td_error": (self.squares / count) ** 0.5,
+            "step": self.step / count,
+            "corrected": self.corrected,
+            "refused": self.refused,
+        }
+
+    def clear(self) -> None:
+        """Begin a new row."""
+        self.__init__()  # type: ignore[misc]
+
+
+def to_csv(rows: list[Row]) -> str:
+    """The log as CSV with exact decimals; what was not measured is left empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    if rows:
+        writer.writerow(rows[0])
+    for row in rows:
+        writer.writerow(
+            "" if isnan(value) else repr(int(value) if value == int(value) else value)
+            for value in row.values()
+        )
+    return stream.getvalue()

@@ -244,6 +244,7 @@ def test_another_layout_is_refused(nmpc, problem):
 # failures -------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:invalid:RuntimeWarning")
 @pytest.mark.parametrize("s", [[np.nan, 50.0], [25.0, np.inf]])
 def test_a_state_that_is_not_finite_raises_and_the_qp_is_carried(s, nmpc):
     with pytest.raises(QpError, match="not finite: state") as caught:

@@ -1,0 +1,56 @@
+"""Controllers by name, for real scenarios."""
+
+import numpy as np
+import pytest
+
+from controllers import ConvergedNmpc, Parameters, Problem
+from controllers.errors import ParameterError
+from controllers.factories import converged, from_file, naive
+from cosim import Scenario
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return Scenario.load("paper")
+
+
+def changed(scenario, **settings):
+    controller = scenario.controller.model_copy(update=settings)
+    return scenario.model_copy(update={"controller": controller})
+
+
+def test_naive_has_the_papers_theta(paper):
+    controller = naive(paper)
+    expected = Parameters.naive(Problem.from_scenario(paper))
+    np.testing.assert_array_equal(controller.theta, expected.theta)
+
+
+def test_the_value_offset_is_the_scenarios(paper):
+    level = naive(changed(paper, value_offset="discounted")).parameters["c_lambda"]
+    assert level == pytest.approx(paper.controller.reference_cost / 0.01)
+    assert naive(paper).parameters["c_lambda"] == paper.controller.reference_cost
+
+
+def test_backend_and_hessian_are_the_scenarios(paper):
+    s = paper.reference_state + np.array([0.5, 1.0])
+    first = naive(changed(paper, backend="proxqp", hessian="exact"))
+    assert first.feedback(s).value == pytest.approx(naive(paper).feedback(s).value, rel=1e-6)
+    assert type(first._backend).__name__ == "ProxQpBackend"
+    assert first.feedback(s).prepared.spectrum is not None
+
+
+def test_converged_is_solved_to_convergence(paper):
+    controller = converged(paper)
+    assert isinstance(controller, ConvergedNmpc)
+    assert controller.feedback([27.0, 52.0]).residual < 1e-8
+
+
+def test_a_file_gives_the_same_controller(paper, tmp_path):
+    parameters = Parameters.naive(Problem.from_scenario(paper)).replace({"x_l": [26, 40]})
+    controller = from_file(paper, parameters.save(tmp_path / "theta.toml"))
+    assert controller.parameters.hash == parameters.hash
+
+
+def test_a_missing_file_is_named(paper):
+    with pytest.raises(ParameterError, match=r"nowhere\.toml: there is no such parameters file"):
+        from_file(paper, "nowhere.toml")

@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-from code_blocks import COVERED, FENCE, ROOT, Session, blocks, is_slow, pages
+from code_blocks import COVERED, FENCE, ROOT, SMALLER, Session, blocks, is_slow, pages
 
 
 def parameters():
@@ -29,6 +29,11 @@ def test_the_page_does_what_it_says(page, tmp_path, monkeypatch):
                 del sys.modules[name]
 
 
+def test_every_smaller_budget_stands_in_for_one_on_a_page():
+    text = "".join(page.read_text() for page in pages())
+    assert all(budget in text for budget in SMALLER)
+
+
 def test_no_fence_escapes_the_collector():
     for page in pages():
         fences = [line for line in page.read_text().splitlines() if line.startswith("```")]
@@ -44,4 +49,5 @@ def test_what_is_not_typed_is_on_a_page_and_covered_elsewhere():
         if command.startswith("make "):
             assert f"\n{command.removeprefix('make ')}:" in makefile
     assert "make test" in script
-    assert "cosim demo" in script
+    assert "make check" in script
+    assert "cosim demo" in makefile[makefile.index("\ncheck:") :]

@@ -44,7 +44,7 @@ title = "A run"
 table = "trajectory.csv"
 keys = ["time"]
 drop = ["status", "residual"]
-files = ["summary.json"]
+files = ["scenario.toml"]
 [experiment.run.runs]
 naive = "cosim simulate --steps 200"
 
@@ -58,7 +58,7 @@ drop = [
 [experiment.table.runs]
 naive = "cosim evaluate --controllers naive --seeds 3 --steps 200 --jobs 1"
 """
-TRAIN = "train --algorithm batch-q-learning --samples 4000 --log-every 500 --evaluate-every 2000"
+TRAIN = "train --algorithm batch-q-learning --samples 2000 --log-every 250 --evaluate-every 1000"
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Job:
 
 
 def _train(folder: Path) -> list[str]:
-    words = [*TRAIN.split(), "--checkpoint-every", "500", "--out", "out"]
+    words = [*TRAIN.split(), "--checkpoint-every", "250", "--out", "out"]
     return [*words, "--resume"] if (folder / "out" / "checkpoint.npz").exists() else words
 
 
@@ -146,13 +146,13 @@ JOBS = (
     Job("training", _train, ("out/learning.csv", "out/parameters.toml"), _inspect_training),
     Job(
         "evaluation",
-        lambda _: ["evaluate", "--seeds", "6", "--steps", "400", "--jobs", "2", "--out", "out"],
+        lambda _: ["evaluate", "--seeds", "4", "--steps", "300", "--jobs", "2", "--out", "out"],
         ("out/evaluation.csv", "out/evaluation.parquet"),
         _inspect_units,
     ),
     Job(
         "recording",
-        lambda _: ["simulate", "--steps", "4000", "--record", "--out", "out"],
+        lambda _: ["simulate", "--steps", "2500", "--record", "--out", "out"],
         ("out/trajectory.csv", "out/scenario.toml"),
         _inspect_recording,
     ),
@@ -202,8 +202,11 @@ def trial(job: Job, reference: Path, folder: Path, delay: float) -> Counter[str]
     return seen
 
 
-def campaign(trials: int, seed: int, names: tuple[str, ...] = ()) -> dict[str, dict[str, int]]:
-    """Run trials in turn over the jobs; what was seen, by job."""
+def campaign(
+    trials: int, seed: int, names: tuple[str, ...] = (), seconds: float = float("inf")
+) -> dict[str, dict[str, int]]:
+    """Run trials in turn over the jobs, for a time; what was seen, by job."""
+    end = time.monotonic() + seconds
     draw = random.Random(seed)
     jobs = [job for job in JOBS if not names or job.name in names]
     seen: dict[str, Counter[str]] = {job.name: Counter() for job in jobs}
@@ -213,6 +216,8 @@ def campaign(trials: int, seed: int, names: tuple[str, ...] = ()) -> dict[str, d
             shutil.copytree(ROOT / package, Path(top) / "code" / package)
         references, durations = {}, {}
         for number in range(trials):
+            if time.monotonic() > end:
+                break
             job = jobs[number % len(jobs)]
             if job.name not in references:
                 folder = references[job.name] = Path(top) / f"reference {job.name}"
@@ -225,6 +230,7 @@ def campaign(trials: int, seed: int, names: tuple[str, ...] = ()) -> dict[str, d
             folder.mkdir()
             delay = draw.uniform(0.1, 1.0) * durations[job.name]
             seen[job.name] += trial(job, references[job.name], folder, delay)
+            print(f"trial {number + 1}: {job.name}, kill at {delay:.2f} s", file=sys.stderr)
             shutil.rmtree(folder)
     return {name: dict(counter) for name, counter in seen.items()}
 
@@ -234,8 +240,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after")
     options = parser.parse_args()
-    print(json.dumps(campaign(options.trials, options.seed), indent=1, ensure_ascii=False))
+    seen = campaign(options.trials, options.seed, seconds=options.seconds)
+    print(json.dumps(seen, indent=1, ensure_ascii=False))
 
 
 if __name__ == "__main__":

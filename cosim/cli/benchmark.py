@@ -95,7 +95,10 @@ def controllers(
         int, typer.Option("--steps", "-n", min=50, max=1_000_000, help="Samples of each run.")
     ] = 2000,
     every: Annotated[
-        int, typer.Option("--every", min=1, help="Compare every so many samples with the others.")
+        int,
+        typer.Option(
+            "--every", min=1, max=1_000_000, help="Compare every so many samples with the others."
+        ),
     ] = 10,
     json: JsonOption = False,
 ) -> None:

@@ -76,13 +76,13 @@ def fuzz(reader, folder: Path, examples: int) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_damaged_file_is_refused_or_read_as_it_was(files, tmp_path, name):
-    fuzz(files[name], tmp_path, EXAMPLES.get(name, 60))
+    fuzz(files[name], tmp_path, EXAMPLES.get(name, 40))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_many_damaged_files(files, tmp_path, name):
-    fuzz(files[name], tmp_path, 20 * EXAMPLES.get(name, 60))
+    fuzz(files[name], tmp_path, 20 * EXAMPLES.get(name, 40))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -48,13 +48,14 @@ class EconomicTuning:
         )
         return "\n".join(
             [
-                f"optimal steady state  x = {steady.x}, u = {steady.u}, cost {steady.cost:.6g}",
+                f"optimal steady state  x = {_short(steady.x)}, u = {_short(steady.u)}, "
+                f"cost {steady.cost:.6g}",
                 f"strictly active       {active or 'none'}",
-                f"economic Hessian      eigenvalues {np.linalg.eigvalsh(steady.hessian)}",
-                f"convexified Hessian   eigenvalues {convex.eigenvalues}, α = {convex.alpha:.4g}, "
-                f"β = {convex.beta:.4g}, F = {convex.F.tolist()}",
-                f"economic gain         {self.economic.gain.tolist()}",
-                f"tuned gain differs by {self.gain_error:.2g}",
+                f"economic Hessian      eigenvalues {_short(steady.eigenvalues)}",
+                f"convexified Hessian   eigenvalues {_short(convex.eigenvalues)}, "
+                f"α = {convex.alpha:.4g}, β = {convex.beta:.4g}, F = {_short(convex.F)}",
+                f"economic gain         {_short(self.economic.gain)}",
+                f"tuned gain            differs by {self.gain_error:.2g}",
             ]
         )
 
@@ -114,3 +115,9 @@ def _symmetric(matrix: Array) -> Array:
     """Rounding made symmetric, as θ's packing demands."""
     symmetric: Array = 0.5 * (matrix + matrix.T)
     return symmetric
+
+
+def _short(array: Array) -> str:
+    """Entries to five digits, on one line."""
+    rows = [_short(row) if row.ndim else f"{float(row):.5g}" for row in array]
+    return f"[{', '.join(rows)}]"

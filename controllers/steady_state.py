@@ -41,6 +41,11 @@ class SteadyState:
     C: Array
     active: tuple[str, ...]
 
+    @property
+    def eigenvalues(self) -> Array:
+        """Eigenvalues of `hessian`, ascending."""
+        return np.linalg.eigvalsh(self.hessian).astype(np.float64)
+
 
 def optimal_steady_state(problem: Problem) -> SteadyState:
     """Solve for the optimal steady state with IPOPT, started from the problem's reference.

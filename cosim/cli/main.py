@@ -19,6 +19,7 @@ from cosim.cli import (
     scenario,
     simulate,
     train,
+    tuning,
     view,
 )
 
@@ -38,6 +39,7 @@ app.command("train")(train.train)
 app.command("view")(view.view)
 app.command("compare")(compare.compare)
 app.command("optimum")(optimum.optimum)
+app.command("tuning")(tuning.tuning)
 app.command("scenario")(scenario.scenario)
 app.add_typer(benchmark.app, name="benchmark")
 app.command("reproduce")(reproduce.reproduce)

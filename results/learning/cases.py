@@ -3,8 +3,7 @@
 The hyperparameters of the cases `*-paper` and `*-extended` are the algorithms' defaults, but for
 the parametrisation; `q-learning-literal` is the paper's rule as it is printed, and
 `q-learning-line-search` that with the line search that the paper names as an option; the cases
-`*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one;
-`q-learning-rti` and `q-learning-converged` differ in the controller only.
+`*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one.
 """
 
 from __future__ import annotations
@@ -24,13 +23,17 @@ LITERAL = {
 
 @dataclass(frozen=True)
 class Case:
-    """One algorithm with its settings; `seeds` training seeds 0, 1, …"""
+    """One algorithm with its settings.
+
+    It is trained with `seeds` seeds 0, 1, … and evaluated on `noise_seeds` held-out ones.
+    """
 
     algorithm: str
     samples: int
     settings: dict[str, Any] = field(default_factory=dict)
     seeds: int = 10
     controller: str = "rti"
+    noise_seeds: int = 50
 
 
 CASES = {
@@ -44,6 +47,4 @@ CASES = {
     "q-learning-line-search": Case("q-learning", 20_000, {**LITERAL, "line_search": True}, seeds=5),
     "q-learning-mean-cost": Case("q-learning", 40_000, {"discount": 1.0}),
     "batch-q-learning-mean-cost": Case("batch-q-learning", 30_000, {"discount": 1.0}),
-    "q-learning-rti": Case("q-learning", 20_000, seeds=5),
-    "q-learning-converged": Case("q-learning", 20_000, seeds=5, controller="converged"),
 }

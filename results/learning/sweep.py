@@ -31,17 +31,17 @@ from learning.run import Run
 from learning.starting_point import build_controller
 from learning.training import Training
 
-SEEDS, STEPS = 50, 1000
+STEPS = 1000
 FIGURES = ("J", "economic_cost", "mean_violation", "violating_share", "failures")
 
 
-def evaluate(plant: FmuPlant, controller: Any) -> str:
+def evaluate(plant: FmuPlant, controller: Any, seeds: int) -> str:
     """Figures of a controller on each held-out seed, as CSV."""
-    costs = Evaluation(plant, held_out(SEEDS), STEPS).costs(controller)
+    costs = Evaluation(plant, held_out(seeds), STEPS).costs(controller)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(("seed", *FIGURES))
-    for row, seed in enumerate(held_out(SEEDS)):
+    for row, seed in enumerate(held_out(seeds)):
         writer.writerow((seed, *(repr(float(costs[name][row])) for name in FIGURES)))
     return stream.getvalue()
 
@@ -60,7 +60,7 @@ def train(out: Path, scenario: Scenario, name: str, case: Case, seed: int) -> st
         seed=seed,
         configuration=algorithm.Configuration.from_dict(case.settings),
         controller=case.controller,
-        log_every=500,
+        log_every=min(500, case.samples // 20),
         evaluate_every=case.samples // 20,
         checkpoint_every=case.samples // 5,
         evaluation_seeds=4,
@@ -73,7 +73,7 @@ def train(out: Path, scenario: Scenario, name: str, case: Case, seed: int) -> st
         elapsed = time.perf_counter() - begin[0], time.process_time() - begin[1]
         problem = Problem.from_scenario(scenario)
         controller = build_controller(case.controller, scenario, problem, result.parameters)
-        evaluation = evaluate(other, controller)
+        evaluation = evaluate(other, controller, case.noise_seeds)
     summary = summarise(run, result)
     summary["timing"] = {"wall_seconds": elapsed[0], "process_seconds": elapsed[1]}
     result.parameters.save(folder / "parameters.toml")

@@ -1,0 +1,93 @@
+"""The paper's last remark: RTI and converged NMPC learn different θ.
+
+    python results/learning/converged.py
+
+Both learn from the very same transitions of the stochastic FMU, by the same rule (Gauss–Newton fits
+of batch Q-learning, targets renewed in each) from the same θ; only what evaluates Q and V differs.
+Writes OUT/converged.csv: an entry of θ a row, its change under either, in units of its scale.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.problem import Problem
+from controllers.storage import write_atomically
+from cosim import FmuPlant, Scenario
+from cosim.simulation import spawn_seeds
+from learning import BatchQLearning
+from learning.fit import least_squares
+from learning.interaction import Interaction
+from learning.level import Level
+from learning.protocols import LearnableController
+from learning.replay import ReplayBuffer
+from learning.starting_point import build_controller, build_strategy, starting_parameters
+from learning.step import ParameterStep
+
+SAMPLES, ITERATIONS, GAIN, RADIUS = 150, 6, 0.5, 1.0
+
+
+def fill(scenario: Scenario, controller: LearnableController) -> ReplayBuffer:
+    """Transitions of the stochastic plant at the controller's θ, with exploration."""
+    configuration = BatchQLearning.Configuration.from_dict({})
+    strategy = build_strategy(configuration, scenario, SAMPLES)
+    algorithm = BatchQLearning(controller, scenario, configuration, SAMPLES, strategy)
+    seed, rng = spawn_seeds(0)
+    buffer = ReplayBuffer(SAMPLES)
+    with FmuPlant(scenario) as plant:
+        interaction = Interaction(plant, controller, algorithm, strategy, rng)
+        interaction.start(seed)
+        for _ in range(SAMPLES):
+            sample, _ = interaction.next()
+            if sample is not None:
+                buffer.add(sample)
+    return buffer
+
+
+def learn(
+    scenario: Scenario, controller: LearnableController, buffer: ReplayBuffer
+) -> NDArray[np.float64]:
+    """Change of θ, scaled, after all fits to the buffer."""
+    start = controller.theta.copy()
+    step = ParameterStep(controller, BatchQLearning.Configuration.from_dict({}))
+    level = Level(scenario.discount, 0, 1.0, 0.0)
+    for _ in range(ITERATIONS):
+        replayed = buffer.replay(controller, level)
+        gradient = replayed.gradient * step.scale
+        fit = least_squares(gradient.T @ gradient, gradient.T @ replayed.td_error, 1e-2)
+        step.take(fit.shrunk(GAIN).clipped(RADIUS), 0.0)
+    change: NDArray[np.float64] = (controller.theta - start) / step.scale
+    return change
+
+
+def main() -> None:
+    """Learn with both and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("results/learning"))
+    arguments = parser.parse_args()
+    scenario = Scenario.load("paper")
+    problem = Problem.from_scenario(scenario)  # type: ignore[arg-type]
+    parameters = starting_parameters(problem, BatchQLearning.Configuration.from_dict({}))
+    made: dict[str, Any] = {
+        kind: build_controller(kind, scenario, problem, parameters) for kind in ("rti", "converged")
+    }
+    buffer = fill(scenario, made["rti"])
+    made["rti"].parameters = parameters
+    rti, converged = (learn(scenario, made[kind], buffer) for kind in ("rti", "converged"))
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(("entry", "rti", "converged"))
+    for label, one, other in zip(parameters.layout.labels, rti, converged, strict=True):
+        writer.writerow((label, f"{one:.8g}", f"{other:.8g}"))
+    write_atomically(arguments.out / "converged.csv", stream.getvalue())
+
+
+if __name__ == "__main__":
+    main()

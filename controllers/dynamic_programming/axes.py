@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from controllers.dynamic_programming.bellman import BellmanOperator
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.howard import Iterate
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.problem import Problem
@@ -41,9 +40,14 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
 
 
 def finer_grid(
-    problem: Problem, law: DisturbanceLaw, iterate: Iterate, settings: Settings, level: int
+    problem: Problem,
+    law: DisturbanceLaw,
+    grid: Grid,
+    distribution: Array,
+    settings: Settings,
+    level: int,
 ) -> Grid:
-    """Grid that resolves the support of the closed loop with cells·2^level cells a state.
+    """Grid that resolves the support of a distribution (G,) with cells·2^level cells a state.
 
     It reaches as far again beyond the support on either side, and at least a twentieth of the
     bounds' span: farther states are so rare that the policy at the box's edge serves them.
@@ -51,9 +55,9 @@ def finer_grid(
     """
     share = 1.0 if law.deterministic else 0.05
     margin = share * (problem.state_upper - problem.state_lower)
-    mass = np.maximum(iterate.distribution, 0.0).reshape(iterate.grid.shape)
+    mass = np.maximum(distribution, 0.0).reshape(grid.shape)
     axes = []
-    for i, axis in enumerate(iterate.grid.axes):
+    for i, axis in enumerate(grid.axes):
         others = tuple(j for j in range(mass.ndim) if j != i)
         first, last = support(axis, mass.sum(axis=others), settings.tail)
         width = last - first

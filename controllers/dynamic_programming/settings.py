@@ -74,7 +74,7 @@ def accurate_substeps(
 
     Allowed is `tolerance`·(1 + |x|), tried at 2000 points: states within the first quarter of the
     bounds' box around the reference, actions in their box, disturbances of the law. Raises
-    OptimumError where 64 substeps do not do.
+    OptimumError where 128 substeps do not do.
     """
     generator = np.random.default_rng(0)
     reach = 0.25 * (problem.state_upper - problem.state_lower)
@@ -86,7 +86,7 @@ def accurate_substeps(
     u = generator.uniform(problem.action_lower, problem.action_upper, (2000, problem.n_actions))
     d = law.draw(generator, 2000)
     before: Array | None = None
-    for substeps in 2 ** np.arange(7):
+    for substeps in 2 ** np.arange(8):
         step = Elementwise(discretise(problem.model, problem.sampling_time, int(substeps)))
         # A step that is too long may overflow; then the next one is tried.
         with np.errstate(all="ignore"):
@@ -97,6 +97,6 @@ def accurate_substeps(
             return int(substeps)
         before = x_next
     raise OptimumError(
-        f"model '{problem.model.name}': 64 RK4 substeps a sample do not integrate it to "
+        f"model '{problem.model.name}': 128 RK4 substeps a sample do not integrate it to "
         f"{tolerance:g}; shorten the sampling time"
     )

@@ -86,7 +86,7 @@ def solve(
     report = _Reporter(progress)
     for level in range(settings.level):
         iterate = _approach(operator if level else draft, iterate, settings, report)
-        grid = finer_grid(problem, law, iterate, settings, level + 1)
+        grid = finer_grid(problem, law, grid, iterate.distribution, settings, level + 1)
         iterate = _transfer(operator, iterate, grid)
         report.level = level + 1
     return _optimum(_converge(operator, iterate, settings, report), operator, accuracy)
@@ -97,22 +97,23 @@ def refine(
     law: DisturbanceLaw,
     settings: Settings,
     optimum: Optimum,
-    accuracy: Accuracy,
     *,
+    grid: Grid | None = None,
+    accuracy: Accuracy | None = None,
     parameters: Array | None = None,
     workers: int = 2,
     progress: Callable[[Progress], None] | None = None,
 ) -> Optimum:
-    """Solve again from a solution: on the grid of `settings.level`, with another accuracy.
+    """Solve again from a solution, on another grid or with another accuracy.
 
-    Equal to `solve` with these, up to the tolerances, but quicker. Raises OptimumError as it does.
+    Raises OptimumError as `solve` does.
     """
+    grid, accuracy = grid or optimum.grid, accuracy or optimum.accuracy
     parameters = problem.model.nominal_parameters if parameters is None else parameters
     operator = BellmanOperator(
         problem, law, parameters, accuracy, discount=optimum.discount, workers=workers
     )
     start = begin(operator, optimum.grid, optimum.actions)
-    grid = finer_grid(problem, law, start, settings, settings.level)
     report = _Reporter(progress)
     report.level = settings.level
     iterate = _converge(operator, _transfer(operator, start, grid), settings, report)

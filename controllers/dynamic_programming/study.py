@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.dynamic_programming.axes import finer_grid
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum, Progress, refine
@@ -52,9 +53,9 @@ def study(
         after = refine(
             problem,
             law,
-            replace(settings, level=level),
+            settings,
             before,
-            optimum.accuracy,
+            grid=finer_grid(problem, law, before.grid, before.distribution, settings, level),
             parameters=parameters,
             progress=progress,
         )
@@ -66,7 +67,7 @@ def study(
         law,
         settings,
         optimum,
-        optimum.accuracy.finer(),
+        accuracy=optimum.accuracy.finer(),
         parameters=parameters,
         progress=progress,
     )

@@ -89,7 +89,7 @@ def test_chain_is_stochastic_and_agrees_with_values():
 
 
 def test_model_that_no_step_integrates_is_refused():
-    with pytest.raises(OptimumError, match="64 RK4 substeps a sample do not integrate"):
+    with pytest.raises(OptimumError, match="128 RK4 substeps a sample do not integrate"):
         accurate_substeps(evaporator_problem(sampling_time=1e5), LAW, P, 1e-7)
 
 

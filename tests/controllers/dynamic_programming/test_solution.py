@@ -95,11 +95,10 @@ def test_number_of_workers_changes_no_bit():
 
 
 def test_refining_a_solution_equals_solving_finely(scalar_levels):
-    settings = Settings(level=3)
-    refined = refine(
-        SCALAR.problem, SCALAR.law, settings, scalar_levels[0], scalar_levels[0].accuracy
-    )
-    assert refined.gain == pytest.approx(scalar_levels[1].gain, rel=2e-3)
+    coarse, fine = scalar_levels[:2]
+    refined = refine(SCALAR.problem, SCALAR.law, Settings(), coarse, grid=fine.grid)
+    assert refined.gain == pytest.approx(fine.gain, rel=1e-4)
+    np.testing.assert_array_equal(refined.grid.points, fine.grid.points)
 
 
 def test_unstable_plant_that_leaves_its_box_is_refused():

@@ -75,7 +75,10 @@ class Scenario(Table):
             for part in table.split("."):
                 value = getattr(value, part)
             if len(value) != size and not (optional and not value):
-                raise _misfit(table, f"must have one entry per {of} ({size}), not {len(value)}")
+                raise _misfit(
+                    table,
+                    f"must have one entry per {of} (plant.{of}s has {size}), not {len(value)}",
+                )
         for kind in ("state", "action"):
             lower = getattr(self.bounds, f"{kind}_lower")
             upper = getattr(self.bounds, f"{kind}_upper")

@@ -137,7 +137,7 @@ BAD = {
     "wrong size": (
         "x.toml",
         'extends="paper"\n[bounds]\nstate_lower = [25.0]',
-        ["bounds.state_lower", "one entry per state (2), not 1"],
+        ["bounds.state_lower", "one entry per state (plant.states has 2), not 1"],
     ),
     "bounds crossed": (
         "x.toml",

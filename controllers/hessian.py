@@ -69,16 +69,16 @@ class GaussNewton:
 
     def __init__(self, problem: Problem, prepared: BufferedFunction) -> None:
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        self._discounts = problem.discount ** np.arange(horizon)
+        self.discounts = problem.discount ** np.arange(horizon)
         self._end = problem.discount**horizon
-        self._L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
-        self._q = prepared.inputs["q"].reshape(horizon, n + m)
+        self.L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
+        self.q = prepared.inputs["q"].reshape(horizon, n + m)
         self._L_N, self._q_N = prepared.inputs["L_N"], prepared.inputs["q_N"]
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Write the costs of θ, which no linearisation point changes."""
-        self._L[:] = 2 * self._discounts[:, None, None] * parameters["B_l"]
-        self._q[:] = self._discounts[:, None] * parameters["b_l"]
+        self.L[:] = 2 * self.discounts[:, None, None] * parameters["B_l"]
+        self.q[:] = self.discounts[:, None] * parameters["b_l"]
         self._L_N[:] = 2 * self._end * parameters["B_Vf"].reshape(-1)
         self._q_N[:] = self._end * parameters["b_Vf"]
 
@@ -105,9 +105,6 @@ class Exact:
         self._cost = GaussNewton(problem, prepared)
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = np.concatenate([problem.reference_state, problem.reference_action])
-        self._discounts = problem.discount ** np.arange(horizon)
-        self._L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
-        self._q = prepared.inputs["q"].reshape(horizon, n + m)
         symbols = SymbolicParameters.of(problem, layout)
         x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
         guess = ca.SX.sym("guess", n, horizon)
@@ -129,22 +126,21 @@ class Exact:
         for name, value in (("x", x), ("u", u), ("guess", costates)):
             call.inputs[name][:] = value.reshape(-1)
         call()
-        size = self._reference.size
-        cost = 2 * self._discounts[:, None, None] * self._B
-        raw = cost + call.part("D").reshape(-1, size, size)
+        L, q, discounts = self._cost.L, self._cost.q, self._cost.discounts
+        raw = 2 * discounts[:, None, None] * self._B + call.part("D").reshape(L.shape)
         if not np.isfinite(raw).all():
             # The controller refuses the QP; an eigenvalue solver would raise its own error.
-            self._L[:] = np.nan
+            L[:] = np.nan
             return np.nan
         values, vectors = np.linalg.eigh(raw)
-        floor = np.asarray(self._floor * self._discounts[:, None], dtype=np.float64)
+        floor = np.asarray(self._floor * discounts[:, None], dtype=np.float64)
         self.spectrum = Spectrum(values, vectors, floor)
         lifted = np.maximum(values, floor)
-        self._L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
+        L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
         at = np.concatenate([x, u], axis=1) - self._reference
-        curved = np.einsum("kij,kj->ki", self._L, at)
-        flat = 2 * self._discounts[:, None] * (at @ self._B)
-        self._q[:] = flat + self._discounts[:, None] * self._b - curved
+        curved = np.einsum("kij,kj->ki", L, at)
+        flat = 2 * discounts[:, None] * (at @ self._B)
+        q[:] = flat + discounts[:, None] * self._b - curved
         return float((at * (curved - flat)).sum() / 2)
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
 from controllers.buffered import StackedFunction, stacked
 from controllers.layout import Layout
 from controllers.problem import Problem
+from controllers.qp import SoftQp, Stages
 
 
 def symmetric(packed: ca.SX, dimension: int) -> ca.SX:
@@ -210,3 +212,39 @@ def embedding(problem: Problem, layout: Layout, prepared: StackedFunction) -> St
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
         {name: prepared.stack[prepared.slices[name]] for name in prior},
     )
+
+
+def qp_in_memory(
+    problem: Problem, prepared: StackedFunction, embedded: StackedFunction
+) -> tuple[SoftQp, Stages]:
+    """The QP whose data are the memory of the preparation and the embedding, and its stages.
+
+    Calling the two functions rewrites it in place. The inputs' bounds and the sizes stand; the
+    initial state, the state's bounds and the slack weights are the caller's to write.
+    """
+    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+    stages = Stages(
+        A=prepared.part("A").reshape(horizon, n, n),
+        B=prepared.part("B").reshape(horizon, n, m),
+        r=prepared.part("r"),
+        L=prepared.inputs["L"].reshape(horizon, n + m, n + m),
+        q=prepared.inputs["q"].reshape(horizon, n + m),
+        L_N=prepared.inputs["L_N"].reshape(n, n),
+        q_N=prepared.inputs["q_N"],
+        initial=np.zeros(n),
+        state_lower=np.zeros(n),
+        state_upper=np.zeros(n),
+    )
+    qp = SoftQp(
+        H=prepared.part("H"),
+        f=embedded.part("f"),
+        lower=np.tile(problem.action_lower - problem.reference_action, horizon),
+        upper=np.tile(problem.action_upper - problem.reference_action, horizon),
+        rows=prepared.part("Gamma"),
+        row_lower=embedded.part("lower"),
+        row_upper=embedded.part("upper"),
+        w=np.zeros(n * horizon),
+        W=np.zeros(n * horizon),
+        stages=stages,
+    )
+    return qp, stages

@@ -61,6 +61,14 @@ class Parameters:
         """Copy with another flat vector."""
         return Parameters(self.layout, np.asarray(theta, dtype=np.float64))
 
+    def require_well_posed(self) -> None:
+        """Raise ParameterError on an x_l not below its x_u or a slack weight not positive."""
+        if not (self["x_l"] < self["x_u"]).all():
+            raise ParameterError(f"θ: x_l = {self['x_l']} must stay below x_u = {self['x_u']}")
+        for name in ("w_sigma", "W_sigma"):
+            if name in self.layout and not (self[name] > 0).all():
+                raise ParameterError(f"θ: {name} = {self[name]} must be positive")
+
     @property
     def hash(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of names and exact values."""

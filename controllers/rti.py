@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ControllerError, ParameterError, QpError
 from controllers.hessian import make_hessian
 from controllers.lagrangian import readout, sensitivities
-from controllers.ocp import embedding, preparation
+from controllers.ocp import embedding, preparation, qp_in_memory
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.qp import QpBackend, SoftQp, Stages, make_backend
+from controllers.qp import QpBackend, make_backend
 from controllers.qp.kink import settle
 from controllers.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 
@@ -64,32 +64,8 @@ class RtiNmpc:
         self._functions = Functions(
             problem, self._prepare, self._embed, self._readout, gradient, policy
         )
-        self._stages = Stages(
-            A=self._prepare.part("A").reshape(horizon, n, n),
-            B=self._prepare.part("B").reshape(horizon, n, m),
-            r=self._prepare.part("r"),
-            L=self._prepare.inputs["L"].reshape(horizon, n + m, n + m),
-            q=self._prepare.inputs["q"].reshape(horizon, n + m),
-            L_N=self._prepare.inputs["L_N"].reshape(n, n),
-            q_N=self._prepare.inputs["q_N"],
-            initial=np.zeros(n),
-            state_lower=np.zeros(n),
-            state_upper=np.zeros(n),
-        )
-        self._action_lower = np.tile(problem.action_lower - problem.reference_action, horizon)
-        self._action_upper = np.tile(problem.action_upper - problem.reference_action, horizon)
-        self._qp = SoftQp(
-            H=self._prepare.part("H"),
-            f=self._embed.part("f"),
-            lower=self._action_lower.copy(),
-            upper=self._action_upper.copy(),
-            rows=self._prepare.part("Gamma"),
-            row_lower=self._embed.part("lower"),
-            row_upper=self._embed.part("upper"),
-            w=np.zeros(n * horizon),
-            W=np.zeros(n * horizon),
-            stages=self._stages,
-        )
+        self._qp, self._stages = qp_in_memory(problem, self._prepare, self._embed)
+        self._action_lower, self._action_upper = self._qp.lower.copy(), self._qp.upper.copy()
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
         self._u = self._prepare.inputs["u"].reshape(horizon, m)
         self._costates = np.zeros((horizon, n))
@@ -110,7 +86,13 @@ class RtiNmpc:
 
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
-        self._check(parameters)
+        current = getattr(self, "_parameters", parameters)
+        if parameters.layout != current.layout:
+            raise ParameterError(
+                "θ has another layout than the controller was built with: "
+                f"{', '.join(parameters.layout.slices)}; build a new controller for it"
+            )
+        parameters.require_well_posed()
         problem, horizon = self.problem, self.problem.horizon
         self._parameters = parameters
         self._hessian.set_parameters(parameters)
@@ -125,22 +107,6 @@ class RtiNmpc:
         self._stages.state_lower[:] = parameters["x_l"] - problem.reference_state
         self._stages.state_upper[:] = parameters["x_u"] - problem.reference_state
         self._prepared: Prepared | None = None
-
-    def _check(self, parameters: Parameters) -> None:
-        current = getattr(self, "_parameters", parameters)
-        if parameters.layout != current.layout:
-            raise ParameterError(
-                "θ has another layout than the controller was built with: "
-                f"{', '.join(parameters.layout.slices)}; build a new controller for it"
-            )
-        if not (parameters["x_l"] < parameters["x_u"]).all():
-            raise ParameterError(
-                f"θ: x_l = {parameters['x_l']} must stay below x_u = {parameters['x_u']}"
-            )
-        if "w_sigma" in parameters.layout:
-            for name in ("w_sigma", "W_sigma"):
-                if not (parameters[name] > 0).all():
-                    raise ParameterError(f"θ: {name} = {parameters[name]} must be positive")
 
     @property
     def theta(self) -> Vector:

@@ -138,8 +138,13 @@ class RtiSolution:
 
     @cached_property
     def residuals(self) -> Residuals:
-        """KKT residuals and duality gap of the QP's solution."""
+        """KKT residuals of the QP's solution."""
         return self.multipliers.residuals(self.qp)
+
+    @property
+    def duality_gap(self) -> float:
+        """Relative duality gap of the QP's solution."""
+        return self.multipliers.duality_gap(self.qp)
 
     @property
     def residual(self) -> float:

@@ -102,14 +102,12 @@ class Residuals(NamedTuple):
 
     `stationarity` ‖Hv + f + ν + Γᵀλ‖∞ divided by max(1, ‖f‖∞, ‖Hv‖∞, ‖Γᵀλ‖∞); `bounds`
     ‖v − clip(v + ν)‖∞ and `rows` ‖y − prox_φ(y + λ)‖∞ in the units of v and y = Γv, where φ is the
-    soft bound: they measure feasibility, sign and complementarity at once. `gap` is the duality
-    gap relative to max(1, |objective|).
+    soft bound: they measure feasibility, sign and complementarity at once.
     """
 
     stationarity: float
     bounds: float
     rows: float
-    gap: float
 
     @property
     def largest(self) -> float:
@@ -145,15 +143,16 @@ class QpSolution(NamedTuple):
         sizes = np.abs(parts).max(axis=1).tolist()
         stationarity, bounds = sizes[0] / max(1.0, *sizes[2:]), sizes[1]
         rows = float(np.abs(y - _proximal(y + lam, qp)).max())
-        return Residuals(stationarity, bounds, rows, self._gap(qp, curvature))
+        return Residuals(stationarity, bounds, rows)
 
-    def _gap(self, qp: SoftQp, curvature: Vector) -> float:
+    def duality_gap(self, qp: SoftQp) -> float:
+        """Objective minus dual function, |·| relative to max(1, |objective|)."""
         v, nu, lam = self
         # The dual function at (ν, λ): minus the conjugates of the bounds and of the soft rows.
         bound = np.where(nu > 0, nu * qp.upper, nu * qp.lower).sum()
         over = np.maximum(np.abs(lam) - qp.w, 0.0)
         soft = np.where(lam > 0, lam * qp.row_upper, lam * qp.row_lower).sum()
-        dual = -0.5 * float(v @ curvature) - bound - soft - float((over**2 / (4 * qp.W)).sum())
+        dual = -0.5 * float(v @ qp.H @ v) - bound - soft - float((over**2 / (4 * qp.W)).sum())
         primal = qp.objective(v)
         return abs(primal - float(dual)) / max(1.0, abs(primal))
 

@@ -88,7 +88,7 @@ def test_any_change_of_the_solution_shows(case, name, step):
 
 def test_residuals_vanish_at_the_solutions_of_real_qps(solved):
     assert max(answer.residual for answer in solved) < 1e-9
-    assert max(answer.residuals.gap for answer in solved) < 1e-9
+    assert max(answer.duality_gap for answer in solved) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["v", "nu", "lam"])
@@ -105,7 +105,7 @@ def test_a_change_of_real_solutions_shows(name, solved):
 def test_the_duality_gap_bounds_the_distance_to_the_optimum():
     # Any dual point gives a lower bound: here ν = λ = 0 with v = −f, whose dual value is −f²/2.
     qp = scalar_qp(-3.0)
-    gap = solution(3.0, 0.0, 0.0).residuals(qp).gap
+    gap = solution(3.0, 0.0, 0.0).duality_gap(qp)
     primal, dual = qp.objective(np.array([3.0])), -4.5
     assert gap == pytest.approx((primal - dual) / max(1, abs(primal)))
     assert primal - qp.objective(np.array([4 / 3])) < primal - dual

@@ -18,9 +18,10 @@ LAST = 0.25
 def indicators(run: Trajectory) -> dict[str, float]:
     """Indicators of a run, by name; each a mean per sample unless it says otherwise.
 
-    `economic_cost` ℓ; `mean_violation` Σᵢ vᵢ; `violating_share` share of samples with any vᵢ > 0;
-    `J` mean of ℓ + penalty (design's yardstick); `input_effort` (see there); `failures` number of
-    samples under the fallback action.
+    `economic_cost` ℓ; `mean_violation` Σᵢ vᵢ; `violating_share` share of samples with
+    Σᵢ vᵢ > `cosim.penalty.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does
+    not count; `J` mean of ℓ + penalty, to which every violation counts; `input_effort` (see there);
+    `failures` number of samples under the fallback action.
     """
     summary = run.summary()
     names = ("economic_cost", "mean_violation", "violating_share", "J")

@@ -5,6 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+VIOLATING = 1e-6
+"""Violation Σᵢ vᵢ, in the states' units, above which a sample counts as violating.
+
+A controller that holds a state on its bound crosses it by rounding, by 1e-12, at every other
+sample: that is no violation to report. Mean violation, penalty and J take violations as they are.
+"""
+
 
 class Penalty:
     """Exact penalty of the state bounds, Σᵢ bᵢ vᵢ + Bᵢ vᵢ² with v = max(x_l − x, x − x_u, 0).

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from controllers.storage import write_atomically
 from cosim.errors import TrajectoryError
+from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -107,14 +108,15 @@ class Trajectory:
         """Per-sample means of the run and its counts; the same for the same signals.
 
         `economic_cost` mean of ℓ; `mean_violation` mean of Σᵢ vᵢ; `violating_share` share of
-        samples with any vᵢ > 0; `J` mean of ℓ + penalty; `failures` samples under the fallback
-        action; `explored` samples that the exploration changed; `statuses` samples by status.
+        samples with Σᵢ vᵢ > `VIOLATING`; `J` mean of ℓ + penalty; `failures` samples under the
+        fallback action; `explored` samples that the exploration changed; `statuses` samples by
+        status.
         """
         return {
             "samples": len(self),
             "economic_cost": float(np.mean(self["stage_cost"])),
             "mean_violation": float(np.mean(self["violation"])),
-            "violating_share": float(np.mean(self["violation"] > 0)),
+            "violating_share": float(np.mean(self["violation"] > VIOLATING)),
             "J": float(np.mean(self["stage_cost"] + self["penalty"])),
             "failures": int(np.sum(self["failed"])),
             "explored": int(np.sum(self["explored"])),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.figures.style import BOUND, colors, figure, label, legend_above, plain, save
+from cosim.penalty import VIOLATING
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ def plot_density(
     """Draw each controller's density of one state, (K,) samples, against its lower bound.
 
     The bins are common and an edge lies on the bound, so that no bin mixes both sides; the axis
-    leaves out the outermost 0.1 % of all samples. The legend gives the share below the bound.
+    leaves out the outermost 0.1 % of all samples. The legend gives the share that violates it.
     """
     everything = np.concatenate(list(samples.values()))
     low, high = np.quantile(everything, (0.001, 0.999))
@@ -40,7 +41,7 @@ def plot_density(
         axes = drawn.subplots()
         color = colors(list(samples))
         for controller, values in samples.items():
-            share = float(np.mean(values < bound))
+            share = float(np.mean(bound - values > VIOLATING))
             counts, _ = np.histogram(values, edges)
             heights = counts / (len(values) * width)
             axes.stairs(heights, edges, fill=True, alpha=0.12, color=color[controller])

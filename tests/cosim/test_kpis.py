@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from loop import Hold, Proportional
 
-from cosim import FmuPlant, simulate
+from cosim import FmuPlant, Scenario, simulate
+from cosim.cli.compose import build_controller
 from cosim.kpis import displaced, indicators, input_effort, settling_time
 from cosim.trajectory import Signal, Trajectory, signal_names
 
@@ -73,7 +74,24 @@ def test_indicators_are_the_definitions_applied_to_the_signals(paper):
     )
     penalty = (1e5 * violation + violation**2).sum(axis=1)
     assert found["mean_violation"] == pytest.approx(violation.sum(axis=1).mean(), rel=1e-12)
-    assert found["violating_share"] == np.mean(np.any(violation > 0, axis=1))
+    assert found["violating_share"] == np.mean(violation.sum(axis=1) > 1e-6)
     assert found["J"] == pytest.approx(np.mean(run["stage_cost"] + penalty), rel=1e-12)
     assert found["economic_cost"] == pytest.approx(np.mean(run["stage_cost"]), rel=1e-12)
     assert found["failures"] == 0
+
+
+def test_rounding_at_a_bound_is_no_violation_but_a_millionth_is(paper):
+    below = np.array([0.0, 1e-14, 1e-9, 9e-7, 1.1e-6, 1e-3])
+    run = run_with_states(paper, np.arange(6.0), np.stack([25.0 - below, np.full(6, 50.0)], axis=1))
+    run.signals["violation"].values[:] = below
+    found = indicators(run)
+    assert found["violating_share"] == 2 / 6
+    assert found["mean_violation"] == pytest.approx(below.mean(), rel=1e-12)
+
+
+def test_a_controller_that_rests_on_its_bound_does_not_violate_it():
+    nominal = Scenario.load("nominal")
+    with FmuPlant(nominal) as plant:
+        run = simulate(plant, build_controller("tuned", nominal), 300, 0)
+    assert np.mean(run["violation"] > 0) > 0.2, "rounds nowhere below the bound: proves nothing"
+    assert indicators(run)["violating_share"] == 0.0

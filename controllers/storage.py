@@ -1,10 +1,24 @@
-"""Files that are either there whole or not there at all."""
+"""Files that are there whole or not at all, and the user's folder for what is cached."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 from pathlib import Path
+
+import platformdirs
+
+CACHE_VARIABLE = "COSIM_CACHE"
+
+
+def user_cache(kind: str) -> Path:
+    """The user's folder for cached files of a kind, which need not exist yet.
+
+    It lies under the environment's COSIM_CACHE, else where the platform keeps caches.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE)
+    root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
+    return root.absolute() / kind
 
 
 def write_atomically(path: str | Path, data: bytes | str) -> Path:

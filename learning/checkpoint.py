@@ -77,7 +77,8 @@ def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
 
 def _entries(path: Path) -> dict[str, Array]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # NumPy leaves a file open that it opened itself and then found damaged.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise CheckpointError(

@@ -14,7 +14,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import platformdirs
 from numpy.typing import NDArray
 
 from controllers.dynamic_programming.bellman import Accuracy
@@ -24,7 +23,7 @@ from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum
 from controllers.errors import OptimumError
 from controllers.problem import Problem
-from controllers.storage import write_atomically
+from controllers.storage import user_cache, write_atomically
 
 Array = NDArray[np.float64]
 # Part of every key: raise it when the solver changes what it finds.
@@ -80,8 +79,8 @@ def _expression(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
 
 
 def cache_folder() -> Path:
-    """The user's folder of solved problems (its place is the platform's choice)."""
-    return Path(platformdirs.user_cache_dir("rti-cosim", appauthor=False)) / "optima"
+    """The user's folder of solved problems."""
+    return user_cache("optima")
 
 
 def stored(name: str) -> Path | None:
@@ -120,7 +119,8 @@ def read(path: Path, name: str) -> Optimum:
     """Read a solved problem; raises OptimumError where the file is damaged or another problem's."""
     mend = "delete it to have the policy computed anew"
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # NumPy leaves a file open that it opened itself and then found damaged.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {entry: archive[entry] for entry in archive.files}
         document = json.loads(str(arrays.pop("document")))
         axes = [arrays[f"axis_{i}"] for i in range(sum(e.startswith("axis_") for e in arrays))]

@@ -1,26 +1,25 @@
-"""FMU archives: found by name or path, checked, unpacked once per process and shared."""
+"""FMU archives: found by name or path, checked, and read once per process."""
 
 from __future__ import annotations
 
-import atexit
 import hashlib
-import shutil
 import stat
-import tempfile
 import threading
 import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO
 
 import fmpy
 from fmpy.model_description import ValidationError, read_model_description
 
 import fmus
 from cosim.errors import PlantError
+from cosim.plant.unpacking import place
 
 SHIPPED = ("evaporator", "evaporator_fmi3")
+DESCRIPTION = "modelDescription.xml"
 MAX_ENTRIES = 20_000
 MAX_BYTES = 1 << 30
 
@@ -52,7 +51,7 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
         raise PlantError(f"FMU '{path}' cannot be read: {error.strerror}") from None
     key = (path, status.st_mtime_ns, status.st_size)
     with _lock:
-        if key not in _unpacked:
+        if key not in _unpacked or not _unpacked[key].folder.is_dir():
             _unpacked[key] = _unpack(path)
         return _unpacked[key]
 
@@ -75,21 +74,20 @@ def _locate(fmu: str | Path) -> Path:
 
 
 def _unpack(path: Path) -> UnpackedFmu:
-    folder = Path(tempfile.mkdtemp(prefix="cosim-fmu-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     try:
-        with path.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        with zipfile.ZipFile(path) as archive:
+        with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
             _check_entries(path, archive.infolist())
-            archive.extractall(folder)
+            description = _describe(path, archive, stream)
+            stream.seek(0)
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            folder = place(archive, digest)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise PlantError(
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
     except OSError as error:
         raise PlantError(f"FMU '{path}' cannot be unpacked: {error}") from None
-    return UnpackedFmu(path, digest, folder, _describe(path, folder))
+    return UnpackedFmu(path, digest, folder, description)
 
 
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
@@ -109,11 +107,13 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             raise PlantError(f"FMU '{path}' is refused: entry '{name}' is a link")
 
 
-def _describe(path: Path, folder: Path) -> Any:
-    if not (folder / "modelDescription.xml").is_file():
-        raise PlantError(f"'{path}' is not an FMU: it has no modelDescription.xml")
+def _describe(path: Path, archive: zipfile.ZipFile, stream: BinaryIO) -> Any:
+    if DESCRIPTION not in archive.namelist():
+        raise PlantError(f"'{path}' is not an FMU: it has no {DESCRIPTION}")
+    # Damage of the archive is told from damage of the text: zipfile checks what it reads.
+    archive.read(DESCRIPTION)
     try:
-        return read_model_description(str(folder))
+        return read_model_description(stream)
     except ValidationError as error:
         problems = error.problems
         raise PlantError(

@@ -3,7 +3,7 @@ import stat
 
 import pytest
 
-from controllers.storage import write_atomically
+from controllers.storage import user_cache, write_atomically
 
 
 def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path):
@@ -29,3 +29,15 @@ def test_the_file_is_as_readable_as_any_other(tmp_path):
 def test_a_folder_that_is_not_there_raises_oserror(tmp_path):
     with pytest.raises(OSError, match="No such file"):
         write_atomically(tmp_path / "missing" / "file", "")
+
+
+def test_the_cache_lies_where_the_environment_says_else_where_the_platform_does(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    assert user_cache("optima") == tmp_path / "optima"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COSIM_CACHE", "here")
+    assert user_cache("fmus") == tmp_path / "here" / "fmus"
+    monkeypatch.setenv("COSIM_CACHE", "")
+    assert user_cache("fmus").parts[-2:] == ("rti-cosim", "fmus")

@@ -1,0 +1,15 @@
+"""The user's cache is left alone: what tests unpack and solve ends with them."""
+
+import os
+import shutil
+import tempfile
+
+OWN = "COSIM_CACHE" not in os.environ
+if OWN:
+    # Before any test module is imported, and inherited by pytest's and our own worker processes.
+    os.environ["COSIM_CACHE"] = tempfile.mkdtemp(prefix="cosim-tests-")
+
+
+def pytest_unconfigure():
+    if OWN:
+        shutil.rmtree(os.environ["COSIM_CACHE"], ignore_errors=True)

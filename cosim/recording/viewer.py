@@ -99,7 +99,11 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
     port = _free_port()
     options = ["--headless", "--hide-welcome-screen", "--port", str(port)]
     window = ["--window-size", f"{size[0]}x{size[1]}"]
-    with tempfile.TemporaryFile() as log:
+    # The viewer leaves its temporary files behind when it is ended: they go to a folder of ours.
+    with (
+        tempfile.TemporaryFile() as log,
+        tempfile.TemporaryDirectory(prefix="cosim-viewer-") as temporary,
+    ):
         # A session of its own: the command is a shim, and ending it alone would leave the viewer.
         process = subprocess.Popen(
             [*_viewer(), *options, *window],
@@ -107,7 +111,7 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
             stderr=log,
             start_new_session=True,
             # Messages below an error would be drawn over the views.
-            env=os.environ | {"RUST_LOG": "error"},
+            env=os.environ | {"RUST_LOG": "error", "TMPDIR": temporary},
         )
 
         def answers() -> bool:

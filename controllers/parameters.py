@@ -21,6 +21,7 @@ from controllers.storage import write_atomically
 
 Vector = NDArray[np.float64]
 SCHEMA = 1
+KEYS = ("schema", "hash", "theta", "model_parameters")
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Parameters:
         """Read θ for a problem; the file says which optional blocks it has.
 
         Raises ParameterError where the file is missing, is no TOML, has another schema, lacks or
-        adds a block, or where its values do not match its hash.
+        adds a key or a block, or where its values do not match its hash.
         """
         document = _read_document(Path(path))
         blocks = document["theta"]
@@ -164,6 +165,10 @@ def _read_document(path: Path) -> dict[str, Any]:
     if document.get("schema") != SCHEMA:
         raise ParameterError(
             f"{path}: schema is {document.get('schema')!r}; this version reads schema = {SCHEMA}"
+        )
+    if unknown := [repr(key) for key in document if key not in KEYS]:
+        raise ParameterError(
+            f"{path}: not known: {', '.join(unknown)}; a parameters file holds {', '.join(KEYS)}"
         )
     if not isinstance(document.get("theta"), dict):
         raise ParameterError(f"{path}: there is no table [theta]")

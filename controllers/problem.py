@@ -167,8 +167,13 @@ class Problem:
         )
 
 
-def load_model(name: str) -> Model:
-    """Import a model by `module:factory`; raises ModelError where it cannot be had."""
+def load_model(name: str | None) -> Model:
+    """Import a model by `module:factory`; raises ModelError where there is none to be had."""
+    if name is None:
+        raise ModelError(
+            'the scenario names no model for this controller; add model = "module:factory" to its '
+            'table [controller], for the evaporator "controllers.evaporator:model"'
+        )
     module_name, _, factory_name = name.partition(":")
     try:
         factory = getattr(importlib.import_module(module_name), factory_name)

@@ -89,6 +89,13 @@ def test_a_model_that_cannot_be_had_is_named(name, message):
         load_model(name)
 
 
+def test_a_scenario_without_a_model_says_which_line_is_missing():
+    with pytest.raises(
+        ModelError, match=r'names no model .* model = "module:factory" .*\[controller\]'
+    ):
+        load_model(None)
+
+
 def test_replacing_a_field_checks_again(problem):
     with pytest.raises(ModelError, match="horizon"):
         replace(problem, horizon=-1)

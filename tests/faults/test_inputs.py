@@ -293,6 +293,31 @@ def test_a_wrong_name_is_one_line_and_exit_code_2(monkeypatch, capfd, tmp_path, 
     assert not out.strip()
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "simulate --steps 3",
+        "simulate --steps 3 --controller tuned",
+        "simulate --steps 3 --controller theta.toml",
+        "evaluate --seeds 1 --steps 3 --jobs 1",
+        "train --algorithm q-learning --samples 20 --log-every 20 --evaluate-every 20",
+        "optimum",
+        "tuning",
+        "benchmark controllers",
+    ],
+)
+def test_a_command_that_needs_the_model_left_out_says_so(monkeypatch, capfd, tmp_path, files, line):
+    monkeypatch.chdir(tmp_path)
+    document = copy.deepcopy(PAPER)
+    del document["controller"]["model"]
+    (tmp_path / "plain.toml").write_text(Scenario.from_dict(document).to_toml())
+    (tmp_path / "theta.toml").write_bytes(files["theta"].good)
+    code, out, err = run(monkeypatch, capfd, [*line.split(), "--scenario", "plain.toml"])
+    assert code == 2, err
+    assert "error: the scenario names no model" in err
+    assert not out.strip()
+
+
 @pytest.mark.parametrize("line", ["scenario", "fmu info", "train -a q-learning --explain"])
 def test_json_is_all_that_comes_out(monkeypatch, capfd, line):
     code, out, _ = run(monkeypatch, capfd, [*line.split(), "--json"])

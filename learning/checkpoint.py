@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.storage import write_atomically
+from controllers.storage import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
 SCHEMA = 1
@@ -77,14 +76,12 @@ def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
 
 def _entries(path: Path) -> dict[str, Array]:
     try:
-        # NumPy leaves a file open that it opened itself and then found damaged.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+        return read_arrays(path)
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: there is no checkpoint to resume from; run without --resume"
         ) from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
 
 

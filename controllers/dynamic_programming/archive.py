@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -23,12 +21,11 @@ from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum
 from controllers.errors import OptimumError
 from controllers.problem import Problem
-from controllers.storage import user_cache, write_atomically
+from controllers.storage import read_arrays, user_cache, write_atomically
 
 Array = NDArray[np.float64]
 # Part of every key: raise it when the solver changes what it finds.
 VERSION = 1
-_DAMAGE = (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 SHIPPED = Path(__file__).parent.parent / "optima"
 
 
@@ -119,9 +116,7 @@ def read(path: Path, name: str) -> Optimum:
     """Read a solved problem; raises OptimumError where the file is damaged or another problem's."""
     mend = "delete it to have the policy computed anew"
     try:
-        # NumPy leaves a file open that it opened itself and then found damaged.
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {entry: archive[entry] for entry in archive.files}
+        arrays = read_arrays(path)
         document = json.loads(str(arrays.pop("document")))
         axes = [arrays[f"axis_{i}"] for i in range(sum(e.startswith("axis_") for e in arrays))]
         accuracy = document["accuracy"]
@@ -140,7 +135,7 @@ def read(path: Path, name: str) -> Optimum:
                 tuple(accuracy["penalty_nodes"]),
             ),
         )
-    except _DAMAGE as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise OptimumError(f"{path}: not a readable optimal policy ({error}); {mend}") from error
     size = optimum.grid.size
     shapes_fit = (

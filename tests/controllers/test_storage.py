@@ -1,9 +1,10 @@
 import os
 import stat
 
+import numpy as np
 import pytest
 
-from controllers.storage import user_cache, write_atomically
+from controllers.storage import read_arrays, user_cache, write_atomically
 
 
 def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path):
@@ -41,3 +42,33 @@ def test_the_cache_lies_where_the_environment_says_else_where_the_platform_does(
     assert user_cache("fmus") == tmp_path / "here" / "fmus"
     monkeypatch.setenv("COSIM_CACHE", "")
     assert user_cache("fmus").parts[-2:] == ("rti-cosim", "fmus")
+
+
+def test_arrays_with_any_byte_changed_are_read_as_they_were_or_refused(tmp_path):
+    path, arrays = tmp_path / "arrays.npz", {"a": np.arange(3.0), "b": np.array("text")}
+    np.savez_compressed(path, **arrays)
+    whole = path.read_bytes()
+    refused = 0
+    for position in range(len(whole)):
+        for change in (0x01, 0x40, 0xFF):
+            damaged = bytearray(whole)
+            damaged[position] ^= change
+            path.write_bytes(damaged)
+            try:
+                found = read_arrays(path)
+            except ValueError:
+                refused += 1
+            else:
+                assert all(np.array_equal(found[name], arrays[name]) for name in found)
+    assert refused > len(whole)
+
+
+def test_python_objects_are_refused_not_executed(tmp_path):
+    np.savez(tmp_path / "arrays.npz", a=np.array([print], dtype=object))
+    with pytest.raises(ValueError, match="pickle"):
+        read_arrays(tmp_path / "arrays.npz")
+
+
+def test_a_missing_file_is_no_damage(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        read_arrays(tmp_path / "missing.npz")

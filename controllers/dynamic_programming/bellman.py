@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -19,8 +20,9 @@ from controllers.problem import Problem
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
-# Arrays of one block, block × quadrature nodes, are to stay in a core's cache.
-_BLOCK = 128
+# States whose arrays, states × quadrature nodes, are worked on at once: fewer leave two threads
+# waiting for the interpreter's lock between short operations, more leave the cores' caches.
+_BLOCK = 512
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,7 @@ class BellmanOperator:
 
         def block(part: slice) -> Array:
             cost, x_next = self._expected_cost(states[part], actions[part])
-            following: Array = grid.interpolate(W, x_next) @ self._weights
-            return cost + self.discount * following
+            return cost + self.discount * _mean(grid.interpolate(W, x_next), self._weights)
 
         return np.concatenate(list(self._map(block, len(states))))
 
@@ -136,7 +137,7 @@ class BellmanOperator:
         )
         shape = (len(states), len(self._weights))
         x_next = [np.broadcast_to(entry, shape) for entry in self._step(*arguments)]
-        cost: Array = np.broadcast_to(self._cost(*arguments)[0], shape) @ self._weights
+        cost = _mean(np.broadcast_to(self._cost(*arguments)[0], shape), self._weights)
         return cost + self.discount * self._expected_penalty(x_next), x_next
 
     def _expected_penalty(self, x_next: Sequence[Array]) -> Array:
@@ -156,9 +157,16 @@ class BellmanOperator:
                     penalty = (
                         problem.penalty_linear[i] + problem.penalty_quadratic[i] * violation
                     ) * violation
-                    total[near] += penalty @ self._refine.weights
+                    total[near] += _mean(penalty, self._refine.weights)
         return total
 
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
-        parts = [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
+        edges = np.linspace(0, count, -(-count // _BLOCK) + 1).astype(int)
+        parts = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
         return self._pool.map(task, parts) if self._pool else map(task, parts)
+
+
+def _mean(values: Array, weights: Array) -> Array:
+    """Weighted mean of each row, without BLAS, whose own threads would compete with the blocks'."""
+    mean: Array = np.einsum("bq,q->b", values, weights)
+    return mean

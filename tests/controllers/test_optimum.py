@@ -123,7 +123,8 @@ def test_the_fmus_mean_cost_is_the_gain(policies, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "fast-sampling"])
 def test_no_other_controller_has_a_lower_cost(name):
-    J = paired(Scenario.load(name), ["optimal", "naive", "tuned"], seeds=20, steps=1000)
+    names = ["optimal", "naive", "tuned", "converged"]
+    J = paired(Scenario.load(name), names, seeds=20, steps=1000)
     for other in J[1:]:
         difference = other - J[0]
         half_width = scipy.stats.t.ppf(0.975, 19) * difference.std(ddof=1) / np.sqrt(20)

@@ -11,46 +11,48 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.style import SERIES, colors, figure, plain, save
+from cosim.figures.style import SERIES, WIDTH, colors, figure, legend_above, plain, save
 
 Array = NDArray[np.float64]
 
+Curves = Mapping[str, tuple[Array, Array]]
+"""Learning curves by name: samples (K,) and the values of S seeds, (S, K) or (K,) for one."""
+
 
 def plot_learning_curves(
-    curves: Mapping[str, tuple[Array, Array]],
+    panels: Mapping[str, Curves],
     path: str | Path,
     *,
     ylabel: str = "J per sample",
     references: Mapping[str, float] | None = None,
     logarithmic: bool = False,
 ) -> Path:
-    """Draw curves (samples (K,), values (S, K)) of S seeds: median, quartiles, and full range.
+    """Draw a panel for each set of curves: median over seeds, their quartiles and full range.
 
-    `references` are levels drawn as dashed lines, e.g. the baselines and the optimum.
+    `panels` are named in their legends. `references` are levels drawn as dashed lines in all of
+    them, e.g. the baselines and the optimum.
     """
-    with figure(2.8, 4.9) as drawn:
-        axes = drawn.subplots()
-        color = colors(list(curves))
-        for name, (samples, values) in curves.items():
-            _band(axes, samples, np.atleast_2d(values), color[name], plain(name))
-        levels = references or {}
-        for name, level in levels.items():
-            axes.axhline(level, color=colors([name])[name], linewidth=0.9, linestyle=(0, (4, 2)))
-            axes.annotate(
-                f"{plain(name)} {level:.0f}",
-                (1.01, level),
-                xycoords=("axes fraction", "data"),
-                va="center",
-                fontsize=6.5,
-                color=colors([name])[name],
-            )
+    with figure(3.0, 4.9 if len(panels) == 1 else WIDTH) as drawn:
+        row = drawn.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, (title, curves) in zip(row, panels.items(), strict=True):
+            color = colors(list(curves))
+            for name, (samples, values) in curves.items():
+                _band(axes, samples, np.atleast_2d(values), color[name], plain(name))
+            for name, level in (references or {}).items():
+                axes.axhline(
+                    level,
+                    color=colors([name])[name],
+                    linewidth=0.9,
+                    linestyle=(0, (4, 2)),
+                    label=f"{plain(name)} {level:.0f}",
+                )
+            axes.set_xlim(left=0.0)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.set_xlabel("samples")
+            legend_above(axes, columns=1, title=plain(title))
+        row[0].set_ylabel(ylabel)
         if logarithmic:
-            axes.set_yscale("log")
-        axes.set_xlim(left=0.0)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.set_xlabel("samples")
-        axes.set_ylabel(ylabel)
-        axes.legend(loc="best")
+            row[0].set_yscale("log")
     return save(drawn, path)
 
 
@@ -58,14 +60,14 @@ def _band(axes: Axes, samples: Array, values: Array, color: str, name: str) -> N
     seeds = len(values)
     axes.plot(
         samples,
-        np.nanmedian(values, axis=0),
+        np.median(values, axis=0),
         color=color,
         linewidth=1.3,
         label=f"{name} ({seeds} seeds)" if seeds > 1 else name,
     )
     if seeds > 1:
         for low, high, alpha in ((0.0, 1.0, 0.12), (0.25, 0.75, 0.25)):
-            edges = np.nanquantile(values, (low, high), axis=0)
+            edges = np.quantile(values, (low, high), axis=0)
             axes.fill_between(samples, *edges, color=color, alpha=alpha, linewidth=0)
 
 
@@ -73,20 +75,20 @@ def plot_parameters_and_td_error(
     samples: Array,
     increments: Mapping[str, Array],
     td_samples: Array,
-    td_mean: Array,
+    td_error: Array,
     path: str | Path,
     *,
     window: int = 10_000,
 ) -> Path:
-    """Draw the paper's figure: increments of θ by block, and the TD error's running mean.
+    """Draw the paper's figure: increments of θ by block, and the TD error over a window.
 
-    `increments` maps a block's name to θ − θ₀ (K, entries) at `samples` (K,); `td_mean` (M,) at
-    `td_samples` (M,) is the mean over the preceding `window` samples. Source: paper.tex,
-    fig. nmpc_learn.
+    `increments` maps a block's name to θ − θ₀ (K, entries) at `samples` (K,); `td_error` (M,) at
+    `td_samples` (M,) is the root mean square over the preceding `window` samples. Source:
+    paper.tex, fig. nmpc_learn.
     """
     moving = {name: np.atleast_2d(values.T).T for name, values in increments.items()}
     moving = {name: values for name, values in moving.items() if np.any(values)}
-    columns = 3
+    columns = 4
     rows = -(-len(moving) // columns)
     end = float(max(td_samples[-1], samples[-1]))
     with figure(1.3 * rows + 1.8) as drawn:
@@ -103,11 +105,12 @@ def plot_parameters_and_td_error(
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
         axes = drawn.add_subplot(grid[rows, :])
-        axes.plot(td_samples, td_mean, color=SERIES[1], linewidth=1.0)
+        axes.plot(td_samples, td_error, color=SERIES[1], linewidth=1.0)
         axes.set_xlim(0.0, end)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_xlabel("samples")
-        axes.set_title(f"TD error, mean of the preceding {window} samples", loc="left", fontsize=8)
+        title = f"TD error, root mean square of the preceding {window} samples"
+        axes.set_title(title, loc="left", fontsize=8.0)
     return save(drawn, path)
 
 

@@ -12,14 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from numpy.typing import NDArray
 
-from cosim.figures.style import (
-    BOUND,
-    WIDTH,
-    figure,
-    label,
-    plain,
-    save,
-)
+from cosim.figures.style import BOUND, WIDTH, figure, label, plain, save
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -86,8 +79,9 @@ def plot_phase_portraits(
                 label(scenario.plant.states[1], units.get(scenario.plant.states[1], ""))
             )
         drawn.supxlabel(
-            f"arrows: input less its operating point, right {first}, up {second}; "
-            f"the longest is {100 * longest:.0f} % of the input range",
+            f"arrows: input less its operating point, right {first}, up {second}; the longest is "
+            f"{100 * longest:.0f} % of the input range\ncolour: how often the state was there, "
+            "logarithmic; red: bounds; cross: operating point",
             fontsize=7.0,
         )
     return save(drawn, path)

@@ -29,6 +29,7 @@ _KNOWN = {
     "tuned": "#E69F00",
     "converged": "#CC79A7",
     "optimal": "#111111",
+    "learned": "#0072B2",
 }
 
 _STYLE: Any = {
@@ -97,8 +98,9 @@ def save(drawn: Figure, path: str | Path) -> Path:
 
 
 def colors(names: Sequence[str]) -> Mapping[str, str]:
-    """A colour for each controller: the baselines have their own, the others the cycle's."""
-    others = cycle(color for color in SERIES if color not in _KNOWN.values())
+    """A colour for each controller: the known ones have their own, the others the cycle's."""
+    taken = {_KNOWN.get(name) for name in names}
+    others = cycle(color for color in SERIES if color not in taken)
     return {name: _KNOWN.get(name) or next(others) for name in names}
 
 
@@ -135,7 +137,7 @@ def limit(axes: Axes, value: float, text: str = "") -> None:
         )
 
 
-def legend_above(axes: Axes, columns: int = 2) -> None:
+def legend_above(axes: Axes, columns: int = 2, title: str = "") -> None:
     """Put the legend over the axes, where it hides no data."""
     axes.legend(
         loc="lower left",
@@ -143,4 +145,7 @@ def legend_above(axes: Axes, columns: int = 2) -> None:
         ncols=columns,
         borderaxespad=0.2,
         handlelength=1.4,
+        title=title,
+        title_fontsize=8.5,
+        alignment="left",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +17,26 @@ from cosim.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 
-def plot_trajectory(trajectory: Trajectory, scenario: Scenario, path: str | Path) -> Path:
+def plot_trajectory(
+    trajectory: Trajectory,
+    scenario: Scenario,
+    path: str | Path,
+    *,
+    beside: Sequence[Trajectory] = (),
+) -> Path:
     """Draw a run to a PNG or SVG file; raises FigureError as `save` does."""
-    return save(trajectory_figure(trajectory, scenario), path)
+    return save(trajectory_figure(trajectory, scenario, beside=beside), path)
 
 
-def trajectory_figure(trajectory: Trajectory, scenario: Scenario) -> Figure:
+def trajectory_figure(
+    trajectory: Trajectory, scenario: Scenario, *, beside: Sequence[Trajectory] = ()
+) -> Figure:
     """Left: states, then inputs, with bounds (red) and operating point (grey).
 
     Right: disturbances and the cost per sample. Inputs, disturbances and costs hold from one
-    sample to the next. Violated bounds are shaded, fallback actions marked.
+    sample to the next. Violated bounds are shaded, fallback actions marked; a bound that is far
+    from the data is named in place of drawn. The axes span the runs `beside` this one too, so
+    that figures of a set can be compared.
     """
     plant, units = scenario.plant, {k: s.unit for k, s in trajectory.signals.items()}
     scale, time_unit = _time_unit(trajectory.time)
@@ -44,6 +55,8 @@ def trajectory_figure(trajectory: Trajectory, scenario: Scenario) -> Figure:
                 axes[name] = drawn.add_subplot(cell, sharex=next(iter(axes.values()), None))
                 axes[name].set_ylabel(label(name, units[name]), fontsize=7.0)
                 axes[name].tick_params(labelbottom=i == len(names) - 1)
+                for run in beside:
+                    _span(axes[name], time, run[name])
             axes[names[-1]].set_xlabel(f"time [{time_unit}]")
         for i, name in enumerate(plant.states):
             lower, upper = float(scenario.state_lower[i]), float(scenario.state_upper[i])
@@ -58,6 +71,7 @@ def trajectory_figure(trajectory: Trajectory, scenario: Scenario) -> Figure:
             axes[name].step(time, trajectory[name], where="post", color=SERIES[3], linewidth=0.6)
         _cost(axes["stage_cost"], time, trajectory["stage_cost"], SERIES[4])
         _cost(axes["penalty"], time, trajectory["penalty"], SERIES[1])
+        axes["penalty"].set_ylim(bottom=0.0)
         axes[left[0]].set_xlim(time[0], time[-1] + (time[1] - time[0] if len(time) > 1 else 1.0))
         drawn.align_ylabels()
         drawn.suptitle(_title(trajectory, scenario), fontsize=8.5)
@@ -82,6 +96,12 @@ def _time_unit(time: Array) -> tuple[float, str]:
     return (60.0, "min") if duration <= 86400.0 else (3600.0, "h")
 
 
+def _span(axes: Axes, time: Array, values: Array) -> None:
+    """Make room for values that another figure shows."""
+    axes.update_datalim([(time[0], np.min(values)), (time[0], np.max(values))])
+    axes.autoscale_view()
+
+
 def _state(axes: Axes, time: Array, values: Array, lower: float, upper: float, color: str) -> None:
     axes.plot(time, values, color=color, linewidth=0.9)
     for bound, outside in ((lower, values < lower), (upper, values > upper)):
@@ -93,12 +113,25 @@ def _state(axes: Axes, time: Array, values: Array, lower: float, upper: float, c
 
 
 def _limits(axes: Axes, lower: float, upper: float) -> None:
-    """Draw a bound where it is no farther from the data than they are wide."""
+    """Draw a bound where it is no farther from the data than they are wide, else name it."""
     low, high = axes.dataLim.intervaly
     span = max(high - low, 1e-9)
-    for bound, distance in ((lower, low - lower), (upper, upper - high)):
+    far = []
+    for name, bound, distance in (("≥", lower, low - lower), ("≤", upper, upper - high)):
         if distance < span:
             limit(axes, bound)
+        else:
+            far.append(f"{name} {bound:g}")
+    if far:
+        axes.annotate(
+            f"bound {', '.join(far)}",
+            (1.0, 1.0),
+            xycoords="axes fraction",
+            ha="right",
+            va="bottom",
+            fontsize=6.5,
+            color=BOUND,
+        )
 
 
 def _failures(axes: Axes, time: Array, values: Array, failed: Array) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,14 +41,19 @@ def draw(experiment: Experiment, runs: Mapping[str, Path], target: Path, policy:
 
 def _trajectories(runs: Mapping[str, Path]) -> dict[str, Trajectory]:
     return {
-        label: read_csv(run / "trajectory.csv", Scenario.load(run / "scenario.toml"))
+        label: replace(
+            read_csv(run / "trajectory.csv", Scenario.load(run / "scenario.toml")),
+            controller=label,
+        )
         for label, run in runs.items()
     }
 
 
 def _trajectory(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
-    for label, run in _trajectories(runs).items():
-        plot_trajectory(run, run.scenario, path.with_name(f"trajectory-{label}{path.suffix}"))
+    found = _trajectories(runs)
+    for label, run in found.items():
+        target = path.with_name(f"trajectory-{label}{path.suffix}")
+        plot_trajectory(run, run.scenario, target, beside=list(found.values()))
 
 
 def _density(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
@@ -102,7 +108,7 @@ def _learning(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
         evaluated = np.array([cell != "" for cell in table["greedy_J"]])
         samples = np.array(table["samples"], float)[evaluated]
         curves[label] = (samples, np.array(table["greedy_J"])[evaluated].astype(float)[None])
-    plot_learning_curves(curves, path, ylabel="J per sample, greedy")
+    plot_learning_curves({"": curves}, path, ylabel="J per sample, greedy")
 
 
 _FIGURES: dict[str, Callable[[Mapping[str, Path], Path, Policy], None]] = {

@@ -1,10 +1,10 @@
-"""Tables and figures of the sweep, and the baselines that they need.
+"""Tables of the sweep, and the baselines that they need.
 
     python results/learning/tables.py --runs results/learning/runs
 
 Evaluates naive, tuned and optimal on the sweep's held-out seeds (once; kept in OUT), then writes to
-OUT: evaluation.csv (controller and noise seed), runs.csv (training run), curves.csv, README.md and
-learning-SCENARIO.png/.svg. Baselines that cannot be built yet are named in the README.
+OUT: evaluation.csv (controller and noise seed), runs.csv (training run), curves.csv and README.md.
+Baselines that cannot be built yet are named in the README. The figures are drawn by figures.py.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from cases import CASES
 from numpy.typing import NDArray
@@ -29,9 +28,6 @@ from cosim import FmuPlant, Scenario
 from cosim.cli.compose import build_controller
 from cosim.errors import CosimError
 from cosim.evaluation.statistics import Estimate, ratio
-
-mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 Array = NDArray[np.float64]
 SEEDS = 50
@@ -237,37 +233,6 @@ def converged_page(path: Path) -> str:
     )
 
 
-def draw(path: Path, scenario: str, reference: Any, cases: dict[str, Runs]) -> None:
-    """Greedy J above J* against samples: median over seeds and range."""
-    figure, axis = plt.subplots(figsize=(8, 5), layout="constrained")
-    floor = reference["optimal"]["J"].mean() if "optimal" in reference else 0.0
-    for number, (name, runs) in enumerate(cases.items()):
-        log = min(runs.logs, key=lambda log: len(log["samples"]))
-        known = np.flatnonzero(~np.isnan(log["greedy_J"]))
-        curves = [
-            log["greedy_J"][known] - floor for log in runs.logs if len(log["samples"]) > known[-1]
-        ]
-        style = {"color": f"C{number % 10}", "linestyle": "--" if name.endswith("paper") else "-"}
-        axis.plot(log["samples"][known], np.median(curves, axis=0), label=name, **style)
-        axis.fill_between(
-            log["samples"][known],
-            np.min(curves, axis=0),
-            np.max(curves, axis=0),
-            color=style["color"],
-            alpha=0.08,
-        )
-    axis.set(xlabel="samples", ylabel="greedy J − J*" if floor else "greedy J", yscale="log")
-    axis.set_title(f"{scenario}: median and range over training seeds (4 × 500 held-out samples)")
-    axis.legend(fontsize=7)
-    axis.grid(alpha=0.3)
-    for suffix in ("png", "svg"):
-        figure.savefig(path.with_suffix(f".{suffix}"), dpi=120, metadata=METADATA[suffix])
-    plt.close(figure)
-
-
-METADATA: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}}
-
-
 def collect(
     arguments: argparse.Namespace,
 ) -> dict[str, tuple[dict[str, dict[str, Array]], dict[str, Runs]]]:
@@ -347,7 +312,6 @@ def main() -> None:
     text = [(Path(__file__).parent / "preface.md").read_text().format(seeds=SEEDS, steps=STEPS)]
     for name, (reference, cases) in found.items():
         text.append(scenario_page(Scenario.load(name), reference, cases))
-        draw(arguments.out / f"learning-{name}", name, reference, cases)
     text.append(papers_figures(found))
     if (arguments.out / "converged.csv").exists():
         text.append(converged_page(arguments.out / "converged.csv"))

@@ -54,6 +54,24 @@ def test_a_trajectory_shows_the_bound_and_the_fallbacks(trajectory, paper):
     assert [list(line.get_xdata()) for line in marks] == [[5.0, 6.0]]
 
 
+def test_a_bound_far_from_the_data_is_named(trajectory, paper):
+    axes = axes_by_label(trajectory_figure(trajectory, paper))
+    said = {name: [text.get_text() for text in axis.texts] for name, axis in axes.items()}
+    assert said["$X_{2}$ [%]"] == ["bound ≤ 100"]
+    assert said["$F_{200}$ [kg/min]"] == ["bound ≥ 100, ≤ 400"]
+
+
+def test_runs_side_by_side_have_the_same_axes(trajectory, paper):
+    with FmuPlant(paper) as plant:
+        other = simulate(plant, Proportional(paper), 120, 1)
+    both = [
+        axes_by_label(trajectory_figure(run, paper, beside=[trajectory, other]))
+        for run in (trajectory, other)
+    ]
+    for name, axes in both[0].items():
+        assert axes.get_ylim() == pytest.approx(both[1][name].get_ylim(), rel=1e-9), name
+
+
 def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
     with FmuPlant(paper) as plant:
         run = simulate(plant, Proportional(paper), 1, 0)
@@ -74,7 +92,10 @@ def figures(rng, paper):
         "density": lambda path: plot_density(
             {"naive": cloud[:, 0], "$mine": cloud[:, 0] + 1}, 25.0, "X2", "%", path
         ),
-        "learning": lambda path: plot_learning_curves(curves, path, references={"optimal": 0.1}),
+        "learning": lambda path: plot_learning_curves(
+            {"$one": curves, "two": curves}, path, references={"optimal": 0.1}
+        ),
+        "learning alone": lambda path: plot_learning_curves({"": curves}, path, logarithmic=True),
         "parameters": lambda path: plot_parameters_and_td_error(
             samples, increments, samples[10:], rng.random(41), path
         ),
@@ -83,7 +104,10 @@ def figures(rng, paper):
     }
 
 
-@pytest.mark.parametrize("name", ["phase", "density", "learning", "parameters", "pareto", "times"])
+@pytest.mark.parametrize(
+    "name",
+    ["phase", "density", "learning", "learning alone", "parameters", "pareto", "times"],
+)
 def test_every_figure_repeats_its_bytes(name, tmp_path, paper):
     files = []
     for i in range(2):

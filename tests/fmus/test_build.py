@@ -83,7 +83,8 @@ def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
     old = os.environ["PATH"]
     os.environ["PATH"] = search
     try:
-        build_platform_binary(str(folder), cmake_options=options)
+        # A build folder of our own: fmpy leaves it to the garbage collector to delete its own.
+        build_platform_binary(str(folder), build_dir=tmp_path / "build", cmake_options=options)
     finally:
         os.environ["PATH"] = old
     experiment = {"stop_time": 600.0, "output_interval": 60.0, "fmi_type": "CoSimulation"}

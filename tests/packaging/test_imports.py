@@ -1,0 +1,28 @@
+"""Every module of the four packages is imported in one interpreter that takes warnings as errors."""
+
+import subprocess
+import sys
+
+CODE = """
+import importlib, pkgutil
+for package in ("fmus", "cosim", "controllers", "learning"):
+    root = importlib.import_module(package)
+    for found in pkgutil.walk_packages(root.__path__, package + "."):
+        if not found.name.endswith("__main__") and found.name not in OPTIONAL:
+            importlib.import_module(found.name)
+            print(found.name)
+"""
+# Only with the extra that brings the tool that it drives.
+OPTIONAL = ("fmus.checks.ecospy_check", "fmus.checks.libcosimpy_check")
+
+
+def test_no_module_warns_when_it_is_imported():
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", f"OPTIONAL = {OPTIONAL!r}\n{CODE}"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert not result.stderr
+    assert len(result.stdout.split()) > 150

@@ -84,6 +84,7 @@ def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
     os.environ["PATH"] = search
     try:
         # A build folder of our own: fmpy leaves it to the garbage collector to delete its own.
+        (tmp_path / "build").mkdir()
         build_platform_binary(str(folder), build_dir=tmp_path / "build", cmake_options=options)
     finally:
         os.environ["PATH"] = old

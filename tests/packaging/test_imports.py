@@ -1,4 +1,4 @@
-"""Every module of the four packages is imported in one interpreter that takes warnings as errors."""
+"""Every module of the four packages is imported once, with warnings as errors."""
 
 import subprocess
 import sys

@@ -75,22 +75,24 @@ def _evaluate(
     sizes: Budget, learned: Mapping[str, Path], folder: Path, jobs: int, output: Output
 ) -> Evaluation:
     """Baselines, converged NMPC, the optimum and every learned θ on the scenario `paper`."""
+    from cosim.cli.training import trained
+
     factories: dict[str, Any] = {name: _factory(name) for name in ("naive", "tuned", "converged")}
     factories |= {
         name: _factory(str(learned[name]))
         for learner in sizes.learners
-        for name in _group(learner.name, sizes)
+        for name in trained(learner, sizes.training_seeds)
     }
-    best = _group(sizes.learners[-1].name, sizes)[0]
+    best = trained(sizes.mapper, 1)[0]
     factories[f"{best}-converged"] = partial(converged_with, str(learned[best]))
     factories["optimal"] = _factory("optimal")
-    return _run("paper", factories, sizes.noise_seeds, sizes.steps, folder, jobs, output)
+    return _run("paper", factories, sizes, folder, jobs, output)
 
 
 def _map(
     sizes: Budget, learned: Mapping[str, Path], folder: Path, jobs: int, output: Output
 ) -> list[tuple[Reading, Evaluation]]:
-    from cosim.cli.training import map_key
+    from cosim.cli.training import mapped
     from cosim.reproduction.readings import readings
     from cosim.scenario import Scenario
 
@@ -98,23 +100,20 @@ def _map(
     evaluations = []
     for reading in readings(sizes.factorial):
         factories: dict[str, Any] = {name: _factory(name) for name in ("naive", "tuned")}
-        for seed in range(sizes.map_seeds):
-            path = learned[map_key(sizes, reading, seed)]
-            factories[f"{sizes.mapper.name}-{seed}"] = _factory(str(path))
-        if sizes.map_optimum:
+        factories |= {
+            name: _factory(str(learned[key])) for name, key in mapped(sizes, reading).items()
+        }
+        if sizes.factorial:
             factories["optimal"] = _factory("optimal")
         scenario = reading.scenario(paper)
-        sized = (sizes.map_noise_seeds, sizes.map_steps)
-        evaluation = _run(scenario, factories, *sized, folder, jobs, output)
-        evaluations.append((reading, evaluation))
+        evaluations.append((reading, _run(scenario, factories, sizes, folder, jobs, output)))
     return evaluations
 
 
 def _run(
     scenario: Scenario | str,
     factories: dict[str, Any],
-    seeds: int,
-    steps: int,
+    sizes: Budget,
     folder: Path,
     jobs: int,
     output: Output,
@@ -123,12 +122,13 @@ def _run(
     from cosim.reproduction.budget import FIRST_SEED
 
     name = scenario if isinstance(scenario, str) else scenario.name
-    with output.progress(f"evaluation, {name}", len(factories) * (seeds + 1)) as progress:
+    units = len(factories) * (sizes.noise_seeds + 1)
+    with output.progress(f"evaluation, {name}", units) as progress:
         return evaluate(
             scenario,
             factories,
-            range(FIRST_SEED, FIRST_SEED + seeds),
-            steps,
+            range(FIRST_SEED, FIRST_SEED + sizes.noise_seeds),
+            sizes.steps,
             folder=folder,
             jobs=jobs,
             progress=progress,
@@ -153,10 +153,6 @@ def converged_with(path: str, scenario: Scenario) -> Controller:
     return ConvergedNmpc(problem, Parameters.load(path, problem), backend=backend)
 
 
-def _group(learner: str, sizes: Budget) -> list[str]:
-    return [f"{learner}-{seed}" for seed in range(sizes.training_seeds)]
-
-
 def _write(
     budget: str,
     sizes: Budget,
@@ -167,17 +163,17 @@ def _write(
     readings: Sequence[tuple[Reading, Evaluation]],
 ) -> dict[str, Any]:
     from controllers.storage import write_atomically
-    from cosim.cli.training import figure
+    from cosim.cli.training import figure, trained
     from cosim.reproduction.comparison import Table, against_converged, rows
     from cosim.reproduction.report import report
 
-    groups = {learner.name: _group(learner.name, sizes) for learner in sizes.learners}
+    groups = {learner.name: trained(learner, sizes.training_seeds) for learner in sizes.learners}
     comparison, map_ = Table(), Table()
     comparison.add(rows(evaluation, groups))
-    mapper = [f"{sizes.mapper.name}-{seed}" for seed in range(sizes.map_seeds)]
+    on_map = {sizes.mapper.name: trained(sizes.mapper, sizes.map_seeds)}
     for reading, there in readings:
-        map_.add(rows(there, {sizes.mapper.name: mapper}), reading.to_dict())
-    best = groups[sizes.learners[-1].name][0]
+        map_.add(rows(there, on_map), reading.to_dict())
+    best = groups[sizes.mapper.name][0]
     pairs = {"naive": "converged", best: f"{best}-converged"}
     converged = against_converged(evaluation, pairs)
     evaluation.write(folder)

@@ -72,33 +72,47 @@ def train(task: Training) -> str:
 
 
 def trainings(sizes: Budget, folder: Path) -> dict[str, Training]:
-    """Every training of the reproduction, under the name of its controller."""
+    """Every training of the reproduction by its key; those on `paper` come first.
+
+    Writes the scenarios of the map into `folder`.
+    """
     from controllers.storage import write_atomically
     from cosim.reproduction.readings import Reading, readings
     from cosim.scenario import Scenario
 
     tasks = {
-        f"{learner.name}-{seed}": Training(learner, "paper", seed, folder, f"{learner.name}-{seed}")
+        key: Training(learner, "paper", seed, folder, key)
         for learner in sizes.learners
-        for seed in range(sizes.training_seeds)
+        for seed, key in enumerate(trained(learner, sizes.training_seeds))
     }
     paper = Scenario.load("paper")
     for reading in readings(sizes.factorial):
-        source = "paper"
-        if reading != Reading():
-            path = folder / "map" / f"{reading.name}.toml"
-            path.parent.mkdir(exist_ok=True)
-            write_atomically(path, reading.scenario(paper).to_toml())
-            source = str(path.relative_to(folder))
-        for seed in range(sizes.map_seeds):
-            key = map_key(sizes, reading, seed)
+        if reading == Reading():
+            continue
+        path = folder / "map" / f"{reading.name}.toml"
+        path.parent.mkdir(exist_ok=True)
+        write_atomically(path, reading.scenario(paper).to_toml())
+        source = path.relative_to(folder).as_posix()
+        for seed, key in enumerate(mapped(sizes, reading).values()):
             tasks[key] = Training(sizes.mapper, source, seed, folder, key)
     return tasks
 
 
-def map_key(sizes: Budget, reading: Reading, seed: int) -> str:
-    """Name of a training of the map."""
-    return f"map-{reading.name}-{sizes.mapper.name}-{seed}"
+def trained(learner: Learner, seeds: int) -> list[str]:
+    """Names of a learner's controllers in the tables, one per training seed."""
+    return [f"{learner.name}-{seed}" for seed in range(seeds)]
+
+
+def mapped(sizes: Budget, reading: Reading) -> dict[str, str]:
+    """Keys of the trainings that the map shows at a reading, by their controllers' names there.
+
+    The reading that is the scenario `paper` shows those of the comparison.
+    """
+    from cosim.reproduction.readings import Reading
+
+    names = trained(sizes.mapper, sizes.map_seeds)
+    prefix = "" if reading == Reading() else f"map-{reading.name}-"
+    return {name: f"{prefix}{name}" for name in names}
 
 
 def figure(task: Training, folder: Path) -> str:
@@ -109,7 +123,8 @@ def figure(task: Training, folder: Path) -> str:
     from cosim.reproduction.curves import increments, read_log, running_mean
 
     log = read_log(task.folder / "learning.csv")
-    mean = running_mean(log["samples"], log["td_error"], log["updates"], WINDOW)
+    # A row of the log holds the root mean square over its updates.
+    td_error = np.sqrt(running_mean(log["samples"], log["td_error"] ** 2, log["updates"], WINDOW))
     samples = np.concatenate([[0.0], log["samples"]])
     moved = {
         block: np.vstack([np.zeros(values.shape[1]), values])
@@ -121,7 +136,7 @@ def figure(task: Training, folder: Path) -> str:
             samples,
             moved,
             log["samples"],
-            mean,
+            td_error,
             folder / f"{name}.{suffix}",
             window=WINDOW,
         )

@@ -1,4 +1,4 @@
-"""What a training's log shows: increments of θ by block, and the TD error's running mean."""
+"""What a training's log shows: increments of θ by block, and means over a running window."""
 
 from __future__ import annotations
 

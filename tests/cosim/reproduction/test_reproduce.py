@@ -16,12 +16,8 @@ TINY = Budget(
     training_seeds=2,
     noise_seeds=2,
     steps=60,
-    mapper=Learner("q-learning", "q-learning", 500),
     map_seeds=1,
-    map_noise_seeds=2,
-    map_steps=40,
     factorial=False,
-    map_optimum=False,
 )
 TABLES = ("comparison.csv", "converged.csv", "map.csv", "evaluation.csv", "evaluation.parquet")
 
@@ -50,7 +46,7 @@ def test_twice_gives_identical_files_with_one_worker_or_two(once, tmp_path):
 def test_what_is_finished_is_not_done_again(once):
     folder, first = once
     trained = {path: path.stat().st_mtime_ns for path in folder.glob("training/*/learning.csv")}
-    assert len(trained) == 2 * 2 + 6
+    assert len(trained) == 2 * 2 + 5
     assert reproduce(folder, 1) == first
     assert {path: path.stat().st_mtime_ns for path in trained} == trained
 

@@ -42,7 +42,10 @@ class Output:
             self.console().print(text, highlight=False, soft_wrap=True)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Print a table, its first column left and the others right justified."""
+        """Print a table, its first column left and the others right justified.
+
+        A file or pipe gets it as wide as it is; a terminal that is too narrow gets folded cells.
+        """
         if self.as_json:
             return
         from rich.console import Console
@@ -50,10 +53,13 @@ class Output:
 
         table = Table(title=title, title_justify="left")
         for number, column in enumerate(header):
-            table.add_column(column, justify="right" if number else "left")
+            table.add_column(column, justify="right" if number else "left", overflow="fold")
         for row in rows:
             table.add_row(*row)
-        Console().print(table)
+        console = Console()
+        if not console.is_terminal:
+            console.width = max(console.width, console.measure(table).maximum)
+        console.print(table)
 
     def json(self, document: Mapping[str, Any]) -> None:
         """Print the document if JSON was asked for."""

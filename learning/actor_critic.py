@@ -14,6 +14,7 @@ from learning.critic import AdvantageRegression, lstdv
 from learning.exploration import Strategy
 from learning.fit import policy_gradient_fit
 from learning.protocols import LearnableController, Sample, Update
+from learning.schedule import Geometric
 from learning.step import ParameterStep
 
 Vector = NDArray[np.float64]
@@ -64,7 +65,8 @@ class ActorCritic:
         samples: int,
         strategy: Strategy,
     ) -> None:
-        self._configuration, self._strategy, self._samples = configuration, strategy, samples
+        self._configuration, self._strategy = configuration, strategy
+        self._radius = Geometric(configuration.radius, configuration.radius_end, samples)
         self._discount = configuration.critic_discount
         self._step = ParameterStep(controller, configuration)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
@@ -116,9 +118,7 @@ class ActorCritic:
             metric = fisher + (floor + np.finfo(float).tiny) * np.eye(weights.size)
         fit = policy_gradient_fit(gradient, settings.step_size, metric)
         moved = float(fit.minimiser @ fisher @ fit.minimiser) ** 0.5
-        share = min(number / self._samples, 1.0)
-        radius = settings.radius * (settings.radius_end / settings.radius) ** share
-        fit = fit.shrunk(min(1.0, radius / moved) if moved > 0 else 0.0)
+        fit = fit.shrunk(min(1.0, self._radius(number) / moved) if moved > 0 else 0.0)
         return self._step.take(fit, float(np.sqrt(np.mean(errors * errors))))
 
     def state(self) -> dict[str, NDArray[Any]]:

@@ -11,11 +11,12 @@ from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
 from cosim.scenario import Scenario
-from learning.configuration import Configuration, Count, NonNegative, Positive
+from learning.configuration import Configuration, Count, Positive
 from learning.exploration import Strategy
-from learning.fit import Fit, least_squares
+from learning.fit import Fit, damped, least_squares
 from learning.level import level
 from learning.protocols import LearnableController, Sample, Update
+from learning.q_configuration import FinalGain, Gain, QConfiguration
 from learning.replay import ReplayBuffer, Replayed
 from learning.step import ParameterStep
 
@@ -24,43 +25,32 @@ Matrix = NDArray[np.float64]
 
 
 class Trial(NamedTuple):
-    """A step that the next replay judges: θ before it, and by transition `number` the target y,
-    the squared error before it and the squared error that the fit promised.
+    """A step that the next replay judges.
+
+    `theta` and `mean_cost` were before it; by transition `number`, (K,) each: the `target` y, the
+    squared `error` before the step and the one that the fit `predicted`.
     """
 
     theta: Vector
+    mean_cost: Vector
     number: NDArray[np.int64]
     target: Vector
     error: Vector
     predicted: Vector
 
 
-class BatchQLearningConfiguration(Configuration):
+class BatchQLearningConfiguration(QConfiguration):
     """Hyperparameters of batch Q-learning."""
 
-    exploration_probability: float = Field(
-        0.3, ge=0, le=1, description="share of samples that explore, at the start"
-    )
-    exploration_deviation: tuple[NonNegative, ...] = Field(
-        (10.0,), description="standard deviation of e in the units of u, one or one per action"
-    )
+    gain: Gain = 0.5
+    gain_end: FinalGain = 0.05
     rule: Literal["first-order", "gauss-newton", "lstdq"] = Field(
         "gauss-newton",
         description="normalised gradient; Gauss–Newton on Q's fit; or the projected Bellman error",
     )
-    discount: float | None = Field(
-        None, gt=0, le=1, description="of the TD error: the scenario's if not given; 1 is mean cost"
-    )
     batch_size: Count = Field(500, description="samples between two updates")
     buffer_size: Count = Field(1000, description="transitions that are replayed, the latest ones")
     iterations: Count = Field(1, description="replays and steps of θ per update")
-    gain: Positive = Field(0.5, le=1, description="share of the step taken, at the start")
-    gain_end: Positive | None = Field(
-        0.05, le=1, description="the same at the end, approached geometrically"
-    )
-    ridge: NonNegative = Field(
-        1e-2, description="Levenberg–Marquardt term relative to each entry's information"
-    )
     radius: Positive = Field(1.0, description="trust region: largest scaled entry of a step")
     radius_minimum: Positive = Field(
         0.01, description="size below which the trust region does not shrink"
@@ -72,8 +62,8 @@ class BatchQLearning:
 
     One iteration replays the buffer at θ, stands on the target y = ℓ + γV_θ(s₊), and steps
     towards min Σ (y − Q_θ̄)²; under `lstdq` towards the zero of Σ ∇Q δ, the target moving too. The
-    next replay tells whether the errors to the old target fell as predicted: else the trust region
-    is halved, and θ goes back where they rose.
+    next replay tells whether the errors fell as predicted: else the trust region is halved, and
+    where they rose θ goes back, the mean cost g too.
     """
 
     Configuration: ClassVar[type[Configuration]] = BatchQLearningConfiguration
@@ -87,7 +77,7 @@ class BatchQLearning:
         strategy: Strategy,
     ) -> None:
         self._controller, self._configuration = controller, configuration
-        self._samples = samples
+        self._gain = configuration.gains(samples)
         self._moving = configuration.rule == "lstdq"
         self._step = ParameterStep(controller, configuration)
         self._level = level(configuration.discount, scenario, self._step)
@@ -102,37 +92,38 @@ class BatchQLearning:
         self._buffer.add(sample)
         if (sample.number + 1) % self._configuration.batch_size:
             return None
-        settings = self._configuration
-        end = settings.gain if settings.gain_end is None else settings.gain_end
-        gain = settings.gain * (end / settings.gain) ** min(sample.number / self._samples, 1.0)
         update: Update | None = None
-        for _ in range(settings.iterations):
+        for _ in range(self._configuration.iterations):
             replayed = self._buffer.replay(self._controller, self._level)
-            if not len(replayed.number):
-                return None
             if self._trial is not None and self._rose(self._trial, replayed):
                 self._controller.theta = self._trial.theta
+                self._level.mean_cost = float(self._trial.mean_cost)
                 replayed = self._buffer.replay(self._controller, self._level)
-            update = self._iterate(replayed, gain)
+            if not len(replayed.number):
+                break
+            update = self._iterate(replayed, self._gain(sample.number))
         return update
 
     def _iterate(self, replayed: Replayed, gain: float) -> Update:
         gradient = replayed.gradient * self._step.scale
-        jacobian = gradient
+        change = gradient
         if self._moving:
-            jacobian = gradient - self._level.discount * replayed.next_gradient * self._step.scale
+            change = gradient - self._level.discount * replayed.next_gradient * self._step.scale
         fit = RULES[self._configuration.rule](
-            gradient, jacobian, replayed.td_error, self._configuration.ridge
+            gradient, self._level.descent(change), replayed.td_error, self._configuration.ridge
         )
-        before = self._controller.theta
+        theta, mean_cost = self._controller.theta, np.array(self._level.mean_cost)
         fit = self._level.take(fit.shrunk(gain).clipped(self._radius))
         update = self._step.take(fit, float(np.sqrt(np.mean(replayed.td_error**2))))
-        step = (self._controller.theta - before) / self._step.scale
-        predicted = replayed.td_error - jacobian @ step
-        self._trial = Trial(
-            before, replayed.number, replayed.target, replayed.td_error**2, predicted**2
+        predicted = replayed.td_error - change @ (
+            (self._controller.theta - theta) / self._step.scale
         )
-        return update
+        if self._moving:
+            predicted -= self._level.mean_cost - mean_cost
+        self._trial = Trial(
+            theta, mean_cost, replayed.number, replayed.target, replayed.td_error**2, predicted**2
+        )
+        return update._replace(failures=replayed.failures)
 
     def _rose(self, trial: Trial, replayed: Replayed) -> bool:
         """Whether the last step raised the errors it was to lower; adapts the trust region."""
@@ -158,7 +149,7 @@ class BatchQLearning:
             "radius": np.array(self._radius),
             "mean_cost": np.array(self._level.mean_cost),
             **{f"buffer_{name}": values for name, values in self._buffer.state().items()},
-            **{f"trial_{name}": values for name, values in trial.items()},
+            **{f"trial_{name}": np.asarray(value) for name, value in trial.items()},
         }
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
@@ -174,7 +165,8 @@ class BatchQLearning:
             for prefix in ("buffer", "trial")
         }
         self._buffer.restore(part["buffer"])
-        self._trial = Trial(**part["trial"]) if part["trial"] else None
+        trial = part["trial"]
+        self._trial = Trial(*(trial[name] for name in Trial._fields)) if trial else None
 
 
 def steepest_descent(gradient: Matrix, jacobian: Matrix, td_error: Vector, ridge: float) -> Fit:
@@ -193,10 +185,7 @@ def gauss_newton(gradient: Matrix, jacobian: Matrix, td_error: Vector, ridge: fl
 
 def projected_bellman(gradient: Matrix, jacobian: Matrix, td_error: Vector, ridge: float) -> Fit:
     """LSTDQ: zero of Gᵀ(δ − E d), E = ∇Q − γ∇V₊, as min of its norm in (GᵀG)⁻¹ (MSPBE)."""
-    information = gradient.T @ gradient
-    diagonal = np.diag(information)
-    floor = max(float(diagonal.max()), np.finfo(float).tiny) * 1e-8
-    factor = cho_factor(information + np.diag(ridge * diagonal + floor))
+    factor = cho_factor(damped(gradient.T @ gradient, ridge))
     cross = gradient.T @ jacobian
     weighted = cho_solve(factor, cross)
     return least_squares(cross.T @ weighted, weighted.T @ (gradient.T @ td_error), ridge)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import statistics
 import time
-from typing import Any, cast
+from typing import Any
 
-from controllers.problem import Problem
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
-from cosim.simulation import spawn_seeds
-from learning.interaction import Interaction
-from learning.protocols import Algorithm
+from learning.learner import Learner
 from learning.registry import load_algorithm
-from learning.starting_point import build_controller, build_strategy, starting_parameters
+from learning.run import Run
 
 ALGORITHMS = ("q-learning", "actor-critic", "batch-q-learning")
 SETTLING = 1000
@@ -45,33 +42,21 @@ class _Stopwatch:
         setattr(target, method, timed)
 
 
-class _Bench:
-    """One algorithm in its loop with a plant, without log, evaluation and checkpoints."""
+def _learner(plant: FmuPlant, name: str, samples: int) -> Learner:
+    """An algorithm in its loop with a plant, without log, evaluation and checkpoints."""
+    algorithm = load_algorithm(name)
+    configuration = algorithm.Configuration.from_dict({})
+    learner = Learner(Run(name, plant.scenario, samples, 0, configuration), algorithm, plant)
+    learner.begin()
+    return learner
 
-    def __init__(self, plant: FmuPlant, name: str, samples: int) -> None:
-        scenario = plant.scenario
-        algorithm = load_algorithm(name)
-        configuration = algorithm.Configuration.from_dict({})
-        problem = Problem.from_scenario(cast("Any", scenario))
-        parameters = starting_parameters(problem, configuration)
-        self.controller = build_controller("rti", scenario, problem, parameters)
-        strategy = build_strategy(configuration, scenario, samples)
-        self.algorithm: Algorithm = algorithm(
-            self.controller, scenario, configuration, samples, strategy
-        )
-        plant_seed, rng = spawn_seeds(0)
-        self.interaction = Interaction(plant, self.controller, self.algorithm, strategy, rng)
-        self.interaction.start(plant_seed)
 
-    def run(self, samples: int) -> float:
-        """CPU seconds of `samples` samples."""
-        interaction, observe = self.interaction, self.algorithm.observe
-        begin = time.process_time()
-        for _ in range(samples):
-            sample, _ = interaction.next()
-            if sample is not None and observe(sample) is not None:
-                interaction.renew()
-        return time.process_time() - begin
+def _advance(learner: Learner, samples: int) -> float:
+    """CPU seconds of `samples` samples."""
+    begin = time.process_time()
+    for _ in range(samples):
+        learner.advance()
+    return time.process_time() - begin
 
 
 def measure(scenario: Scenario, samples: int, repetitions: int = 5) -> dict[str, Any]:
@@ -84,9 +69,9 @@ def measure(scenario: Scenario, samples: int, repetitions: int = 5) -> dict[str,
     rows = []
     for name in ALGORITHMS:
         with FmuPlant(scenario) as plant:
-            bench = _Bench(plant, name, SETTLING + samples * (repetitions + 1))
-            bench.run(SETTLING)
-            seconds = [bench.run(samples) for _ in range(repetitions)]
+            learner = _learner(plant, name, SETTLING + samples * (repetitions + 1))
+            _advance(learner, SETTLING)
+            seconds = [_advance(learner, samples) for _ in range(repetitions)]
             rates = sorted(samples / value for value in seconds)
             rows.append(
                 {
@@ -94,21 +79,21 @@ def measure(scenario: Scenario, samples: int, repetitions: int = 5) -> dict[str,
                     "median_samples_per_second": statistics.median(rates),
                     "lowest_samples_per_second": rates[0],
                     "highest_samples_per_second": rates[-1],
-                    "microseconds_per_sample": _profile(bench, plant, samples),
+                    "microseconds_per_sample": _profile(learner, plant, samples),
                 }
             )
     return {"scenario": scenario.name, "samples": samples, "repetitions": repetitions, "rows": rows}
 
 
-def _profile(bench: _Bench, plant: FmuPlant, samples: int) -> dict[str, float]:
+def _profile(learner: Learner, plant: FmuPlant, samples: int) -> dict[str, float]:
     """Microseconds per sample by part of the loop."""
     watch = _Stopwatch()
     watch.watch(plant, "step", "plant")
-    watch.watch(bench.controller, "prepare", "prepare")
-    watch.watch(bench.controller, "prepare_at", "prepare")
-    watch.watch(bench.controller, "feedback", "feedback")
-    watch.watch(bench.algorithm, "observe", "learning rule")
-    total = bench.run(samples)
+    watch.watch(learner.controller, "prepare", "prepare")
+    watch.watch(learner.controller, "prepare_at", "prepare")
+    watch.watch(learner.controller, "feedback", "feedback")
+    watch.watch(learner.algorithm, "observe", "learning rule")
+    total = _advance(learner, samples)
     parts = dict(watch.seconds)
     parts["rest of the loop"] = total - sum(parts.values())
     return {name: 1e6 * value / samples for name, value in parts.items()}

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from controllers.storage import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
-SCHEMA = 1
+SCHEMA = 2
 Array = NDArray[Any]
 
 

@@ -15,6 +15,14 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
+# The rules differ in how much exploration they need, so these two have other defaults in each.
+ExplorationProbability = Annotated[
+    Share, Field(description="share of samples that explore, at the start")
+]
+ExplorationDeviation = Annotated[
+    tuple[NonNegative, ...],
+    Field(description="standard deviation of e in the units of u, one or one per action"),
+]
 
 
 class Configuration(BaseModel):
@@ -51,15 +59,11 @@ class Configuration(BaseModel):
         description="a = sat(π+e), a = sat(e), a = π of a cost with a random linear term in u, "
         "or what the scenario says",
     )
-    exploration_probability: Share = Field(
-        1.0, description="share of samples that explore, at the start"
-    )
+    exploration_probability: ExplorationProbability = 1.0
     exploration_probability_end: Share | None = Field(
         None, description="share at the end, approached linearly; the same if not given"
     )
-    exploration_deviation: tuple[NonNegative, ...] = Field(
-        (5.0,), description="standard deviation of e in the units of u, one or one per action"
-    )
+    exploration_deviation: ExplorationDeviation = (5.0,)
     exploration_deviation_end: tuple[NonNegative, ...] | None = Field(
         None, description="the same at the end, approached linearly"
     )

@@ -1,4 +1,4 @@
-"""Exploration of the actions: additive, literal, by a perturbed cost; schedules; saturation.
+"""Exploration of the actions: additive, literal, by a perturbed cost; and what saturation does.
 
 A strategy maps (π(s), generator) to the action to apply, which the loop saturates to the actuators'
 bounds. It returns the very array it was given where the sample stays greedy.
@@ -11,34 +11,15 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from learning.errors import ConfigurationError
+from learning.schedule import Linear
 
 Vector = NDArray[np.float64]
 PerturbedPolicy = Callable[[Vector], Vector]
 """Maps a linear cost term on the actions, (m,), to the policy's action under it, (m,)."""
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """A value that goes linearly from `start` to `end` over `samples`, then stays."""
-
-    start: Vector
-    end: Vector
-    samples: int
-
-    def __call__(self, sample: int) -> Vector:
-        """Value at a sample, in the shape of `start`."""
-        share = min(sample / self.samples, 1.0) if self.samples > 0 else 1.0
-        return self.start + share * (self.end - self.start)
-
-
-def schedule(start: ArrayLike, end: ArrayLike | None, samples: int) -> Schedule:
-    """Linear schedule; without `end` it is constant."""
-    first = np.asarray(start, dtype=np.float64)
-    return Schedule(first, first if end is None else np.asarray(end, dtype=np.float64), samples)
 
 
 class Strategy(Protocol):
@@ -59,8 +40,8 @@ class Exploration:
 
     lower: Vector
     upper: Vector
-    probability: Schedule
-    deviation: Schedule
+    probability: Linear
+    deviation: Linear
 
     def noise(self, rng: np.random.Generator, sample: int) -> Vector | None:
         """Draw e ~ N(0, diag σ²), (m,), or None for a greedy sample."""
@@ -70,6 +51,14 @@ class Exploration:
             return None
         scaled: Vector = self.deviation(sample) * e
         return scaled
+
+    def saturated_mean(self, centre: Vector, sample: int) -> Vector:
+        """Mean of sat(c + e) − c, (m,), by the moments of the censored normal distribution."""
+        sigma = np.maximum(self.deviation(sample), np.finfo(float).tiny)
+        low, high = (self.lower - centre) / sigma, (self.upper - centre) / sigma
+        density = (np.exp(-(low**2) / 2) - np.exp(-(high**2) / 2)) / np.sqrt(2 * np.pi)
+        mean: Vector = sigma * (density + low * ndtr(low) + high * ndtr(-high))
+        return mean
 
 
 @dataclass(frozen=True)
@@ -84,12 +73,8 @@ class Additive(Exploration):
         return action if e is None else action + e
 
     def bias(self, action: Vector, sample: int) -> Vector:
-        """Mean of sat(π + e) − π, (m,), by the moments of the censored normal distribution."""
-        sigma = np.maximum(self.deviation(sample), np.finfo(float).tiny)
-        low, high = (self.lower - action) / sigma, (self.upper - action) / sigma
-        density = (np.exp(-(low**2) / 2) - np.exp(-(high**2) / 2)) / np.sqrt(2 * np.pi)
-        mean: Vector = sigma * (density + low * ndtr(low) + high * ndtr(-high))
-        return mean
+        """Mean of sat(π + e) − π, (m,)."""
+        return self.saturated_mean(action, sample)
 
 
 @dataclass(frozen=True)
@@ -105,8 +90,7 @@ class Literal(Exploration):
 
     def bias(self, action: Vector, sample: int) -> Vector:
         """Mean of sat(e) − π, (m,)."""
-        origin = np.zeros_like(action)
-        return Additive.bias(self, origin, sample) - action  # type: ignore[arg-type]
+        return self.saturated_mean(np.zeros_like(action), sample) - action
 
 
 @dataclass(frozen=True)
@@ -137,7 +121,7 @@ STRATEGIES: dict[str, type[Additive | Literal | PerturbedCost]] = {
 
 
 def strategy(
-    kind: str, lower: Vector, upper: Vector, probability: Schedule, deviation: Schedule
+    kind: str, lower: Vector, upper: Vector, probability: Linear, deviation: Linear
 ) -> Strategy:
     """Strategy by name; raises ConfigurationError on a wrong name or number of deviations."""
     if kind not in STRATEGIES:

@@ -70,18 +70,26 @@ def td_step(td_error: float, gradient: Vector, step_size: float) -> Fit:
     )
 
 
-def least_squares(information: Matrix, gradient: Vector, ridge: float) -> Fit:
-    """Gauss–Newton or Newton-like fit with M = A + ρ diag(A) + a floor, b = Σ δ∇Q.
+def damped(information: Matrix, ridge: float) -> Matrix:
+    """A + ρ diag(A) + a floor, (n, n), positive definite.
 
-    `information` A (n, n), symmetric positive semidefinite; the Levenberg–Marquardt term `ridge` ρ
-    is relative to each entry's own information, so the step does not depend on units. Raises
-    DivergenceError where the data are not finite.
+    The Levenberg–Marquardt term `ridge` ρ is relative to each entry's own information, so that a
+    step does not depend on units; the floor serves entries that the data say nothing of.
+    """
+    diagonal = np.diag(information)
+    floor = max(float(diagonal.max()), np.finfo(float).tiny) * 1e-8
+    return information + np.diag(ridge * diagonal + floor)
+
+
+def least_squares(information: Matrix, gradient: Vector, ridge: float) -> Fit:
+    """Gauss–Newton or Newton-like fit with M = A, `damped`, and b = Σ δ∇Q, (n,).
+
+    `information` A (n, n), symmetric positive semidefinite. Raises DivergenceError where the data
+    are not finite.
     """
     if not (np.isfinite(information).all() and np.isfinite(gradient).all()):
         raise DivergenceError("TD errors or gradients are not finite")
-    diagonal = np.diag(information)
-    floor = max(float(diagonal.max()), np.finfo(float).tiny) * 1e-8
-    metric = information + np.diag(ridge * diagonal + floor)
+    metric = damped(information, ridge)
     return Fit(
         gradient=gradient,
         minimiser=cho_solve(cho_factor(metric), gradient),

@@ -75,23 +75,10 @@ class Interaction:
     def next(self) -> tuple[Sample | None, float]:
         """One sample of the plant; returns it, or None after a failure, and its cost."""
         policy, point, s, number = self._policy, self._point, self.s, self.number
-        action_value, explored = policy, False
-        if policy is None:
-            a = self._applied
-        else:
-            try:
-                a = self._strategy(policy.action, self._rng, number, self._perturbed)
-            except QpError:  # of the perturbed cost; the policy itself was solved for
-                self.failures += 1
-                a = policy.action
-            explored = a is not policy.action
-            # The QP keeps bounds to its tolerance, the actuator exactly.
-            a = np.minimum(np.maximum(a, self._lower), self._upper)
-            if explored:
-                self.explored += 1
-                self.saturated += bool(((a == self._lower) | (a == self._upper)).any())
-                if self._algorithm.needs_action_value:
-                    action_value = self._action_value(s, a)
+        a, explored = (self._applied, False) if policy is None else self._choose(policy.action)
+        action_value = policy
+        if explored and self._algorithm.needs_action_value:
+            action_value = self._action_value(s, a)
         step = self._plant.step(a)
         self._applied, self.s, self.number = a, step.s, number + 1
         self._policy = self._solve()
@@ -114,6 +101,21 @@ class Interaction:
             point=point if keep else None,
             next_point=self._point if keep else None,
         ), cost
+
+    def _choose(self, action: Vector) -> tuple[Vector, bool]:
+        """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
+        try:
+            a = self._strategy(action, self._rng, self.number, self._perturbed)
+        except QpError:  # of the perturbed cost; the policy itself was solved for
+            self.failures += 1
+            a = action
+        explored = a is not action
+        # The QP keeps bounds to its tolerance, the actuator exactly.
+        a = np.minimum(np.maximum(a, self._lower), self._upper)
+        if explored:
+            self.explored += 1
+            self.saturated += bool(((a == self._lower) | (a == self._upper)).any())
+        return a, explored
 
     def renew(self) -> None:
         """Solve once more for the present state, at the guess as it was: θ has moved."""

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cosim.scenario import Scenario
 from learning.fit import Fit
 from learning.step import ParameterStep
+
+Matrix = NDArray[np.float64]
 
 
 class Level:
@@ -28,6 +33,18 @@ class Level:
     def target(self, cost: float, next_value: float) -> float:
         """What Q(s, a) is fitted to."""
         return cost - self.mean_cost + self.discount * next_value
+
+    def descent(self, change: Matrix) -> Matrix:
+        """How a fit's scaled step lowers the TD errors, (K, n_θ), with g in c_lambda's column.
+
+        `change` (K, n_θ) is that of θ alone: ∇Q, or ∇Q − γ∇V(s₊) where the target moves along; in
+        the latter c_lambda cancels at γ = 1, and g, which moves all δ alike, would not be fitted.
+        """
+        if self.discount != 1.0:
+            return change
+        jacobian = change.copy()
+        jacobian[:, self._position] = self._scale
+        return jacobian
 
     def take(self, fit: Fit) -> Fit:
         """Move g by its part of a fit's step; returns the rest, which is for θ."""

@@ -64,10 +64,6 @@ class Totals:
             "refused": self.refused,
         }
 
-    def clear(self) -> None:
-        """Begin a new row."""
-        self.__init__()  # type: ignore[misc]
-
 
 def to_csv(rows: list[Row]) -> str:
     """The log as CSV with exact decimals; what was not measured is left empty."""

@@ -92,7 +92,8 @@ class Update(NamedTuple):
     """What an algorithm says of an update of θ, for the log.
 
     `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
-    step, `smallest_eigenvalue` the certificate's; `corrected` and `refused` are its flags.
+    step, `smallest_eigenvalue` the certificate's; `corrected` and `refused` are its flags;
+    `failures` counts QPs of its own that failed.
     """
 
     td_error: float
@@ -100,6 +101,7 @@ class Update(NamedTuple):
     smallest_eigenvalue: float
     corrected: bool = False
     refused: bool = False
+    failures: int = 0
 
 
 class Algorithm(Protocol):

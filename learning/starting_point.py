@@ -12,8 +12,9 @@ from controllers.rti import RtiNmpc
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.exploration import Strategy, schedule, strategy
+from learning.exploration import Strategy, strategy
 from learning.protocols import LearnableController
+from learning.schedule import linear
 
 CONTROLLERS = ("rti", "converged")
 
@@ -70,6 +71,6 @@ def build_strategy(configuration: Configuration, scenario: Scenario, samples: in
         kind,
         scenario.action_lower,
         scenario.action_upper,
-        schedule(probability, probability_end, samples),
-        schedule(deviation, deviation_end, samples),
+        linear(probability, probability_end, samples),
+        linear(deviation, deviation_end, samples),
     )

@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
+from controllers.errors import QpError
+from controllers.rti import RtiNmpc
+from learning import BatchQLearning
 from learning.batch_q_learning import RULES, gauss_newton, projected_bellman, steepest_descent
+from learning.interaction import Interaction
+from learning.starting_point import build_strategy
 
 
 @pytest.fixture
@@ -39,3 +44,74 @@ def test_steepest_descent_goes_to_the_minimum_on_its_line(data):
 def test_every_rule_is_a_consistent_fit(data, name):
     fit = RULES[name](*data, 1e-2)
     assert fit.metric() @ fit.minimiser == pytest.approx(fit.gradient, rel=1e-6, abs=1e-9)
+
+
+class Bench:
+    """BatchQLearning on the linear-quadratic task, batch after batch."""
+
+    def __init__(self, task, controller=None, noise=0.3, **settings):
+        configuration = BatchQLearning.Configuration.from_dict(
+            {
+                "parametrisation": "paper",
+                "value_offset": "stage-cost",
+                "exploration_deviation": (1.0,),
+                "batch_size": 20,
+                "buffer_size": 40,
+                **settings,
+            }
+        )
+        self.controller = controller or RtiNmpc(task.problem, task.wrong())
+        strategy = build_strategy(configuration, task.scenario, 1000)
+        self.algorithm = BatchQLearning(
+            self.controller, task.scenario, configuration, 1000, strategy
+        )
+        self.interaction = Interaction(
+            task.plant(noise), self.controller, self.algorithm, strategy, np.random.default_rng(2)
+        )
+        self.interaction.start(3)
+
+    def update(self):
+        """Samples until θ moves."""
+        for _ in range(1000):
+            sample, _ = self.interaction.next()
+            update = None if sample is None else self.algorithm.observe(sample)
+            if update is not None:
+                self.interaction.renew()
+                return update
+        raise AssertionError("θ never moved")
+
+
+@pytest.mark.parametrize("rule", ["gauss-newton", "lstdq"])
+def test_a_step_that_is_taken_back_takes_the_mean_cost_back_too(linear_quadratic, rule):
+    bench = Bench(
+        linear_quadratic, rule=rule, discount=1.0, gain=1.0, gain_end=1.0, ridge=0.0, radius=1e3
+    )
+    before, taken_back = None, 0
+    for _ in range(30):
+        bench.update()
+        state = {key: value.copy() for key, value in bench.algorithm.state().items()}
+        if before is not None and np.array_equal(state["trial_theta"], before["trial_theta"]):
+            taken_back += 1
+            assert state["trial_mean_cost"] == before["trial_mean_cost"]
+            assert state["mean_cost"] != before["mean_cost"]
+        before = state
+    assert taken_back > 0
+
+
+class FailsNow(RtiNmpc):
+    """Fails at Q where told to, like a solver."""
+
+    failing = False
+
+    def feedback(self, s, a=None):
+        if self.failing and a is not None:
+            raise QpError("told to fail", status="failed")
+        return super().feedback(s, a)
+
+
+def test_an_update_counts_the_qps_that_failed_in_its_replay(linear_quadratic):
+    controller = FailsNow(linear_quadratic.problem, linear_quadratic.wrong())
+    bench = Bench(linear_quadratic, controller, exploration_probability=0.5)
+    assert bench.update().failures == 0
+    controller.failing = True
+    assert 0 < bench.update().failures < 40

@@ -30,11 +30,18 @@ def test_assignments_are_read_as_toml_and_bare_words_as_text():
         ("gain=nan", "gain"),
         ("rule=newton", "rule.*td"),
         ("memory=many", "memory"),
+        ("line_search=true", "line_search: has no part in the rule gauss-newton"),
     ],
 )
 def test_a_bad_assignment_gets_one_clear_message(assignment, message):
     with pytest.raises(ConfigurationError, match=message):
         QLearning.Configuration.from_assignments([assignment])
+
+
+def test_an_option_of_another_rule_is_refused_and_its_default_is_not():
+    with pytest.raises(ConfigurationError, match="memory: has no part in the rule fit"):
+        QLearning.Configuration.from_dict({"rule": "fit", "memory": 10.0})
+    QLearning.Configuration.from_dict({"rule": "fit", "memory": 4000.0})
 
 
 @pytest.mark.parametrize("cls", CLASSES)

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from learning.errors import ConfigurationError
-from learning.exploration import schedule, strategy
+from learning.exploration import strategy
+from learning.schedule import linear
 
 LOWER, UPPER = np.array([100.0, 100.0]), np.array([400.0, 400.0])
 POLICY = np.array([190.0, 215.0])
@@ -10,7 +11,7 @@ POLICY = np.array([190.0, 215.0])
 
 def make(kind, probability=1.0, deviation=(10.0,)):
     return strategy(
-        kind, LOWER, UPPER, schedule(probability, None, 100), schedule(deviation, None, 100)
+        kind, LOWER, UPPER, linear(probability, None, 100), linear(deviation, None, 100)
     )
 
 
@@ -59,11 +60,6 @@ def test_bias_of_the_literal_reading_is_the_way_to_the_corner():
 
 def test_bias_of_the_perturbed_cost_is_not_known():
     assert np.isnan(make("perturbed-cost").bias(POLICY, 0)).all()
-
-
-def test_schedule_is_linear_and_then_constant():
-    values = schedule((10.0,), (2.0,), 100)
-    assert values(0) == 10.0 and values(50) == 6.0 and values(100) == 2.0 and values(500) == 2.0
 
 
 def test_noise_is_drawn_alike_whatever_the_probability():

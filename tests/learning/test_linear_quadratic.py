@@ -10,7 +10,13 @@ from learning.interaction import Interaction
 from learning.starting_point import build_strategy
 
 
-def learn(task, cls, samples, noise, controller=None, **settings):
+def learn(*arguments, **settings):
+    """The controller that `train` leaves."""
+    return train(*arguments, **settings)[0]
+
+
+def train(task, cls, samples, noise, controller=None, **settings):
+    """Controller and algorithm after training on the task."""
     configuration = cls.Configuration.from_dict(
         {"parametrisation": "paper", "value_offset": "stage-cost", **settings}
     )
@@ -25,7 +31,7 @@ def learn(task, cls, samples, noise, controller=None, **settings):
         sample, _ = interaction.next()
         if algorithm.observe(sample) is not None:
             interaction.renew()
-    return controller
+    return controller, algorithm
 
 
 def gain(controller):
@@ -97,6 +103,27 @@ def test_batch_q_learning_finds_the_riccati_solution(linear_quadratic, rule):
     )
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-3)
     assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
+
+
+MEAN_COST = {"discount": 1.0, "gain": 1.0, "ridge": 1e-6, **EXPLORATION}
+
+
+@pytest.mark.parametrize("rule", ["gauss-newton", "lstdq"])
+def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, rule):
+    exact = linear_quadratic.riccati(1.0)[1]
+    assert np.abs(exact - linear_quadratic.K).max() > 0.04
+    settings = {"rule": rule, "batch_size": 50, "buffer_size": 100, "gain_end": 1.0, **MEAN_COST}
+    controller = learn(linear_quadratic, BatchQLearning, 3000, 0.0, **settings)
+    assert gain(controller) == pytest.approx(exact, abs=0.01)
+
+
+@pytest.mark.parametrize("rule", ["gauss-newton", "lstdq"])
+def test_the_mean_cost_is_found_beside_theta(linear_quadratic, rule):
+    noise = 0.1
+    exact = noise**2 * np.trace(linear_quadratic.riccati(1.0)[0])
+    settings = {"rule": rule, "batch_size": 100, "buffer_size": 300, "gain_end": 0.1, **MEAN_COST}
+    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **settings)
+    assert float(algorithm.state()["mean_cost"]) == pytest.approx(exact, rel=0.2)
 
 
 def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):

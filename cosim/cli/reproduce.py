@@ -65,7 +65,7 @@ def reproduce(
         learned = {key: task.folder / "parameters.toml" for key, task in tasks.items()}
         evaluation = _evaluate(sizes, learned, folder, workers, out_)
         readings = _map(sizes, learned, folder, workers, out_)
-        summary = _write(budget.value, sizes, folder, tasks, status, evaluation, readings)
+        summary = _write(sizes, folder, tasks, status, evaluation, readings)
         _show(summary, out_)
         out_.note(f"report and tables are in {folder}")
         out_.json(summary)
@@ -132,7 +132,7 @@ def _run(
             folder=folder,
             jobs=jobs,
             progress=progress,
-            command="cosim reproduce",
+            command=f"cosim reproduce --budget {sizes.name}",
         )
 
 
@@ -154,7 +154,6 @@ def converged_with(path: str, scenario: Scenario) -> Controller:
 
 
 def _write(
-    budget: str,
     sizes: Budget,
     folder: Path,
     tasks: Mapping[str, Training],
@@ -181,16 +180,17 @@ def _write(
     write_atomically(folder / "map.csv", map_.to_csv())
     write_atomically(folder / "converged.csv", converged.to_csv())
     figures = [figure(tasks[group[0]], folder) for group in groups.values()]
+    described = evaluation.summary()
     summary = {
-        "budget": budget,
+        "budget": sizes.name,
         "comparison": comparison.records,
         "converged": converged.records,
         "map": map_.records,
         "trainings": {
             key: {"command": task.command(), "status": status[key]} for key, task in tasks.items()
         },
-        "controllers": evaluation.summary()["controllers"],
-        "timing": evaluation.summary()["timing"],
+        "controllers": described["controllers"],
+        "timing": described["timing"],
     }
     write_atomically(folder / "report.md", report(summary, figures))
     write_atomically(folder / "summary.json", dump(summary))

@@ -39,6 +39,7 @@ class Budget:
     point, without J*.
     """
 
+    name: str
     learners: tuple[Learner, ...]
     training_seeds: int
     noise_seeds: int
@@ -53,6 +54,7 @@ class Budget:
 
 
 QUICK = Budget(
+    name="quick",
     learners=(
         Learner("q-learning-literal", "q-learning", 20_000, LITERAL),
         Learner("actor-critic", "actor-critic", 20_000),
@@ -68,6 +70,7 @@ QUICK = Budget(
 # Twice the samples, and the rule that the quick budget has no time for.
 FULL = replace(
     QUICK,
+    name="full",
     learners=(
         Learner("batch-q-learning", "batch-q-learning", 40_000),
         *(replace(learner, samples=2 * learner.samples) for learner in QUICK.learners),
@@ -79,4 +82,4 @@ FULL = replace(
     factorial=True,
 )
 
-BUDGETS = {"quick": QUICK, "full": FULL}
+BUDGETS = {budget.name: budget for budget in (QUICK, FULL)}

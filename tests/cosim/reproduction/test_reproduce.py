@@ -9,6 +9,7 @@ from cosim.cli.main import app
 from cosim.reproduction.budget import BUDGETS, LITERAL, Budget, Learner
 
 TINY = Budget(
+    name="quick",
     learners=(
         Learner("q-learning-literal", "q-learning", 1000, LITERAL),
         Learner("q-learning", "q-learning", 1000),

@@ -20,9 +20,9 @@ from controllers.problem import Problem
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
-# States whose arrays, states × quadrature nodes, are worked on at once: fewer leave two threads
+# Entries of an array, states × quadrature nodes, worked on at once: fewer leave two threads
 # waiting for the interpreter's lock between short operations, more leave the cores' caches.
-_BLOCK = 512
+_ENTRIES = 100_000
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,8 @@ class BellmanOperator:
         return total
 
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
-        edges = np.linspace(0, count, -(-count // _BLOCK) + 1).astype(int)
+        blocks = -(-count * len(self._weights) // _ENTRIES)
+        edges = np.linspace(0, count, min(blocks, count) + 1).astype(int)
         parts = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
         return self._pool.map(task, parts) if self._pool else map(task, parts)
 

@@ -58,7 +58,8 @@ class Output:
             table.add_row(*row)
         console = Console()
         if not console.is_terminal:
-            console.width = max(console.width, console.measure(table).maximum)
+            unlimited = console.options.update(max_width=1000)
+            console.width = max(console.width, console.measure(table, options=unlimited).maximum)
         console.print(table)
 
     def json(self, document: Mapping[str, Any]) -> None:

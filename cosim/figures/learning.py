@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
@@ -91,7 +92,7 @@ def plot_parameters_and_td_error(
     columns = 4
     rows = -(-len(moving) // columns)
     end = float(max(td_samples[-1], samples[-1]))
-    with figure(1.3 * rows + 1.8) as drawn:
+    with figure(1.3 * rows + 2.2) as drawn:
         grid = drawn.add_gridspec(rows + 1, columns, height_ratios=[*[1.0] * rows, 1.2])
         first: Axes | None = None
         for i, (name, values) in enumerate(moving.items()):
@@ -111,7 +112,20 @@ def plot_parameters_and_td_error(
         axes.set_xlabel("samples")
         title = f"TD error, root mean square of the preceding {window} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
+        most = max((values.shape[1] for values in moving.values()), default=0)
+        drawn.legend(
+            handles=[Line2D([], [], color=color, linewidth=1.2) for color in SERIES[:most]],
+            labels=[_ordinals(i, most) for i in range(min(most, len(SERIES)))],
+            loc="outside lower center",
+            ncols=len(SERIES) + 1,
+            title="entry of its block",
+        )
     return save(drawn, path)
+
+
+def _ordinals(color: int, entries: int) -> str:
+    """Numbers, from 1, of the entries that have a colour of the cycle."""
+    return ", ".join(str(i + 1) for i in range(color, entries, len(SERIES)))
 
 
 def _symbol(name: str) -> str:

@@ -11,6 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+NOISE_SEEDS, STEPS = 50, 1000
+"""Held-out noise seeds, and samples on each, of every evaluation."""
+TUNING_SEEDS, TUNING_NOISE_SEEDS = 6, 8
+"""How many of the first training and noise seeds hyperparameters were chosen on."""
 LITERAL = {
     "rule": "fit",
     "step_size": 1e-3,
@@ -23,17 +27,12 @@ LITERAL = {
 
 @dataclass(frozen=True)
 class Case:
-    """One algorithm with its settings.
-
-    It is trained with `seeds` seeds 0, 1, … and evaluated on `noise_seeds` held-out ones.
-    """
+    """One algorithm with its settings, trained with `seeds` seeds 0, 1, …"""
 
     algorithm: str
     samples: int
     settings: dict[str, Any] = field(default_factory=dict)
     seeds: int = 10
-    controller: str = "rti"
-    noise_seeds: int = 50
 
 
 CASES = {

@@ -13,42 +13,41 @@ import argparse
 import csv
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.storage import write_atomically
 from cosim import FmuPlant, Scenario
-from cosim.simulation import spawn_seeds
 from learning import BatchQLearning
+from learning.batch_q_learning import BatchQLearningConfiguration
 from learning.fit import least_squares
-from learning.interaction import Interaction
+from learning.learner import Learner
 from learning.level import Level
 from learning.protocols import LearnableController
 from learning.replay import ReplayBuffer
-from learning.starting_point import build_controller, build_strategy, starting_parameters
+from learning.run import Run
+from learning.starting_point import build_controller
 from learning.step import ParameterStep
 
 SAMPLES, ITERATIONS, GAIN, RADIUS = 150, 6, 0.5, 1.0
+CONFIGURATION = BatchQLearningConfiguration.from_dict({})
 
 
-def fill(scenario: Scenario, controller: LearnableController) -> ReplayBuffer:
-    """Transitions of the stochastic plant at the controller's θ, with exploration."""
-    configuration = BatchQLearning.Configuration.from_dict({})
-    strategy = build_strategy(configuration, scenario, SAMPLES)
-    algorithm = BatchQLearning(controller, scenario, configuration, SAMPLES, strategy)
-    seed, rng = spawn_seeds(0)
+def fill(scenario: Scenario) -> tuple[ReplayBuffer, Parameters]:
+    """Transitions of the stochastic plant under RTI with exploration, and their θ."""
+    run = Run("batch-q-learning", scenario, SAMPLES, 0, CONFIGURATION)
     buffer = ReplayBuffer(SAMPLES)
     with FmuPlant(scenario) as plant:
-        interaction = Interaction(plant, controller, algorithm, strategy, rng)
-        interaction.start(seed)
+        learner = Learner(run, BatchQLearning, plant)
+        learner.begin()
         for _ in range(SAMPLES):
-            sample, _ = interaction.next()
+            sample, _ = learner.interaction.next()
             if sample is not None:
                 buffer.add(sample)
-    return buffer
+    return buffer, learner.start
 
 
 def learn(
@@ -56,7 +55,7 @@ def learn(
 ) -> NDArray[np.float64]:
     """Change of θ, scaled, after all fits to the buffer."""
     start = controller.theta.copy()
-    step = ParameterStep(controller, BatchQLearning.Configuration.from_dict({}))
+    step = ParameterStep(controller, CONFIGURATION)
     level = Level(scenario.discount, 0, 1.0, 0.0)
     for _ in range(ITERATIONS):
         replayed = buffer.replay(controller, level)
@@ -73,18 +72,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/learning"))
     arguments = parser.parse_args()
     scenario = Scenario.load("paper")
-    problem = Problem.from_scenario(scenario)  # type: ignore[arg-type]
-    parameters = starting_parameters(problem, BatchQLearning.Configuration.from_dict({}))
-    made: dict[str, Any] = {
-        kind: build_controller(kind, scenario, problem, parameters) for kind in ("rti", "converged")
-    }
-    buffer = fill(scenario, made["rti"])
-    made["rti"].parameters = parameters
-    rti, converged = (learn(scenario, made[kind], buffer) for kind in ("rti", "converged"))
+    problem = Problem.from_scenario(scenario)
+    buffer, start = fill(scenario)
+    rti, converged = (
+        learn(scenario, build_controller(kind, scenario, problem, start), buffer)
+        for kind in ("rti", "converged")
+    )
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(("entry", "rti", "converged"))
-    for label, one, other in zip(parameters.layout.labels, rti, converged, strict=True):
+    for label, one, other in zip(start.layout.labels, rti, converged, strict=True):
         writer.writerow((label, f"{one:.8g}", f"{other:.8g}"))
     write_atomically(arguments.out / "converged.csv", stream.getvalue())
 

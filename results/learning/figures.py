@@ -9,12 +9,12 @@ diverged is held at the J that it ended with.
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 from cases import CASES
 from numpy.typing import NDArray
+from stored import SCENARIOS, rows
 
 from cosim import FmuPlant, Scenario
 from cosim.cli.compose import build_controller
@@ -24,12 +24,6 @@ from learning.evaluation import Evaluation, held_out
 Array = NDArray[np.float64]
 HERE = Path(__file__).parent
 SEEDS, STEPS = 4, 500  # the defaults of `cosim train`, with which the sweep was made
-
-
-def read(name: str, scenario: str) -> list[dict[str, str]]:
-    """Rows of a stored table that belong to a scenario."""
-    with (HERE / name).open(newline="", encoding="utf-8") as stream:
-        return [row for row in csv.DictReader(stream) if row["scenario"] == scenario]
 
 
 def level(scenario: Scenario, name: str) -> float:
@@ -58,13 +52,14 @@ def held(samples: Array, values: Array, end: float) -> tuple[Array, Array]:
 
 def main() -> None:
     """Draw a figure for each scenario."""
-    for name in ("paper", "fast-sampling"):
-        scenario, rows = Scenario.load(name), read("curves.csv", name)
-        ended = [row["case"] for row in read("runs.csv", name) if row["status"] == "diverged"]
+    for name in SCENARIOS:
+        scenario, points = Scenario.load(name), rows(HERE / "curves.csv", name)
+        runs = rows(HERE / "runs.csv", name)
+        ended = [run["case"] for run in runs if run["status"] == "diverged"]
         optimum = level(scenario, "optimal")
         panels: dict[str, dict[str, tuple[Array, Array]]] = {}
         for case, settings in CASES.items():
-            mine = [row for row in rows if row["case"] == case]
+            mine = [point for point in points if point["case"] == case]
             if not mine:
                 continue
             samples, values = curves(mine)

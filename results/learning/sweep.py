@@ -3,8 +3,9 @@
     python results/learning/sweep.py --jobs 2 --scenarios paper fast-sampling
 
 Each run has a folder OUT/SCENARIO/CASE/SEED with what `cosim train` writes and evaluation.csv: its
-θ greedily on 50 held-out noise seeds × 1000 steps. A run that has evaluation.csv is not run again;
-one that has a checkpoint goes on from there. `tables.py` makes the tables and figures.
+θ greedily on 50 held-out noise seeds × 1000 steps; each baseline a folder OUT/SCENARIO/NAME with
+evaluation.csv. What has evaluation.csv is not run again; a training that has a checkpoint goes on
+from there. `gather.py` stores the results, `tables.py` and `figures.py` show them.
 """
 
 from __future__ import annotations
@@ -13,45 +14,63 @@ import argparse
 import csv
 import io
 import json
+import subprocess
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from cases import CASES, Case
-from joblib import Parallel, delayed
+from cases import CASES, NOISE_SEEDS, STEPS
+from stored import BASELINES, FIGURES, SCENARIOS
 
 from controllers.problem import Problem
 from controllers.storage import write_atomically
 from cosim import FmuPlant, Scenario
+from cosim.cli.compose import build_controller
 from cosim.cli.train import summarise
+from cosim.evaluation.parallel import run_all
 from learning.evaluation import Evaluation, held_out
 from learning.log import to_csv
 from learning.registry import load_algorithm
 from learning.run import Run
-from learning.starting_point import build_controller
+from learning.starting_point import build_controller as learnable
 from learning.training import Training
 
-STEPS = 1000
-FIGURES = ("J", "economic_cost", "mean_violation", "violating_share", "failures")
+
+class Task(NamedTuple):
+    """A training seed of a case or, without one, a baseline; `commit` says which code runs it."""
+
+    out: Path
+    scenario: str
+    name: str
+    seed: int | None
+    commit: str
+
+    @property
+    def folder(self) -> Path:
+        """Where the task's files are."""
+        folder = self.out / self.scenario / self.name
+        return folder if self.seed is None else folder / f"{self.seed:02d}"
 
 
-def evaluate(plant: FmuPlant, controller: Any, seeds: int) -> str:
-    """Figures of a controller on each held-out seed, as CSV."""
-    costs = Evaluation(plant, held_out(seeds), STEPS).costs(controller)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(("seed", *FIGURES))
-    for row, seed in enumerate(held_out(seeds)):
-        writer.writerow((seed, *(repr(float(costs[name][row])) for name in FIGURES)))
-    return stream.getvalue()
+def perform(task: Task) -> str:
+    """Run a task unless it is there already; returns a line for the log."""
+    if (task.folder / "evaluation.csv").exists():
+        return f"{task.folder}: there already"
+    task.folder.mkdir(parents=True, exist_ok=True)
+    return baseline(task) if task.seed is None else train(task, task.seed)
 
 
-def train(out: Path, scenario: Scenario, name: str, case: Case, seed: int) -> str:
-    """One run to its evaluation; returns a line for the log."""
-    folder = out / scenario.name / name / f"{seed:02d}"
-    if (folder / "evaluation.csv").exists():
-        return f"{folder}: there already"
-    folder.mkdir(parents=True, exist_ok=True)
+def baseline(task: Task) -> str:
+    """Evaluate a baseline."""
+    scenario = Scenario.load(task.scenario)
+    with FmuPlant(scenario) as plant:
+        evaluate(task.folder, plant, build_controller(task.name, scenario))
+    return f"{task.folder}: evaluated"
+
+
+def train(task: Task, seed: int) -> str:
+    """Train a case and evaluate the θ that it ends with."""
+    scenario, case, folder = Scenario.load(task.scenario), CASES[task.name], task.folder
     algorithm = load_algorithm(case.algorithm)
     run = Run(
         algorithm=case.algorithm,
@@ -59,28 +78,55 @@ def train(out: Path, scenario: Scenario, name: str, case: Case, seed: int) -> st
         samples=case.samples,
         seed=seed,
         configuration=algorithm.Configuration.from_dict(case.settings),
-        controller=case.controller,
         log_every=min(500, case.samples // 20),
         evaluate_every=case.samples // 20,
         checkpoint_every=case.samples // 5,
-        evaluation_seeds=4,
-        evaluation_steps=500,
     )
     begin = time.perf_counter(), time.process_time()
     with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
         training = Training(run, algorithm, plant, other, out=folder)
         result = training.go(resume=(folder / "checkpoint.npz").exists())
         elapsed = time.perf_counter() - begin[0], time.process_time() - begin[1]
+        summary = summarise(run, result) | {"commit": task.commit}
+        summary["timing"] = {"wall_seconds": elapsed[0], "process_seconds": elapsed[1]}
+        result.parameters.save(folder / "parameters.toml")
+        write_atomically(folder / "learning.csv", to_csv(result.rows))
+        write_atomically(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
         problem = Problem.from_scenario(scenario)
-        controller = build_controller(case.controller, scenario, problem, result.parameters)
-        evaluation = evaluate(other, controller, case.noise_seeds)
-    summary = summarise(run, result)
-    summary["timing"] = {"wall_seconds": elapsed[0], "process_seconds": elapsed[1]}
-    result.parameters.save(folder / "parameters.toml")
-    write_atomically(folder / "learning.csv", to_csv(result.rows))
-    write_atomically(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
-    write_atomically(folder / "evaluation.csv", evaluation)
+        evaluate(folder, other, learnable(run.controller, scenario, problem, result.parameters))
     return f"{folder}: J {summary['J']:.1f}, {result.status}, {elapsed[0]:.0f} s"
+
+
+def evaluate(folder: Path, plant: FmuPlant, controller: Any) -> None:
+    """Write a controller's figures on each held-out seed; the last file of a task."""
+    seeds = held_out(NOISE_SEEDS)
+    costs = Evaluation(plant, seeds, STEPS).costs(controller)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(("seed", *FIGURES))
+    for row, seed in enumerate(seeds):
+        writer.writerow((seed, *(repr(float(costs[name][row])) for name in FIGURES)))
+    write_atomically(folder / "evaluation.csv", stream.getvalue())
+
+
+def tasks(out: Path, scenarios: list[str], names: list[str]) -> dict[str, Task]:
+    """All tasks in the order of their worth, by folder.
+
+    Baselines first, then seed after seed: stopped early, the sweep has every case for fewer seeds.
+    """
+    describe = ["git", "describe", "--always", "--dirty", "--abbrev=7"]
+    commit = subprocess.run(
+        describe, cwd=Path(__file__).parent, check=True, capture_output=True, text=True
+    ).stdout.strip()
+    made = [Task(out, scenario, name, None, commit) for scenario in scenarios for name in BASELINES]
+    made += [
+        Task(out, scenario, name, seed, commit)
+        for seed in range(max(CASES[name].seeds for name in names))
+        for scenario in scenarios
+        for name in names
+        if seed < CASES[name].seeds
+    ]
+    return {str(task.folder): task for task in made}
 
 
 def main() -> None:
@@ -88,23 +134,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/learning/runs"))
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--scenarios", nargs="+", default=["paper", "fast-sampling"])
+    parser.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), choices=SCENARIOS)
     parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
     arguments = parser.parse_args()
-    # Seeds go round in the outer loop: stopped early, the sweep has every case for fewer seeds.
-    work = [
-        (Scenario.load(scenario), name, seed)
-        for scenario in arguments.scenarios
-        for seed in range(max(CASES[name].seeds for name in arguments.cases))
-        for name in arguments.cases
-        if seed < CASES[name].seeds
-    ]
-    lines = Parallel(n_jobs=arguments.jobs, return_as="generator_unordered")(
-        delayed(train)(arguments.out, scenario, name, CASES[name], seed)
-        for scenario, name, seed in work
-    )
-    for done, line in enumerate(lines, start=1):
-        print(f"{done}/{len(work)} {line}", flush=True)
+    work = tasks(arguments.out, arguments.scenarios, arguments.cases)
+    done: list[str] = []
+
+    def report(folder: str, line: str) -> None:
+        done.append(folder)
+        print(f"{len(done)}/{len(work)} {line}", flush=True)
+
+    run_all(perform, work, report, jobs=arguments.jobs)
 
 
 if __name__ == "__main__":

@@ -1,37 +1,22 @@
-"""Tables of the sweep, and the baselines that they need.
+"""README.md of the sweep, from the stored tables and preface.md.
 
-    python results/learning/tables.py --runs results/learning/runs
-
-Evaluates naive, tuned and optimal on the sweep's held-out seeds (once; kept in OUT), then writes to
-OUT: evaluation.csv (controller and noise seed), runs.csv (training run), curves.csv and README.md.
-Baselines that cannot be built yet are named in the README. The figures are drawn by figures.py.
+python results/learning/tables.py
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
-import io
-import json
-import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from cases import CASES
-from numpy.typing import NDArray
-from sweep import FIGURES, STEPS, evaluate
+from cases import CASES, NOISE_SEEDS, STEPS, TUNING_NOISE_SEEDS, TUNING_SEEDS
+from stored import SCENARIOS, Run, Stored, load
 
 from controllers.storage import write_atomically
-from cosim import FmuPlant, Scenario
-from cosim.cli.compose import build_controller
-from cosim.errors import CosimError
-from cosim.evaluation.statistics import Estimate, ratio
+from cosim.evaluation.statistics import Estimate, ratio, shown
 
-Array = NDArray[np.float64]
-SEEDS = 50
-BASELINES = ("naive", "tuned", "optimal")
+HERE = Path(__file__).parent
 TARGETS = {  # median and worst share of the gap closed that the benchmark asks for
     "actor-critic": (0.995, 0.98),
     "batch-q-learning": (0.98, 0.95),
@@ -39,84 +24,9 @@ TARGETS = {  # median and worst share of the gap closed that the benchmark asks 
 }
 
 
-def read(path: Path) -> dict[str, Array]:
-    """Columns of a CSV of numbers; an empty cell is NaN."""
-    with path.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    return {k: np.array([float(row[k]) if row[k] else np.nan for row in rows]) for k in rows[0]}
-
-
-def to_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """CSV text; floats with eight digits."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    for row in rows:
-        writer.writerow([f"{v:.8g}" if isinstance(v, float) else v for v in row])
-    return stream.getvalue()
-
-
-def baselines(out: Path, scenario: Scenario) -> dict[str, dict[str, Array]]:
-    """Figures of each baseline by held-out seed; those that exist already are read."""
-    found = {}
-    for name in BASELINES:
-        path = out / "baselines" / f"{scenario.name}-{name}.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.exists():
-            try:
-                controller = build_controller(name, scenario)
-            except CosimError as error:
-                print(f"{scenario.name}: {name} is left out: {error}")
-                continue
-            with FmuPlant(scenario) as plant:
-                write_atomically(path, evaluate(plant, controller, SEEDS))
-        found[name] = read(path)
-    return found
-
-
-class Runs:
-    """The training runs of one case on one scenario, in the order of their seeds."""
-
-    def __init__(self, folder: Path) -> None:
-        folders = sorted(path.parent for path in folder.glob("*/evaluation.csv"))
-        self.seeds = [int(path.name) for path in folders]
-        self.evaluations = [read(path / "evaluation.csv") for path in folders]
-        self.logs = [read(path / "learning.csv") for path in folders]
-        self.summaries = [json.loads((path / "summary.json").read_text()) for path in folders]
-        self.theta = [
-            tomllib.loads((path / "parameters.toml").read_text())["theta"] for path in folders
-        ]
-
-    def __len__(self) -> int:
-        """Number of runs."""
-        return len(self.seeds)
-
-    def figure(self, name: str) -> Array:
-        """Mean of a figure over the held-out seeds, for each run."""
-        return np.array([evaluation[name].mean() for evaluation in self.evaluations])
-
-    def steadiness(self) -> Array:
-        """Worst greedy J in the last 20 % of training relative to the last one, less 1."""
-        worst = []
-        for log in self.logs:
-            known = ~np.isnan(log["greedy_J"])
-            late = known & (log["samples"] > 0.8 * log["samples"][-1])
-            worst.append(log["greedy_J"][late].max() / log["greedy_J"][known][-1] - 1)
-        return np.array(worst)
-
-
 def percent(estimate: Estimate) -> str:
     """Value and 95 % interval in percent."""
-    if estimate.t is None:
-        return f"{100 * estimate.value:.2f}"
-    low, high = estimate.t
-    return f"{100 * estimate.value:.2f} [{100 * low:.2f}, {100 * high:.2f}]"
-
-
-def gap(reference: dict[str, dict[str, Array]], cost: Array) -> Estimate:
-    """Gap closed with its paired interval over the held-out seeds."""
-    naive, optimum = (reference[name]["J"][: len(cost)] for name in ("naive", "optimal"))
-    return ratio(naive - cost, naive - optimum)
+    return shown(estimate.value, estimate.t, 100.0)
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -125,96 +35,106 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *rows)) + "\n"
 
 
-def scenario_page(
-    scenario: Scenario, reference: dict[str, dict[str, Array]], cases: dict[str, Runs]
-) -> str:
-    """The README's section of one scenario."""
-    known = "optimal" in reference
-    text = [f"## Scenario `{scenario.name}`\n"]
-    rows = [
-        [
-            name,
-            *(f"{reference[name][f].mean():.{d}f}" for f, d in (("economic_cost", 1), ("J", 1))),
-            f"{reference[name]['mean_violation'].mean():.5f}",
-            f"{100 * reference[name]['violating_share'].mean():.2f}",
-            percent(gap(reference, reference[name]["J"])) if known else "",
-        ]
-        for name in reference
-    ]
+def ranked(runs: list[Run]) -> list[Run]:
+    """Runs from the best J to the worst."""
+    return sorted(runs, key=lambda run: run.cost)
+
+
+def middle(runs: list[Run]) -> Run:
+    """The median run; the better of the two middle ones where their number is even."""
+    return ranked(runs)[(len(runs) - 1) // 2]
+
+
+def baselines(stored: Stored) -> str:
+    """Table of the baselines of a scenario."""
     header = ("controller", "economic cost", "J", "mean violation", "violating %", "gap closed %")
-    text.append(table(header, rows))
     rows = []
-    for name, runs in cases.items():
-        order = np.argsort(runs.figure("J"))
-        middle, worst = order[(len(order) - 1) // 2], order[-1]
-        algorithm = CASES[name].algorithm
-        finished = sum(s["status"] == "finished" for s in runs.summaries)
-        row = [name, str(CASES[name].samples), f"{finished}/{len(runs)}"]
-        row += [f"{np.median(runs.figure('J')):.1f}", f"{runs.figure('J').max():.1f}"]
-        if known:
-            gaps = [gap(reference, e["J"]) for e in runs.evaluations]
-            median = float(np.median([g.value for g in gaps]))
-            row += [f"{100 * median:.2f}", percent(gaps[middle]), percent(gaps[worst])]
-            wanted, least = TARGETS[algorithm]
-            met = median >= wanted and (least is None or gaps[worst].value >= least)
-            row.append("yes" if met else "no")
-        else:
-            row += [""] * 4
-        row.append(f"{100 * runs.steadiness().max():.2f}")
-        rows.append(row)
+    for name, found in stored.baselines.items():
+        row = [name, *(f"{found[f].mean():.1f}" for f in ("economic_cost", "J"))]
+        row.append(f"{found['mean_violation'].mean():.5f}")
+        row.append(f"{100 * found['violating_share'].mean():.2f}")
+        rows.append([*row, percent(stored.gap(found["J"]))])
+    return table(header, rows)
+
+
+def cases(stored: Stored) -> str:
+    """Table of the learned controllers of a scenario."""
+    rows = []
+    for name, runs in stored.cases.items():
+        gaps = [stored.gap(run.figures["J"]) for run in ranked(runs)]
+        median = float(np.median([gap.value for gap in gaps]))
+        wanted, least = TARGETS[CASES[name].algorithm]
+        met = median >= wanted and (least is None or gaps[-1].value >= least)
+        finished = sum(run.record["status"] == "finished" for run in runs)
+        rows.append(
+            [
+                name,
+                str(CASES[name].samples),
+                f"{finished}/{len(runs)}",
+                f"{np.median([run.cost for run in runs]):.1f}",
+                f"{max(run.cost for run in runs):.1f}",
+                f"{100 * median:.2f}",
+                percent(gaps[(len(gaps) - 1) // 2]),
+                percent(gaps[-1]),
+                "yes" if met else "no",
+                f"{100 * max(float(run.record['late_rise']) for run in runs):.2f}",
+                ", ".join(dict.fromkeys(run.record["commit"] for run in runs)),
+            ]
+        )
     header = (
-        "case",
-        "samples",
-        "finished",
-        "J, median",
-        "J, worst",
-        "gap closed %, median",
-        "median run [95 %]",
-        "worst run [95 %]",
-        "target met",
-        "late rise of J %",
+        "case", "samples", "finished", "J, median", "J, worst", "gap closed %, median",
+        "median run [95 %]", "worst run [95 %]", "target met", "late rise of J %", "commit",
+    )  # fmt: skip
+    return table(header, rows)
+
+
+def untouched(found: dict[str, Stored]) -> str:
+    """Gap closed on the training and noise seeds that no hyperparameter was chosen on."""
+    rows = []
+    for scenario, stored in found.items():
+        for name, runs in stored.cases.items():
+            fresh = [run for run in runs if run.seed >= TUNING_SEEDS]
+            if not fresh:
+                continue
+            naive, optimum = (
+                stored.baselines[n]["J"][TUNING_NOISE_SEEDS:] for n in ("naive", "optimal")
+            )
+            gaps = [
+                ratio(naive - run.figures["J"][TUNING_NOISE_SEEDS:], naive - optimum).value
+                for run in fresh
+            ]
+            cells = (f"{100 * value:.2f}" for value in (np.median(gaps), min(gaps)))
+            rows.append([name, scenario, str(len(fresh)), *cells])
+    text = (
+        f"## On untouched seeds\n\nTraining seeds from {TUNING_SEEDS} on, noise seeds from the "
+        f"{TUNING_NOISE_SEEDS + 1}th on: nothing was chosen on these.\n\n"
     )
-    text.append(table(header, rows))
-    text.append(f"![learning](learning-{scenario.name}.png)\n")
-    return "\n".join(text)
+    header = ("case", "scenario", "runs", "gap closed %, median", "gap closed %, worst")
+    return text + table(header, rows)
 
 
-def papers_figures(
-    found: dict[str, tuple[dict[str, dict[str, Array]], dict[str, Runs]]],
-) -> str:
+def papers_figures(found: dict[str, Stored]) -> str:
     """The paper's 21 % over naive and 15 % over tuned, beside ours."""
     rows = [["paper.tex, RTI Q-learning", "", "21", "15", "", ""]]
-    for scenario, (reference, cases) in found.items():
-        for name, runs in cases.items():
-            order = np.argsort(runs.figure("J"))
-            run = runs.evaluations[order[(len(order) - 1) // 2]]
-            gains = [
-                percent(
-                    ratio(
-                        reference[base][f][: len(run[f])] - run[f],
-                        reference[base][f][: len(run[f])],
-                    )
-                )
-                if base in reference
-                else ""
-                for f in ("J", "economic_cost")
-                for base in ("naive", "tuned")
-            ]
+    for scenario, stored in found.items():
+        for name, runs in stored.cases.items():
+            run = middle(runs)
+            gains = []
+            for figure in ("J", "economic_cost"):
+                for base in ("naive", "tuned"):
+                    reference = stored.baselines[base][figure]
+                    gains.append(percent(ratio(reference - run.figures[figure], reference)))
             rows.append([name, scenario, *gains])
     header = (
-        "case (median run)",
-        "scenario",
-        "J over naive %",
-        "J over tuned %",
-        "economic cost over naive %",
-        "economic cost over tuned %",
-    )
+        "case (median run)", "scenario", "J over naive %", "J over tuned %",
+        "economic cost over naive %", "economic cost over tuned %",
+    )  # fmt: skip
     return "## The paper's own figures beside ours\n\n" + table(header, rows)
 
 
-def converged_page(path: Path) -> str:
+def converged(path: Path) -> str:
     """The entries of θ in which RTI and converged NMPC differ most (`converged.py`)."""
-    with path.open(newline="") as stream:
+    with path.open(newline="", encoding="utf-8") as stream:
         rows = [
             (row["entry"], float(row["rti"]), float(row["converged"]))
             for row in csv.DictReader(stream)
@@ -233,89 +153,16 @@ def converged_page(path: Path) -> str:
     )
 
 
-def collect(
-    arguments: argparse.Namespace,
-) -> dict[str, tuple[dict[str, dict[str, Array]], dict[str, Runs]]]:
-    """Baselines and runs of every scenario that has runs."""
-    found = {}
-    for name in ("paper", "fast-sampling"):
-        cases = {case: Runs(arguments.runs / name / case) for case in CASES}
-        cases = {case: runs for case, runs in cases.items() if len(runs)}
-        if cases:
-            found[name] = (baselines(arguments.out, Scenario.load(name)), cases)
-    return found
-
-
-def evaluation_rows(found: Any) -> Iterable[Sequence[Any]]:
-    """Rows of evaluation.csv."""
-    for scenario, (reference, cases) in found.items():
-        sources: list[tuple[str, int | str, dict[str, Array]]] = [
-            (name, "", figures) for name, figures in reference.items()
-        ]
-        for case, runs in cases.items():
-            sources += [(case, s, e) for s, e in zip(runs.seeds, runs.evaluations, strict=True)]
-        for name, seed, figures in sources:
-            for row, noise in enumerate(figures["seed"]):
-                yield (scenario, name, seed, int(noise), *(float(figures[f][row]) for f in FIGURES))
-
-
-def run_rows(found: Any) -> Iterable[Sequence[Any]]:
-    """Rows of runs.csv: one a training run."""
-    for scenario, (reference, cases) in found.items():
-        for case, runs in cases.items():
-            for k, seed in enumerate(runs.seeds):
-                cost, summary = runs.evaluations[k]["J"], runs.summaries[k]
-                closed = gap(reference, cost).value if "optimal" in reference else ""
-                yield (
-                    scenario, case, seed, summary["samples"], summary["status"].split(":")[0],
-                    float(cost.mean()), closed, float(runs.steadiness()[k]),
-                    float(summary["smallest_eigenvalue"]), int(summary["training_failures"]),
-                )  # fmt: skip
-
-
-def curve_rows(found: Any) -> Iterable[Sequence[Any]]:
-    """Rows of curves.csv: the greedy evaluations of each run."""
-    for scenario, (_, cases) in found.items():
-        for case, runs in cases.items():
-            for seed, log in zip(runs.seeds, runs.logs, strict=True):
-                for row in np.flatnonzero(~np.isnan(log["greedy_J"])):
-                    figures = (float(log[name][row]) for name in ("greedy_J", "td_error"))
-                    yield (scenario, case, seed, int(log["samples"][row]), *figures)
-
-
 def main() -> None:
-    """Write everything."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=Path, default=Path("results/learning/runs"))
-    parser.add_argument("--out", type=Path, default=Path("results/learning"))
-    arguments = parser.parse_args()
-    found = collect(arguments)
-    files: dict[str, tuple[Sequence[str], Callable[[Any], Iterable[Sequence[Any]]]]] = {
-        "evaluation.csv": (
-            ("scenario", "controller", "training_seed", "seed", *FIGURES),
-            evaluation_rows,
-        ),
-        "runs.csv": (
-            (
-                "scenario", "case", "training_seed", "samples", "status", "J", "gap_closed",
-                "late_rise", "smallest_eigenvalue", "failures",
-            ),
-            run_rows,
-        ),
-        "curves.csv": (
-            ("scenario", "case", "training_seed", "samples", "greedy_J", "td_error"),
-            curve_rows,
-        ),
-    }  # fmt: skip
-    for name, (header, rows) in files.items():
-        write_atomically(arguments.out / name, to_csv(header, rows(found)))
-    text = [(Path(__file__).parent / "preface.md").read_text().format(seeds=SEEDS, steps=STEPS)]
-    for name, (reference, cases) in found.items():
-        text.append(scenario_page(Scenario.load(name), reference, cases))
-    text.append(papers_figures(found))
-    if (arguments.out / "converged.csv").exists():
-        text.append(converged_page(arguments.out / "converged.csv"))
-    write_atomically(arguments.out / "README.md", "\n".join(text))
+    """Write README.md."""
+    found = {scenario: load(HERE, scenario) for scenario in SCENARIOS}
+    preface = (HERE / "preface.md").read_text(encoding="utf-8")
+    text = [preface.format(seeds=NOISE_SEEDS, steps=STEPS)]
+    for scenario, stored in found.items():
+        text += [f"## Scenario `{scenario}`\n", baselines(stored), cases(stored)]
+        text.append(f"![learning](learning-{scenario}.png)\n")
+    text += [untouched(found), papers_figures(found), converged(HERE / "converged.csv")]
+    write_atomically(HERE / "README.md", "\n".join(text))
 
 
 if __name__ == "__main__":

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Mapping
 from functools import cached_property
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -16,6 +14,7 @@ import tomli_w
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
+from cosim.documents import merged, read
 from cosim.errors import ScenarioError
 from cosim.tables import (
     BoundsTable,
@@ -28,7 +27,7 @@ from cosim.tables import (
     Positive,
     Table,
 )
-from cosim.validation import describe, suggestion
+from cosim.validation import describe
 
 
 class Scenario(Table):
@@ -97,7 +96,7 @@ class Scenario(Table):
 
         A document with `extends = NAME_OR_PATH` states only what differs from another one.
         """
-        document, origin = _read(source)
+        document, origin = read(source)
         return cls._validated(document, origin)
 
     @classmethod
@@ -117,7 +116,7 @@ class Scenario(Table):
 
         Tables are merged, everything else is replaced; the result is validated as a whole.
         """
-        return self._validated(_merged(self.to_dict(), changes), f"scenario '{self.name}'")
+        return self._validated(merged(self.to_dict(), changes), f"scenario '{self.name}'")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document that this scenario was validated from, every default written out."""
@@ -188,16 +187,6 @@ class Scenario(Table):
         return _frozen(self.controller.reference_action)
 
 
-def presets() -> list[str]:
-    """Names of the scenarios that the package ships."""
-    folder = files("cosim.presets")
-    return sorted(
-        entry.name.removesuffix(".toml")
-        for entry in folder.iterdir()
-        if entry.name.endswith(".toml")
-    )
-
-
 def _misfit(field: str, message: str) -> ValueError:
     return ValueError(f"{field}: {message}")
 
@@ -206,72 +195,3 @@ def _frozen(values: tuple[float, ...]) -> NDArray[np.float64]:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
-
-
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in changes.items():
-        old = merged.get(key)
-        both_tables = isinstance(value, Mapping) and isinstance(old, Mapping)
-        merged[key] = _merged(old, value) if both_tables else value  # type: ignore[arg-type]
-    return merged
-
-
-def _read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any], str]:
-    """Read a preset or file and what it extends; returns the document and its origin's name."""
-    path = Path(source)
-    if str(source) in presets():
-        origin = f"preset '{source}'"
-        text = files("cosim.presets").joinpath(f"{source}.toml").read_text("utf-8")
-        folder = None
-    elif path.suffix == ".toml" or len(path.parts) > 1 or path.is_file():
-        origin = f"scenario file '{source}'"
-        text = _text(path, origin)
-        folder = path.resolve().parent
-    else:
-        raise ScenarioError(
-            f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
-            f"{', '.join(presets())}, or give the path of a TOML file"
-        )
-    try:
-        document = tomllib.loads(text)
-    # A document nested without end exhausts the parser's stack.
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
-    if folder is not None:
-        _anchor_fmu(document, folder)
-    if (base := document.pop("extends", None)) is not None:
-        document = _merged(_extended(base, origin, folder, (*seen, str(path.resolve()))), document)
-    return document, origin
-
-
-def _text(path: Path, origin: str) -> str:
-    try:
-        return path.read_text("utf-8")
-    except FileNotFoundError:
-        raise ScenarioError(f"{origin} does not exist") from None
-    except UnicodeDecodeError:
-        raise ScenarioError(f"{origin} is not UTF-8 text") from None
-    except OSError as error:
-        raise ScenarioError(f"{origin} cannot be read: {error.strerror}") from None
-
-
-def _extended(
-    base: object, origin: str, folder: Path | None, seen: tuple[str, ...]
-) -> dict[str, Any]:
-    if not isinstance(base, str):
-        raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
-    if folder is not None and base not in presets():
-        base = str(folder / base)
-    if str(Path(base).resolve()) in seen:
-        raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
-    return _read(base, seen)[0]
-
-
-def _anchor_fmu(document: dict[str, Any], folder: Path) -> None:
-    """Make an FMU's relative path absolute, as seen from the scenario's folder."""
-    plant = document.get("plant")
-    if isinstance(plant, dict) and isinstance(plant.get("fmu"), str):
-        fmu = Path(plant["fmu"])
-        if fmu.suffix == ".fmu" or len(fmu.parts) > 1:
-            plant["fmu"] = str(folder / fmu)

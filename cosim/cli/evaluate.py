@@ -12,6 +12,11 @@ import typer
 from cosim.cli.output import JsonOption, Output, dump, open_folder, output
 from cosim.cli.simulate import ScenarioOption, StepsOption
 
+JobsOption = Annotated[
+    int | None,
+    typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
+]
+
 
 def evaluate(
     controllers: Annotated[
@@ -32,10 +37,7 @@ def evaluate(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
         "cosim-evaluation"
     ),
-    jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
-    ] = None,
+    jobs: JobsOption = None,
     scheduler: Annotated[
         str | None,
         typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs."),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from cosim.cli.evaluate import JobsOption
 from cosim.cli.output import JsonOption, Output, dump, open_folder, output
 
 if TYPE_CHECKING:
@@ -35,10 +36,7 @@ def reproduce(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
         "cosim-reproduction"
     ),
-    jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
-    ] = None,
+    jobs: JobsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Train, compare with (a) naive and (b) tuned, with converged NMPC and with the optimum.

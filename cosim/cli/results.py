@@ -53,8 +53,12 @@ def check(
 
         from cosim.cli.inner import run_command
         from cosim.results.check import differences, stored_table
-        from cosim.results.experiments import chosen, load_experiments, load_tolerances
-        from cosim.results.location import stored_results
+        from cosim.results.experiments import (
+            chosen,
+            load_experiments,
+            load_tolerances,
+            stored_results,
+        )
         from cosim.results.making import compute
 
         folder = folder or (Path("results") if Path("results").is_dir() else stored_results())

@@ -19,7 +19,7 @@ from cosim.plant.closing import Closing
 from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
-from cosim.plant.snapshot import Snapshot, packed, unpacked
+from cosim.plant.snapshot import Memory, Snapshot, packed, unpacked
 from cosim.plant.wiring import Wirer
 from cosim.protocols import Step
 from cosim.scenario import Scenario
@@ -58,8 +58,7 @@ class FmuPlant(Closing):
     def __init__(self, scenario: Scenario | str | Path, fmu: str | Path | None = None) -> None:
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self._fmi: Instance | None = None
-        self._handles: list[ctypes.c_void_p] = []
-        self._free_handles: list[ctypes.c_void_p] = []
+        self._memory = Memory()
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
         version = str(archive.description.fmiVersion)
         if archive.description.coSimulation is None:
@@ -161,7 +160,7 @@ class FmuPlant(Closing):
         fmi = self._instance
         if self._k < 0:
             self._refuse_unstarted()
-        handle = self._handle()
+        handle = self._memory.take()
         fmi.save(handle)
         return Snapshot(self, handle, self._k)
 
@@ -188,14 +187,14 @@ class FmuPlant(Closing):
         k, state = unpacked(data, self.fmu_sha256)
         if not self._started:
             self.reset(0)
-        handle = self._handle()
+        handle = self._memory.take()
         fmi.deserialise(state, handle)
         return Snapshot(self, handle, k)
 
     def recycle(self, handle: ctypes.c_void_p) -> None:
         """Keep a dropped snapshot's memory for the next one."""
         if self._fmi is not None:
-            self._free_handles.append(handle)
+            self._memory.give(handle)
 
     def close(self) -> None:
         """Free the FMU instance and every snapshot; a closed plant refuses all calls."""
@@ -203,22 +202,13 @@ class FmuPlant(Closing):
             return
         fmi, self._fmi = self._fmi, None
         self._k = _NOT_STARTED
-        for handle in self._handles:
-            fmi.free(handle)
+        self._memory.free(fmi)
         fmi.close()
 
     def __del__(self) -> None:
         """Free the instance of a plant that nobody closed."""
         if getattr(self, "_fmi", None) is not None:
             self.close()
-
-    def _handle(self) -> ctypes.c_void_p:
-        """A dropped snapshot's memory, or none yet: the FMU allocates what it needs."""
-        if self._free_handles:
-            return self._free_handles.pop()
-        handle = ctypes.c_void_p()
-        self._handles.append(handle)
-        return handle
 
     @property
     def _instance(self) -> Instance:

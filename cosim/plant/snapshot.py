@@ -10,6 +10,7 @@ from cosim.errors import PlantError
 
 if TYPE_CHECKING:
     from cosim.plant.fmu_plant import FmuPlant
+    from cosim.plant.instance import Instance
 
 _HEADER = struct.Struct("<8sq32s")
 _MAGIC = b"cosimfs1"
@@ -35,6 +36,31 @@ class Snapshot:
     def __del__(self) -> None:
         """Give the memory back to the plant."""
         self._plant.recycle(self.handle)
+
+
+class Memory:
+    """The FMU's memory of saved states, used again: what an FMU allocates leaks until freed."""
+
+    def __init__(self) -> None:
+        self._all: list[ctypes.c_void_p] = []
+        self._free: list[ctypes.c_void_p] = []
+
+    def take(self) -> ctypes.c_void_p:
+        """A dropped snapshot's memory, or none yet: the FMU allocates what it needs."""
+        if self._free:
+            return self._free.pop()
+        handle = ctypes.c_void_p()
+        self._all.append(handle)
+        return handle
+
+    def give(self, handle: ctypes.c_void_p) -> None:
+        """Keep a dropped snapshot's memory for the next one."""
+        self._free.append(handle)
+
+    def free(self, fmi: Instance) -> None:
+        """Hand all of it back to the FMU."""
+        for handle in self._all:
+            fmi.free(handle)
 
 
 def packed(k: int, sha256: str, state: bytes) -> bytes:

@@ -64,6 +64,12 @@ class _Tolerances(_Table):
     tolerance: dict[Text, Tolerance]
 
 
+def stored_results() -> Path:
+    """Folder of this version's results: an installed wheel's, else the checkout's."""
+    package = Path(__file__).parent
+    return package if (package / EXPERIMENTS).is_file() else package.parents[1] / "results"
+
+
 def load_experiments(folder: Path) -> dict[str, Experiment]:
     """Experiments by name, in the file's order; raises ResultsError."""
     document: _Experiments = _validated(folder / EXPERIMENTS, _Experiments)

@@ -20,6 +20,7 @@ from cosim.figures import (
     plot_trajectory,
     policy_on_grid,
 )
+from cosim.reproduction.curves import read_log
 from cosim.results.experiments import Experiment
 from cosim.scenario import Scenario
 from cosim.trajectory import Trajectory, read_csv
@@ -104,10 +105,9 @@ def _learning(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
     """The greedy policy's J, where it was evaluated."""
     curves = {}
     for label, run in runs.items():
-        table = _columns(run / "learning.csv")
-        evaluated = np.array([cell != "" for cell in table["greedy_J"]])
-        samples = np.array(table["samples"], float)[evaluated]
-        curves[label] = (samples, np.array(table["greedy_J"])[evaluated].astype(float)[None])
+        log = read_log(run / "learning.csv")
+        evaluated = ~np.isnan(log["greedy_J"])
+        curves[label] = (log["samples"][evaluated], log["greedy_J"][evaluated])
     plot_learning_curves({"": curves}, path, ylabel="J per sample, greedy")
 
 

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
@@ -21,6 +21,13 @@ if TYPE_CHECKING:
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON summary on standard output, nothing else.")
 ]
+
+
+class Progressing(Protocol):
+    """Takes the number of things done, and a few words to show behind the bar."""
+
+    def __call__(self, done: int, remark: str = "") -> None:
+        """Show them."""
 
 
 class Output:
@@ -72,8 +79,8 @@ class Output:
                 sys.stdout.write(text)
 
     @contextmanager
-    def progress(self, label: str, total: int) -> Iterator[Any]:
-        """Progress bar on standard error; yields a function that takes the number done."""
+    def progress(self, label: str, total: int) -> Iterator[Progressing]:
+        """Progress bar on standard error; yields a function of the number done and a remark."""
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -84,12 +91,13 @@ class Output:
 
         console = self.console()
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        ends = (TimeRemainingColumn(), TextColumn("{task.fields[remark]}"))
         hidden = self.as_json or not console.is_terminal
-        with Progress(*columns, TimeRemainingColumn(), console=console, disable=hidden) as bar:
-            task = bar.add_task(label, total=total)
+        with Progress(*columns, *ends, console=console, disable=hidden) as bar:
+            task = bar.add_task(label, total=total, remark="")
 
-            def update(done: int) -> None:
-                bar.update(task, completed=done)
+            def update(done: int, remark: str = "") -> None:
+                bar.update(task, completed=done, remark=remark)
 
             yield update
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.output import JsonOption, Output, dump, open_folder, output
+from cosim.cli.output import JsonOption, Output, Progressing, dump, open_folder, output
 from cosim.cli.simulate import ScenarioOption
 
 if TYPE_CHECKING:
+    from learning.log import Row
     from learning.run import Result, Run
 
 AlgorithmOption = Annotated[
@@ -139,7 +142,7 @@ def _execute(
     with (
         build_plant(run.scenario, output) as plant,
         build_plant(run.scenario) as evaluation_plant,
-        _progress(run, output) as progress,
+        output.progress(run.algorithm, run.samples) as progress,
     ):
         training = Training(
             run,
@@ -150,49 +153,28 @@ def _execute(
             out=folder,
             recorder=recorder,
         )
-        result = training.go(resume=resume, progress=progress)
+        result = training.go(resume=resume, progress=_remark(progress))
     if training.obstacle:
         output.note(f"left no checkpoint, --resume is not possible: {training.obstacle}")
     return result
 
 
-def _progress(run: Run, output: Output) -> Any:
-    """Progress bar with J, TD error, gap closed and the smallest eigenvalue."""
-    from contextlib import contextmanager
-    from math import isnan
+def _remark(progress: Progressing) -> Callable[[int, Row | None], None]:
+    """Show J, TD error, gap closed and the smallest eigenvalue of the log's rows behind the bar."""
+    last = {"greedy_J": nan, "gap_closed": nan}
 
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    @contextmanager
-    def bar() -> Any:
-        console = output.console()
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            Remaining(),
-            TextColumn("{task.fields[figures]}"),
+    def update(done: int, row: Row | None) -> None:
+        if row is None:
+            return
+        last.update({name: row[name] for name in last if not isnan(row[name])})
+        progress(
+            done,
+            f"J {row['J']:.0f}  greedy {last['greedy_J']:.0f}  "
+            f"gap closed {100 * last['gap_closed']:.1f} %  TD {row['td_error']:.3g}  "
+            f"λmin {row['smallest_eigenvalue']:.2g}",
         )
-        hidden = output.as_json or not console.is_terminal
-        with Progress(*columns, console=console, disable=hidden) as view:
-            task = view.add_task(run.algorithm, total=run.samples, figures="")
-            seen = {"greedy_J": float("nan"), "gap_closed": float("nan")}
 
-            def update(done: int, row: dict[str, float] | None) -> None:
-                if row is None:
-                    return
-                seen.update({name: row[name] for name in seen if not isnan(row[name])})
-                figures = (
-                    f"J {row['J']:.0f}  greedy {seen['greedy_J']:.0f}  "
-                    f"gap closed {100 * seen['gap_closed']:.1f} %  TD {row['td_error']:.3g}  "
-                    f"λmin {row['smallest_eigenvalue']:.2g}"
-                )
-                view.update(task, completed=done, figures=figures)
-
-            yield update
-
-    return bar()
+    return update
 
 
 def summarise(run: Run, result: Result) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from math import isnan, nan
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +16,15 @@ from cosim.cli.simulate import ScenarioOption
 if TYPE_CHECKING:
     from learning.log import Row
     from learning.run import Result, Run
+
+# Columns of the log behind the progress bar: name, text, scale, format.
+FIGURES = (
+    ("J", "J", 1, ".0f"),
+    ("greedy_J", "greedy", 1, ".0f"),
+    ("gap_closed", "gap closed %", 100, ".1f"),
+    ("td_error", "TD", 1, ".3g"),
+    ("smallest_eigenvalue", "λmin", 1, ".2g"),
+)
 
 AlgorithmOption = Annotated[
     str,
@@ -161,18 +170,18 @@ def _execute(
 
 def _remark(progress: Progressing) -> Callable[[int, Row | None], None]:
     """Show J, TD error, gap closed and the smallest eigenvalue of the log's rows behind the bar."""
-    last = {"greedy_J": nan, "gap_closed": nan}
+    last: Row = {}
 
     def update(done: int, row: Row | None) -> None:
         if row is None:
             return
-        last.update({name: row[name] for name in last if not isnan(row[name])})
-        progress(
-            done,
-            f"J {row['J']:.0f}  greedy {last['greedy_J']:.0f}  "
-            f"gap closed {100 * last['gap_closed']:.1f} %  TD {row['td_error']:.3g}  "
-            f"λmin {row['smallest_eigenvalue']:.2g}",
-        )
+        last.update({name: value for name, value in row.items() if not isnan(value)})
+        figures = [
+            f"{text} {scale * last[name]:{form}}"
+            for name, text, scale, form in FIGURES
+            if name in last
+        ]
+        progress(done, "  ".join(figures))
 
     return update
 

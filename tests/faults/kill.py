@@ -58,7 +58,10 @@ drop = [
 [experiment.table.runs]
 naive = "cosim evaluate --controllers naive --seeds 3 --steps 200 --jobs 1"
 """
-TRAIN = "train --algorithm batch-q-learning --samples 2000 --log-every 250 --evaluate-every 1000"
+# So long that a small part of each command's time is its start, before it writes anything.
+TRAIN = "train --algorithm batch-q-learning --samples 6000 --log-every 100 --evaluate-every 1000"
+EVALUATE = "evaluate --seeds 8 --steps 2000 --jobs 2"
+RECORD = "simulate --steps 20000 --record"
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class Job:
 
 
 def _train(folder: Path) -> list[str]:
-    words = [*TRAIN.split(), "--checkpoint-every", "250", "--out", "out"]
+    words = [*TRAIN.split(), "--checkpoint-every", "100", "--out", "out"]
     return [*words, "--resume"] if (folder / "out" / "checkpoint.npz").exists() else words
 
 
@@ -146,13 +149,13 @@ JOBS = (
     Job("training", _train, ("out/learning.csv", "out/parameters.toml"), _inspect_training),
     Job(
         "evaluation",
-        lambda _: ["evaluate", "--seeds", "4", "--steps", "300", "--jobs", "2", "--out", "out"],
+        lambda _: [*EVALUATE.split(), "--out", "out"],
         ("out/evaluation.csv", "out/evaluation.parquet"),
         _inspect_units,
     ),
     Job(
         "recording",
-        lambda _: ["simulate", "--steps", "2500", "--record", "--out", "out"],
+        lambda _: [*RECORD.split(), "--out", "out"],
         ("out/trajectory.csv", "out/scenario.toml"),
         _inspect_recording,
     ),

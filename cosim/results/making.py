@@ -14,7 +14,7 @@ from cosim.evaluation.provenance import code_hash, versions
 from cosim.results.check import table_path
 from cosim.results.experiments import Experiment
 from cosim.results.figures import Policy, draw
-from cosim.results.tidy import LARGEST, Tidy, join, read
+from cosim.results.tidy import DIGITS, LARGEST, Tidy, join, read
 
 Runner = Callable[[list[str], Path], None]
 """Runs a `cosim` command, given as words, with an output folder; raises what the command raises."""
@@ -90,9 +90,14 @@ def _summary(run: Path) -> dict[str, Any]:
     path = run / SUMMARY
     if not path.is_file():
         return {}
-    document: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    document: dict[str, Any] = json.loads(path.read_text("utf-8"), parse_float=_rounded)
     document.pop("timing", None)
     return document
+
+
+def _rounded(number: str) -> float:
+    """As the tables are, so that a last bit does not show as a change."""
+    return float(f"{float(number):.{DIGITS}g}")
 
 
 def _json(document: dict[str, Any]) -> str:

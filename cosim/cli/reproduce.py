@@ -31,7 +31,12 @@ class BudgetName(enum.StrEnum):
 
 def reproduce(
     budget: Annotated[
-        BudgetName, typer.Option("--budget", help="quick: minutes; full: what the results show.")
+        BudgetName,
+        typer.Option(
+            "--budget",
+            help="Time on 2 cores: quick within 5 minutes; full within 3 hours, with more seeds "
+            "and samples, batch Q-learning, all readings of the paper and J* at each.",
+        ),
     ] = BudgetName.quick,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
         "cosim-reproduction"

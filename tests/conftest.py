@@ -8,6 +8,7 @@ OWN = "COSIM_CACHE" not in os.environ
 if OWN:
     # Before any test module is imported, and inherited by pytest's and our own worker processes.
     os.environ["COSIM_CACHE"] = tempfile.mkdtemp(prefix="cosim-tests-")
+    os.environ.setdefault("DASK_TEMPORARY_DIRECTORY", os.environ["COSIM_CACHE"])
 
 
 def pytest_unconfigure():

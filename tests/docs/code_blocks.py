@@ -109,8 +109,11 @@ class Session:
             raise AssertionError(f"{where}: nothing here executes a block of '{kind}'")
 
     def _type(self, text: str, where: str) -> None:
-        """Run each `$ ` line in a shell; the lines below it are what it must print."""
-        for part in re.split(r"^\$ ", text, flags=re.MULTILINE)[1:]:
+        """Run each `$ ` line in a shell; the lines below it are what it must print.
+
+        A command goes on in the next line after a backslash.
+        """
+        for part in re.split(r"^\$ ", text.replace("\\\n", ""), flags=re.MULTILINE)[1:]:
             line, _, expected = part.partition("\n")
             command, _, comment = line.partition(" # ")
             command = command.strip()

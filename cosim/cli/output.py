@@ -58,7 +58,7 @@ class Output:
         from rich.console import Console
         from rich.table import Table
 
-        table = Table(title=title, title_justify="left")
+        table = Table(title=title, title_justify="left", min_width=len(title))
         for number, column in enumerate(header):
             table.add_column(column, justify="right" if number else "left", overflow="fold")
         for row in rows:

@@ -46,23 +46,27 @@ class Output:
     def note(self, text: str) -> None:
         """Print a line on standard error, unless JSON was asked for."""
         if not self.as_json:
-            self.console().print(text, highlight=False, soft_wrap=True)
+            self.console().print(text, highlight=False, soft_wrap=True, markup=False)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Print a table, its first column left and the others right justified.
+        """Print a table, columns of numbers right justified and the others left.
 
         A file or pipe gets it as wide as it is; a terminal that is too narrow gets folded cells.
         """
         if self.as_json:
             return
         from rich.console import Console
+        from rich.markup import escape
         from rich.table import Table
 
-        table = Table(title=title, title_justify="left", min_width=len(title))
+        table = Table(title=escape(title), title_justify="left", min_width=len(title))
         for number, column in enumerate(header):
-            table.add_column(column, justify="right" if number else "left", overflow="fold")
+            numeric = all(_is_number(row[number]) for row in rows)
+            table.add_column(
+                escape(column), justify="right" if numeric else "left", overflow="fold"
+            )
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(escape, row))
         console = Console()
         if not console.is_terminal:
             unlimited = console.options.update(max_width=1000)
@@ -100,6 +104,15 @@ class Output:
                 bar.update(task, completed=done, remark=remark)
 
             yield update
+
+
+def _is_number(cell: str) -> bool:
+    """Whether a cell begins with a number, or says nothing."""
+    try:
+        float(cell.split(maxsplit=1)[0].strip("()[],"))
+    except (IndexError, ValueError):
+        return cell.strip() in ("", "–")
+    return True
 
 
 @contextmanager

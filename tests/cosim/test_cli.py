@@ -1,8 +1,8 @@
 import json
+import resource
 import subprocess
 import sys
 from pathlib import Path
-from time import perf_counter
 
 import pytest
 from tank import build_tank, write_scenario
@@ -158,14 +158,20 @@ def test_version_gives_the_fmus_hashes(cosim):
     assert hashlib.sha256(fmus.path("evaporator_fmi3").read_bytes()).hexdigest() in out
 
 
+def time_of_children():
+    """The processors' time [s], which others on the machine hardly change."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
 def test_help_is_there_for_every_command_and_starts_quickly():
     times = []
     for _ in range(3):
-        begin = perf_counter()
+        begin = time_of_children()
         result = subprocess.run(
             [sys.executable, "-m", "cosim", "--help"], capture_output=True, text=True, check=True
         )
-        times.append(perf_counter() - begin)
+        times.append(time_of_children() - begin)
     for command in ("demo", "simulate", "view", "benchmark"):
         assert command in result.stdout
     assert min(times) < 0.5

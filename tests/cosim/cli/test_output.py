@@ -12,11 +12,11 @@ HEADER, ROW = ("a heading", "b" * 30, "c"), ("x" * 40, "y", "z" * 40)
 def printed(monkeypatch):
     """The table as printed to a terminal of 60 columns, or to a file."""
 
-    def text(terminal):
+    def text(terminal, title="title", header=HEADER, rows=(ROW,)):
         stream = io.StringIO()
         console = rich.console.Console(file=stream, force_terminal=terminal, width=60)
         monkeypatch.setattr(rich.console, "Console", lambda: console)
-        Output(False).table("title", HEADER, [ROW])
+        Output(False).table(title, header, rows)
         return stream.getvalue()
 
     return text
@@ -31,3 +31,39 @@ def test_a_narrow_terminal_gets_folded_cells_without_loss(printed):
     text = printed(terminal=True)
     assert "…" not in text
     assert [text.count(letter) for letter in "xz"] == [40, 40]
+
+
+def test_brackets_are_text(printed):
+    text = printed(False, "a[b]", ("c[red]",), [("pip install 'rti-cosim[cluster]'",)])
+    assert "a[b]" in text
+    assert "c[red]" in text
+    assert "'rti-cosim[cluster]'" in text
+
+
+def test_brackets_of_a_note_are_text(capsys):
+    Output(False).note("files are in out[1]")
+    assert "out[1]" in capsys.readouterr().err
+
+
+def test_a_title_is_not_folded_where_there_is_room(printed):
+    assert "a title much wider than its table" in printed(
+        True, "a title much wider than its table", ("a",), [("b",)]
+    )
+
+
+@pytest.mark.parametrize(
+    ("cells", "right"),
+    [
+        (("-1", "2.5"), True),
+        (("24.67 %", "nan"), True),
+        (("[72.43, 81.91]", "", "–"), True),
+        (("38.5 / 62.7 µs",), True),
+        (("1e-3", "lmi"), False),
+        (("no problem found",), False),
+    ],
+)
+def test_only_numbers_stand_on_the_right(printed, cells, right):
+    text = printed(False, "title", ("a wide heading above it all",), [(cell,) for cell in cells])
+    line = next(line for line in text.splitlines() if cells[0] in line)
+    assert line.startswith(f"│ {cells[0]}") is not right
+    assert line.endswith(f"{cells[0]} │") is right

@@ -18,7 +18,7 @@ def plot_pareto(
     points: Mapping[str, tuple[Array, Array]],
     path: str | Path,
     *,
-    xlabel: str = "mean violation per sample",
+    xlabel: str = "mean violation per sample, in the states' units",
     ylabel: str = "economic cost per sample",
 ) -> Path:
     """Draw controllers by (violation (S,), economic cost (S,)) over S seeds.

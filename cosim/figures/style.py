@@ -98,9 +98,13 @@ def save(drawn: Figure, path: str | Path) -> Path:
 
 
 def colors(names: Sequence[str]) -> Mapping[str, str]:
-    """A colour for each controller: the known ones have their own, the others the cycle's."""
+    """A colour for each controller: the known ones have their own, the others what is left.
+
+    A known one's colour goes to another only if it is absent, and after all colours of nobody.
+    """
     taken = {_KNOWN.get(name) for name in names}
-    others = cycle(color for color in SERIES if color not in taken)
+    left = [color for color in SERIES if color not in taken]
+    others = cycle(sorted(left, key=lambda color: color in _KNOWN.values()))
     return {name: _KNOWN.get(name) or next(others) for name in names}
 
 

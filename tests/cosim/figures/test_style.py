@@ -53,3 +53,9 @@ def test_controllers_have_colours_of_their_own():
     chosen = colors(["naive", "mine", "optimal", "yours", "tuned"])
     assert len(set(chosen.values())) == 5
     assert colors(["tuned"])["tuned"] == chosen["tuned"]
+
+
+def test_colours_differ_and_that_of_an_absent_controller_goes_last():
+    names = ["naive", "tuned", "learned", "mpcrl", "sac", "ppo", "optimal"]
+    assert len(set(colors(names).values())) == 7
+    assert colors(["converged"])["converged"] not in colors(names[:-2]).values()

@@ -5,7 +5,6 @@ from cosim.figures.learning import plot_learning_curves, plot_parameters_and_td_
 from cosim.figures.pareto import plot_pareto
 from cosim.figures.phase import Portrait, plot_phase_portraits, policy_on_grid
 from cosim.figures.style import save
-from cosim.figures.timing import plot_step_times
 from cosim.figures.trajectory import plot_trajectory, trajectory_figure
 
 __all__ = [
@@ -15,7 +14,6 @@ __all__ = [
     "plot_parameters_and_td_error",
     "plot_pareto",
     "plot_phase_portraits",
-    "plot_step_times",
     "plot_trajectory",
     "policy_on_grid",
     "save",

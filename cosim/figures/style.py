@@ -23,7 +23,6 @@ WIDTH = 7.16
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BOUND = "#B2182B"
 REFERENCE = "#5A6570"
-LIGHT = "#C9D1D9"
 _KNOWN = {
     "naive": "#7F7F7F",
     "tuned": "#E69F00",

@@ -13,7 +13,6 @@ from cosim.figures import (
     plot_parameters_and_td_error,
     plot_pareto,
     plot_phase_portraits,
-    plot_step_times,
     plot_trajectory,
     policy_on_grid,
     trajectory_figure,
@@ -100,13 +99,12 @@ def figures(rng, paper):
             samples, increments, samples[10:], rng.random(41), path
         ),
         "pareto": lambda path: plot_pareto(cost, path),
-        "times": lambda path: plot_step_times({"a": rng.random(99) + 9, "$b": rng.random(9)}, path),
     }
 
 
 @pytest.mark.parametrize(
     "name",
-    ["phase", "density", "learning", "learning alone", "parameters", "pareto", "times"],
+    ["phase", "density", "learning", "learning alone", "parameters", "pareto"],
 )
 def test_every_figure_repeats_its_bytes(name, tmp_path, paper):
     files = []

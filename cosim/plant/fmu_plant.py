@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import operator
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
@@ -20,22 +19,12 @@ from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
 from cosim.plant.snapshot import Memory, Snapshot, packed, unpacked
-from cosim.plant.wiring import Wirer
+from cosim.plant.wiring import Wirer, seed_words
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
 _NOT_STARTED = -1
-
-
-def _checked_seed(seed: int) -> int:
-    try:
-        word = operator.index(seed)
-    except TypeError:
-        word = -1
-    if not 0 <= word < 1 << 64:
-        raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
-    return word
 
 
 class FmuPlant(Closing):
@@ -120,10 +109,8 @@ class FmuPlant(Closing):
         written anew, so that nothing of an earlier episode remains.
         """
         fmi = self._instance
-        word = _checked_seed(seed)
-        for reference, width in self._seeds:
-            fmi.change_start(reference, word if width == 64 else word & 0xFFFFFFFF)
-            word >>= 32
+        for reference, word in seed_words(seed, self._seeds):
+            fmi.change_start(reference, word)
         if initial_state is not None or self._elsewhere:
             self._start_from(fmi, initial_state)
         self._k = _NOT_STARTED

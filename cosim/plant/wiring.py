@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import operator
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from cosim.errors import PlantError
@@ -142,3 +143,21 @@ class Wirer:
 def _unit(variable: Any) -> str:
     declared = variable.declaredType.unit if variable.declaredType is not None else None
     return str(variable.unit or declared or "")
+
+
+def seed_words(seed: int, variables: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """A seed's words by value reference, for variables as `Wirer.seeds` gives them.
+
+    Raises PlantError for anything but an integer in [0, 2⁶⁴).
+    """
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = -1
+    if not 0 <= number < 1 << 64:
+        raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
+    words, shift = [], 0
+    for reference, width in variables:
+        words.append((reference, number >> shift & (1 << width) - 1))
+        shift += width
+    return words

@@ -18,11 +18,13 @@ Array = NDArray[np.float64]
 TRAJECTORY = "trajectory.csv"
 # Read off the clock: two equal runs differ in them.
 _MEASURED = ("prepare_time", "feedback_time")
+# Itself an error, of the size of rounding: no share of it is a tolerance.
+_ERROR = "residual"
 
 
 @dataclass(frozen=True)
 class Run:
-    """Signals of a run by name, all of K samples, and the status of each ([] if not known)."""
+    """A run's `signals` by name, all of K samples, and the status of each ([] if not known)."""
 
     name: str
     signals: Mapping[str, Signal]
@@ -35,7 +37,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Difference:
-    """How one signal differs between runs A and B over the samples that both have.
+    """How one signal, with its name and unit, differs between runs A and B where both have samples.
 
     `maximum` is max |a − b| (infinite where only one is NaN) at sample `at`, with the values `a`
     and `b` there; `first` is the first sample with |a − b| > `tolerance`, None if there is none.
@@ -61,7 +63,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Differences by signal, and what else sets two runs apart."""
+    """The `differences` by signal, and what else sets two runs apart.
+
+    `samples` are the two lengths; `only_a` and `only_b` signals that one run has; `status` is the
+    first sample whose status differs, None if there is none; `times` (K,) in s are those of A.
+    """
 
     samples: tuple[int, int]
     differences: Sequence[Difference]
@@ -108,7 +114,8 @@ def compare(
     """Compare two runs; two NaN are equal.
 
     A signal's tolerance is `tolerances[name]`, in its unit, else `relative` times its largest
-    magnitude in A; without either every bit counts.
+    magnitude in A; without either every bit counts. The solver's `residual` is left out of
+    `relative`: it counts with a tolerance of its own, or to the bit.
 
     Raises
     ------
@@ -131,7 +138,8 @@ def compare(
     for name in both:
         values = a.signals[name].values
         finite = np.abs(values[np.isfinite(values)])
-        tolerance = tolerances.get(name, relative * float(finite.max(initial=0.0)))
+        share = np.inf if name == _ERROR and relative else relative * finite.max(initial=0.0)
+        tolerance = float(tolerances.get(name, share))
         differences.append(_difference(a.signals[name], b.signals[name], tolerance))
     time = a.signals.get("time")
     return Comparison(

@@ -24,7 +24,9 @@ def compare(
     relative: Annotated[
         float,
         typer.Option(
-            "--relative", min=0.0, help="Tolerance of the others, per largest magnitude in A."
+            "--relative",
+            min=0.0,
+            help="Tolerance of the others, per largest magnitude in A; the residual is left out.",
         ),
     ] = 0.0,
     record: Annotated[

@@ -76,6 +76,14 @@ def test_the_relative_tolerance_goes_with_the_largest_magnitude():
     assert [d.first for d in result.differences] == [None, 1]
 
 
+def test_the_residual_is_left_out_of_the_relative_tolerance_alone():
+    a, b = run(P2=[50.0], residual=[1e-16]), run(P2=[50.1], residual=[1e-12])
+    assert compare(a, b, relative=0.01).equal
+    assert compare(a, b, {"P2": 1.0}).lines() == compare(a, b, {"P2": 1.0}, relative=0.0).lines()
+    assert compare(a, b, {"P2": 1.0}).first == 0
+    assert compare(a, b, {"residual": 1e-13}, relative=0.01).first == 0
+
+
 def test_runs_of_unequal_length_differ_and_their_common_part_is_compared():
     result = compare(run(P2=[1.0, 2.0, 3.0]), run(P2=[1.0, 2.0]))
     assert not result.equal

@@ -19,8 +19,9 @@ Vector = NDArray[np.float64]
 class Block:
     """A named part of θ: a scalar, a vector or a symmetric matrix of the given dimension.
 
-    A symmetric matrix is packed as its upper triangle row by row, each entry once. `scale` is the
-    typical size of a change worth making, in the block's own units.
+    `kind` says which of these it is. A symmetric matrix is packed as its upper triangle row by row,
+    each entry once. `scale` is the typical size of a change worth making, in the block's own units,
+    `meaning` a few words, and `labels` name the entries where they have names of their own.
     """
 
     name: str

@@ -16,7 +16,7 @@ Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 
 @dataclass(frozen=True)
 class Quantity:
-    """A named quantity with its unit and nominal value."""
+    """A quantity: its name, unit and nominal value."""
 
     name: str
     unit: str
@@ -27,8 +27,9 @@ class Quantity:
 class Model:
     """A continuous-time model x' = ode(x, u, d, p) with the economic cost ℓ(x, u, d, p).
 
-    States x, actions u, disturbances d and parameters p are columns in the order of their
-    quantities; `time_unit` is the length in seconds of the unit of time in which `ode` counts.
+    The states x, actions u, disturbances d and parameters p are columns in the order of their
+    quantities; `economic_cost` is ℓ; `name` is for messages; `time_unit` is the length in seconds
+    of the unit of time in which `ode` counts.
     """
 
     name: str

@@ -26,7 +26,7 @@ KEYS = ("schema", "hash", "theta", "model_parameters")
 
 @dataclass(frozen=True)
 class Parameters:
-    """A value of θ with its layout; `parameters["B_l"]` is the unpacked block.
+    """A value `theta` of θ, (layout.size,), with its layout; `parameters["B_l"]` is a whole block.
 
     Raises ParameterError on a vector of wrong length or with an entry that is not finite.
     """

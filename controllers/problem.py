@@ -74,10 +74,12 @@ def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
 class Problem:
     """A discounted optimal control problem around a reference steady state.
 
-    `sampling_time` [s]; `horizon` N stages; `discount` γ ∈ (0, 1]; bounds and reference in the
-    units of the model's quantities; the penalty of a violation v ≥ 0 is Σ_i linear_i v_i +
-    quadratic_i v_i² (paper.tex, Simulations); `reference_cost` ℓ_s. `substeps` RK4 steps make a
-    sample of the model. Raises ModelError on sizes or values that do not fit.
+    `sampling_time` [s]; `horizon` N stages; `discount` γ ∈ (0, 1]; the bounds `state_lower` and
+    `state_upper` (n,), `action_lower` and `action_upper` (m,), and the reference `reference_state`
+    x_s (n,), `reference_action` u_s (m,), in the units of the model's quantities; `reference_cost`
+    ℓ_s. The penalty of a violation v ≥ 0 is Σ_i linear_i v_i + quadratic_i v_i² with
+    `penalty_linear` and `penalty_quadratic` (n,) (paper.tex, Simulations). `substeps` RK4 steps
+    make a sample of the model. Raises ModelError on sizes or values that do not fit.
     """
 
     model: Model

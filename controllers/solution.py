@@ -35,7 +35,11 @@ class LinearisationPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Functions:
-    """The CasADi functions of a controller (`controllers.ocp`, `controllers.lagrangian`)."""
+    """The CasADi functions that a controller of the `problem` calls.
+
+    `preparation` and `embedding` make the QP (`controllers.ocp`), `readout` takes its value,
+    `gradient` and `policy` its derivatives in θ (`controllers.lagrangian`).
+    """
 
     problem: Problem
     preparation: StackedFunction
@@ -46,7 +50,12 @@ class Functions:
 
 
 class Prepared(NamedTuple):
-    """What the preparation phase fixed, kept for read-outs after the next one has begun."""
+    """What the preparation phase fixed, kept for read-outs after the next one has begun.
+
+    The linearisation `point` and `parameters`; `stack` all that the preparation computed; `L`
+    (N, n+m, n+m) and `L_N` (n, n) the Hessians of the stages; `w` and `W` the slack weights of the
+    QP's rows; `spectrum` what convexified them, None for Gauss–Newton; `functions` its maker's.
+    """
 
     point: LinearisationPoint
     parameters: Parameters
@@ -66,6 +75,9 @@ class RtiSolution:
     `action` (m,) is u_0; `value` is V or Q; `multipliers` is the primal-dual solution of
     the condensed QP `qp`. All derivatives are those of the QP that was solved, at the point where
     it was linearised (paper.tex, RTI Sensitivities); they are one-sided where `weakly_active`.
+    `enforced` says which of the two it is; `status` is `solved`. What derivatives are computed from
+    when they are asked for: `prepared`, and the `stack` of the read-out, the `embedded` state and
+    the `limits` on the controls of this very feedback.
     """
 
     action: Vector

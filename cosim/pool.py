@@ -19,7 +19,10 @@ Array = NDArray[np.float64]
 
 
 class Steps(NamedTuple):
-    """One step of every plant of a pool: the fields of `Step` with a leading axis of plants."""
+    """One step of every plant of a pool: the fields of `Step` with a leading axis of plants.
+
+    `s` (count, n), `stage_cost` and `penalty` (count,), `disturbance` (count, p).
+    """
 
     s: Array
     stage_cost: Array

@@ -104,7 +104,8 @@ Return the very same array to leave the sample greedy. The loop saturates the re
 class Block:
     """K consecutive samples of a run, as columns; arrays are views that the loop overwrites later.
 
-    `states` (K, n), `actions` (K, m), `disturbances` (K, p), `time` (K,) in s; `explored` and
+    `first` is the number of the first sample. `states` (K, n), `actions` (K, m), `disturbances`
+    (K, p), `time` (K,) in s; `stage_cost`, `penalty`, `value` and `residual` (K,); `explored` and
     `failed` (K,) bool; `prepare_time` and `feedback_time` (K,) in s; `status` K strings;
     `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m), NaN where the controller
     gave none, or None if it never did in this block.

@@ -38,16 +38,27 @@ class Scenario(Table):
     """
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
+    """`schema` in the file: 1."""
     name: Name
+    """What tables and figures call the scenario; it does not count in its hash."""
     description: str = ""
+    """A line for readers."""
     sampling_time: Positive
+    """Sampling time h in s; actions and disturbances are held that long."""
     discount: Annotated[float, Field(gt=0, le=1)]
+    """Discount γ of the controller and of learning."""
     plant: PlantTable
+    """Table `[plant]`: the true plant, an FMU."""
     disturbance: DisturbanceTable = DisturbanceTable()
+    """Table `[disturbance]`: the law by which the FMU draws."""
     bounds: BoundsTable
+    """Table `[bounds]`: the true bounds."""
     penalty: PenaltyTable
+    """Table `[penalty]`: the price of a violation."""
     exploration: ExplorationTable = ExplorationTable()
+    """Table `[exploration]`: exploration where an algorithm asks for the scenario's."""
     controller: ControllerTable
+    """Table `[controller]`: what the controller is told."""
 
     @model_validator(mode="after")
     def _sizes_and_signs_fit(self) -> Self:

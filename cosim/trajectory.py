@@ -26,7 +26,7 @@ FALLBACK = "fallback"
 
 @dataclass(frozen=True)
 class Signal:
-    """A sampled quantity: its name, its unit ("" if it has none) and one value per sample."""
+    """A sampled quantity: its name, its unit ("" if it has none) and `values`, one per sample."""
 
     name: str
     unit: str
@@ -46,7 +46,8 @@ class Trajectory:
     FMU names; `stage_cost` ℓ(x_k, u_k, d_k) without penalty; `penalty` and `violation` Σᵢ vᵢ of
     x_k at the true bounds; the controller's `value` and `residual` (NaN if it has none);
     `explored` and `failed` (0 or 1). `status` has one word per sample, `fallback` where the
-    controller failed. `timing` holds wall-clock times [s] by name, (K,); `final_state` is x_K.
+    controller failed. `timing` holds wall-clock times [s] by name, (K,); `final_state` is x_K;
+    `seed` is the noise's. `signals` maps names to signals.
     """
 
     scenario: Scenario

@@ -32,7 +32,11 @@ _CAPABILITIES = {
 
 @dataclass(frozen=True)
 class VariableSummary:
-    """One variable as its model description has it; a number that is not given is None."""
+    """One variable as its model description has it.
+
+    Its name, value `reference`, FMI `type`, causality, variability, unit, description, and the
+    texts of `start`, `min` and `max`; what is not given is None.
+    """
 
     name: str
     reference: int
@@ -48,7 +52,11 @@ class VariableSummary:
 
 @dataclass(frozen=True)
 class Information:
-    """Contents of a model description, and the file's SHA-256."""
+    """Contents of a model description, and the file's path and SHA-256 (`sha256`).
+
+    `fmi_version`, name and description of the model; `interfaces` and `capabilities` in words;
+    the default experiment's `start_time`, `stop_time` and `step_size` in s; all `variables`.
+    """
 
     path: str
     sha256: str

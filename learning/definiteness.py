@@ -27,7 +27,7 @@ SOLVED = ("Solved", "AlmostSolved")
 
 @dataclass(frozen=True)
 class Certificate:
-    """What vouches for a step: the least eigenvalue of each Hessian block after it.
+    """What vouches for a step: `eigenvalues`, the least of each Hessian block after it, by block.
 
     `corrected` says that the free step would have violated the constraint, `refused` that no
     admissible step was found and θ stays.

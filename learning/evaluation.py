@@ -23,7 +23,7 @@ HELD_OUT = 1_000_000
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Runs of `steps` samples from the initial state, one for each held-out seed."""
+    """Runs of `steps` samples of `plant` from the initial state, one for each of the `seeds`."""
 
     plant: Plant
     seeds: tuple[int, ...]

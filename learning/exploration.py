@@ -36,7 +36,11 @@ class Strategy(Protocol):
 
 @dataclass(frozen=True)
 class Exploration:
-    """What all strategies share: how often and how far, between which bounds."""
+    """What all strategies share.
+
+    `probability` is the share of samples that explore and `deviation` (m,) that of the noise in the
+    actions' units, each linear in the sample; `lower` and `upper` (m,) bound the action.
+    """
 
     lower: Vector
     upper: Vector

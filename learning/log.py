@@ -33,7 +33,11 @@ COLUMNS = (
 
 @dataclass
 class Totals:
-    """Sums since the last line of the log."""
+    """Sums since the last line of the log.
+
+    `cost` over the samples; `updates`, and over these `squares` of the TD error, norms of the
+    `step`, flags `corrected` and `refused`; `smallest_eigenvalue` is the least of all.
+    """
 
     cost: float = 0.0
     updates: int = 0

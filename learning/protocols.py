@@ -68,9 +68,10 @@ class Sample(NamedTuple):
 
     `policy` is the solution for V(s) and π(s); `action_value` that for Q(s, a), the same object
     where the sample was greedy (then Q = V) or the algorithm does not need it; `next_policy` that
-    for V(s₊), π(s₊). `cost` is stage cost plus penalty of s, the sample's share of J;
-    `next_penalty` the penalty of s₊. `point` and `next_point` are the linearisation points at s
-    and s₊, None unless the algorithm `needs_points`. `number` counts from 0.
+    for V(s₊), π(s₊); `next_s` is s₊; `explored` says that a is not π(s). `stage_cost` is ℓ, `cost`
+    ℓ plus the penalty of s, the sample's share of J; `next_penalty` the penalty of s₊. `point` and
+    `next_point` are the linearisation points at s and s₊, None unless the algorithm
+    `needs_points`. `number` counts from 0.
     """
 
     number: int

@@ -17,6 +17,8 @@ from learning.log import Row
 class Run:
     """What identifies a training run; a checkpoint goes on only in the very same one.
 
+    The `algorithm` by name, its `configuration`, the `scenario`, the kind of `controller` (`rti` or
+    `converged`) that learns from `samples` samples with this `seed` of noise and exploration.
     `log_every`, `evaluate_every`, `checkpoint_every` in samples; `evaluation_seeds` held-out runs
     of `evaluation_steps` samples. A greedy J that is worse than the naive one's by more than
     (`divergence` − 1) of its magnitude ends the run.
@@ -70,7 +72,7 @@ class TrainingRecorder(Protocol):
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a run: θ, the log, the greedy evaluation of θ, and how it ended.
+    """What came of a run: θ, the log's `rows`, the greedy evaluation of θ, and how it ended.
 
     `status` is `finished` or `diverged: …`; then `parameters` is the last θ that evaluated well.
     """

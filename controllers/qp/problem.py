@@ -18,9 +18,10 @@ Matrix = NDArray[np.float64]
 class Stages:
     """The same QP stage by stage, before the states are eliminated.
 
-    ξ_{k+1} = A_k ξ_k + B_k v_k + r_k from ξ_0; stage costs ½wᵀL_k w + q_kᵀw with w = (ξ, v),
-    terminal ½ξᵀL_N ξ + q_Nᵀξ. Shapes: A (N, n, n), B (N, n, m), r (N, n), L (N, n+m, n+m),
-    q (N, n+m), L_N (n, n), q_N (n,), state_lower and state_upper (n,), the limits on ξ_1…ξ_N.
+    ξ_{k+1} = A_k ξ_k + B_k v_k + r_k from ξ_0 = `initial`; stage costs ½wᵀL_k w + q_kᵀw with
+    w = (ξ, v), terminal ½ξᵀL_N ξ + q_Nᵀξ. Shapes: A (N, n, n), B (N, n, m), r (N, n),
+    L (N, n+m, n+m), q (N, n+m), L_N (n, n), q_N (n,), state_lower and state_upper (n,), the
+    limits on ξ_1…ξ_N.
     """
 
     A: Matrix
@@ -44,7 +45,8 @@ class SoftQp:
 
     The stacked controls V = (v_0, …, v_{N−1}) are the variables, the predicted states Γ V the
     rows; paper.tex eq. param_nlp_qp with the dynamics eliminated. `lower = upper` fixes a variable,
-    which is how u_0 = a is enforced. `stages`, where given, holds the QP with the dynamics.
+    which is how u_0 = a is enforced. `stages`, where given, holds the QP with the dynamics. Shapes
+    for d variables and c rows: H (d, d), f, lower and upper (d,), rows Γ (c, d), else w, W: (c,).
     """
 
     H: Matrix
@@ -116,7 +118,7 @@ class Residuals(NamedTuple):
 
 
 class QpSolution(NamedTuple):
-    """Primal-dual solution: Hv + f + ν + Γᵀλ = 0.
+    """Primal-dual solution `v`, `nu`, `lam`: Hv + f + ν + Γᵀλ = 0.
 
     A multiplier is positive where an upper limit pushes and negative where a lower one does; ν
     belongs to the bounds (for fixed variables it is the multiplier of that equation), λ to the

@@ -3,7 +3,8 @@
 The hyperparameters of the cases `*-paper` and `*-extended` are the algorithms' defaults, but for
 the parametrisation; `q-learning-literal` is the paper's rule as it is printed, and
 `q-learning-line-search` that with the line search that the paper names as an option; the cases
-`*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one.
+`*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one;
+`q-learning-cautious` begins after 1000 samples in place of 200 and takes smaller steps.
 """
 
 from __future__ import annotations
@@ -45,5 +46,6 @@ CASES = {
     "q-learning-literal": Case("q-learning", 100_000, LITERAL, seeds=5),
     "q-learning-line-search": Case("q-learning", 20_000, {**LITERAL, "line_search": True}, seeds=5),
     "q-learning-mean-cost": Case("q-learning", 40_000, {"discount": 1.0}),
+    "q-learning-cautious": Case("q-learning", 40_000, {"warm_up": 1000, "largest_step": 0.2}),
     "batch-q-learning-mean-cost": Case("batch-q-learning", 30_000, {"discount": 1.0}),
 }

@@ -30,7 +30,8 @@ def record_comparison(path: str | Path, a: Run, b: Run, comparison: Comparison) 
     differences = {name: _difference(name, a, b) for name in names}
     duration = max(float(_time(run)[-1]) if len(run) else 0.0 for run in (a, b))
     stream = Stream(path, "comparison")
-    stream.layout(_blueprint(duration, overlaid, differences), [])
+    title = drawable(f"A: {a.name}, B: {b.name}")
+    stream.layout(_blueprint(title, duration, overlaid, differences), [])
     text = _text(a, b, comparison)
     stream.static("about", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
     for run, side in zip((a, b), _SIDES, strict=True):
@@ -67,6 +68,7 @@ def _time(run: Run) -> np.ndarray:
 
 
 def _blueprint(
+    title: str,
     duration: float,
     overlaid: dict[str, list[Channel]],
     differences: dict[str, tuple[Channel, np.ndarray]],
@@ -88,7 +90,7 @@ def _blueprint(
     ]
     return framed(
         rrb.Tabs(
-            rrb.Grid(*runs, grid_columns=3, name="A and B"),
+            rrb.Grid(*runs, grid_columns=3, name=title),
             rrb.Grid(*deviations, grid_columns=3, name="A - B"),
             rrb.TextDocumentView(name="what differs", origin="/about"),
         )
@@ -98,7 +100,7 @@ def _blueprint(
 def _text(a: Run, b: Run, comparison: Comparison) -> str:
     found = comparison.lines() or ["no signal differs by more than its tolerance"]
     rows = "\n".join(
-        f"| {d.name} | {d.unit or '-'} | {_number(d.maximum)} | {d.at} | {_number(d.tolerance)} |"
+        f"| {d.name} | {d.unit or '-'} | {_number(d.maximum)} | {d.at} | {d.tolerance:.6g} |"
         for d in comparison.differences
     )
     page = f"""# A against B

@@ -33,6 +33,14 @@ def test_the_site_builds_without_a_warning(build):
 
 
 @pytest.mark.slow
+def test_the_reference_shows_nothing_private(build):
+    for page in (build[0] / "reference").glob("*/index.html"):
+        anchors = re.findall(r'<h\d id="([^"]+)"', page.read_text())
+        assert len(anchors) > 10
+        assert [name for name in anchors if re.search(r"(^|\.)_", name)] == []
+
+
+@pytest.mark.slow
 def test_every_formula_is_mathml_that_browsers_know(build):
     folder, _ = build
     page = (folder / "method" / "index.html").read_text()

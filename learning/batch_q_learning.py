@@ -51,7 +51,9 @@ class BatchQLearningConfiguration(QConfiguration):
     batch_size: Count = Field(500, description="samples between two updates")
     buffer_size: Count = Field(1000, description="transitions that are replayed, the latest ones")
     iterations: Count = Field(1, description="replays and steps of θ per update")
-    radius: Positive = Field(1.0, description="trust region: largest scaled entry of a step")
+    radius: Positive = Field(
+        1.0, description="trust region: largest scaled entry of a step, before definiteness"
+    )
     radius_minimum: Positive = Field(
         0.01, description="size below which the trust region does not shrink"
     )

@@ -140,7 +140,9 @@ class CholeskyParametrisation:
     """The step taken in the factor L of B = LLᵀ + εI, so that B ≻ εI by construction.
 
     dL is the change that reproduces the free step D of B to first order, dL Lᵀ + L dLᵀ = D:
-    dL = L Φ(L⁻¹ D L⁻ᵀ), where Φ takes the lower triangle and halves the diagonal.
+    dL = L Φ(X), X = L⁻¹ D L⁻ᵀ, where Φ takes the lower triangle and halves the diagonal. To first
+    order means little where ‖X‖₂ > 1, where the free step would double B or lose it: the block's
+    step is shortened to ‖X‖₂ = 1 then.
     """
 
     FLOOR = 1e-9
@@ -166,6 +168,7 @@ class CholeskyParametrisation:
                 ) from error
             inner = solve_triangular(factor, block.unpack(step[where]), lower=True)
             inner = solve_triangular(factor, inner.T, lower=True)
+            inner /= max(1.0, float(np.linalg.norm(inner, 2)))
             lower = np.tril(inner)
             np.fill_diagonal(lower, np.diag(inner) / 2)
             moved = factor + factor @ lower

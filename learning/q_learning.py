@@ -51,7 +51,7 @@ class QLearningConfiguration(QConfiguration):
         4000.0, description="gauss-newton: samples after which a sample's weight has fallen to 1/e"
     )
     largest_step: Positive = Field(
-        1.0, description="gauss-newton: cap on each scaled entry of a step"
+        1.0, description="gauss-newton: cap on each scaled entry of a step, before definiteness"
     )
     warm_up: int = Field(200, ge=0, description="gauss-newton: samples before the first step")
 

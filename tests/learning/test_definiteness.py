@@ -92,6 +92,18 @@ def test_cholesky_takes_a_small_step_to_first_order(layout, parameters, rng):
     assert errors[1] < 0.012 * errors[0] + 1e-8
 
 
+def test_cholesky_does_not_follow_a_step_far_beyond_the_present_hessian(layout, parameters, rng):
+    enforce = enforcement("cholesky", layout, SMALLEST)
+    fit = random_fit(layout, rng, size=1e4)
+    new, vouched = enforce(parameters.theta, fit)
+    assert vouched.smallest >= SMALLEST
+    for name in ("B_l", "B_Vf"):
+        before, after = (matrix_of(layout, theta, name) for theta in (parameters.theta, new))
+        # ‖Φ(X)‖ ≤ √(n/2) for ‖X‖₂ = 1
+        most = (1 + np.sqrt(len(before) / 2)) ** 2
+        assert np.linalg.norm(after, 2) <= 1.01 * most * np.linalg.norm(before, 2)
+
+
 def test_lmi_step_equals_a_generic_conic_solution(layout, parameters, rng):
     theta = parameters.theta
     for _ in range(3):

@@ -22,6 +22,15 @@ from learning.step import ParameterStep
 Vector = NDArray[np.float64]
 
 
+AS_PRINTED: dict[str, Any] = {
+    "rule": "fit",
+    "step_size": 1e-3,
+    "scaled": False,
+    "exploration": "scenario",
+    "value_offset": "stage-cost",
+    "parametrisation": "paper",
+}
+"""Hyperparameters of the rule as the paper prints it (paper.tex, Simulations)."""
 ONE_SAMPLE = {"td": td_step, "fit": td_fit}
 """The rules that step on one sample; `gauss-newton` steps on all that it remembers."""
 OPTIONS_OF_ONE_SAMPLE = ("step_size", "line_search")
@@ -33,8 +42,7 @@ OPTIONS_OF_GAUSS_NEWTON = (
 class QLearningConfiguration(QConfiguration):
     """Hyperparameters of online Q-learning; the defaults are the recommended variant.
 
-    The paper's rule as written: `rule="fit"`, `step_size=1e-3`, `scaled=false`,
-    `exploration="scenario"`, `value_offset="stage-cost"`, `parametrisation="paper"`.
+    `AS_PRINTED` has those of the paper's rule.
     """
 
     rule: Literal["td", "fit", "gauss-newton"] = Field(

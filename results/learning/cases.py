@@ -12,18 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from learning.q_learning import AS_PRINTED
+
 NOISE_SEEDS, STEPS = 50, 1000
 """Held-out noise seeds, and samples on each, of every evaluation."""
 TUNING_SEEDS, TUNING_NOISE_SEEDS = 6, 8
 """How many of the first training and noise seeds hyperparameters were chosen on."""
-LITERAL = {
-    "rule": "fit",
-    "step_size": 1e-3,
-    "scaled": False,
-    "exploration": "scenario",
-    "value_offset": "stage-cost",
-    "parametrisation": "paper",
-}
 
 
 @dataclass(frozen=True)
@@ -43,8 +37,10 @@ CASES = {
     "batch-q-learning-extended": Case("batch-q-learning", 30_000, {"parametrisation": "extended"}),
     "q-learning-paper": Case("q-learning", 40_000, {"parametrisation": "paper"}),
     "q-learning-extended": Case("q-learning", 40_000, {"parametrisation": "extended"}),
-    "q-learning-literal": Case("q-learning", 100_000, LITERAL, seeds=5),
-    "q-learning-line-search": Case("q-learning", 20_000, {**LITERAL, "line_search": True}, seeds=5),
+    "q-learning-literal": Case("q-learning", 100_000, AS_PRINTED, seeds=5),
+    "q-learning-line-search": Case(
+        "q-learning", 20_000, {**AS_PRINTED, "line_search": True}, seeds=5
+    ),
     "q-learning-mean-cost": Case("q-learning", 40_000, {"discount": 1.0}),
     "q-learning-cautious": Case("q-learning", 40_000, {"warm_up": 1000, "largest_step": 0.2}),
     "batch-q-learning-mean-cost": Case("batch-q-learning", 30_000, {"discount": 1.0}),

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from carrier import Carrier
 
 from controllers.parameters import Parameters
 from learning import ActorCritic
@@ -10,21 +11,6 @@ from learning.starting_point import build_strategy
 class Solution:
     def __init__(self, action, jacobian):
         self.action, self.policy_jacobian = action, jacobian
-
-
-class Carrier:
-    """Carries θ and nothing else."""
-
-    def __init__(self, parameters):
-        self.parameters = parameters
-
-    @property
-    def theta(self):
-        return self.parameters.theta
-
-    @theta.setter
-    def theta(self, theta):
-        self.parameters = self.parameters.with_theta(theta)
 
 
 def algorithm(problem, scenario, **settings):

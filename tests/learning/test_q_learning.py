@@ -5,16 +5,8 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import QLearning
 from learning.interaction import Interaction
+from learning.q_learning import AS_PRINTED
 from learning.starting_point import build_strategy, starting_parameters
-
-PAPER = {
-    "rule": "fit",
-    "step_size": 1e-3,
-    "scaled": False,
-    "exploration": "scenario",
-    "value_offset": "stage-cost",
-    "parametrisation": "paper",
-}
 
 
 class Bench:
@@ -47,7 +39,7 @@ def plant(scenario):
 
 
 def test_the_papers_rule_takes_the_closed_form_step(plant, problem):
-    bench = Bench(plant, problem, **PAPER)
+    bench = Bench(plant, problem, **AS_PRINTED)
     sample, _ = bench.interaction.next()
     delta = sample.cost + plant.scenario.discount * sample.next_policy.value
     delta -= sample.action_value.value
@@ -60,7 +52,7 @@ def test_the_papers_rule_takes_the_closed_form_step(plant, problem):
 
 
 def test_a_line_searched_step_never_raises_the_sampled_td_error(plant, problem):
-    bench = Bench(plant, problem, **{**PAPER, "line_search": True, "step_size": 10.0})
+    bench = Bench(plant, problem, **{**AS_PRINTED, "line_search": True, "step_size": 10.0})
     shortened = 0
     for _ in range(60):
         sample, _ = bench.interaction.next()
@@ -74,7 +66,7 @@ def test_a_line_searched_step_never_raises_the_sampled_td_error(plant, problem):
 
 
 def test_without_line_search_some_steps_do_raise_it(plant, problem):
-    bench = Bench(plant, problem, **{**PAPER, "step_size": 10.0})
+    bench = Bench(plant, problem, **{**AS_PRINTED, "step_size": 10.0})
     raised = 0
     for _ in range(60):
         point = bench.controller.linearisation_point

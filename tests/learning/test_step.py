@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from carrier import Carrier
 
 from controllers.layout import Layout
 from controllers.parameters import Parameters
@@ -9,24 +10,9 @@ from learning.fit import Fit
 from learning.step import ParameterStep, unscaled
 
 
-class Controller:
-    """Carries θ and nothing else."""
-
-    def __init__(self, parameters):
-        self.parameters = parameters
-
-    @property
-    def theta(self):
-        return self.parameters.theta
-
-    @theta.setter
-    def theta(self, theta):
-        self.parameters = self.parameters.with_theta(theta)
-
-
 @pytest.fixture
 def controller(problem):
-    return Controller(Parameters.naive(problem, Layout.of(problem, slack_weights=True)))
+    return Carrier(Parameters.naive(problem, Layout.of(problem, slack_weights=True)))
 
 
 def towards(layout, **blocks):

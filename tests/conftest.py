@@ -1,9 +1,14 @@
-"""The user's cache is left alone: what tests unpack and solve ends with them."""
+"""The environment of the tests, inherited by all processes that they start.
+
+The user's cache is left alone: what tests unpack and solve ends with them.
+"""
 
 import os
 import shutil
 import tempfile
 
+# pytest's own filter ends with this process; what tests start has to be as strict.
+os.environ.setdefault("PYTHONWARNINGS", "error")
 OWN = "COSIM_CACHE" not in os.environ
 if OWN:
     # Before any test module is imported, and inherited by pytest's and our own worker processes.

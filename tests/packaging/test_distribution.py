@@ -19,7 +19,11 @@ ROOT = Path(__file__).parents[2]
 PRESETS = {"paper", "nominal", "fast-sampling"}
 
 
-def run(*command, cwd, env=None):
+# Other people's tools may warn; what is installed may not.
+TOOLS = {name: value for name, value in os.environ.items() if name != "PYTHONWARNINGS"}
+
+
+def run(*command, cwd, env=TOOLS):
     result = subprocess.run(
         [str(word) for word in command],
         cwd=cwd,
@@ -78,7 +82,8 @@ def installed(wheel, python):
 
 def bare_environment(python):
     """A path on which there is no compiler, and nothing that leads back to the checkout."""
-    return {"PATH": str(python.parent), "HOME": os.environ.get("HOME", "/")}
+    home = os.environ.get("HOME", "/")
+    return {"PATH": str(python.parent), "HOME": home, "PYTHONWARNINGS": "error"}
 
 
 def test_the_sdist_holds_what_a_fork_needs(sdist):

@@ -39,7 +39,7 @@ def trajectory_figure(
     that figures of a set can be compared.
     """
     plant, units = scenario.plant, {k: s.unit for k, s in trajectory.signals.items()}
-    scale, time_unit = _time_unit(trajectory.time)
+    scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
     left = [*plant.states, *plant.actions]
     right = [*plant.disturbances, "stage_cost", "penalty"]
@@ -57,7 +57,7 @@ def trajectory_figure(
                 axes[name].tick_params(labelbottom=i == len(names) - 1)
                 for run in beside:
                     _span(axes[name], time, run[name])
-            axes[names[-1]].set_xlabel(f"time [{time_unit}]")
+            axes[names[-1]].set_xlabel(f"time [{unit}]")
         for i, name in enumerate(plant.states):
             lower, upper = float(scenario.state_lower[i]), float(scenario.state_upper[i])
             _state(axes[name], time, trajectory[name], lower, upper, SERIES[0])
@@ -65,7 +65,7 @@ def trajectory_figure(
         for i, name in enumerate(plant.actions):
             axes[name].step(time, trajectory[name], where="post", color=SERIES[2], linewidth=0.9)
             axes[name].axhline(scenario.reference_action[i], color=REFERENCE, linewidth=0.7)
-            _limits(axes[name], scenario.action_lower[i], scenario.action_upper[i])
+            limits(axes[name], scenario.action_lower[i], scenario.action_upper[i])
             _failures(axes[name], time, trajectory[name], trajectory["failed"])
         for name in plant.disturbances:
             axes[name].step(time, trajectory[name], where="post", color=SERIES[3], linewidth=0.6)
@@ -89,7 +89,8 @@ def _title(trajectory: Trajectory, scenario: Scenario) -> str:
     )
 
 
-def _time_unit(time: Array) -> tuple[float, str]:
+def time_unit(time: Array) -> tuple[float, str]:
+    """Seconds in the unit in which a run of this length reads best, and its name."""
     duration = float(time[-1])
     if duration <= 300.0:
         return 1.0, "s"
@@ -109,10 +110,10 @@ def _state(axes: Axes, time: Array, values: Array, lower: float, upper: float, c
             axes.fill_between(
                 time, values, bound, where=list(outside), color=BOUND, alpha=0.35, linewidth=0
             )
-    _limits(axes, lower, upper)
+    limits(axes, lower, upper)
 
 
-def _limits(axes: Axes, lower: float, upper: float) -> None:
+def limits(axes: Axes, lower: float, upper: float) -> None:
     """Draw a bound where it is no farther from the data than they are wide, else name it."""
     low, high = axes.dataLim.intervaly
     span = max(high - low, 1e-9)

@@ -37,7 +37,9 @@ class Experiment(_Table):
     keys: tuple[Text, ...] = Field(min_length=1)
     drop: tuple[Text, ...] = ()
     files: tuple[Text, ...] = ()
-    figures: tuple[Literal["trajectory", "density", "phase", "pareto", "learning"], ...] = ()
+    figures: tuple[
+        Literal["trajectory", "overlay", "density", "phase", "pareto", "learning"], ...
+    ] = ()
 
     def command(self, label: str) -> list[str]:
         """Words of a run's command after `cosim`; raises ResultsError where it is no such thing."""

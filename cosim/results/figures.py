@@ -15,6 +15,7 @@ from cosim.figures import (
     Portrait,
     plot_density,
     plot_learning_curves,
+    plot_overlay,
     plot_pareto,
     plot_phase_portraits,
     plot_trajectory,
@@ -55,6 +56,10 @@ def _trajectory(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
     for label, run in found.items():
         target = path.with_name(f"trajectory-{label}{path.suffix}")
         plot_trajectory(run, run.scenario, target, beside=list(found.values()))
+
+
+def _overlay(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
+    plot_overlay(_trajectories(runs), path)
 
 
 def _density(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
@@ -113,6 +118,7 @@ def _learning(runs: Mapping[str, Path], path: Path, _: Policy) -> None:
 
 _FIGURES: dict[str, Callable[[Mapping[str, Path], Path, Policy], None]] = {
     "trajectory": _trajectory,
+    "overlay": _overlay,
     "density": _density,
     "phase": _phase,
     "pareto": _pareto,

@@ -8,8 +8,10 @@ from scipy.stats import t as student
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures import (
     Portrait,
+    overlay_figure,
     plot_density,
     plot_learning_curves,
+    plot_overlay,
     plot_parameters_and_td_error,
     plot_pareto,
     plot_phase_portraits,
@@ -53,6 +55,17 @@ def test_a_trajectory_shows_the_bound_and_the_fallbacks(trajectory, paper):
     assert [list(line.get_xdata()) for line in marks] == [[5.0, 6.0]]
 
 
+def test_an_overlay_shows_each_run_and_its_cost(trajectory):
+    figure = overlay_figure({"naive": trajectory, "$mine": trajectory})
+    axes = axes_by_label(figure)
+    assert list(axes) == ["$X_{2}$ [%]", "$P_{2}$ [kPa]", "$P_{100}$ [kPa]", "$F_{200}$ [kg/min]"]
+    for name, axis in zip(("X2", "P2", "P100", "F200"), axes.values(), strict=True):
+        assert all(np.array_equal(line.get_ydata(), trajectory[name]) for line in axis.lines[:2])
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    J = f"J = {trajectory.summary()['J']:.0f}"
+    assert [J in text for text in legend] == [True, True, False]
+
+
 def test_a_bound_far_from_the_data_is_named(trajectory, paper):
     axes = axes_by_label(trajectory_figure(trajectory, paper))
     said = {name: [text.get_text() for text in axis.texts] for name, axis in axes.items()}
@@ -75,6 +88,7 @@ def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
     with FmuPlant(paper) as plant:
         run = simulate(plant, Proportional(paper), 1, 0)
     assert plot_trajectory(run, paper, tmp_path / "a.png").stat().st_size > 10_000
+    assert plot_overlay({"one": run}, tmp_path / "b.png").stat().st_size > 10_000
 
 
 def figures(rng, paper):

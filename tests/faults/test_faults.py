@@ -69,6 +69,20 @@ def test_a_kill_loses_nothing_that_was_written(job):
     assert seen[job]["equal to the byte afterwards"] == 1
 
 
+# Endurance -------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_short_endurance_run_fails_nowhere_and_does_not_grow():
+    script = Path(__file__).with_name("endurance.py")
+    words = [sys.executable, str(script), "--samples", "5000"]
+    seen = json.loads(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
+    assert seen["status"] == "finished"
+    assert seen["failures"] == 0
+    assert len(seen["J"]) == 10
+    assert seen["growth_mb"] < 5
+
+
 # Disks -----------------------------------------------------------------------------------------
 
 

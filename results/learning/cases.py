@@ -4,7 +4,8 @@ The hyperparameters of the cases `*-paper` and `*-extended` are the algorithms' 
 the parametrisation; `q-learning-literal` is the paper's rule as it is printed, and
 `q-learning-line-search` that with the line search that the paper names as an option; the cases
 `*-mean-cost` have the extended θ and TD errors of the mean cost in place of the discounted one;
-`q-learning-cautious` begins after 1000 samples in place of 200 and takes smaller steps.
+`q-learning-warm-up` begins after 1000 samples in place of 200, and `q-learning-cautious` takes
+smaller steps besides.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ CASES = {
         "q-learning", 20_000, {**AS_PRINTED, "line_search": True}, seeds=5
     ),
     "q-learning-mean-cost": Case("q-learning", 40_000, {"discount": 1.0}),
+    "q-learning-warm-up": Case("q-learning", 40_000, {"warm_up": 1000}),
     "q-learning-cautious": Case("q-learning", 40_000, {"warm_up": 1000, "largest_step": 0.2}),
     "batch-q-learning-mean-cost": Case("batch-q-learning", 30_000, {"discount": 1.0}),
 }

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
+import os
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +23,7 @@ from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum
 from controllers.errors import OptimumError
 from controllers.problem import Problem
-from controllers.storage import read_arrays, user_cache, write_atomically
+from controllers.storage import CACHE_VARIABLE, read_arrays, user_cache, write_atomically
 
 Array = NDArray[np.float64]
 # Part of every key: raise it when the solver changes what it finds.
@@ -78,6 +80,22 @@ def _expression(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
 def cache_folder() -> Path:
     """The user's folder of solved problems."""
     return user_cache("optima")
+
+
+def require_cache() -> Path:
+    """The user's folder, made if need be; raises OptimumError where it cannot be written."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        reason = "" if os.access(folder, os.W_OK) else os.strerror(errno.EACCES)
+    except OSError as error:
+        reason = str(error.strerror)
+    if reason:
+        raise OptimumError(
+            f"{folder}: the optimal policy cannot be kept there ({reason}); name a folder that can "
+            f"be written in the environment's {CACHE_VARIABLE}"
+        )
+    return folder
 
 
 def stored(name: str) -> Path | None:
@@ -158,6 +176,7 @@ def obtain(name: str, make: Callable[[], Optimum]) -> Optimum:
     path = stored(name)
     if path is not None:
         return read(path, name)
+    folder = require_cache()
     optimum = make()
-    write(cache_folder() / f"{name}.npz", optimum, name)
+    write(folder / f"{name}.npz", optimum, name)
     return optimum

@@ -89,8 +89,9 @@ def _solve(
     key = archive.key(problem, law, parameters, settings)
     with _progress(out_) as show:
         if recompute or archive.stored(key) is None:
+            folder = archive.require_cache()
             solved = solve(problem, law, settings, parameters=parameters, progress=show)
-            archive.write(archive.cache_folder() / f"{key}.npz", solved, key)
+            archive.write(folder / f"{key}.npz", solved, key)
         else:
             solved = archive.obtain(key, lambda: solve(problem, law, settings))
         rows = [Row("solution", solved)]

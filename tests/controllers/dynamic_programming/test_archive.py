@@ -92,6 +92,15 @@ def test_what_is_solved_once_is_read_the_next_time(optimum, tmp_path, monkeypatc
     np.testing.assert_array_equal(first.W, second.W)
 
 
+def test_a_cache_that_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "file"))
+    calls = []
+    with pytest.raises(OptimumError, match=r"cannot be kept there .*COSIM_CACHE"):
+        archive.obtain("abc", lambda: calls.append(1))
+    assert not calls
+
+
 def changed_key(problem=PROBLEM, law=LAW, parameters=P, settings=None):
     return archive.key(problem, law, parameters, settings or Settings())
 

@@ -49,6 +49,15 @@ def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):
     assert "delete it to have the policy computed anew" in err
 
 
+def test_a_cache_that_cannot_be_written_is_refused_before_the_work(cosim, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "file"))
+    code, out, err = cosim("optimum", "--scenario", "paper", "--recompute")
+    assert (code, out) == (2, "")
+    assert "error: " in err
+    assert "COSIM_CACHE" in err
+
+
 @pytest.mark.slow
 def test_solving_anew_takes_two_minutes_of_two_cores_at_most(cosim, tmp_path, monkeypatch):
     monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)

@@ -6,7 +6,6 @@ import hashlib
 import stat
 import threading
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
@@ -81,12 +80,15 @@ def _unpack(path: Path) -> UnpackedFmu:
             stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
             folder = place(archive, digest)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except PlantError:
+        raise
+    except OSError as error:
+        raise PlantError(f"FMU '{path}' cannot be unpacked: {error}") from None
+    # Damaged bytes make zipfile and zlib raise a dozen types, unrelated ones among them.
+    except Exception as error:
         raise PlantError(
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
-    except OSError as error:
-        raise PlantError(f"FMU '{path}' cannot be unpacked: {error}") from None
     return UnpackedFmu(path, digest, folder, description)
 
 

@@ -16,6 +16,7 @@ from cosim.figures.style import SERIES, WIDTH, colors, figure, legend_above, pla
 
 Array = NDArray[np.float64]
 
+LINES = ("-", "--", ":")
 Curves = Mapping[str, tuple[Array, Array]]
 """Learning curves by name: samples (K,) and the values of S seeds, (S, K) or (K,) for one."""
 
@@ -37,8 +38,12 @@ def plot_learning_curves(
         row = drawn.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (title, curves) in zip(row, panels.items(), strict=True):
             color = colors(list(curves))
+            drawn_before: list[str] = []
             for name, (samples, values) in curves.items():
-                _band(axes, samples, np.atleast_2d(values), color[name], plain(name))
+                # More curves than colours: a colour comes again with another line.
+                style = LINES[drawn_before.count(color[name]) % len(LINES)]
+                drawn_before.append(color[name])
+                _band(axes, samples, np.atleast_2d(values), color[name], plain(name), style)
             for name, level in (references or {}).items():
                 axes.axhline(
                     level,
@@ -57,13 +62,14 @@ def plot_learning_curves(
     return save(drawn, path)
 
 
-def _band(axes: Axes, samples: Array, values: Array, color: str, name: str) -> None:
+def _band(axes: Axes, samples: Array, values: Array, color: str, name: str, style: str) -> None:
     seeds = len(values)
     axes.plot(
         samples,
         np.median(values, axis=0),
         color=color,
         linewidth=1.3,
+        linestyle=style,
         label=f"{name} ({seeds} seeds)" if seeds > 1 else name,
     )
     if seeds > 1:

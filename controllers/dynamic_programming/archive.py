@@ -174,8 +174,14 @@ def read(path: Path, name: str) -> Optimum:
 def obtain(name: str, make: Callable[[], Optimum]) -> Optimum:
     """Stored solution of the problem with this key, or `make` it and keep it for the user."""
     path = stored(name)
-    if path is not None:
-        return read(path, name)
+    return renew(name, make) if path is None else read(path, name)
+
+
+def renew(name: str, make: Callable[[], Optimum]) -> Optimum:
+    """`make` the solution of the problem with this key and keep it, whatever is stored.
+
+    Raises OptimumError before it begins where the user's folder cannot be written.
+    """
     folder = require_cache()
     optimum = make()
     write(folder / f"{name}.npz", optimum, name)

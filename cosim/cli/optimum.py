@@ -88,12 +88,9 @@ def _solve(
     settings = Settings(criterion=criterion.value)
     key = archive.key(problem, law, parameters, settings)
     with _progress(out_) as show:
-        if recompute or archive.stored(key) is None:
-            folder = archive.require_cache()
-            solved = solve(problem, law, settings, parameters=parameters, progress=show)
-            archive.write(folder / f"{key}.npz", solved, key)
-        else:
-            solved = archive.obtain(key, lambda: solve(problem, law, settings))
+        solved = (archive.renew if recompute else archive.obtain)(
+            key, lambda: solve(problem, law, settings, parameters=parameters, progress=show)
+        )
         rows = [Row("solution", solved)]
         if refine:
             rows = study(problem, law, settings, solved, parameters=parameters, progress=show)

@@ -1,4 +1,4 @@
-"""The paper's last remark: RTI and converged NMPC learn different θ.
+"""The paper's last remark, at the first two fits: RTI and converged NMPC take different steps of θ.
 
     python results/learning/converged.py
 

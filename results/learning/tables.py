@@ -142,7 +142,8 @@ def converged(path: Path) -> str:
     one, other = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
     apart = np.linalg.norm(one - other) / np.linalg.norm(one)
     text = (
-        "## RTI and converged NMPC learn different θ\n\n"
+        "## RTI and converged NMPC: the first two fits differ\n\n"
+        "Two early fits on 150 transitions, not what learning converges to.\n\n"
         "From the very same transitions and start, by the same fits (`converged.py`): changes "
         f"of θ in units of its scale. ‖difference‖ / ‖change under RTI‖ = {apart:.3f}; the ten "
         "entries that differ most:\n\n"

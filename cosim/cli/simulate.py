@@ -12,7 +12,7 @@ from cosim.cli.run import Run, execute, show
 
 ScenarioOption = Annotated[
     str,
-    typer.Option("--scenario", "-s", help="Preset (paper, nominal, fast-sampling) or TOML file."),
+    typer.Option("--scenario", "-s", help="Preset (paper, fouled, mismatched, …) or TOML file."),
 ]
 StepsOption = Annotated[
     int, typer.Option("--steps", "-n", min=1, max=100_000_000, help="Number of samples.")

@@ -11,7 +11,7 @@ from cosim.scenario import Scenario
 
 
 def test_presets_are_those_that_the_design_names():
-    assert presets() == ["fast-sampling", "nominal", "paper"]
+    assert presets() == ["fast-sampling", "fouled", "mismatched", "nominal", "paper"]
 
 
 def test_paper_holds_the_numbers_of_the_paper(paper):
@@ -41,7 +41,7 @@ def test_paper_reference_is_the_nominal_optimum_of_the_paper(paper):
     assert round(paper.controller.reference_cost, 4) == 6210.3845
 
 
-def test_other_presets_differ_from_paper_in_one_point_each(paper):
+def test_other_presets_differ_from_paper_in_what_their_name_says(paper):
     differing = {
         name: {
             key
@@ -54,7 +54,20 @@ def test_other_presets_differ_from_paper_in_one_point_each(paper):
         "paper": set(),
         "nominal": {"disturbance"},
         "fast-sampling": {"sampling_time"},
+        "fouled": {"plant"},
+        "mismatched": {"plant", "disturbance"},
     }
+
+
+@pytest.mark.parametrize("name", ["fouled", "mismatched"])
+def test_a_wrong_model_is_wrong_in_the_plant_alone(paper, name):
+    scenario, told = Scenario.load(name), paper.to_dict()
+    for table in ("controller", "bounds", "penalty", "sampling_time", "discount"):
+        assert scenario.to_dict()[table] == told[table]
+    expected = dict(paper.to_dict()["plant"], parameters=dict(scenario.plant.parameters))
+    assert scenario.to_dict()["plant"] == expected
+    for parameter, value in scenario.plant.parameters.items():
+        assert f"{parameter}" in scenario.description and f"{value:g}" in scenario.description
 
 
 @pytest.mark.parametrize("name", presets())

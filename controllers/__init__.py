@@ -2,13 +2,13 @@
 
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
-from controllers.layout import Layout
 from controllers.model import Model, Quantity
 from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.solution import LinearisationPoint, RtiSolution
+from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.theta import Layout
 
 __all__ = [
     "ControllerError",

@@ -13,7 +13,7 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp
 from controllers.rti import RtiNmpc
-from controllers.solution import LinearisationPoint, RtiSolution
+from controllers.rti.solution import LinearisationPoint, RtiSolution
 
 Vector = NDArray[np.float64]
 

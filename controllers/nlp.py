@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.buffered import StackedFunction, stacked
-from controllers.layout import Layout
-from controllers.ocp import SymbolicParameters, sampled_jacobian
+from controllers.dynamics import sampled_jacobian
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Layout, SymbolicParameters
 
 Vector = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ import tomli_w
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError, ParameterError
-from controllers.layout import Layout
 from controllers.problem import Problem
 from controllers.storage import write_atomically
+from controllers.theta import Layout
 
 Vector = NDArray[np.float64]
 SCHEMA = 1

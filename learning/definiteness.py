@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import solve_triangular
 
-from controllers.layout import Layout
+from controllers.theta import Layout
 from learning.errors import DefinitenessError
 from learning.fit import Fit
 

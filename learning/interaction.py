@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import QpError
-from controllers.solution import LinearisationPoint
+from controllers.rti.solution import LinearisationPoint
 from cosim.penalty import Penalty
 from cosim.protocols import Step
 from cosim.scenario import Scenario

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from controllers.converged import ConvergedNmpc
-from controllers.layout import Layout
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
+from controllers.theta import Layout
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError

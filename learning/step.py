@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.layout import Layout
+from controllers.theta import Layout
 from learning.configuration import Configuration
 from learning.definiteness import Certificate, certificate, enforcement
 from learning.errors import DivergenceError

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from controllers.layout import Layout
 from controllers.parameters import Parameters
+from controllers.theta import Layout
 from learning.definiteness import (
     LinearMatrixInequality,
     certificate,

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from carrier import Carrier
 
-from controllers.layout import Layout
 from controllers.parameters import Parameters
+from controllers.theta import Layout
 from learning.configuration import Configuration
 from learning.errors import DivergenceError
 from learning.fit import Fit

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from controllers import Layout
 from controllers.errors import ModelError, ParameterError
-from controllers.layout import Block
+from controllers.theta import Block
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 MATRIX = Block("B", "symmetric", 3, (1.0,) * 6)

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.buffered import BufferedFunction, stacked
+from controllers.dynamics import sampled_curvature
 from controllers.errors import ControllerError
-from controllers.lagrangian import sampled_curvature
-from controllers.layout import Layout
-from controllers.ocp import SymbolicParameters
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Layout, SymbolicParameters
 
 Vector = NDArray[np.float64]
 RULES = ("gauss-newton", "exact", "exact-unlifted")

@@ -11,14 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.blas import dasum
 
 from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.hessian import make_hessian
-from controllers.lagrangian import readout, sensitivities
-from controllers.ocp import embedding, preparation, qp_in_memory
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend, make_backend
-from controllers.qp.kink import settle
-from controllers.solution import Functions, LinearisationPoint, Prepared, RtiSolution
+from controllers.qp.enforced_action import multipliers_at_kink
+from controllers.rti.feedback import embedding, readout
+from controllers.rti.hessian import make_hessian
+from controllers.rti.preparation import preparation, qp_in_memory
+from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
+from controllers.sensitivities import sensitivities
 
 Vector = NDArray[np.float64]
 
@@ -232,7 +233,9 @@ class RtiNmpc:
             )
         multipliers = self._backend.solve(qp)
         if a is not None:
-            multipliers = settle(qp, multipliers, self._action_lower[:m], self._action_upper[:m])
+            multipliers = multipliers_at_kink(
+                qp, multipliers, self._action_lower[:m], self._action_upper[:m]
+            )
         inputs = self._readout.inputs
         inputs["s"][:], inputs["constant"][0] = s, self._constant
         inputs["v"][:], inputs["lam"][:] = multipliers.v, multipliers.lam

@@ -5,9 +5,9 @@ from sampling import evaporator_problem, random_parameters, random_point
 
 from controllers import Layout
 from controllers.errors import ControllerError
-from controllers.hessian import Exact, Spectrum, make_hessian
 from controllers.model import discretise
-from controllers.ocp import preparation
+from controllers.rti.hessian import Exact, Spectrum, make_hessian
+from controllers.rti.preparation import preparation
 
 N, n, m = 10, 2, 2
 DISCOUNTS = 0.99 ** np.arange(N)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -181,3 +182,39 @@ class Layout:
                 )
             )
         return cls(tuple(blocks))
+
+
+def symmetric(packed: ca.SX, dimension: int) -> ca.SX:
+    """Symmetric matrix from its upper triangle, row by row."""
+    matrix = ca.SX(dimension, dimension)
+    position = 0
+    for i in range(dimension):
+        for j in range(i, dimension):
+            matrix[i, j] = matrix[j, i] = packed[position]
+            position += 1
+    return matrix
+
+
+@dataclass(frozen=True)
+class SymbolicParameters:
+    """θ as one symbol and its blocks, with the problem's constants where θ has no block."""
+
+    theta: ca.SX
+    blocks: dict[str, ca.SX]
+    model_parameters: ca.SX
+
+    @classmethod
+    def of(cls, problem: Problem, layout: Layout) -> SymbolicParameters:
+        """Symbols for a layout of θ."""
+        theta = ca.SX.sym("theta", layout.size)
+        blocks = {}
+        for block in layout.blocks:
+            part = theta[layout.slices[block.name]]
+            blocks[block.name] = symmetric(part, block.dimension) if block.symmetric else part
+        blocks.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
+        blocks.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
+        parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
+        if "p" in layout:
+            for i, index in enumerate(problem.model.parameter_indices(layout.block("p").labels)):
+                parameters[index] = blocks["p"][i]
+        return cls(theta, blocks, parameters)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.convexification import Convexification, convexify
-from controllers.layout import Layout
-from controllers.local_feedback import LocalFeedback, local_feedback
+from controllers.economic.convexification import Convexification, convexify
+from controllers.economic.local_feedback import LocalFeedback, local_feedback
+from controllers.economic.steady_state import SteadyState, optimal_steady_state
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.steady_state import SteadyState, optimal_steady_state
+from controllers.theta import Layout
 
 Array = NDArray[np.float64]
 

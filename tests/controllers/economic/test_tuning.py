@@ -7,12 +7,12 @@ import scipy.linalg
 from sampling import evaporator_problem
 
 from controllers import Layout, LinearisationPoint, Model, Quantity, RtiNmpc
-from controllers.convexification import convexify, rotation
 from controllers.economic import tune
+from controllers.economic.convexification import convexify, rotation
+from controllers.economic.local_feedback import local_feedback
+from controllers.economic.steady_state import optimal_steady_state
 from controllers.errors import TuningError
-from controllers.local_feedback import local_feedback
 from controllers.model import discretise, economic_cost
-from controllers.steady_state import optimal_steady_state
 
 PROBLEMS = {
     "paper": evaporator_problem(),

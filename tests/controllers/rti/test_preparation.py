@@ -6,8 +6,11 @@ import pytest
 from sampling import evaporator_problem, random_parameters, random_point, random_state
 
 from controllers import Layout
+from controllers.dynamics import sampled_jacobian
 from controllers.model import discretise
-from controllers.ocp import SymbolicParameters, embedding, preparation, sampled_jacobian, symmetric
+from controllers.rti.feedback import embedding
+from controllers.rti.preparation import preparation
+from controllers.theta import SymbolicParameters, symmetric
 
 N, n, m = 10, 2, 2
 

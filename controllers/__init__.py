@@ -8,12 +8,11 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.rti.solution import LinearisationPoint, RtiSolution
-from controllers.theta import Layout
+from controllers.theta import ThetaBlocks
 
 __all__ = [
     "ControllerError",
     "ConvergedNmpc",
-    "Layout",
     "LinearisationPoint",
     "Model",
     "OptimalPolicy",
@@ -23,4 +22,5 @@ __all__ = [
     "Quantity",
     "RtiNmpc",
     "RtiSolution",
+    "ThetaBlocks",
 ]

@@ -55,7 +55,7 @@ class ConvergedNmpc(RtiNmpc):
     ) -> None:
         """Build the functions; see the class."""
         self._tolerance, self._iterations = tolerance, iterations
-        self._merit = merit(problem, parameters.layout)
+        self._merit = merit(problem, parameters.blocks)
         self._known = _Known()
         self._programme = RtiNmpc(
             problem, parameters, hessian="exact-unlifted", backend=lambda: self._known

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 
 from controllers.problem import Problem
-from controllers.theta import SymbolicParameters
+from controllers.theta import SymbolicTheta
 
 
 def sampled_jacobian(
@@ -41,7 +41,7 @@ def sampled_jacobian(
 
 
 def linearisation(
-    problem: Problem, symbols: SymbolicParameters, x: ca.SX, u: ca.SX
+    problem: Problem, symbols: SymbolicTheta, x: ca.SX, u: ca.SX
 ) -> tuple[list[ca.SX], list[ca.SX], list[ca.SX]]:
     """Matrices A_k, B_k and offsets r_k of ξ₊ = A_k ξ + B_k v + r_k along the points x, u.
 
@@ -55,14 +55,12 @@ def linearisation(
         a, b = jacobian[:, :n], jacobian[:, n:]
         by_state.append(a)
         by_action.append(b)
-        offset.append(
-            x_next - x_s - a @ (x[:, k] - x_s) - b @ (u[:, k] - u_s) + symbols.blocks["c_f"]
-        )
+        offset.append(x_next - x_s - a @ (x[:, k] - x_s) - b @ (u[:, k] - u_s) + symbols["c_f"])
     return by_state, by_action, offset
 
 
 def sampled_curvature(
-    problem: Problem, symbols: SymbolicParameters, x: ca.SX, u: ca.SX, chi: ca.SX
+    problem: Problem, symbols: SymbolicTheta, x: ca.SX, u: ca.SX, chi: ca.SX
 ) -> list[ca.SX]:
     """Second derivatives D_k of χ_{k+1}ᵀ f(x_k, u_k) with respect to (x, u), stage by stage."""
     curvature = []

@@ -14,7 +14,7 @@ import casadi as ca
 from controllers.buffered import StackedFunction, stacked
 from controllers.dynamics import linearisation, sampled_curvature
 from controllers.problem import Problem
-from controllers.theta import Layout, SymbolicParameters
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class PrimalDual:
 
 def _theta_part(
     problem: Problem,
-    symbols: SymbolicParameters,
+    symbols: SymbolicTheta,
     y: PrimalDual,
     x: ca.SX,
     u: ca.SX,
@@ -59,35 +59,34 @@ def _theta_part(
     stage's second-order term with respect to L_k, and χ̄ are the costates at which D_k was taken.
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    blocks = symbols.blocks
     x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
-    part = ca.bilin(blocks["B_lambda"], y.xi[:, 0]) + ca.dot(blocks["b_lambda"], y.xi[:, 0])
-    part += blocks["c_lambda"]
+    part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
+    part += symbols["c_lambda"]
     by_state, by_action, offset = linearisation(problem, symbols, x, u)
     curvature = sampled_curvature(problem, symbols, x, u, exact[1]) if exact else []
     for k in range(horizon):
         w = ca.vertcat(y.xi[:, k], y.v[:, k])
-        stage = ca.dot(blocks["b_l"], w)
+        stage = ca.dot(symbols["b_l"], w)
         if exact is None:
-            stage += ca.bilin(blocks["B_l"], w)
+            stage += ca.bilin(symbols["B_l"], w)
         else:
             at = ca.vertcat(x[:, k] - x_s, u[:, k] - u_s)
             columns = slice(k * (n + m), (k + 1) * (n + m))
             M = exact[0][:, columns]
-            stage += ca.bilin(blocks["B_l"], at, 2 * w - at) + 2 * ca.dot(M, blocks["B_l"])
+            stage += ca.bilin(symbols["B_l"], at, 2 * w - at) + 2 * ca.dot(M, symbols["B_l"])
             part += ca.dot(M, curvature[k])
         predicted = by_state[k] @ y.xi[:, k] + by_action[k] @ y.v[:, k] + offset[k]
         part += gamma**k * stage + ca.dot(y.chi[:, k + 1], predicted)
-        part += gamma ** (k + 1) * ca.dot(blocks["w_sigma"], y.t[:, k])
-        part += gamma ** (k + 1) * ca.dot(blocks["W_sigma"], y.t[:, k] ** 2)
-        part += ca.dot(ca.fmax(-y.lam[:, k], 0), blocks["x_l"])
-        part -= ca.dot(ca.fmax(y.lam[:, k], 0), blocks["x_u"])
+        part += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], y.t[:, k])
+        part += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], y.t[:, k] ** 2)
+        part += ca.dot(ca.fmax(-y.lam[:, k], 0), symbols["x_l"])
+        part -= ca.dot(ca.fmax(y.lam[:, k], 0), symbols["x_u"])
     end = y.xi[:, horizon]
-    return part + gamma**horizon * (ca.bilin(blocks["B_Vf"], end) + ca.dot(blocks["b_Vf"], end))
+    return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
 
 
 def sensitivities(
-    problem: Problem, layout: Layout, *, exact: bool
+    problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, StackedFunction]:
     """Gradient of the value in θ, and its directional derivatives along the KKT adjoints.
 
@@ -98,7 +97,7 @@ def sensitivities(
     second also dM, the directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    symbols = SymbolicParameters.of(problem, layout)
+    symbols = SymbolicTheta.of(problem, blocks)
     y = PrimalDual.symbols(problem)
     x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
     M = ca.SX.sym("M", n + m, horizon * (n + m))

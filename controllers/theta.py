@@ -1,7 +1,8 @@
-"""How θ is laid out in one flat vector: named blocks, symmetric packing, learning scales."""
+"""θ in one flat vector: named blocks, symmetric packing, learning scales, CasADi symbols."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -83,7 +84,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ThetaBlocks:
     """The blocks of θ, in order."""
 
     blocks: tuple[Block, ...]
@@ -124,6 +125,10 @@ class Layout:
                 ]
         return tuple(names)
 
+    def __iter__(self) -> Iterator[Block]:
+        """The blocks, in order."""
+        return iter(self.blocks)
+
     def __contains__(self, name: str) -> bool:
         """Whether θ has a block of this name."""
         return name in self.slices
@@ -142,8 +147,8 @@ class Layout:
         *,
         slack_weights: bool = False,
         model_parameters: tuple[str, ...] = (),
-    ) -> Layout:
-        """Layout of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
+    ) -> ThetaBlocks:
+        """Blocks of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
 
         `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
         predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
@@ -196,25 +201,29 @@ def symmetric(packed: ca.SX, dimension: int) -> ca.SX:
 
 
 @dataclass(frozen=True)
-class SymbolicParameters:
-    """θ as one symbol and its blocks, with the problem's constants where θ has no block."""
+class SymbolicTheta:
+    """θ as one symbol; `symbols["B_l"]` is a whole block, or the problem's constant without one."""
 
     theta: ca.SX
-    blocks: dict[str, ca.SX]
+    unpacked: dict[str, ca.SX]
     model_parameters: ca.SX
 
+    def __getitem__(self, name: str) -> ca.SX:
+        """Unpacked symbol of a block."""
+        return self.unpacked[name]
+
     @classmethod
-    def of(cls, problem: Problem, layout: Layout) -> SymbolicParameters:
-        """Symbols for a layout of θ."""
-        theta = ca.SX.sym("theta", layout.size)
-        blocks = {}
-        for block in layout.blocks:
-            part = theta[layout.slices[block.name]]
-            blocks[block.name] = symmetric(part, block.dimension) if block.symmetric else part
-        blocks.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
-        blocks.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
+    def of(cls, problem: Problem, blocks: ThetaBlocks) -> SymbolicTheta:
+        """Symbols for these blocks of θ."""
+        theta = ca.SX.sym("theta", blocks.size)
+        unpacked = {}
+        for block in blocks:
+            part = theta[blocks.slices[block.name]]
+            unpacked[block.name] = symmetric(part, block.dimension) if block.symmetric else part
+        unpacked.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
+        unpacked.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
         parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
-        if "p" in layout:
-            for i, index in enumerate(problem.model.parameter_indices(layout.block("p").labels)):
-                parameters[index] = blocks["p"][i]
-        return cls(theta, blocks, parameters)
+        if "p" in blocks:
+            for i, index in enumerate(problem.model.parameter_indices(blocks.block("p").labels)):
+                parameters[index] = unpacked["p"][i]
+        return cls(theta, unpacked, parameters)

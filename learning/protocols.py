@@ -44,7 +44,7 @@ class LearnableController(Protocol):
 
     @property
     def parameters(self) -> Parameters:
-        """θ with its layout."""
+        """θ with its blocks."""
 
     @property
     def linearisation_point(self) -> LinearisationPoint:

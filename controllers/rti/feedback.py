@@ -6,17 +6,17 @@ import casadi as ca
 
 from controllers.buffered import StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.theta import Layout, SymbolicParameters
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
-def embedding(problem: Problem, layout: Layout, prepared: StackedFunction) -> StackedFunction:
+def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
     """Initial value embedding: the vectors of the QP that depend on the state s.
 
     Inputs: s; theta; the rest is read from the preparation's memory. Results: the gradient f, and
     the lower and upper limits that the soft rows Γ V must respect.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    symbols = SymbolicParameters.of(problem, layout)
+    symbols = SymbolicTheta.of(problem, blocks)
     s = ca.SX.sym("s", n)
     x_s = ca.DM(problem.reference_state)
     prior = {
@@ -26,8 +26,8 @@ def embedding(problem: Problem, layout: Layout, prepared: StackedFunction) -> St
         "F": ca.SX.sym("F", n, horizon * m),
     }
     free = prior["Phi"].T @ (s - x_s) + prior["g"]
-    lower = ca.repmat(symbols.blocks["x_l"] - x_s, horizon, 1) - free
-    upper = ca.repmat(symbols.blocks["x_u"] - x_s, horizon, 1) - free
+    lower = ca.repmat(symbols["x_l"] - x_s, horizon, 1) - free
+    upper = ca.repmat(symbols["x_u"] - x_s, horizon, 1) - free
     return stacked(
         "embedding",
         {"s": s, "theta": symbols.theta, **prior},
@@ -36,7 +36,7 @@ def embedding(problem: Problem, layout: Layout, prepared: StackedFunction) -> St
     )
 
 
-def readout(problem: Problem, layout: Layout, prepared: StackedFunction) -> StackedFunction:
+def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
     """States, slack, costates and value that belong to a solution (v, λ) of the condensed QP.
 
     Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta; the QP's
@@ -45,8 +45,7 @@ def readout(problem: Problem, layout: Layout, prepared: StackedFunction) -> Stac
     The costates χ solve the adjoint recursion, so χ_0 is the gradient of the value in s.
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    symbols = SymbolicParameters.of(problem, layout)
-    blocks = symbols.blocks
+    symbols = SymbolicTheta.of(problem, blocks)
     x_s = ca.DM(problem.reference_state)
     s, v, lam = ca.SX.sym("s", n), ca.SX.sym("v", m, horizon), ca.SX.sym("lam", n, horizon)
     A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
@@ -59,8 +58,8 @@ def readout(problem: Problem, layout: Layout, prepared: StackedFunction) -> Stac
         problem.penalty_quadratic, violation**2
     )
     xi = [s - x_s]
-    value = constant + known + blocks["c_lambda"]
-    value += ca.bilin(blocks["B_lambda"], xi[0]) + ca.dot(blocks["b_lambda"], xi[0])
+    value = constant + known + symbols["c_lambda"]
+    value += ca.bilin(symbols["B_lambda"], xi[0]) + ca.dot(symbols["b_lambda"], xi[0])
     t, weights = [], []
     for k in range(horizon):
         w = ca.vertcat(xi[k], v[:, k])
@@ -68,10 +67,10 @@ def readout(problem: Problem, layout: Layout, prepared: StackedFunction) -> Stac
         value += ca.bilin(weights[k], w) / 2 + ca.dot(q[:, k], w)
         columns = slice(k * n, (k + 1) * n)
         xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ v[:, k] + r[:, k])
-        outside = ca.fmax(blocks["x_l"] - x_s - xi[k + 1], xi[k + 1] - blocks["x_u"] + x_s)
+        outside = ca.fmax(symbols["x_l"] - x_s - xi[k + 1], xi[k + 1] - symbols["x_u"] + x_s)
         t.append(ca.fmax(outside, 0))
         value += gamma ** (k + 1) * (
-            ca.dot(blocks["w_sigma"], t[k]) + ca.dot(blocks["W_sigma"], t[k] ** 2)
+            ca.dot(symbols["w_sigma"], t[k]) + ca.dot(symbols["W_sigma"], t[k] ** 2)
         )
     value += ca.bilin(L_N, xi[horizon]) / 2 + ca.dot(q_N, xi[horizon])
 
@@ -80,7 +79,7 @@ def readout(problem: Problem, layout: Layout, prepared: StackedFunction) -> Stac
         w = ca.vertcat(xi[k], v[:, k])
         costate = weights[k][:n, :] @ w + q[:n, k] + A[:, k * n : (k + 1) * n] @ chi[0]
         if k == 0:
-            costate += 2 * blocks["B_lambda"] @ xi[0] + blocks["b_lambda"]
+            costate += 2 * symbols["B_lambda"] @ xi[0] + symbols["b_lambda"]
             costate += ca.gradient(known, s)
         else:
             costate += lam[:, k - 1]

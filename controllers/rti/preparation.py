@@ -13,10 +13,10 @@ from controllers.buffered import StackedFunction, stacked
 from controllers.dynamics import linearisation
 from controllers.problem import Problem
 from controllers.qp import SoftQp, Stages
-from controllers.theta import Layout, SymbolicParameters
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
-def preparation(problem: Problem, layout: Layout) -> StackedFunction:
+def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     """Linearise and condense: all of the QP that does not depend on the state s.
 
     With V = (v_0, …, v_{N−1}) the predicted states are Ξ = Γ V + Φ ξ_0 + g, and the cost is
@@ -26,7 +26,7 @@ def preparation(problem: Problem, layout: Layout) -> StackedFunction:
     L_N (n, n), q_N (n); theta. Results: A, B, r by stage; H, Γ by rows; Φ, g, f, F.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    symbols = SymbolicParameters.of(problem, layout)
+    symbols = SymbolicTheta.of(problem, blocks)
     x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
     quadratic = ca.SX.sym("L", n + m, horizon * (n + m))
     linear = ca.SX.sym("q", n + m, horizon)

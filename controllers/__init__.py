@@ -2,17 +2,18 @@
 
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
+from controllers.layout import Layout
 from controllers.model import Model, Quantity
 from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.rti.solution import LinearisationPoint, RtiSolution
-from controllers.theta import ThetaBlocks
+from controllers.solution import LinearisationPoint, RtiSolution
 
 __all__ = [
     "ControllerError",
     "ConvergedNmpc",
+    "Layout",
     "LinearisationPoint",
     "Model",
     "OptimalPolicy",
@@ -22,5 +23,4 @@ __all__ = [
     "Quantity",
     "RtiNmpc",
     "RtiSolution",
-    "ThetaBlocks",
 ]

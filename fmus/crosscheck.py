@@ -24,6 +24,13 @@ CASES: dict[str, dict[str, str]] = {
     "nominal": {"stochastic": "false"},
     "seed1": {"seed": "1"},
     "seed2": {"seed": "2"},
+    "drifting": {
+        "seed": "3",
+        "law": "2",
+        "fouling_rate": "20",
+        "fouling_floor": "0.6",
+        "cleaning_period": "0.03",
+    },
 }
 OUTPUTS = ("X2", "P2", "X1", "F1", "T1", "T200", "economic_cost", "F2", "F100")
 STOP_TIME = 6000.0  # s

@@ -72,6 +72,8 @@ class Unit:
 UNITS = (
     Unit("1"),
     Unit("s", 1.0, 0.0, (("s", 1),)),
+    Unit("d", 86400.0, 0.0, (("s", 1),)),
+    Unit("1/d", 1 / 86400, 0.0, (("s", -1),)),
     Unit("%", 0.01),
     Unit("%/s", 0.01, 0.0, (("s", -1),)),
     Unit("kg", 1.0, 0.0, (("kg", 1),)),
@@ -186,7 +188,7 @@ VARIABLES: tuple[Variable, ...] = (
     _output("T100", "degC", -1e3, 1e3, 120.0, "steam temperature", "f P100 g"),
     _output("UA1", "kW/K", -1e3, 1e3, 10.0, "heat transfer of the heater", "h F1 F3"),
     _output("Q100", "kW", -1e5, 1e5, 350.0, "heater duty", "UA1 T100 T2"),
-    _output("Q200", "kW", -1e5, 1e5, 300.0, "condenser duty", "UA2 T3 T200 Cp F200"),
+    _output("Q200", "kW", -1e5, 1e5, 300.0, "condenser duty", "UA2_present T3 T200 Cp F200"),
     _switch("stochastic", Kind.TUNABLE, True, "draw the disturbances; false: the nominal plant"),
     _switch("override", Kind.TUNABLE, False, "take the disturbances from the inputs *_in"),
     Variable("law", Kind.FIXED, Type.LAW, "", 1.0, 1.0, 2.0, None, "law of the disturbances"),
@@ -214,11 +216,19 @@ VARIABLES: tuple[Variable, ...] = (
     _tunable("h", "kW.min/(kg.K)", 0.16, 0.0, 10.0, "heat transfer of the heater per flow"),
     _tunable("M", "kg", 20.0, 1.0, 1e4, "liquid holdup"),
     _tunable("C", "kg/kPa", 4.0, 0.1, 1e4, "vapour holdup per pressure"),
-    _tunable("UA2", "kW/K", 6.84, 0.0, 1e3, "heat transfer of the condenser"),
+    _tunable("UA2", "kW/K", 6.84, 0.0, 1e3, "heat transfer of the clean condenser"),
     _tunable("Cp", "kW.min/(kg.K)", 0.07, 0.001, 10.0, "heat capacity of liquor and cooling water"),
     _tunable("lambda_", "kW.min/kg", 38.5, 1.0, 1e3, "latent heat of the evaporated water"),
     _tunable("lambda_s", "kW.min/kg", 36.6, 1.0, 1e3, "latent heat of the steam"),
     _tunable("F3", "kg/min", 50.0, 0.0, 1e3, "circulating flow"),
+    Variable("fouling_rate", Kind.TUNABLE, Type.REAL, "1/d", 0.0, 0.0, 1e3, 0.1,
+             "rate at which the condenser fouls; 0: it does not"),
+    _tunable("fouling_floor", "1", 0.7, 0.0, 1.0, "share of UA2 that fouling leaves in the end"),
+    _tunable("cleaning_period", "d", 6.0, 0.0, 1e5,
+             "the condenser is cleaned at its multiples; 0: never"),
+    _output("UA2_present", "kW/K", 0.0, 1e3, 6.84,
+            "present heat transfer of the condenser: UA2 while it is clean",
+            "UA2 fouling_rate fouling_floor cleaning_period sampling_time time"),
 )  # fmt: skip
 
 FmiVersion = Literal[2, 3]

@@ -8,6 +8,7 @@
 static void adjoint(const State *state, double s[N_VARIABLES]) {
     const double *v = state->v;
     const CondenserPartials q = condenser_partials(v);
+    const FoulingPartials u = fouling_partials(v, state->sample);
     double y;
     y = s[VR_der_P2] / (60.0 * v[VR_C]);
     s[VR_F4] += y;
@@ -31,7 +32,7 @@ static void adjoint(const State *state, double s[N_VARIABLES]) {
     s[VR_Q200] += y;
     s[VR_lambda_] -= y * v[VR_F5];
     y = s[VR_Q200];
-    s[VR_UA2] += q.UA2 * y;
+    s[VR_UA2_present] += q.UA2 * y;
     s[VR_T3] += q.T3 * y;
     s[VR_T200] -= q.T3 * y;
     s[VR_Cp] += q.Cp * y;
@@ -67,6 +68,12 @@ static void adjoint(const State *state, double s[N_VARIABLES]) {
     s[VR_b] += y * v[VR_X2];
     s[VR_X2] += y * v[VR_b];
     s[VR_c] += y;
+    y = s[VR_UA2_present];
+    s[VR_UA2] += u.UA2 * y;
+    s[VR_fouling_rate] += u.fouling_rate * y;
+    s[VR_fouling_floor] += u.fouling_floor * y;
+    s[VR_cleaning_period] += u.cleaning_period * y;
+    s[VR_sampling_time] += u.sampling_time * y;
     for (int i = 0; i < N_DISTURBANCES; i++) {
         const DisturbancePartials p = disturbance_partials(state, i);
         for (int j = 0; j < 2; j++)

@@ -25,20 +25,21 @@ static int states_are_parameters(const State *state) {
     return (state->mode & (INSTANTIATED | INITIALIZATION)) != 0;
 }
 
-/* Partial derivatives of Q200 = UA2 (T3 - T200) / (1 + UA2 / (2 Cp F200)). */
+/* Partial derivatives of Q200 = UA2 (T3 - T200) / (1 + UA2 / (2 Cp F200)), UA2 the present one. */
 typedef struct {
     double UA2, T3, Cp, F200;
 } CondenserPartials;
 
 static CondenserPartials condenser_partials(const double *v) {
-    const double r = v[VR_UA2] / (2.0 * v[VR_Cp] * v[VR_F200]);
+    const double UA2 = v[VR_UA2_present];
+    const double r = UA2 / (2.0 * v[VR_Cp] * v[VR_F200]);
     const double s = 1.0 / (1.0 + r);
     const double difference = v[VR_T3] - v[VR_T200];
     CondenserPartials partials;
     partials.UA2 = difference * s * s;
-    partials.T3 = v[VR_UA2] * s;
-    partials.Cp = v[VR_UA2] * difference * s * s * r / v[VR_Cp];
-    partials.F200 = v[VR_UA2] * difference * s * s * r / v[VR_F200];
+    partials.T3 = UA2 * s;
+    partials.Cp = UA2 * difference * s * s * r / v[VR_Cp];
+    partials.F200 = UA2 * difference * s * s * r / v[VR_F200];
     return partials;
 }
 
@@ -46,6 +47,7 @@ static CondenserPartials condenser_partials(const double *v) {
 static void tangent(const State *state, double d[N_VARIABLES]) {
     const double *v = state->v;
     const CondenserPartials q = condenser_partials(v);
+    const FoulingPartials u = fouling_partials(v, state->sample);
     if (states_are_parameters(state)) {
         d[VR_X2] = d[VR_X2_start];
         d[VR_P2] = d[VR_P2_start];
@@ -55,6 +57,10 @@ static void tangent(const State *state, double d[N_VARIABLES]) {
         d[DISTURBANCES[i].realised] =
             p.factor[0] * d[p.source[0]] + p.factor[1] * d[p.source[1]];
     }
+    d[VR_UA2_present] = u.UA2 * d[VR_UA2] + u.fouling_rate * d[VR_fouling_rate] +
+                        u.fouling_floor * d[VR_fouling_floor] +
+                        u.cleaning_period * d[VR_cleaning_period] +
+                        u.sampling_time * d[VR_sampling_time];
     d[VR_T2] = v[VR_a] * d[VR_P2] + d[VR_a] * v[VR_P2] + v[VR_b] * d[VR_X2] +
                d[VR_b] * v[VR_X2] + d[VR_c];
     d[VR_T3] = v[VR_d] * d[VR_P2] + d[VR_d] * v[VR_P2] + d[VR_e];
@@ -67,8 +73,8 @@ static void tangent(const State *state, double d[N_VARIABLES]) {
                 v[VR_F4] * d[VR_lambda_]) /
                v[VR_lambda_];
     d[VR_F2] = d[VR_F1] - d[VR_F4];
-    d[VR_Q200] = q.UA2 * d[VR_UA2] + q.T3 * (d[VR_T3] - d[VR_T200]) + q.Cp * d[VR_Cp] +
-                 q.F200 * d[VR_F200];
+    d[VR_Q200] = q.UA2 * d[VR_UA2_present] + q.T3 * (d[VR_T3] - d[VR_T200]) +
+                 q.Cp * d[VR_Cp] + q.F200 * d[VR_F200];
     d[VR_F5] = (d[VR_Q200] - v[VR_F5] * d[VR_lambda_]) / v[VR_lambda_];
     d[VR_F100] = (d[VR_Q100] - v[VR_F100] * d[VR_lambda_s]) / v[VR_lambda_s];
     d[VR_economic_cost] =

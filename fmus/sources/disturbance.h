@@ -9,6 +9,7 @@
 
 #include <math.h>
 
+#include "elementary.h"
 #include "philox.h"
 
 enum { LAW_UNIFORM = 1, LAW_NORMAL = 2, N_DISTURBANCES = 4 };
@@ -24,10 +25,10 @@ static void standard_draws(const uint32_t key[2], int64_t sample, int law,
         const double w = uniform53(word[2], word[3]);
         double *draw = draws + 2 * block;
         if (law == LAW_NORMAL) { /* Box and Muller; 1 - u is never 0 */
-            const double radius = sqrt(-2.0 * log(1.0 - u));
-            const double angle = 6.283185307179586 * w;
-            draw[0] = radius * cos(angle);
-            draw[1] = radius * sin(angle);
+            const double radius = sqrt(-2.0 * natural_logarithm(1.0 - u));
+            cosine_and_sine(w, &draw[0], &draw[1]);
+            draw[0] *= radius;
+            draw[1] *= radius;
         } else {
             draw[0] = 2.0 * u - 1.0;
             draw[1] = 2.0 * w - 1.0;

@@ -18,8 +18,8 @@ static void evaluate(double v[N_VARIABLES]) {
     v[VR_Q100] = v[VR_UA1] * (v[VR_T100] - v[VR_T2]);
     v[VR_F4] = (v[VR_Q100] - v[VR_F1] * v[VR_Cp] * (v[VR_T2] - v[VR_T1])) / v[VR_lambda_];
     v[VR_F2] = v[VR_F1] - v[VR_F4];
-    v[VR_Q200] = v[VR_UA2] * (v[VR_T3] - v[VR_T200]) /
-                 (1.0 + v[VR_UA2] / (2.0 * v[VR_Cp] * v[VR_F200]));
+    v[VR_Q200] = v[VR_UA2_present] * (v[VR_T3] - v[VR_T200]) /
+                 (1.0 + v[VR_UA2_present] / (2.0 * v[VR_Cp] * v[VR_F200]));
     v[VR_F5] = v[VR_Q200] / v[VR_lambda_];
     v[VR_F100] = v[VR_Q100] / v[VR_lambda_s];
     v[VR_economic_cost] =
@@ -40,7 +40,8 @@ static Rates held_rates(const double v[N_VARIABLES]) {
     const double heat = v[VR_F1] * v[VR_Cp];
     const double slope = (UA1 + heat) / v[VR_lambda_]; /* F4 = offset - slope T2 */
     const double offset = (UA1 * T100 + heat * v[VR_T1]) / v[VR_lambda_];
-    const double condenser = v[VR_UA2] / (1.0 + v[VR_UA2] / (2.0 * v[VR_Cp] * v[VR_F200])) /
+    const double UA2 = v[VR_UA2_present];
+    const double condenser = UA2 / (1.0 + UA2 / (2.0 * v[VR_Cp] * v[VR_F200])) /
                              v[VR_lambda_]; /* F5 = condenser (T3 - T200) */
     const double F4_at_zero = offset - slope * v[VR_c];
     const double m = 1.0 / (60.0 * v[VR_M]), n = 1.0 / (60.0 * v[VR_C]);

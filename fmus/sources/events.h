@@ -1,4 +1,4 @@
-/* Model exchange: the time events at which the disturbances are redrawn, and the state vector.
+/* Model exchange: the time events at which a sample begins, and the state vector.
  *
  * The sample index is a discrete state: in continuous-time mode it keeps its value, also at the very
  * end of the sample, until the importer handles the time event.
@@ -15,7 +15,8 @@ static const unsigned STATE_REFERENCES[N_STATES] = {VR_X2, VR_P2};
 static const unsigned DERIVATIVE_REFERENCES[N_STATES] = {VR_der_X2, VR_der_P2};
 
 static int has_time_events(const State *state) {
-    return state->v[VR_stochastic] != 0.0 && state->v[VR_override] == 0.0;
+    const int draws = state->v[VR_stochastic] != 0.0 && state->v[VR_override] == 0.0;
+    return draws || fouls(state->v);
 }
 
 static double next_event_time(const State *state) {

@@ -1,9 +1,10 @@
-/* The calculated variables: realised disturbances, then the model's equations. */
+/* The calculated variables: what is held in a sample, then the model's equations. */
 #ifndef OUTPUTS_H
 #define OUTPUTS_H
 
 #include "disturbance.h"
 #include "evaporator.h"
+#include "fouling.h"
 #include "grid.h"
 #include "instance.h"
 
@@ -39,6 +40,12 @@ static void realise_disturbances(State *state) {
             v[DISTURBANCES[i].nominal] + v[DISTURBANCES[i].range] * state->draws[i];
 }
 
+/* All that is held in a sample: the realised disturbances and the condenser's present state. */
+static void realise(State *state) {
+    realise_disturbances(state);
+    foul(state->v, state->sample);
+}
+
 static void move_to_sample(State *state, int64_t sample) {
     if (sample == state->sample && state->drawn) return;
     state->sample = sample;
@@ -56,7 +63,7 @@ static void refresh(State *state) {
         state->v[VR_X2] = state->v[VR_X2_start];
         state->v[VR_P2] = state->v[VR_P2_start];
     }
-    realise_disturbances(state);
+    realise(state);
     evaluate(state->v);
     state->outputs_current = 1;
 }

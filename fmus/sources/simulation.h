@@ -47,7 +47,7 @@ static Status leave_initialization(Instance *instance, const char *function) {
     return OK;
 }
 
-/* Integrate between two positions of one sample, in which input and disturbance are constant. */
+/* Integrate between two positions of one sample, in which inputs, disturbances and fouling are constant. */
 static void integrate(double v[N_VARIABLES], Grid grid, GridPosition from, GridPosition to) {
     const Rates rates = held_rates(v);
     int64_t whole = to.point - from.point;
@@ -71,7 +71,7 @@ static void advance(State *state, Grid grid, GridPosition from, GridPosition to)
         const int last = to.point < next.point;
         move_to_sample(state, sample);
         if (to.point == from.point && to.fraction == from.fraction) return;
-        realise_disturbances(state);
+        realise(state);
         integrate(state->v, grid, from, last ? to : next);
         if (last) return;
         from = next;

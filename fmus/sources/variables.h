@@ -2,10 +2,10 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{0180995d-634d-5156-9930-7d3c128ab7c8}"
+#define MODEL_TOKEN "{6845faad-6b32-534a-ade1-10a1db5d77a9}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
-#define LAYOUT_DIGEST UINT64_C(0x4c5c8a2cae0d9624)
+#define LAYOUT_DIGEST UINT64_C(0xe41af7b351f96337)
 
 enum {
     VR_time = 0,
@@ -65,7 +65,11 @@ enum {
     VR_lambda_ = 54,
     VR_lambda_s = 55,
     VR_F3 = 56,
-    N_VARIABLES = 57
+    VR_fouling_rate = 57,
+    VR_fouling_floor = 58,
+    VR_cleaning_period = 59,
+    VR_UA2_present = 60,
+    N_VARIABLES = 61
 };
 
 typedef enum { REAL, BOOLEAN, LAW, SEED, SEED_HIGH } VariableType;
@@ -137,6 +141,10 @@ static const VariableInfo VARIABLES[N_VARIABLES] = {
     {"lambda_", REAL, TUNABLE, 38.5, 1.0, 1000.0, 38.5},
     {"lambda_s", REAL, TUNABLE, 36.6, 1.0, 1000.0, 36.6},
     {"F3", REAL, TUNABLE, 50.0, 0.0, 1000.0, 50.0},
+    {"fouling_rate", REAL, TUNABLE, 0.0, 0.0, 1000.0, 0.1},
+    {"fouling_floor", REAL, TUNABLE, 0.7, 0.0, 1.0, 0.7},
+    {"cleaning_period", REAL, TUNABLE, 6.0, 0.0, 100000.0, 6.0},
+    {"UA2_present", REAL, OUTPUT, 0.0, 0.0, 1000.0, 6.84},
 };
 
 #endif

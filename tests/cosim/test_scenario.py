@@ -11,7 +11,7 @@ from cosim.scenario import Scenario
 
 
 def test_presets_are_those_that_the_design_names():
-    assert presets() == ["fast-sampling", "fouled", "mismatched", "nominal", "paper"]
+    assert presets() == ["drifting", "fast-sampling", "fouled", "mismatched", "nominal", "paper"]
 
 
 def test_paper_holds_the_numbers_of_the_paper(paper):
@@ -56,6 +56,7 @@ def test_other_presets_differ_from_paper_in_what_their_name_says(paper):
         "fast-sampling": {"sampling_time"},
         "fouled": {"plant"},
         "mismatched": {"plant", "disturbance"},
+        "drifting": {"plant"},
     }
 
 

@@ -6,7 +6,7 @@ from fmus.dependencies import continuous_dependencies, initial_dependencies
 from fmus.variables import BY_NAME, VARIABLES, Kind, Type
 
 UNKNOWNS = [v.name for v in VARIABLES if v.kind in (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT)]
-MODES = [{}, {"law": 2}, {"stochastic": False}, {"override": True}]
+MODES = [{}, {"law": 2}, {"stochastic": False}, {"override": True}, {"fouling_rate": 0.3}]
 
 
 def moved(name: str) -> float:
@@ -32,14 +32,14 @@ def affected(instance, name: str, mode: dict[str, float]) -> set[str]:
 
 
 def test_initial_dependencies(open_fmu) -> None:
-    # far from the steady state, and not at time zero, where no grid makes another sample
+    # far from the steady state, and after a cleaning, where every grid and period matters
     base = {"X2_start": 30.0, "P2_start": 60.0, "X1_in": 6.0, "F1_in": 9.0, "T1_in": 50.0}
     found: dict[str, set[str]] = {name: set() for name in UNKNOWNS}
     settable = [v.name for v in VARIABLES if v.settable]
     for mode in MODES:
         instance = open_fmu(2)
         instance.set(**base, **mode)
-        instance.enter_initialisation(start=600.0)
+        instance.enter_initialisation(start=6.5 * 86400.0)
         for name in settable:
             for unknown in affected(instance, name, base | mode):
                 found[unknown].add(name)

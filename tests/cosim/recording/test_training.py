@@ -10,7 +10,7 @@ from cosim.errors import RecordingError
 from cosim.recording import TrainingRecorder, read_recording
 
 LABELS = ("b[0]", "b[1]", "c", "B[0,0]", "B[0,1]", "B[1,1]")
-BLOCKS = SimpleNamespace(
+LAYOUT = SimpleNamespace(
     slices={"b": slice(0, 2), "c": slice(2, 3), "B": slice(3, 6)}, labels=LABELS
 )
 
@@ -18,7 +18,7 @@ BLOCKS = SimpleNamespace(
 @dataclass
 class Theta:
     theta: np.ndarray
-    blocks = BLOCKS
+    layout = LAYOUT
     hash = "fedcba9876543210"
 
 

@@ -24,7 +24,9 @@ def adjoint(instance, seed: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "switches", [{}, {"law": 2}, {"stochastic": False}, {"override": True}], ids=str
+    "switches",
+    [{}, {"law": 2}, {"stochastic": False}, {"override": True}, {"fouling_rate": 2.0}],
+    ids=str,
 )
 @pytest.mark.parametrize("initialising", [True, False])
 def test_adjoint_is_the_transposed_jacobian(open_fmu, switches, initialising: bool) -> None:

@@ -11,7 +11,7 @@ from fmus.variables import BY_NAME, VARIABLES, Kind, Type, value_reference
 REALS = [v for v in VARIABLES if v.type is Type.REAL]
 UNKNOWNS = [v.name for v in REALS if v.kind in (Kind.OUTPUT, Kind.DERIVATIVE, Kind.STATE)]
 KNOWNS = [v.name for v in REALS if v.kind in (Kind.INPUT, Kind.TUNABLE)]
-SWITCHES = [{}, {"law": 2}, {"stochastic": False}, {"override": True}]
+SWITCHES = [{}, {"law": 2}, {"stochastic": False}, {"override": True}, {"fouling_rate": 2.0}]
 
 
 def jacobian(instance, unknowns: list[str], knowns: list[str]) -> np.ndarray:
@@ -19,17 +19,24 @@ def jacobian(instance, unknowns: list[str], knowns: list[str]) -> np.ndarray:
     return np.array(columns).T
 
 
+CENTRAL = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60, -1: -3 / 4, -2: 3 / 20, -3: -1 / 60}
+FORWARD = {0: -49 / 20, 1: 6.0, 2: -15 / 2, 3: 20 / 3, 4: -15 / 4, 5: 6 / 5, 6: -1 / 6}
+
+
 def differences(instance, unknowns: list[str], known: str) -> np.ndarray:
-    """Central differences of the sixth order, whose truncation error is below rounding."""
+    """Differences of the sixth order, whose truncation error is below rounding.
+
+    Central ones, but forward ones where the value is the least that the variable may have.
+    """
     centre = instance.get(known)[0]
-    h = 1e-3 * max(1e-2, abs(centre))
+    at_least = centre == BY_NAME[known].min
+    h = 1e-2 if at_least else 1e-3 * max(1e-2, abs(centre))
     total = np.zeros(len(unknowns))
-    for offset, weight in ((1, 45), (2, -9), (3, 1)):
-        for sign in (1, -1):
-            instance.set(**{known: centre + sign * offset * h})
-            total += sign * weight * np.array(instance.get(*unknowns))
+    for offset, weight in (FORWARD if at_least else CENTRAL).items():
+        instance.set(**{known: centre + offset * h})
+        total += weight * np.array(instance.get(*unknowns))
     instance.set(**{known: centre})
-    return total / (60 * h)
+    return total / h
 
 
 @pytest.mark.parametrize("switches", SWITCHES, ids=str)

@@ -2,18 +2,17 @@
 
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
-from controllers.layout import Layout
 from controllers.model import Model, Quantity
 from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.solution import LinearisationPoint, RtiSolution
+from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.theta import ThetaBlocks
 
 __all__ = [
     "ControllerError",
     "ConvergedNmpc",
-    "Layout",
     "LinearisationPoint",
     "Model",
     "OptimalPolicy",
@@ -23,4 +22,5 @@ __all__ = [
     "Quantity",
     "RtiNmpc",
     "RtiSolution",
+    "ThetaBlocks",
 ]

@@ -13,7 +13,7 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp
 from controllers.rti import RtiNmpc
-from controllers.solution import LinearisationPoint, RtiSolution
+from controllers.rti.solution import LinearisationPoint, RtiSolution
 
 Vector = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class ConvergedNmpc(RtiNmpc):
     ) -> None:
         """Build the functions; see the class."""
         self._tolerance, self._iterations = tolerance, iterations
-        self._merit = merit(problem, parameters.layout)
+        self._merit = merit(problem, parameters.blocks)
         self._known = _Known()
         self._programme = RtiNmpc(
             problem, parameters, hessian="exact-unlifted", backend=lambda: self._known

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.buffered import StackedFunction, stacked
-from controllers.layout import Layout
-from controllers.ocp import SymbolicParameters, sampled_jacobian
+from controllers.dynamics import sampled_jacobian
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Vector = NDArray[np.float64]
 
@@ -31,63 +31,61 @@ class Nlp:
     s: ca.SX
     x: ca.SX
     u: ca.SX
-    symbols: SymbolicParameters
+    symbols: SymbolicTheta
     cost: ca.SX
     defects: ca.SX
     problem: Problem
 
     @classmethod
-    def of(cls, problem: Problem, layout: Layout) -> Nlp:
-        """Write the programme for a problem and a layout of θ."""
+    def of(cls, problem: Problem, blocks: ThetaBlocks) -> Nlp:
+        """Write the programme for a problem and the blocks of θ."""
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        symbols = SymbolicParameters.of(problem, layout)
-        blocks = symbols.blocks
+        symbols = SymbolicTheta.of(problem, blocks)
         s = ca.SX.sym("s", n)
         x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
         x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
         states = ca.horzcat(s, x)
         violation = ca.fmax(ca.fmax(problem.state_lower - s, s - problem.state_upper), 0)
         cost = ca.dot(problem.penalty_linear, violation)
-        cost += ca.dot(problem.penalty_quadratic, violation**2) + blocks["c_lambda"]
-        cost += ca.bilin(blocks["B_lambda"], s - x_s) + ca.dot(blocks["b_lambda"], s - x_s)
+        cost += ca.dot(problem.penalty_quadratic, violation**2) + symbols["c_lambda"]
+        cost += ca.bilin(symbols["B_lambda"], s - x_s) + ca.dot(symbols["b_lambda"], s - x_s)
         defects = []
         for k in range(horizon):
             w = ca.vertcat(states[:, k] - x_s, u[:, k] - u_s)
-            stage = ca.bilin(blocks["B_l"], w) + ca.dot(blocks["b_l"], w)
+            stage = ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w)
             cost += problem.discount**k * stage
             x_next, _ = sampled_jacobian(problem, states[:, k], u[:, k], symbols.model_parameters)
-            defects.append(x_next + blocks["c_f"] - states[:, k + 1])
+            defects.append(x_next + symbols["c_f"] - states[:, k + 1])
         end = states[:, horizon] - x_s
-        terminal = ca.bilin(blocks["B_Vf"], end) + ca.dot(blocks["b_Vf"], end)
+        terminal = ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
         cost += problem.discount**horizon * terminal
         return cls(s, x, u, symbols, cost, ca.horzcat(*defects), problem)
 
     def penalty_of(self, slack: ca.SX) -> ca.SX:
         """Discounted penalty of the slack (n, N) of stages 1 … N."""
-        blocks = self.symbols.blocks
         total = ca.SX(0)
         for k in range(self.problem.horizon):
             weight = self.problem.discount ** (k + 1)
-            total += weight * ca.dot(blocks["w_sigma"], slack[:, k])
-            total += weight * ca.dot(blocks["W_sigma"], slack[:, k] ** 2)
+            total += weight * ca.dot(self.symbols["w_sigma"], slack[:, k])
+            total += weight * ca.dot(self.symbols["W_sigma"], slack[:, k] ** 2)
         return total
 
     @property
     def outside(self) -> ca.SX:
         """Distance of each predicted state beyond its learned bounds, negative inside."""
         count = self.problem.horizon
-        lower = ca.repmat(self.symbols.blocks["x_l"], 1, count)
-        upper = ca.repmat(self.symbols.blocks["x_u"], 1, count)
+        lower = ca.repmat(self.symbols["x_l"], 1, count)
+        upper = ca.repmat(self.symbols["x_u"], 1, count)
         return ca.fmax(lower - self.x, self.x - upper)
 
 
-def merit(problem: Problem, layout: Layout) -> StackedFunction:
+def merit(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     """Cost, its gradient, penalty and defects at a point, for an ℓ1 merit function.
 
     Inputs s, x, u, theta; results `cost`, `gradient` (N(n+m), states first), `penalty` and
     `infeasibility` ‖defects‖₁.
     """
-    nlp = Nlp.of(problem, layout)
+    nlp = Nlp.of(problem, blocks)
     return stacked(
         "merit",
         {"s": nlp.s, "x": nlp.x, "u": nlp.u, "theta": nlp.symbols.theta},
@@ -115,14 +113,14 @@ class IpoptNmpc:
     """The same programme solved by IPOPT with explicit slack: an independent implementation."""
 
     def __init__(
-        self, problem: Problem, layout: Layout, options: Mapping[str, Any] | None = None
+        self, problem: Problem, blocks: ThetaBlocks, options: Mapping[str, Any] | None = None
     ) -> None:
         """Build the solver; `options` are CasADi's, added to silent defaults of tolerance 1e-10."""
-        nlp = Nlp.of(problem, layout)
+        nlp = Nlp.of(problem, blocks)
         slack = ca.SX.sym("slack", problem.n_states, problem.horizon)
         z = ca.veccat(nlp.x, nlp.u, slack)
-        lower = ca.repmat(nlp.symbols.blocks["x_l"], 1, problem.horizon) - nlp.x - slack
-        upper = nlp.x - ca.repmat(nlp.symbols.blocks["x_u"], 1, problem.horizon) - slack
+        lower = ca.repmat(nlp.symbols["x_l"], 1, problem.horizon) - nlp.x - slack
+        upper = nlp.x - ca.repmat(nlp.symbols["x_u"], 1, problem.horizon) - slack
         defaults: dict[str, Any] = {
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",

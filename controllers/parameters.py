@@ -15,9 +15,9 @@ import tomli_w
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError, ParameterError
-from controllers.layout import Layout
 from controllers.problem import Problem
 from controllers.storage import write_atomically
+from controllers.theta import ThetaBlocks
 
 Vector = NDArray[np.float64]
 SCHEMA = 1
@@ -26,60 +26,60 @@ KEYS = ("schema", "hash", "theta", "model_parameters")
 
 @dataclass(frozen=True)
 class Parameters:
-    """A value `theta` of θ, (layout.size,), with its layout; `parameters["B_l"]` is a whole block.
+    """A value `theta` of θ, (blocks.size,), with its blocks; `parameters["B_l"]` is a whole block.
 
     Raises ParameterError on a vector of wrong length or with an entry that is not finite.
     """
 
-    layout: Layout
+    blocks: ThetaBlocks
     theta: Vector
 
     def __post_init__(self) -> None:
         """Keep a read-only copy of a valid vector."""
         theta = np.array(self.theta, dtype=np.float64)
-        if theta.shape != (self.layout.size,):
-            raise ParameterError(f"θ has shape {theta.shape}; it must have ({self.layout.size},)")
+        if theta.shape != (self.blocks.size,):
+            raise ParameterError(f"θ has shape {theta.shape}; it must have ({self.blocks.size},)")
         if not np.isfinite(theta).all():
-            bad = self.layout.labels[int(np.flatnonzero(~np.isfinite(theta))[0])]
+            bad = self.blocks.labels[int(np.flatnonzero(~np.isfinite(theta))[0])]
             raise ParameterError(f"θ is not finite at {bad}")
         theta.flags.writeable = False
         object.__setattr__(self, "theta", theta)
 
     def __getitem__(self, name: str) -> Vector:
         """Unpacked value of a block."""
-        return self.layout.block(name).unpack(self.theta[self.layout.slices[name]])
+        return self.blocks.block(name).unpack(self.theta[self.blocks.slices[name]])
 
     def replace(self, blocks: Mapping[str, ArrayLike]) -> Parameters:
         """Copy with the named blocks set to new values."""
         theta = self.theta.copy()
         for name, value in blocks.items():
-            theta[self.layout.slices[self.layout.block(name).name]] = self.layout.block(name).pack(
+            theta[self.blocks.slices[self.blocks.block(name).name]] = self.blocks.block(name).pack(
                 value
             )
-        return Parameters(self.layout, theta)
+        return Parameters(self.blocks, theta)
 
     def with_theta(self, theta: ArrayLike) -> Parameters:
         """Copy with another flat vector."""
-        return Parameters(self.layout, np.asarray(theta, dtype=np.float64))
+        return Parameters(self.blocks, np.asarray(theta, dtype=np.float64))
 
     def require_well_posed(self) -> None:
         """Raise ParameterError on an x_l not below its x_u or a slack weight not positive."""
         if not (self["x_l"] < self["x_u"]).all():
             raise ParameterError(f"θ: x_l = {self['x_l']} must stay below x_u = {self['x_u']}")
         for name in ("w_sigma", "W_sigma"):
-            if name in self.layout and not (self[name] > 0).all():
+            if name in self.blocks and not (self[name] > 0).all():
                 raise ParameterError(f"θ: {name} = {self[name]} must be positive")
 
     @property
     def hash(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of names and exact values."""
-        content = json.dumps([list(self.layout.labels), [float(v).hex() for v in self.theta]])
+        content = json.dumps([list(self.blocks.labels), [float(v).hex() for v in self.theta]])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
         """One line a block: name, meaning and value to six digits."""
-        lines = [f"θ {self.hash} ({self.layout.size} entries)"]
-        for block in self.layout.blocks:
+        lines = [f"θ {self.hash} ({self.blocks.size} entries)"]
+        for block in self.blocks:
             value = np.array2string(
                 self[block.name], precision=6, suppress_small=True, separator=", "
             )
@@ -88,14 +88,18 @@ class Parameters:
 
     @classmethod
     def naive(
-        cls, problem: Problem, layout: Layout | None = None, *, value_offset: float | None = None
+        cls,
+        problem: Problem,
+        blocks: ThetaBlocks | None = None,
+        *,
+        value_offset: float | None = None,
     ) -> Parameters:
         """The paper's naive guess: B_l = I, B_Vf = I, c_lambda = ℓ_s, true bounds, else 0.
 
         `value_offset` is c_lambda where it shall not be ℓ_s, for instance ℓ_s/(1−γ). Slack weights
         in θ start at the true penalty, model parameters at their nominal values.
         """
-        layout = layout or Layout.of(problem)
+        blocks = blocks or ThetaBlocks.of(problem)
         values: dict[str, ArrayLike] = {
             "B_l": np.eye(problem.n_states + problem.n_actions),
             "B_Vf": np.eye(problem.n_states),
@@ -103,20 +107,20 @@ class Parameters:
             "x_l": problem.state_lower,
             "x_u": problem.state_upper,
         }
-        if "w_sigma" in layout:
+        if "w_sigma" in blocks:
             values["w_sigma"] = problem.penalty_linear
             values["W_sigma"] = problem.penalty_quadratic
-        if "p" in layout:
-            chosen = problem.model.parameter_indices(layout.block("p").labels)
+        if "p" in blocks:
+            chosen = problem.model.parameter_indices(blocks.block("p").labels)
             values["p"] = problem.model.nominal_parameters[chosen]
-        return cls(layout, np.zeros(layout.size)).replace(values)
+        return cls(blocks, np.zeros(blocks.size)).replace(values)
 
     def save(self, path: str | Path) -> Path:
         """Write θ as TOML with schema version and hash; the file appears whole or not at all."""
-        blocks = {block.name: self[block.name].tolist() for block in self.layout.blocks}
-        document: dict[str, Any] = {"schema": SCHEMA, "hash": self.hash, "theta": blocks}
-        if "p" in self.layout:
-            document["model_parameters"] = list(self.layout.block("p").labels)
+        values = {block.name: self[block.name].tolist() for block in self.blocks}
+        document: dict[str, Any] = {"schema": SCHEMA, "hash": self.hash, "theta": values}
+        if "p" in self.blocks:
+            document["model_parameters"] = list(self.blocks.block("p").labels)
         return write_atomically(path, tomli_w.dumps(document))
 
     @classmethod
@@ -127,24 +131,24 @@ class Parameters:
         adds a key or a block, or where its values do not match its hash.
         """
         document = _read_document(Path(path))
-        blocks = document["theta"]
+        values = document["theta"]
         try:
-            layout = Layout.of(
+            blocks = ThetaBlocks.of(
                 problem,
-                slack_weights="w_sigma" in blocks or "W_sigma" in blocks,
+                slack_weights="w_sigma" in values or "W_sigma" in values,
                 model_parameters=tuple(document.get("model_parameters", ())),
             )
         except ModelError as error:
             raise ParameterError(f"{path}: {error}") from error
-        missing = [name for name in layout.slices if name not in blocks]
-        unknown = [name for name in blocks if name not in layout]
+        missing = [name for name in blocks.slices if name not in values]
+        unknown = [name for name in values if name not in blocks]
         if missing or unknown:
             raise ParameterError(
                 f"{path}: θ blocks missing: {', '.join(missing) or 'none'}; "
                 f"not known: {', '.join(unknown) or 'none'}"
             )
         try:
-            parameters = cls(layout, np.zeros(layout.size)).replace(blocks)
+            parameters = cls(blocks, np.zeros(blocks.size)).replace(values)
         except ParameterError as error:
             raise ParameterError(f"{path}: {error}") from error
         if document.get("hash", parameters.hash) != parameters.hash:

@@ -29,7 +29,7 @@ class Configuration(BaseModel):
     """Hyperparameters that every algorithm has; an algorithm adds its own in a subclass.
 
     A field's description is its documentation (`documentation`). Scaled coordinates are
-    θ / layout.scale, so that one step size fits all entries.
+    θ / blocks.scale, so that one step size fits all entries.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

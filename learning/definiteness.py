@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import solve_triangular
 
-from controllers.layout import Layout
+from controllers.theta import ThetaBlocks
 from learning.errors import DefinitenessError
 from learning.fit import Fit
 
@@ -48,19 +48,19 @@ Enforcement = Callable[[Vector, Fit], tuple[Vector, Certificate]]
 
 
 def certificate(
-    layout: Layout, theta: Vector, *, corrected: bool = False, refused: bool = False
+    blocks: ThetaBlocks, theta: Vector, *, corrected: bool = False, refused: bool = False
 ) -> Certificate:
     """Least eigenvalue of B_l and B_Vf at θ."""
     return Certificate(
-        {name: float(np.linalg.eigvalsh(matrix_of(layout, theta, name))[0]) for name in HESSIANS},
+        {name: float(np.linalg.eigvalsh(matrix_of(blocks, theta, name))[0]) for name in HESSIANS},
         corrected,
         refused,
     )
 
 
-def matrix_of(layout: Layout, theta: Vector, name: str) -> Matrix:
+def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
     """Symmetric block `name` of θ."""
-    return layout.block(name).unpack(theta[layout.slices[name]])
+    return blocks.block(name).unpack(theta[blocks.slices[name]])
 
 
 class LinearMatrixInequality:
@@ -70,35 +70,35 @@ class LinearMatrixInequality:
     a quadratic programme over positive semidefinite cones (paper.tex, eq. q_solution, pg_solution).
     """
 
-    def __init__(self, layout: Layout, smallest: float) -> None:
-        self._layout, self._smallest = layout, smallest
-        self._rows = {name: _triangle_rows(layout, name) for name in HESSIANS}
+    def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
+        self._blocks, self._smallest = blocks, smallest
+        self._rows = {name: _triangle_rows(blocks, name) for name in HESSIANS}
 
     def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
         """Step of the constrained fit; a failure of the solver refuses the step."""
-        layout = self._layout
-        free = theta + layout.scale * fit.minimiser
-        found = certificate(layout, free)
+        blocks = self._blocks
+        free = theta + blocks.scale * fit.minimiser
+        found = certificate(blocks, free)
         if found.smallest >= self._smallest:
             return free, found
         step = self.solve(theta, fit)
         if step is None:
-            return theta, certificate(layout, theta, corrected=True, refused=True)
+            return theta, certificate(blocks, theta, corrected=True, refused=True)
         # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
-        theta = clip_eigenvalues(layout, theta + layout.scale * step, self._smallest)
-        return theta, certificate(layout, theta, corrected=True)
+        theta = clip_eigenvalues(blocks, theta + blocks.scale * step, self._smallest)
+        return theta, certificate(blocks, theta, corrected=True)
 
     def solve(self, theta: Vector, fit: Fit) -> Vector | None:
         """Scaled step of the constrained fit by the conic solver, (n,), or None where it fails."""
-        layout = self._layout
-        size = layout.size
+        blocks = self._blocks
+        size = blocks.size
         matrices, offsets, cones = [], [], []
         for name in HESSIANS:
-            block, where = layout.block(name), layout.slices[name]
+            block, where = blocks.block(name), blocks.slices[name]
             order, weight = self._rows[name]
-            shifted = matrix_of(layout, theta, name) - self._smallest * np.eye(block.dimension)
+            shifted = matrix_of(blocks, theta, name) - self._smallest * np.eye(block.dimension)
             rows = np.zeros((block.size, size))
-            rows[np.arange(block.size), where.start + order] = -weight * layout.scale[where][order]
+            rows[np.arange(block.size), where.start + order] = -weight * blocks.scale[where][order]
             matrices.append(rows)
             offsets.append(weight * block.pack(shifted)[order])
             cones.append(clarabel.PSDTriangleConeT(block.dimension))
@@ -123,17 +123,17 @@ class LinearMatrixInequality:
 class EigenvalueProjection:
     """The free step, then each Hessian's eigenvalues raised to ε: nearest in Frobenius norm."""
 
-    def __init__(self, layout: Layout, smallest: float) -> None:
-        self._layout, self._smallest = layout, smallest
+    def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
+        self._blocks, self._smallest = blocks, smallest
 
     def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
         """Clip the eigenvalues after the free step."""
-        free = theta + self._layout.scale * fit.minimiser
-        found = certificate(self._layout, free)
+        free = theta + self._blocks.scale * fit.minimiser
+        found = certificate(self._blocks, free)
         if found.smallest >= self._smallest:
             return free, found
-        theta = clip_eigenvalues(self._layout, free, self._smallest)
-        return theta, certificate(self._layout, theta, corrected=True)
+        theta = clip_eigenvalues(self._blocks, free, self._smallest)
+        return theta, certificate(self._blocks, theta, corrected=True)
 
 
 class CholeskyParametrisation:
@@ -147,20 +147,20 @@ class CholeskyParametrisation:
 
     FLOOR = 1e-9
 
-    def __init__(self, layout: Layout, smallest: float) -> None:
-        self._layout, self._smallest = layout, smallest
+    def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
+        self._blocks, self._smallest = blocks, smallest
 
     def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
         """Move the factors; raises DefinitenessError where B(θ) ⪰ εI does not hold already."""
-        layout = self._layout
-        step = layout.scale * fit.minimiser
+        blocks = self._blocks
+        step = blocks.scale * fit.minimiser
         result = theta + step
-        corrected = certificate(layout, result).smallest < self._smallest
+        corrected = certificate(blocks, result).smallest < self._smallest
         for name in HESSIANS:
-            block, where = layout.block(name), layout.slices[name]
+            block, where = blocks.block(name), blocks.slices[name]
             shift = (self._smallest - self.FLOOR) * np.eye(block.dimension)
             try:
-                factor = np.linalg.cholesky(matrix_of(layout, theta, name) - shift)
+                factor = np.linalg.cholesky(matrix_of(blocks, theta, name) - shift)
             except np.linalg.LinAlgError as error:
                 raise DefinitenessError(
                     f"θ block {name} does not have all eigenvalues above {self._smallest}; "
@@ -174,31 +174,31 @@ class CholeskyParametrisation:
             moved = factor + factor @ lower
             matrix = moved @ moved.T + self._smallest * np.eye(block.dimension)
             result[where] = block.pack((matrix + matrix.T) / 2)
-        return result, certificate(layout, result, corrected=corrected)
+        return result, certificate(blocks, result, corrected=corrected)
 
 
-def clip_eigenvalues(layout: Layout, theta: Vector, smallest: float) -> Vector:
+def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vector:
     """Copy of θ whose Hessian blocks have no eigenvalue below `smallest`."""
     theta = theta.copy()
     for name in HESSIANS:
-        matrix = matrix_of(layout, theta, name)
+        matrix = matrix_of(blocks, theta, name)
         values, vectors = np.linalg.eigh(matrix)
         if values[0] < smallest:
             # Rounding of the product must not take the last digits back.
             values = np.maximum(values, smallest * (1 + 1e-9))
             matrix = (vectors * values) @ vectors.T
-            theta[layout.slices[name]] = layout.block(name).pack((matrix + matrix.T) / 2)
+            theta[blocks.slices[name]] = blocks.block(name).pack((matrix + matrix.T) / 2)
     return theta
 
 
-def _triangle_rows(layout: Layout, name: str) -> tuple[NDArray[np.intp], Vector]:
+def _triangle_rows(blocks: ThetaBlocks, name: str) -> tuple[NDArray[np.intp], Vector]:
     """Order and weights that turn a packed block into Clarabel's scaled triangle.
 
     Clarabel stacks the upper triangle column by column with √2 on the off-diagonal.
     """
-    dimension = layout.block(name).dimension
+    dimension = blocks.block(name).dimension
     position = np.zeros((dimension, dimension), dtype=np.intp)
-    position[np.triu_indices(dimension)] = np.arange(layout.block(name).size)
+    position[np.triu_indices(dimension)] = np.arange(blocks.block(name).size)
     pairs = [(i, j) for j in range(dimension) for i in range(j + 1)]
     order = np.array([position[i, j] for i, j in pairs], dtype=np.intp)
     weight = np.array([1.0 if i == j else np.sqrt(2.0) for i, j in pairs])
@@ -212,11 +212,11 @@ ENFORCEMENTS: dict[str, type] = {
 }
 
 
-def enforcement(kind: str, layout: Layout, smallest: float) -> Enforcement:
+def enforcement(kind: str, blocks: ThetaBlocks, smallest: float) -> Enforcement:
     """Enforcement by name; raises DefinitenessError on a name that there is not."""
     if kind not in ENFORCEMENTS:
         raise DefinitenessError(
             f"there is no enforcement of definiteness '{kind}'; there are {', '.join(ENFORCEMENTS)}"
         )
-    made: Enforcement = ENFORCEMENTS[kind](layout, smallest)
+    made: Enforcement = ENFORCEMENTS[kind](blocks, smallest)
     return made

@@ -48,7 +48,7 @@ class Evaluation:
 class Judge:
     """Judges a run's θ by its greedy policy on the held-out seeds.
 
-    `start` is a θ of the run's layout. `optimum` is a controller whose J on the same seeds is J*,
+    `start` is a θ of the run's blocks. `optimum` is a controller whose J on the same seeds is J*,
     for the gap closed; without it the gap is NaN.
     """
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import QpError
-from controllers.solution import LinearisationPoint
+from controllers.rti.solution import LinearisationPoint
 from cosim.penalty import Penalty
 from cosim.protocols import Step
 from cosim.scenario import Scenario
@@ -191,7 +191,7 @@ class Interaction:
         """π(s) of the cost with a linear term on the actions added to b_l."""
         controller, theta, point = self._controller, self._controller.theta, self._point
         assert point is not None
-        where = controller.parameters.layout.slices["b_l"]
+        where = controller.parameters.blocks.slices["b_l"]
         moved = theta.copy()
         moved[where.stop - gradient.size : where.stop] += gradient
         try:

@@ -58,7 +58,7 @@ class Level:
 
 def level(discount: float | None, scenario: Scenario, step: ParameterStep) -> Level:
     """Level for a scenario; `discount` None is the scenario's own."""
-    position = step.layout.slices["c_lambda"].start
+    position = step.blocks.slices["c_lambda"].start
     return Level(
         scenario.discount if discount is None else discount,
         position,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
-from controllers.solution import LinearisationPoint
+from controllers.rti.solution import LinearisationPoint
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.exploration import Strategy
@@ -44,7 +44,7 @@ class LearnableController(Protocol):
 
     @property
     def parameters(self) -> Parameters:
-        """θ with its layout."""
+        """θ with its blocks."""
 
     @property
     def linearisation_point(self) -> LinearisationPoint:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import QpError
-from controllers.solution import LinearisationPoint
+from controllers.rti.solution import LinearisationPoint
 from learning.level import Level
 from learning.protocols import LearnableController, LearnableSolution, Sample
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from controllers.converged import ConvergedNmpc
-from controllers.layout import Layout
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
+from controllers.theta import ThetaBlocks
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
@@ -25,8 +25,8 @@ def starting_parameters(problem: Problem, configuration: Configuration) -> Param
     if configuration.value_offset == "discounted" and problem.discount < 1:
         offset = problem.reference_cost / (1 - problem.discount)
     extended = configuration.parametrisation == "extended"
-    layout = Layout.of(problem, slack_weights=extended)
-    parameters = Parameters.naive(problem, layout, value_offset=offset)
+    blocks = ThetaBlocks.of(problem, slack_weights=extended)
+    parameters = Parameters.naive(problem, blocks, value_offset=offset)
     if not extended:
         return parameters
     ones = np.ones(problem.n_states)

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.layout import Layout
+from controllers.theta import ThetaBlocks
 from learning.configuration import Configuration
 from learning.definiteness import Certificate, certificate, enforcement
 from learning.errors import DivergenceError
@@ -28,11 +28,11 @@ class ParameterStep:
         self, controller: LearnableController, configuration: Configuration, *, scaled: bool = True
     ) -> None:
         self._controller = controller
-        layout = controller.parameters.layout
-        self.layout = layout if scaled else unscaled(layout)
-        self.scale: Vector = self.layout.scale
+        blocks = controller.parameters.blocks
+        self.blocks = blocks if scaled else unscaled(blocks)
+        self.scale: Vector = self.blocks.scale
         self._enforce = enforcement(
-            configuration.definiteness, self.layout, configuration.smallest_eigenvalue
+            configuration.definiteness, self.blocks, configuration.smallest_eigenvalue
         )
         self._weight_minimum = configuration.slack_linear_minimum
 
@@ -43,10 +43,10 @@ class ParameterStep:
             raise DivergenceError("the step of θ is not finite")
         new, vouched = self._enforce(theta, fit)
         new = self._admissible(new)
-        lower, upper = self.layout.slices["x_l"], self.layout.slices["x_u"]
+        lower, upper = self.blocks.slices["x_l"], self.blocks.slices["x_u"]
         if not (new[lower] < new[upper]).all():
             return theta, dataclasses.replace(
-                certificate(self.layout, theta), corrected=True, refused=True
+                certificate(self.blocks, theta), corrected=True, refused=True
             )
         return new, vouched
 
@@ -65,17 +65,17 @@ class ParameterStep:
 
     def _admissible(self, theta: Vector) -> Vector:
         """Keep learned slack weights above what exactness (linear) and convexity ask for."""
-        if "w_sigma" not in self.layout:
+        if "w_sigma" not in self.blocks:
             return theta
         theta = theta.copy()
         for name, minimum in (("w_sigma", self._weight_minimum), ("W_sigma", 1.0)):
-            where = self.layout.slices[name]
+            where = self.blocks.slices[name]
             theta[where] = np.maximum(theta[where], minimum)
         return theta
 
 
-def unscaled(layout: Layout) -> Layout:
-    """The layout with every learning scale 1, for steps in θ itself."""
-    return Layout(
-        tuple(dataclasses.replace(block, scale=(1.0,) * block.size) for block in layout.blocks)
+def unscaled(blocks: ThetaBlocks) -> ThetaBlocks:
+    """The blocks with every learning scale 1, for steps in θ itself."""
+    return ThetaBlocks(
+        tuple(dataclasses.replace(block, scale=(1.0,) * block.size) for block in blocks)
     )

@@ -110,14 +110,14 @@ class Training:
     def _row(self, number: int) -> Row:
         """A line of the log: what happened since the last one, and now and then an evaluation."""
         run, interaction = self._run, self._learner.interaction
-        layout, theta = self._good.layout, self._learner.controller.theta
+        blocks, theta = self._good.blocks, self._learner.controller.theta
         row: Row = dict.fromkeys(COLUMNS, float("nan"))
         row |= self._totals.means(number - (self._rows[-1]["samples"] if self._rows else 0))
         row |= {
             "samples": number,
             # The least certificate of the updates since the last row, whichever step gave it.
             "smallest_eigenvalue": min(
-                self._totals.smallest_eigenvalue, certificate(layout, theta).smallest
+                self._totals.smallest_eigenvalue, certificate(blocks, theta).smallest
             ),
             "failures": interaction.failures,
             "explored": interaction.explored,
@@ -127,7 +127,7 @@ class Training:
             figures = self._judge.figures(theta)
             row |= {f"greedy_{name}": value for name, value in figures.items()}
             row["gap_closed"] = self._judge.gap_closed(figures["J"])
-        row |= {f"theta {label}": float(v) for label, v in zip(layout.labels, theta, strict=True)}
+        row |= {f"theta {label}": float(v) for label, v in zip(blocks.labels, theta, strict=True)}
         self._totals = Totals()
         return row
 
@@ -143,8 +143,8 @@ class Training:
 
     def _record(self, row: Row) -> None:
         assert self._recorder is not None
-        layout = self._good.layout
-        theta = np.array([row[f"theta {label}"] for label in layout.labels])
+        blocks = self._good.blocks
+        theta = np.array([row[f"theta {label}"] for label in blocks.labels])
         self._recorder.record(row, self._good.with_theta(theta), self._judge.controller(theta))
 
     def _checkpoint(self) -> None:

@@ -196,7 +196,7 @@ def _ipopt(scenario: Scenario, visits: list[Visit]) -> tuple[list[float], int]:
     """Time IPOPT on the nonlinear programme, started at the RTI's guess; count the solved."""
     problem = Problem.from_scenario(scenario)
     parameters = naive_parameters(scenario, problem)
-    solver = IpoptNmpc(problem, parameters.layout, {"ipopt.tol": 1e-8} | WARM_START)
+    solver = IpoptNmpc(problem, parameters.blocks, {"ipopt.tol": 1e-8} | WARM_START)
     seconds, solved = [], 0
     for visit in visits:
         states = np.vstack([visit.point.x[1:], visit.point.x[-1:]])

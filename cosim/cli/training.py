@@ -155,4 +155,4 @@ def _start(task: Training) -> dict[str, float]:
     )
     problem = Problem.from_scenario(cast("Any", Scenario.load(task.folder / "scenario.toml")))
     start = starting_parameters(problem, configuration)
-    return dict(zip(start.layout.labels, start.theta.tolist(), strict=True))
+    return dict(zip(start.blocks.labels, start.theta.tolist(), strict=True))

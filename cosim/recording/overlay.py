@@ -11,8 +11,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.comparison import Comparison, Run
+from cosim.recording.blueprint import framed, series, time_axis, union
 from cosim.recording.channels import Channel
-from cosim.recording.layout import framed, series, time_axis, union
 from cosim.recording.palette import SERIES
 from cosim.recording.stream import Stream, line, sample_times
 from cosim.recording.text import drawable

@@ -13,8 +13,8 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.protocols import Controller
+from cosim.recording.blueprint import framed, sample_axis, series, union
 from cosim.recording.channels import Channel, escaped
-from cosim.recording.layout import framed, sample_axis, series, union
 from cosim.recording.palette import SERIES, packed, packed_all
 from cosim.recording.policy_map import PolicyMap
 from cosim.recording.stream import SAMPLE, Stream, line, mark
@@ -41,7 +41,7 @@ class Parameters(Protocol):
         """Flat vector, (n_θ,)."""
 
     @property
-    def layout(self) -> Any:
+    def blocks(self) -> Any:
         """Its `slices` give each block's place in θ, its `labels` a name for each entry."""
 
     @property
@@ -92,7 +92,7 @@ class TrainingRecorder:
     def start(self, run: TrainingRun, parameters: Parameters) -> None:
         """Open the file; the plots of θ count from these parameters."""
         self._samples, self._start = run.samples, parameters.theta.copy()
-        self._slices = parameters.layout.slices
+        self._slices = parameters.blocks.slices
         self._blocks = {name: Channel("theta", name, "", SERIES[0]) for name in self._slices}
         self._scalars: dict[str, Channel] = {}
         self._rows: list[Mapping[str, float]] = []
@@ -118,7 +118,7 @@ class TrainingRecorder:
         if len(scenario.plant.states) >= 2 and len(scenario.plant.actions) >= 2:
             self._map = PolicyMap(stream, scenario)
         for block, entries in self._slices.items():
-            _declare_block(stream, block, parameters.layout.labels[entries])
+            _declare_block(stream, block, parameters.blocks.labels[entries])
 
     def record(
         self, row: Mapping[str, float], parameters: Parameters, controller: Controller

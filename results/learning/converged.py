@@ -81,7 +81,7 @@ def main() -> None:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(("entry", "rti", "converged"))
-    for label, one, other in zip(start.layout.labels, rti, converged, strict=True):
+    for label, one, other in zip(start.blocks.labels, rti, converged, strict=True):
         writer.writerow((label, f"{one:.8g}", f"{other:.8g}"))
     write_atomically(arguments.out / "converged.csv", stream.getvalue())
 

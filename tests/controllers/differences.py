@@ -95,7 +95,7 @@ def natural_scale(parameters: Parameters) -> np.ndarray:
     scale = np.maximum(np.abs(parameters.theta), 1)
     for name in ("B_l", "B_Vf"):
         root = np.sqrt(np.diag(parameters[name]))
-        scale[parameters.layout.slices[name]] = np.outer(root, root)[np.triu_indices(root.size)]
+        scale[parameters.blocks.slices[name]] = np.outer(root, root)[np.triu_indices(root.size)]
     return scale
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from controllers import Layout, LinearisationPoint, Parameters, Problem
+from controllers import LinearisationPoint, Parameters, Problem, ThetaBlocks
 from controllers.evaporator import model
 
 
@@ -30,7 +30,9 @@ def evaporator_problem(**changes: object) -> Problem:
     return replace(problem, **changes)
 
 
-def random_parameters(problem: Problem, layout: Layout, rng: np.random.Generator) -> Parameters:
+def random_parameters(
+    problem: Problem, blocks: ThetaBlocks, rng: np.random.Generator
+) -> Parameters:
     """θ with positive definite Hessians, about the size that learning reaches."""
 
     def definite(size: int) -> np.ndarray:
@@ -51,12 +53,12 @@ def random_parameters(problem: Problem, layout: Layout, rng: np.random.Generator
         "x_l": problem.state_lower + rng.normal(size=n),
         "x_u": problem.state_upper + rng.normal(size=n),
     }
-    if "w_sigma" in layout:
+    if "w_sigma" in blocks:
         values["w_sigma"] = 80 + 50 * rng.random(n)
         values["W_sigma"] = 10 ** rng.uniform(-1, 3, size=n)
-    parameters = Parameters.naive(problem, layout).replace(values)
-    if "p" in layout:
-        spread = 1 + 0.05 * rng.normal(size=layout.block("p").size)
+    parameters = Parameters.naive(problem, blocks).replace(values)
+    if "p" in blocks:
+        spread = 1 + 0.05 * rng.normal(size=blocks.block("p").size)
         parameters = parameters.replace({"p": parameters["p"] * spread})
     return parameters
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from sampling import evaporator_problem
 
-from controllers import Layout, LinearisationPoint, Parameters, RtiNmpc, RtiSolution
+from controllers import LinearisationPoint, Parameters, RtiNmpc, RtiSolution, ThetaBlocks
 
 PATH = Path(__file__).parent / "data" / "qps.npz"
 HESSIANS = ("gauss-newton", "exact")
@@ -30,9 +30,9 @@ class StoredQp(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def layout() -> Layout:
+def blocks() -> ThetaBlocks:
     """All θ of the set have slack weights; the paper's own are set to the true penalty."""
-    return Layout.of(evaporator_problem(), slack_weights=True)
+    return ThetaBlocks.of(evaporator_problem(), slack_weights=True)
 
 
 def write(runs: list[tuple[str, Parameters]], samples: list[tuple[int, StoredQp]]) -> None:
@@ -56,7 +56,7 @@ def qps() -> tuple[StoredQp, ...]:
     """The whole set."""
     with np.load(PATH, allow_pickle=False) as stored:
         data = {name: stored[name] for name in stored.files}
-    thetas = [Parameters(layout(), theta) for theta in data["theta"]]
+    thetas = [Parameters(blocks(), theta) for theta in data["theta"]]
     return tuple(
         StoredQp(
             HESSIANS[data["hessian"][run]],

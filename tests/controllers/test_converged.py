@@ -5,7 +5,7 @@ import pytest
 from differences import assert_close, derivative, natural_scale
 from sampling import evaporator_problem, random_action, random_parameters, random_state
 
-from controllers import ConvergedNmpc, Layout, LinearisationPoint, Parameters, RtiNmpc
+from controllers import ConvergedNmpc, LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import QpError
 from controllers.nlp import IpoptNmpc
 
@@ -13,40 +13,40 @@ WHOLE = {"all": slice(None)}
 
 
 @pytest.fixture(scope="module")
-def layout():
-    return Layout.of(evaporator_problem(), slack_weights=True)
+def blocks():
+    return ThetaBlocks.of(evaporator_problem(), slack_weights=True)
 
 
 @pytest.fixture(scope="module")
-def converged(layout):
+def converged(blocks):
     problem = evaporator_problem()
-    return ConvergedNmpc(problem, Parameters.naive(problem, layout), tolerance=1e-10)
+    return ConvergedNmpc(problem, Parameters.naive(problem, blocks), tolerance=1e-10)
 
 
 @pytest.fixture(scope="module")
 def physical():
     problem = evaporator_problem()
-    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
-    return ConvergedNmpc(problem, Parameters.naive(problem, layout), tolerance=1e-10)
+    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
+    return ConvergedNmpc(problem, Parameters.naive(problem, blocks), tolerance=1e-10)
 
 
 @pytest.fixture(scope="module")
-def ipopt(layout):
-    return IpoptNmpc(evaporator_problem(), layout)
+def ipopt(blocks):
+    return IpoptNmpc(evaporator_problem(), blocks)
 
 
 @pytest.fixture(scope="module")
-def rtis(layout):
+def rtis(blocks):
     problem = evaporator_problem()
-    theta = Parameters.naive(problem, layout)
+    theta = Parameters.naive(problem, blocks)
     return {name: RtiNmpc(problem, theta, hessian=name) for name in ("gauss-newton", "exact")}
 
 
-def sample(problem, layout, number):
+def sample(problem, blocks, number):
     """The naive θ with the true penalty first, then random ones; every other with an action."""
     rng = np.random.default_rng(number)
-    theta = random_parameters(problem, layout, rng)
-    theta = theta if number > 3 else Parameters.naive(problem, layout)
+    theta = random_parameters(problem, blocks, rng)
+    theta = theta if number > 3 else Parameters.naive(problem, blocks)
     a = random_action(problem, rng) if number % 2 else None
     return theta, random_state(problem, rng), a
 
@@ -58,8 +58,8 @@ def solved(converged, theta, s, a=None):
 
 
 @pytest.mark.parametrize("number", range(24))
-def test_it_equals_ipopt(number, converged, ipopt, problem, layout):
-    theta, s, a = sample(problem, layout, number)
+def test_it_equals_ipopt(number, converged, ipopt, problem, blocks):
+    theta, s, a = sample(problem, blocks, number)
     ours, theirs = solved(converged, theta, s, a), ipopt.solve(theta, s, a)
     assert theirs.success
     assert ours.value == pytest.approx(theirs.value, rel=1e-6)
@@ -69,8 +69,8 @@ def test_it_equals_ipopt(number, converged, ipopt, problem, layout):
 
 
 @pytest.mark.parametrize("number", range(0, 24, 4))
-def test_a_warm_start_leads_to_the_same_solution(number, converged, problem, layout):
-    theta, s, a = sample(problem, layout, number)
+def test_a_warm_start_leads_to_the_same_solution(number, converged, problem, blocks):
+    theta, s, a = sample(problem, blocks, number)
     cold = solved(converged, theta, s, a)
     converged.prepare()
     warm = converged.feedback(s, a)
@@ -79,18 +79,18 @@ def test_a_warm_start_leads_to_the_same_solution(number, converged, problem, lay
 
 
 @pytest.mark.parametrize("number", [4, 5, 8, 11])
-def test_its_derivatives_are_those_of_the_programme(number, converged, problem, layout):
-    check_derivatives(number, converged, problem, layout)
+def test_its_derivatives_are_those_of_the_programme(number, converged, problem, blocks):
+    check_derivatives(number, converged, problem, blocks)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(4, 24))
 def test_so_are_those_by_model_parameters(number, physical, problem):
-    check_derivatives(number, physical, problem, physical.parameters.layout)
+    check_derivatives(number, physical, problem, physical.parameters.blocks)
 
 
-def check_derivatives(number, converged, problem, layout):
-    theta, s, a = sample(problem, layout, number)
+def check_derivatives(number, converged, problem, blocks):
+    theta, s, a = sample(problem, blocks, number)
     base = solved(converged, theta, s, a)
     assert not base.weakly_active
 
@@ -99,7 +99,7 @@ def check_derivatives(number, converged, problem, layout):
     )
     by_state = derivative(lambda x: solved(converged, theta, x, a), s, np.ones(2))
     for gradient, jacobian, fd, parts in (
-        (base.value_gradient, "policy_jacobian", by_theta, layout.slices),
+        (base.value_gradient, "policy_jacobian", by_theta, blocks.slices),
         (base.value_state_gradient, "policy_state_jacobian", by_state, WHOLE),
     ):
         assert_close(gradient, fd["value"], parts, "dV or dQ", fd["value_noise"])
@@ -112,9 +112,9 @@ def check_derivatives(number, converged, problem, layout):
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 @pytest.mark.parametrize("number", [4, 5, 6, 7])
 def test_value_gradients_are_those_of_the_rti_in_the_limit(
-    hessian, number, converged, rtis, problem, layout
+    hessian, number, converged, rtis, problem, blocks
 ):
-    theta, s, a = sample(problem, layout, number)
+    theta, s, a = sample(problem, blocks, number)
     expected = solved(converged, theta, s, a)
     rti = rtis[hessian]
     rti.parameters = theta
@@ -128,12 +128,12 @@ def test_value_gradients_are_those_of_the_rti_in_the_limit(
         )
         solution = rti.feedback(s, a)
     assert solution.value == pytest.approx(expected.value, rel=1e-9)
-    assert_close(solution.value_gradient, expected.value_gradient, layout.slices, "dV/dθ", 1e-8)
+    assert_close(solution.value_gradient, expected.value_gradient, blocks.slices, "dV/dθ", 1e-8)
     assert_close(solution.value_state_gradient, expected.value_state_gradient, WHOLE, "dV/ds", 1e-8)
 
 
-def test_its_predictions_follow_the_nonlinear_model(converged, problem, layout):
-    theta, s, _ = sample(problem, layout, 6)
+def test_its_predictions_follow_the_nonlinear_model(converged, problem, blocks):
+    theta, s, _ = sample(problem, blocks, 6)
     solution = solved(converged, theta, s)
     # Linearised at its own solution, the QP's model touches the nonlinear one there.
     point = solution.prepared.point
@@ -142,13 +142,13 @@ def test_its_predictions_follow_the_nonlinear_model(converged, problem, layout):
     assert solution.residual < 1e-9
 
 
-def test_value_and_action_value_agree_at_the_policy(converged, problem, layout):
+def test_value_and_action_value_agree_at_the_policy(converged, problem, blocks):
     for number in (4, 6, 8):
-        theta, s, _ = sample(problem, layout, number)
+        theta, s, _ = sample(problem, blocks, number)
         value = solved(converged, theta, s)
         action_value = converged.feedback(s, value.action)
         assert action_value.value == pytest.approx(value.value, rel=1e-8)
-        assert_close(action_value.value_gradient, value.value_gradient, layout.slices, "", 1e-6)
+        assert_close(action_value.value_gradient, value.value_gradient, blocks.slices, "", 1e-6)
 
 
 def test_too_few_iterations_raise_and_the_qp_is_carried(problem):

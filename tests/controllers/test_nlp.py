@@ -2,25 +2,25 @@ import numpy as np
 import pytest
 from sampling import evaporator_problem, random_parameters, random_point, random_state
 
-from controllers import Layout
+from controllers import ThetaBlocks
 from controllers.model import discretise
 from controllers.nlp import IpoptNmpc, merit
 
 
 @pytest.fixture(scope="module")
-def layout():
-    return Layout.of(evaporator_problem(), slack_weights=True)
+def blocks():
+    return ThetaBlocks.of(evaporator_problem(), slack_weights=True)
 
 
 @pytest.fixture(scope="module")
-def function(layout):
-    return merit(evaporator_problem(), layout)
+def function(blocks):
+    return merit(evaporator_problem(), blocks)
 
 
 @pytest.fixture
-def case(problem, layout, rng):
+def case(problem, blocks, rng):
     point = random_point(problem, rng)
-    return random_parameters(problem, layout, rng), random_state(problem, rng), point.x, point.u
+    return random_parameters(problem, blocks, rng), random_state(problem, rng), point.x, point.u
 
 
 def measured(function, theta, s, x, u):
@@ -70,9 +70,9 @@ def test_the_gradient_is_that_of_the_cost(function, case):
         assert gradient[i] == pytest.approx((ends[0] - ends[1]) / 0.2, rel=1e-6, abs=1e-6)
 
 
-def test_ipopts_value_is_the_merit_of_its_own_trajectory(function, layout, problem, case):
+def test_ipopts_value_is_the_merit_of_its_own_trajectory(function, blocks, problem, case):
     theta, s, _, _ = case
-    answer = IpoptNmpc(problem, layout).solve(theta, s)
+    answer = IpoptNmpc(problem, blocks).solve(theta, s)
     cost, penalty, infeasibility, _ = measured(
         function, theta, s, answer.states[1:], answer.controls
     )
@@ -82,7 +82,7 @@ def test_ipopts_value_is_the_merit_of_its_own_trajectory(function, layout, probl
     np.testing.assert_array_equal(answer.action, answer.controls[0])
 
 
-def test_ipopt_enforces_a_given_action(layout, problem, case):
+def test_ipopt_enforces_a_given_action(blocks, problem, case):
     theta, s, _, _ = case
-    answer = IpoptNmpc(problem, layout).solve(theta, s, [180.0, 230.0])
+    answer = IpoptNmpc(problem, blocks).solve(theta, s, [180.0, 230.0])
     np.testing.assert_allclose(answer.action, [180.0, 230.0], rtol=1e-12)

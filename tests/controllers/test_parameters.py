@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from sampling import evaporator_problem, random_parameters
 
-from controllers import Layout, Parameters
+from controllers import Parameters, ThetaBlocks
 from controllers.errors import ParameterError
 
-LAYOUTS = {
+BLOCKS = {
     "paper": {},
     "extended": {"slack_weights": True},
     "physical": {"slack_weights": True, "model_parameters": ("UA2", "h")},
 }
 
 
-@pytest.fixture(params=LAYOUTS)
+@pytest.fixture(params=BLOCKS)
 def parameters(request, problem, rng):
-    return random_parameters(problem, Layout.of(problem, **LAYOUTS[request.param]), rng)
+    return random_parameters(problem, ThetaBlocks.of(problem, **BLOCKS[request.param]), rng)
 
 
 def test_naive_is_the_papers_guess(problem):
@@ -35,7 +35,7 @@ def test_naive_takes_another_level_of_the_value(problem):
 
 
 def test_optional_blocks_start_at_the_true_penalty_and_the_nominal_model(problem):
-    theta = Parameters.naive(problem, Layout.of(problem, **LAYOUTS["physical"]))
+    theta = Parameters.naive(problem, ThetaBlocks.of(problem, **BLOCKS["physical"]))
     np.testing.assert_array_equal(theta["w_sigma"], [1e5, 1e5])
     np.testing.assert_array_equal(theta["W_sigma"], [1, 1])
     np.testing.assert_array_equal(theta["p"], [6.84, 0.16])
@@ -46,12 +46,12 @@ def test_replace_changes_the_named_blocks_only(problem):
     after = before.replace({"c_f": [0.5, -0.5]})
     np.testing.assert_array_equal(after["c_f"], [0.5, -0.5])
     changed = np.flatnonzero(after.theta != before.theta)
-    assert changed.tolist() == list(range(*before.layout.slices["c_f"].indices(after.layout.size)))
+    assert changed.tolist() == list(range(*before.blocks.slices["c_f"].indices(after.blocks.size)))
 
 
 def test_theta_cannot_be_written_nor_shared(problem):
-    source = np.zeros(Layout.of(problem).size)
-    theta = Parameters(Layout.of(problem), source)
+    source = np.zeros(ThetaBlocks.of(problem).size)
+    theta = Parameters(ThetaBlocks.of(problem), source)
     source[0] = 1.0
     assert theta.theta[0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
@@ -60,21 +60,21 @@ def test_theta_cannot_be_written_nor_shared(problem):
 
 def test_a_wrong_length_is_refused(problem):
     with pytest.raises(ParameterError, match=r"shape \(3,\); it must have \(31,\)"):
-        Parameters(Layout.of(problem), np.zeros(3))
+        Parameters(ThetaBlocks.of(problem), np.zeros(3))
 
 
 def test_an_entry_that_is_not_finite_is_named(problem):
-    layout = Layout.of(problem)
-    theta = np.zeros(layout.size)
-    theta[layout.slices["b_l"].start + 2] = np.nan
+    blocks = ThetaBlocks.of(problem)
+    theta = np.zeros(blocks.size)
+    theta[blocks.slices["b_l"].start + 2] = np.nan
     with pytest.raises(ParameterError, match=re.escape("not finite at b_l[2]")):
-        Parameters(layout, theta)
+        Parameters(blocks, theta)
 
 
 def test_printing_shows_hash_and_each_block(parameters):
     text = str(parameters)
     assert parameters.hash in text
-    assert [line.split()[0] for line in text.splitlines()[1:]] == list(parameters.layout.slices)
+    assert [line.split()[0] for line in text.splitlines()[1:]] == list(parameters.blocks.slices)
 
 
 # hash and file --------------------------------------------------------------------------------
@@ -88,8 +88,8 @@ def test_the_hash_tells_the_smallest_change(parameters):
 
 
 def test_the_hash_tells_which_model_parameters_are_meant(problem):
-    layouts = [Layout.of(problem, model_parameters=(name,)) for name in ("a", "b")]
-    first, second = (Parameters(layout, np.ones(layout.size)) for layout in layouts)
+    several = [ThetaBlocks.of(problem, model_parameters=(name,)) for name in ("a", "b")]
+    first, second = (Parameters(blocks, np.ones(blocks.size)) for blocks in several)
     assert first.hash != second.hash
 
 
@@ -99,7 +99,7 @@ def test_a_file_gives_back_the_same_bits(parameters, problem, tmp_path):
     written = parameters.with_theta(awkward)
     read = Parameters.load(written.save(tmp_path / "theta.toml"), problem)
     assert read.theta.tobytes() == written.theta.tobytes()
-    assert read.layout == written.layout
+    assert read.blocks == written.blocks
     assert read.hash == written.hash
 
 
@@ -162,7 +162,7 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_file_has_one_clear_error_that_names_it(case, problem, rng, tmp_path):
     pattern, replacement, message = BAD[case]
-    parameters = random_parameters(problem, Layout.of(problem, **LAYOUTS["physical"]), rng)
+    parameters = random_parameters(problem, ThetaBlocks.of(problem, **BLOCKS["physical"]), rng)
     path = parameters.save(tmp_path / "theta.toml")
     path.write_text(edited(path.read_text(), pattern, replacement))
     with pytest.raises(ParameterError, match=message) as caught:

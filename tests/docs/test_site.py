@@ -29,7 +29,7 @@ def test_the_site_builds_without_a_warning(build):
     folder, said = build
     assert "WARNING" not in said
     page = (folder / "reference" / "controllers" / "index.html").read_text()
-    assert "controllers.rti.RtiNmpc.feedback" in page
+    assert "controllers.rti.nmpc.RtiNmpc.feedback" in page
 
 
 @pytest.mark.slow

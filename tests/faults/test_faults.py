@@ -259,7 +259,7 @@ def test_an_evaluation_says_how_many_samples_failed(unreliable):
 
 
 def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, monkeypatch):
-    monkeypatch.setattr("controllers.rti.make_backend", lambda name: unreliable())
+    monkeypatch.setattr("controllers.rti.nmpc.make_backend", lambda name: unreliable())
     scenario = Scenario.load("paper")
     run = Run(
         algorithm="q-learning",

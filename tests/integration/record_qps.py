@@ -15,7 +15,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "controllers"))
 
 from sampling import evaporator_problem, random_action, random_parameters
-from stored import PATH, StoredQp, layout, write
+from stored import PATH, StoredQp, blocks, write
 
 from controllers import Parameters, RtiNmpc
 from cosim import FmuPlant
@@ -26,7 +26,7 @@ SAMPLES, EVERY = 90, 3
 def parameters() -> dict[str, Parameters]:
     """θ by name; tuned-like and greedy have the economic gradient and light action weights."""
     problem = evaporator_problem()
-    naive = Parameters.naive(problem, layout())
+    naive = Parameters.naive(problem, blocks())
     tuned = naive.replace(
         {
             "B_l": np.diag([0.9, 0.05, 0.006, 0.002]),
@@ -36,7 +36,7 @@ def parameters() -> dict[str, Parameters]:
     )
     # The coolant is worth so much that it goes to its bound, where the state then leaves its own.
     greedy = tuned.replace({"B_l": np.diag([0.9, 0.05, 0.01, 5e-4]), "b_l": [60.29, 0, -4, -0.25]})
-    learned = random_parameters(problem, layout(), np.random.default_rng(7)).replace(
+    learned = random_parameters(problem, blocks(), np.random.default_rng(7)).replace(
         {
             "x_l": [26.2, 40.3],
             "x_u": [99.0, 79.0],

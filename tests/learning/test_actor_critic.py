@@ -24,7 +24,7 @@ def algorithm(problem, scenario, **settings):
 
 def feed(actor, carrier, rng, slope, action, *, noise=0.0, clip=None):
     """Samples whose cost is linear in the applied action; only b_l's actions move the policy."""
-    size, where = carrier.theta.size, carrier.parameters.layout.slices["b_l"]
+    size, where = carrier.theta.size, carrier.parameters.blocks.slices["b_l"]
     jacobian = np.zeros((2, size))
     jacobian[0, where.stop - 2], jacobian[1, where.stop - 1] = -0.5, -0.5
     solution = Solution(action, jacobian)
@@ -57,7 +57,7 @@ def feed(actor, carrier, rng, slope, action, *, noise=0.0, clip=None):
 @pytest.mark.parametrize("natural", [True, False])
 def test_the_step_moves_the_policy_down_the_costs_slope(problem, scenario, rng, natural):
     carrier, actor = algorithm(problem, scenario, natural=natural)
-    where = carrier.parameters.layout.slices["b_l"]
+    where = carrier.parameters.blocks.slices["b_l"]
     before = carrier.theta[where].copy()
     update = feed(actor, carrier, rng, np.array([3.0, -1.0]), np.array([200.0, 200.0]))
     change = (carrier.theta[where] - before)[2:] * -0.5
@@ -68,7 +68,7 @@ def test_the_step_moves_the_policy_down_the_costs_slope(problem, scenario, rng, 
 
 def test_the_trust_region_bounds_the_rms_change_of_the_action(problem, scenario, rng):
     carrier, actor = algorithm(problem, scenario, radius=0.4, radius_end=0.4)
-    where = carrier.parameters.layout.slices["b_l"]
+    where = carrier.parameters.blocks.slices["b_l"]
     before = carrier.theta[where].copy()
     feed(actor, carrier, rng, np.array([30.0, -10.0]), np.array([200.0, 200.0]))
     assert np.linalg.norm((carrier.theta[where] - before)[2:] * -0.5) == pytest.approx(0.4)

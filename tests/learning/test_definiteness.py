@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from controllers.layout import Layout
 from controllers.parameters import Parameters
+from controllers.theta import ThetaBlocks
 from learning.definiteness import (
     LinearMatrixInequality,
     certificate,
@@ -18,137 +18,137 @@ KINDS = ("lmi", "projection", "cholesky")
 
 
 @pytest.fixture(scope="module")
-def layout(problem):
-    return Layout.of(problem)
+def blocks(problem):
+    return ThetaBlocks.of(problem)
 
 
 def fit_towards(target, metric):
     return Fit(metric @ target, target, lambda: metric)
 
 
-def random_fit(layout, rng, size=5.0):
-    root = rng.normal(size=(layout.size, layout.size))
-    return fit_towards(size * rng.normal(size=layout.size), root @ root.T + np.eye(layout.size))
+def random_fit(blocks, rng, size=5.0):
+    root = rng.normal(size=(blocks.size, blocks.size))
+    return fit_towards(size * rng.normal(size=blocks.size), root @ root.T + np.eye(blocks.size))
 
 
-def projected_gradient(layout, theta, fit, rounds=2000):
+def projected_gradient(blocks, theta, fit, rounds=2000):
     """The constrained fit by Frobenius projections: slow, and nothing in common with Clarabel."""
-    weight = 1.0 / layout.scale
+    weight = 1.0 / blocks.scale
     for name in ("B_l", "B_Vf"):
-        size = layout.block(name).dimension
+        size = blocks.block(name).dimension
         rows, columns = np.triu_indices(size)
-        weight[layout.slices[name]] = np.where(rows == columns, 1.0, np.sqrt(2.0))
+        weight[blocks.slices[name]] = np.where(rows == columns, 1.0, np.sqrt(2.0))
     # In y = weight · scale · d a block's norm is Frobenius's, so clipping is the projection.
-    unit = weight * layout.scale
+    unit = weight * blocks.scale
     metric = fit.metric() / np.outer(unit, unit)
     gradient = fit.gradient / unit
-    y = np.zeros(layout.size)
+    y = np.zeros(blocks.size)
     z, momentum = y.copy(), 1.0
     length = 1.0 / np.linalg.eigvalsh(metric)[-1]
     for _ in range(rounds):
         moved = theta + (z - length * (metric @ z - gradient)) / weight
-        new = (clip_eigenvalues(layout, moved, SMALLEST) - theta) * weight
+        new = (clip_eigenvalues(blocks, moved, SMALLEST) - theta) * weight
         following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
         z, y, momentum = new + (momentum - 1) / following * (new - y), new, following
     return theta + y / weight
 
 
-def objective(layout, theta, new, fit):
-    d = (new - theta) / layout.scale
+def objective(blocks, theta, new, fit):
+    d = (new - theta) / blocks.scale
     return d @ fit.metric() @ d - 2 * fit.gradient @ d
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_step_is_definite_and_certified(layout, parameters, rng, kind):
-    enforce = enforcement(kind, layout, SMALLEST)
+def test_every_step_is_definite_and_certified(blocks, parameters, rng, kind):
+    enforce = enforcement(kind, blocks, SMALLEST)
     theta = parameters.theta
     corrected = 0
     for _ in range(30):
-        new, vouched = enforce(theta, random_fit(layout, rng))
+        new, vouched = enforce(theta, random_fit(blocks, rng))
         assert vouched.smallest >= SMALLEST * (1 - 1e-9)
-        assert vouched.smallest == pytest.approx(certificate(layout, new).smallest)
+        assert vouched.smallest == pytest.approx(certificate(blocks, new).smallest)
         assert not vouched.refused
         corrected += vouched.corrected
     assert corrected > 20
 
 
 @pytest.mark.parametrize("kind", ["lmi", "projection"])
-def test_a_free_step_that_is_definite_is_taken_as_it_is(layout, parameters, rng, kind):
-    fit = random_fit(layout, rng, size=1e-3)
-    new, vouched = enforcement(kind, layout, SMALLEST)(parameters.theta, fit)
-    assert np.array_equal(new, parameters.theta + layout.scale * fit.minimiser)
+def test_a_free_step_that_is_definite_is_taken_as_it_is(blocks, parameters, rng, kind):
+    fit = random_fit(blocks, rng, size=1e-3)
+    new, vouched = enforcement(kind, blocks, SMALLEST)(parameters.theta, fit)
+    assert np.array_equal(new, parameters.theta + blocks.scale * fit.minimiser)
     assert not vouched.corrected
 
 
-def test_cholesky_takes_a_small_step_to_first_order(layout, parameters, rng):
-    enforce = enforcement("cholesky", layout, SMALLEST)
+def test_cholesky_takes_a_small_step_to_first_order(blocks, parameters, rng):
+    enforce = enforcement("cholesky", blocks, SMALLEST)
     errors = []
     for size in (1e-2, 1e-3):
-        fit = random_fit(layout, np.random.default_rng(1), size)
+        fit = random_fit(blocks, np.random.default_rng(1), size)
         new, _ = enforce(parameters.theta, fit)
-        free = parameters.theta + layout.scale * fit.minimiser
+        free = parameters.theta + blocks.scale * fit.minimiser
         errors.append(np.abs(new - free).max())
     # Second order: a tenth of the step leaves a hundredth of the error (and the tiny floor).
     assert errors[1] < 0.012 * errors[0] + 1e-8
 
 
-def test_cholesky_does_not_follow_a_step_far_beyond_the_present_hessian(layout, parameters, rng):
-    enforce = enforcement("cholesky", layout, SMALLEST)
-    fit = random_fit(layout, rng, size=1e4)
+def test_cholesky_does_not_follow_a_step_far_beyond_the_present_hessian(blocks, parameters, rng):
+    enforce = enforcement("cholesky", blocks, SMALLEST)
+    fit = random_fit(blocks, rng, size=1e4)
     new, vouched = enforce(parameters.theta, fit)
     assert vouched.smallest >= SMALLEST
     for name in ("B_l", "B_Vf"):
-        before, after = (matrix_of(layout, theta, name) for theta in (parameters.theta, new))
+        before, after = (matrix_of(blocks, theta, name) for theta in (parameters.theta, new))
         # ‖Φ(X)‖ ≤ √(n/2) for ‖X‖₂ = 1
         most = (1 + np.sqrt(len(before) / 2)) ** 2
         assert np.linalg.norm(after, 2) <= 1.01 * most * np.linalg.norm(before, 2)
 
 
-def test_lmi_step_equals_a_generic_conic_solution(layout, parameters, rng):
+def test_lmi_step_equals_a_generic_conic_solution(blocks, parameters, rng):
     theta = parameters.theta
     for _ in range(3):
-        root = rng.normal(size=(layout.size, layout.size)) / np.sqrt(layout.size)
-        metric = root @ root.T + 0.3 * np.eye(layout.size)
-        fit = fit_towards(2.0 * rng.normal(size=layout.size), metric)
-        new, vouched = LinearMatrixInequality(layout, SMALLEST)(theta, fit)
+        root = rng.normal(size=(blocks.size, blocks.size)) / np.sqrt(blocks.size)
+        metric = root @ root.T + 0.3 * np.eye(blocks.size)
+        fit = fit_towards(2.0 * rng.normal(size=blocks.size), metric)
+        new, vouched = LinearMatrixInequality(blocks, SMALLEST)(theta, fit)
         assert vouched.corrected
-        reference = projected_gradient(layout, theta, fit)
-        assert objective(layout, theta, new, fit) == pytest.approx(
-            objective(layout, theta, reference, fit), rel=1e-6
+        reference = projected_gradient(blocks, theta, fit)
+        assert objective(blocks, theta, new, fit) == pytest.approx(
+            objective(blocks, theta, reference, fit), rel=1e-6
         )
-        assert (new - reference) / layout.scale == pytest.approx(0.0, abs=1e-4)
+        assert (new - reference) / blocks.scale == pytest.approx(0.0, abs=1e-4)
 
 
-def test_lmi_is_never_worse_than_projection(layout, parameters, rng):
+def test_lmi_is_never_worse_than_projection(blocks, parameters, rng):
     theta = parameters.theta
     for _ in range(10):
-        fit = random_fit(layout, rng)
-        lmi, _ = enforcement("lmi", layout, SMALLEST)(theta, fit)
-        clipped, _ = enforcement("projection", layout, SMALLEST)(theta, fit)
-        best = objective(layout, theta, lmi, fit)
-        assert best <= objective(layout, theta, clipped, fit) + 1e-6 * abs(best)
+        fit = random_fit(blocks, rng)
+        lmi, _ = enforcement("lmi", blocks, SMALLEST)(theta, fit)
+        clipped, _ = enforcement("projection", blocks, SMALLEST)(theta, fit)
+        best = objective(blocks, theta, lmi, fit)
+        assert best <= objective(blocks, theta, clipped, fit) + 1e-6 * abs(best)
 
 
-def test_lmi_step_of_the_papers_fit_keeps_its_scale(layout, parameters, rng):
-    gradient = 1e4 * rng.normal(size=layout.size)
+def test_lmi_step_of_the_papers_fit_keeps_its_scale(blocks, parameters, rng):
+    gradient = 1e4 * rng.normal(size=blocks.size)
     fit = td_fit(-1e6, gradient, 10.0)
-    new, vouched = enforcement("lmi", layout, SMALLEST)(parameters.theta, fit)
+    new, vouched = enforcement("lmi", blocks, SMALLEST)(parameters.theta, fit)
     assert vouched.corrected and not vouched.refused
     assert np.isfinite(new).all()
-    assert objective(layout, parameters.theta, new, fit) <= 0.0
+    assert objective(blocks, parameters.theta, new, fit) <= 0.0
 
 
-def test_projection_is_the_nearest_definite_matrix(layout, parameters):
+def test_projection_is_the_nearest_definite_matrix(blocks, parameters):
     matrix = np.diag([1.0, -1.0, 2.0, 0.5])
     theta = parameters.replace({"B_l": matrix}).theta
-    clipped = matrix_of(layout, clip_eigenvalues(layout, theta, SMALLEST), "B_l")
+    clipped = matrix_of(blocks, clip_eigenvalues(blocks, theta, SMALLEST), "B_l")
     assert clipped == pytest.approx(np.diag([1.0, SMALLEST, 2.0, 0.5]))
 
 
-def test_cholesky_refuses_an_indefinite_start(layout, problem, rng):
+def test_cholesky_refuses_an_indefinite_start(blocks, problem, rng):
     theta = Parameters.naive(problem).replace({"B_Vf": np.diag([1.0, -1.0])}).theta
     with pytest.raises(DefinitenessError, match="B_Vf"):
-        enforcement("cholesky", layout, SMALLEST)(theta, random_fit(layout, rng))
+        enforcement("cholesky", blocks, SMALLEST)(theta, random_fit(blocks, rng))
 
 
 def test_unknown_enforcement_is_named():

@@ -77,7 +77,7 @@ def test_replay_sees_the_present_theta(scenario, collected):
     before = buffer.replay(controller, level(scenario))
     theta = controller.theta.copy()
     h = 1e-3
-    position = controller.parameters.layout.slices["b_l"].start
+    position = controller.parameters.blocks.slices["b_l"].start
     moved = theta.copy()
     moved[position] += h
     try:

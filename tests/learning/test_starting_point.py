@@ -12,7 +12,7 @@ def test_the_papers_theta_is_the_naive_guess(problem):
     theta = starting_parameters(
         problem, Configuration(parametrisation="paper", value_offset="stage-cost")
     )
-    assert "w_sigma" not in theta.layout
+    assert "w_sigma" not in theta.blocks
     assert theta["c_lambda"] == pytest.approx(problem.reference_cost)
     assert np.array_equal(theta["B_l"], np.eye(4))
 

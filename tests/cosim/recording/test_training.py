@@ -10,7 +10,7 @@ from cosim.errors import RecordingError
 from cosim.recording import TrainingRecorder, read_recording
 
 LABELS = ("b[0]", "b[1]", "c", "B[0,0]", "B[0,1]", "B[1,1]")
-LAYOUT = SimpleNamespace(
+BLOCKS = SimpleNamespace(
     slices={"b": slice(0, 2), "c": slice(2, 3), "B": slice(3, 6)}, labels=LABELS
 )
 
@@ -18,7 +18,7 @@ LAYOUT = SimpleNamespace(
 @dataclass
 class Theta:
     theta: np.ndarray
-    layout = LAYOUT
+    blocks = BLOCKS
     hash = "fedcba9876543210"
 
 

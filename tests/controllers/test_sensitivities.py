@@ -15,11 +15,11 @@ from sampling import (
     random_state,
 )
 
-from controllers import Layout, LinearisationPoint, Parameters, RtiNmpc
+from controllers import LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import ControllerError
 from controllers.qp import QpSolution
 
-LAYOUTS = {
+BLOCKS = {
     "paper": {},
     "extended": {"slack_weights": True},
     "physical": {"slack_weights": True, "model_parameters": ("UA2", "h")},
@@ -27,13 +27,13 @@ LAYOUTS = {
 HESSIANS = ("gauss-newton", "exact")
 WHOLE = {"all": slice(None)}
 FEW, MANY = 5, 40
-KINDS = [(layout, hessian) for layout in LAYOUTS for hessian in HESSIANS]
+KINDS = [(blocks, hessian) for blocks in BLOCKS for hessian in HESSIANS]
 
 
 @lru_cache
-def controller(layout, hessian, backend="daqp"):
+def controller(blocks, hessian, backend="daqp"):
     problem = evaporator_problem()
-    chosen = Layout.of(problem, **LAYOUTS[layout])
+    chosen = ThetaBlocks.of(problem, **BLOCKS[blocks])
     return RtiNmpc(problem, Parameters.naive(problem, chosen), hessian=hessian, backend=backend)
 
 
@@ -44,12 +44,12 @@ class Sample(NamedTuple):
     a: np.ndarray
 
 
-def sample(layout, hessian, number):
+def sample(blocks, hessian, number):
     """A random θ, linearisation point, state and action; some inputs are cheap and saturate."""
-    nmpc = controller(layout, hessian)
+    nmpc = controller(blocks, hessian)
     problem = nmpc.problem
-    rng = np.random.default_rng([KINDS.index((layout, hessian)), number])
-    theta = random_parameters(problem, nmpc.parameters.layout, rng)
+    rng = np.random.default_rng([KINDS.index((blocks, hessian)), number])
+    theta = random_parameters(problem, nmpc.parameters.blocks, rng)
     if number % 3 == 0:
         cheap = np.diag([1.0, 1.0, 0.2, 0.2])
         theta = theta.replace({"B_l": cheap @ theta["B_l"] @ cheap})
@@ -58,13 +58,13 @@ def sample(layout, hessian, number):
     return Sample(theta, point, random_state(problem, rng), random_action(problem, rng))
 
 
-def check_derivatives(layout, hessian, numbers):
-    nmpc = controller(layout, hessian)
-    slices = nmpc.parameters.layout.slices
+def check_derivatives(blocks, hessian, numbers):
+    nmpc = controller(blocks, hessian)
+    slices = nmpc.parameters.blocks.slices
     for number in numbers:
-        theta, point, s, a = sample(layout, hessian, number)
+        theta, point, s, a = sample(blocks, hessian, number)
         step = Feedback(nmpc, theta.theta, point, s)
-        label = f"{layout}, {hessian}, sample {number}"
+        label = f"{blocks}, {hessian}, sample {number}"
         value, action_value = step(), step(a=a)
         assert not value.weakly_active
         assert not action_value.weakly_active
@@ -90,24 +90,24 @@ def check_derivatives(layout, hessian, numbers):
         )
 
 
-@pytest.mark.parametrize(("layout", "hessian"), KINDS)
-def test_every_derivative_equals_finite_differences(layout, hessian):
-    check_derivatives(layout, hessian, range(FEW))
+@pytest.mark.parametrize(("blocks", "hessian"), KINDS)
+def test_every_derivative_equals_finite_differences(blocks, hessian):
+    check_derivatives(blocks, hessian, range(FEW))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("layout", "hessian"), KINDS)
-def test_every_derivative_equals_finite_differences_at_many_points(layout, hessian):
-    check_derivatives(layout, hessian, range(FEW, MANY))
+@pytest.mark.parametrize(("blocks", "hessian"), KINDS)
+def test_every_derivative_equals_finite_differences_at_many_points(blocks, hessian):
+    check_derivatives(blocks, hessian, range(FEW, MANY))
 
 
 @pytest.mark.parametrize("count", [FEW, MANY])
 def test_the_samples_hold_every_kind_of_activity(count):
     saturated = at_limit = violated = unconverged = 0
-    for layout, hessian in KINDS:
-        nmpc = controller(layout, hessian)
+    for blocks, hessian in KINDS:
+        nmpc = controller(blocks, hessian)
         for number in range(count):
-            theta, point, s, a = sample(layout, hessian, number)
+            theta, point, s, a = sample(blocks, hessian, number)
             step = Feedback(nmpc, theta.theta, point, s)
             for solution in (step(), step(a=a)):
                 held, limits, outside = solution.multipliers.active(solution.qp)
@@ -124,10 +124,10 @@ def test_the_samples_hold_every_kind_of_activity(count):
 
 
 def random_cases(backend="daqp"):
-    for layout, hessian in KINDS if backend == "daqp" else KINDS[:2]:
-        nmpc = controller(layout, hessian, backend)
+    for blocks, hessian in KINDS if backend == "daqp" else KINDS[:2]:
+        nmpc = controller(blocks, hessian, backend)
         for number in range(20):
-            theta, point, s, a = sample(layout, hessian, number)
+            theta, point, s, a = sample(blocks, hessian, number)
             nmpc.parameters = theta
             nmpc.prepare_at(point)
             yield nmpc, s, a
@@ -161,7 +161,7 @@ def test_no_action_is_worth_more_than_the_policys(cases):
 def test_value_and_action_value_have_the_same_gradients_at_the_policy(cases, backend):
     kinks = 0
     for nmpc, s, _ in cases(backend):
-        slices = nmpc.parameters.layout.slices
+        slices = nmpc.parameters.blocks.slices
         value = nmpc.feedback(s)
         action_value = nmpc.feedback(s, value.action)
         kinks += action_value.weakly_active
@@ -183,10 +183,10 @@ def test_value_and_action_value_have_the_same_gradients_at_the_policy(cases, bac
 # flags ----------------------------------------------------------------------------------------
 
 
-def change_of_activity(layout, number):
+def change_of_activity(blocks, number):
     """Two states 1e-13 apart whose QPs have different active sets, and the samples beside them."""
-    nmpc = controller(layout, "gauss-newton")
-    theta, point, low, _ = sample(layout, "gauss-newton", number)
+    nmpc = controller(blocks, "gauss-newton")
+    theta, point, low, _ = sample(blocks, "gauss-newton", number)
     step = Feedback(nmpc, theta.theta, point, low)
 
     def active(s):

@@ -3,37 +3,37 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controllers import Layout
+from controllers import ThetaBlocks
 from controllers.errors import ModelError, ParameterError
-from controllers.layout import Block
+from controllers.theta import Block
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 MATRIX = Block("B", "symmetric", 3, (1.0,) * 6)
 
 
 def test_the_papers_theta_has_its_blocks_in_order(problem):
-    layout = Layout.of(problem)
-    assert list(layout.slices) == [
+    blocks = ThetaBlocks.of(problem)
+    assert list(blocks.slices) == [
         "B_lambda", "b_lambda", "c_lambda", "B_Vf", "b_Vf", "B_l", "b_l", "c_f", "x_l", "x_u",
     ]  # fmt: skip
-    assert layout.size == 3 + 2 + 1 + 3 + 2 + 10 + 4 + 2 + 2 + 2
+    assert blocks.size == 3 + 2 + 1 + 3 + 2 + 10 + 4 + 2 + 2 + 2
 
 
 def test_slices_cover_theta_without_gap_or_overlap(problem):
-    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
-    covered = np.concatenate([np.arange(layout.size)[part] for part in layout.slices.values()])
-    np.testing.assert_array_equal(covered, np.arange(layout.size))
-    assert layout.scale.shape == (layout.size,)
-    assert (layout.scale > 0).all()
+    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
+    covered = np.concatenate([np.arange(blocks.size)[part] for part in blocks.slices.values()])
+    np.testing.assert_array_equal(covered, np.arange(blocks.size))
+    assert blocks.scale.shape == (blocks.size,)
+    assert (blocks.scale > 0).all()
 
 
 def test_labels_name_each_entry(problem):
-    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
-    assert len(set(layout.labels)) == layout.size
-    part = layout.labels[layout.slices["B_l"]]
+    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
+    assert len(set(blocks.labels)) == blocks.size
+    part = blocks.labels[blocks.slices["B_l"]]
     assert part[:5] == ("B_l[0,0]", "B_l[0,1]", "B_l[0,2]", "B_l[0,3]", "B_l[1,1]")
-    assert layout.labels[layout.slices["c_lambda"]] == ("c_lambda",)
-    assert layout.labels[layout.slices["p"]] == ("p[UA2]", "p[h]")
+    assert blocks.labels[blocks.slices["c_lambda"]] == ("c_lambda",)
+    assert blocks.labels[blocks.slices["p"]] == ("p[UA2]", "p[h]")
 
 
 def test_a_symmetric_matrix_is_packed_by_upper_rows():
@@ -71,14 +71,14 @@ def test_a_bad_value_is_refused_with_the_block_named(value, message):
 
 def test_an_unknown_block_is_named_with_those_there_are(problem):
     with pytest.raises(ParameterError, match=r"no block 'B_f'; it has B_lambda, .*x_u"):
-        Layout.of(problem).block("B_f")
+        ThetaBlocks.of(problem).block("B_f")
 
 
 def test_model_parameters_scale_with_their_nominal_value(problem):
-    layout = Layout.of(problem, model_parameters=("UA2", "h"))
-    np.testing.assert_allclose(layout.scale[layout.slices["p"]], [0.684, 0.016])
+    blocks = ThetaBlocks.of(problem, model_parameters=("UA2", "h"))
+    np.testing.assert_allclose(blocks.scale[blocks.slices["p"]], [0.684, 0.016])
 
 
 def test_an_unknown_model_parameter_is_refused(problem):
     with pytest.raises(ModelError, match="no parameter 'U'"):
-        Layout.of(problem, model_parameters=("U",))
+        ThetaBlocks.of(problem, model_parameters=("U",))

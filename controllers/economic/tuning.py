@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.convexification import Convexification, convexify
-from controllers.layout import Layout
-from controllers.local_feedback import LocalFeedback, local_feedback
+from controllers.economic.convexification import Convexification, convexify
+from controllers.economic.local_feedback import LocalFeedback, local_feedback
+from controllers.economic.steady_state import SteadyState, optimal_steady_state
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.steady_state import SteadyState, optimal_steady_state
+from controllers.theta import ThetaBlocks
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ class EconomicTuning:
 
 def tune(
     problem: Problem,
-    layout: Layout | None = None,
+    blocks: ThetaBlocks | None = None,
     *,
     value_offset: float | None = None,
     weight: float = 1e-2,
@@ -90,7 +90,7 @@ def tune(
         [problem.reference_state - steady.x, problem.reference_action - steady.u]
     )
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
-    parameters = Parameters.naive(problem, layout, value_offset=value_offset).replace(
+    parameters = Parameters.naive(problem, blocks, value_offset=value_offset).replace(
         {
             "B_l": _symmetric(0.5 * M),
             "b_l": q + M @ shift,

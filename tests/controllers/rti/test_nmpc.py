@@ -8,7 +8,7 @@ from sampling import (
     random_state,
 )
 
-from controllers import Layout, LinearisationPoint, Parameters, RtiNmpc
+from controllers import LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import ControllerError, ParameterError, QpError
 
 EXTENDED = {"slack_weights": True}
@@ -17,7 +17,7 @@ EXTENDED = {"slack_weights": True}
 @pytest.fixture(scope="module")
 def shared():
     problem = evaporator_problem()
-    theta = Parameters.naive(problem, Layout.of(problem, **EXTENDED))
+    theta = Parameters.naive(problem, ThetaBlocks.of(problem, **EXTENDED))
     return {hessian: RtiNmpc(problem, theta, hessian=hessian) for hessian in HESSIANS}
 
 
@@ -27,7 +27,7 @@ HESSIANS = ("gauss-newton", "exact")
 @pytest.fixture(params=HESSIANS)
 def nmpc(request, shared, problem):
     controller = shared[request.param]
-    controller.parameters = Parameters.naive(problem, controller.parameters.layout)
+    controller.parameters = Parameters.naive(problem, controller.parameters.blocks)
     controller.reset()
     return controller
 
@@ -144,8 +144,8 @@ def test_the_policy_keeps_the_bounds(nmpc, problem, rng):
 
 
 def test_replay_gives_the_same_bits_whatever_was_solved_before(nmpc, problem, rng):
-    layout = nmpc.parameters.layout
-    theta, other = (random_parameters(problem, layout, rng) for _ in range(2))
+    blocks = nmpc.parameters.blocks
+    theta, other = (random_parameters(problem, blocks, rng) for _ in range(2))
     nmpc.parameters = theta
     stored = []
     for number in range(20):
@@ -201,7 +201,7 @@ def test_a_point_is_a_copy_of_its_own(nmpc, problem, rng):
 
 def test_setting_theta_acts_on_the_next_feedback_at_the_same_point(nmpc, problem, rng):
     s, point = random_state(problem, rng), random_point(problem, rng)
-    theta = random_parameters(problem, nmpc.parameters.layout, rng)
+    theta = random_parameters(problem, nmpc.parameters.blocks, rng)
     nmpc.prepare_at(point)
     before = nmpc.feedback(s).value
     nmpc.prepare_at(point)
@@ -237,7 +237,7 @@ def test_a_bad_theta_is_refused_and_the_old_one_stays(case, nmpc):
 
 
 def test_another_layout_is_refused(nmpc, problem):
-    with pytest.raises(ParameterError, match=r"another layout .* build a new controller"):
+    with pytest.raises(ParameterError, match=r"other blocks .* build a new controller"):
         nmpc.parameters = Parameters.naive(problem)
 
 

@@ -1,11 +1,13 @@
-"""How θ is laid out in one flat vector: named blocks, symmetric packing, learning scales."""
+"""θ in one flat vector: named blocks, symmetric packing, learning scales, CasADi symbols."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -82,7 +84,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Layout:
+class ThetaBlocks:
     """The blocks of θ, in order."""
 
     blocks: tuple[Block, ...]
@@ -123,6 +125,10 @@ class Layout:
                 ]
         return tuple(names)
 
+    def __iter__(self) -> Iterator[Block]:
+        """The blocks, in order."""
+        return iter(self.blocks)
+
     def __contains__(self, name: str) -> bool:
         """Whether θ has a block of this name."""
         return name in self.slices
@@ -141,8 +147,8 @@ class Layout:
         *,
         slack_weights: bool = False,
         model_parameters: tuple[str, ...] = (),
-    ) -> Layout:
-        """Layout of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
+    ) -> ThetaBlocks:
+        """Blocks of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
 
         `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
         predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
@@ -181,3 +187,43 @@ class Layout:
                 )
             )
         return cls(tuple(blocks))
+
+
+def symmetric(packed: ca.SX, dimension: int) -> ca.SX:
+    """Symmetric matrix from its upper triangle, row by row."""
+    matrix = ca.SX(dimension, dimension)
+    position = 0
+    for i in range(dimension):
+        for j in range(i, dimension):
+            matrix[i, j] = matrix[j, i] = packed[position]
+            position += 1
+    return matrix
+
+
+@dataclass(frozen=True)
+class SymbolicTheta:
+    """θ as one symbol; `symbols["B_l"]` is a whole block, or the problem's constant without one."""
+
+    theta: ca.SX
+    unpacked: dict[str, ca.SX]
+    model_parameters: ca.SX
+
+    def __getitem__(self, name: str) -> ca.SX:
+        """Unpacked symbol of a block."""
+        return self.unpacked[name]
+
+    @classmethod
+    def of(cls, problem: Problem, blocks: ThetaBlocks) -> SymbolicTheta:
+        """Symbols for these blocks of θ."""
+        theta = ca.SX.sym("theta", blocks.size)
+        unpacked = {}
+        for block in blocks:
+            part = theta[blocks.slices[block.name]]
+            unpacked[block.name] = symmetric(part, block.dimension) if block.symmetric else part
+        unpacked.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
+        unpacked.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
+        parameters = ca.SX(ca.DM(problem.model.nominal_parameters))
+        if "p" in blocks:
+            for i, index in enumerate(problem.model.parameter_indices(blocks.block("p").labels)):
+                parameters[index] = unpacked["p"][i]
+        return cls(theta, unpacked, parameters)

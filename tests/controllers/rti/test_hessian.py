@@ -3,28 +3,28 @@ import numpy as np
 import pytest
 from sampling import evaporator_problem, random_parameters, random_point
 
-from controllers import Layout
+from controllers import ThetaBlocks
 from controllers.errors import ControllerError
-from controllers.hessian import Exact, Spectrum, make_hessian
 from controllers.model import discretise
-from controllers.ocp import preparation
+from controllers.rti.hessian import Exact, Spectrum, make_hessian
+from controllers.rti.preparation import preparation
 
 N, n, m = 10, 2, 2
 DISCOUNTS = 0.99 ** np.arange(N)
 
 
 @pytest.fixture(scope="module")
-def layout():
-    return Layout.of(evaporator_problem())
+def blocks():
+    return ThetaBlocks.of(evaporator_problem())
 
 
 @pytest.fixture(scope="module")
-def prepared(layout):
-    return preparation(evaporator_problem(), layout)
+def prepared(blocks):
+    return preparation(evaporator_problem(), blocks)
 
 
-def filled(name, prepared, layout, problem, parameters, point):
-    rule = make_hessian(name, problem, layout, prepared)
+def filled(name, prepared, blocks, problem, parameters, point):
+    rule = make_hessian(name, problem, blocks, prepared)
     rule.set_parameters(parameters)
     constant = rule.fill(*point)
     L, q = (prepared.inputs[part].reshape(N, n + m, -1).copy() for part in ("L", "q"))
@@ -41,10 +41,10 @@ def spectrum_of(matrix, floor):
     return Spectrum(values, vectors, np.array([[floor]]))
 
 
-def test_gauss_newton_is_the_discounted_cost_itself(prepared, layout, problem, rng):
-    parameters = random_parameters(problem, layout, rng)
+def test_gauss_newton_is_the_discounted_cost_itself(prepared, blocks, problem, rng):
+    parameters = random_parameters(problem, blocks, rng)
     _, L, q, constant = filled(
-        "gauss-newton", prepared, layout, problem, parameters, random_point(problem, rng)
+        "gauss-newton", prepared, blocks, problem, parameters, random_point(problem, rng)
     )
     for k in range(N):
         np.testing.assert_allclose(L[k], 2 * DISCOUNTS[k] * parameters["B_l"], rtol=1e-14)
@@ -57,9 +57,9 @@ def test_gauss_newton_is_the_discounted_cost_itself(prepared, layout, problem, r
     np.testing.assert_allclose(prepared.inputs["q_N"], end * parameters["b_Vf"], rtol=1e-14)
 
 
-def test_exact_unlifted_is_the_hessian_of_the_stage_lagrangian(prepared, layout, problem, rng):
-    parameters, point = random_parameters(problem, layout, rng), random_point(problem, rng)
-    _, L, _, _ = filled("exact-unlifted", prepared, layout, problem, parameters, point)
+def test_exact_unlifted_is_the_hessian_of_the_stage_lagrangian(prepared, blocks, problem, rng):
+    parameters, point = random_parameters(problem, blocks, rng), random_point(problem, rng)
+    _, L, _, _ = filled("exact-unlifted", prepared, blocks, problem, parameters, point)
     model = problem.model
     x, u, d, p = model.symbols()
     chi = ca.SX.sym("chi", n)
@@ -75,11 +75,11 @@ def test_exact_unlifted_is_the_hessian_of_the_stage_lagrangian(prepared, layout,
         np.testing.assert_allclose(L[k], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_exact_lifts_only_what_is_below_the_floor(prepared, layout, problem, rng):
-    parameters, point = random_parameters(problem, layout, rng), random_point(problem, rng)
+def test_exact_lifts_only_what_is_below_the_floor(prepared, blocks, problem, rng):
+    parameters, point = random_parameters(problem, blocks, rng), random_point(problem, rng)
     point.costates[:5] *= -300
-    _, raw, _, _ = filled("exact-unlifted", prepared, layout, problem, parameters, point)
-    _, L, _, _ = filled("exact", prepared, layout, problem, parameters, point)
+    _, raw, _, _ = filled("exact-unlifted", prepared, blocks, problem, parameters, point)
+    _, L, _, _ = filled("exact", prepared, blocks, problem, parameters, point)
     least = np.linalg.eigvalsh(raw)[:, 0]
     assert (least < 0).any(), "the test needs indefinite blocks"
     assert (least > Exact.FLOOR).any(), "the test needs definite blocks"
@@ -89,9 +89,9 @@ def test_exact_lifts_only_what_is_below_the_floor(prepared, layout, problem, rng
 
 
 @pytest.mark.parametrize("name", ["exact", "exact-unlifted"])
-def test_the_model_of_the_cost_touches_it_at_the_point(name, prepared, layout, problem, rng):
-    parameters, point = random_parameters(problem, layout, rng), random_point(problem, rng)
-    _, L, q, constant = filled(name, prepared, layout, problem, parameters, point)
+def test_the_model_of_the_cost_touches_it_at_the_point(name, prepared, blocks, problem, rng):
+    parameters, point = random_parameters(problem, blocks, rng), random_point(problem, rng)
+    _, L, q, constant = filled(name, prepared, blocks, problem, parameters, point)
     w = np.concatenate([point.x, point.u], axis=1)
     w -= np.concatenate([problem.reference_state, problem.reference_action])
     B, b = parameters["B_l"], parameters["b_l"]
@@ -130,6 +130,6 @@ def test_contract_holds_for_repeated_eigenvalues(rng):
     np.testing.assert_allclose(below, 0, atol=1e-15)
 
 
-def test_an_unknown_rule_is_refused_with_the_choices(prepared, layout, problem):
+def test_an_unknown_rule_is_refused_with_the_choices(prepared, blocks, problem):
     with pytest.raises(ControllerError, match="no Hessian 'bfgs'; choose gauss-newton or exact"):
-        make_hessian("bfgs", problem, layout, prepared)
+        make_hessian("bfgs", problem, blocks, prepared)

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.buffered import BufferedFunction, stacked
+from controllers.dynamics import sampled_curvature
 from controllers.errors import ControllerError
-from controllers.lagrangian import sampled_curvature
-from controllers.layout import Layout
-from controllers.ocp import SymbolicParameters
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Vector = NDArray[np.float64]
 RULES = ("gauss-newton", "exact", "exact-unlifted")
@@ -99,13 +98,17 @@ class Exact:
     spectrum: Spectrum | None = None
 
     def __init__(
-        self, problem: Problem, layout: Layout, prepared: BufferedFunction, floor: float = FLOOR
+        self,
+        problem: Problem,
+        blocks: ThetaBlocks,
+        prepared: BufferedFunction,
+        floor: float = FLOOR,
     ) -> None:
         self._floor = floor
         self._cost = GaussNewton(problem, prepared)
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = np.concatenate([problem.reference_state, problem.reference_action])
-        symbols = SymbolicParameters.of(problem, layout)
+        symbols = SymbolicTheta.of(problem, blocks)
         x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
         guess = ca.SX.sym("guess", n, horizon)
         self._curvature = stacked(
@@ -145,7 +148,7 @@ class Exact:
 
 
 def make_hessian(
-    name: str, problem: Problem, layout: Layout, prepared: BufferedFunction
+    name: str, problem: Problem, blocks: ThetaBlocks, prepared: BufferedFunction
 ) -> HessianRule:
     """Rule by name; raises ControllerError on an unknown one.
 
@@ -155,7 +158,7 @@ def make_hessian(
     if name == "gauss-newton":
         return GaussNewton(problem, prepared)
     if name == "exact":
-        return Exact(problem, layout, prepared)
+        return Exact(problem, blocks, prepared)
     if name == "exact-unlifted":
-        return Exact(problem, layout, prepared, floor=-np.inf)
+        return Exact(problem, blocks, prepared, floor=-np.inf)
     raise ControllerError(f"there is no Hessian '{name}'; choose {' or '.join(RULES)}")

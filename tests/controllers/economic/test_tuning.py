@@ -6,13 +6,13 @@ import pytest
 import scipy.linalg
 from sampling import evaporator_problem
 
-from controllers import Layout, LinearisationPoint, Model, Quantity, RtiNmpc
-from controllers.convexification import convexify, rotation
+from controllers import LinearisationPoint, Model, Quantity, RtiNmpc, ThetaBlocks
 from controllers.economic import tune
+from controllers.economic.convexification import convexify, rotation
+from controllers.economic.local_feedback import local_feedback
+from controllers.economic.steady_state import optimal_steady_state
 from controllers.errors import TuningError
-from controllers.local_feedback import local_feedback
 from controllers.model import discretise, economic_cost
-from controllers.steady_state import optimal_steady_state
 
 PROBLEMS = {
     "paper": evaporator_problem(),
@@ -186,8 +186,8 @@ def test_another_reference_changes_nothing_but_the_coordinates():
 
 def test_extended_layouts_are_tuned_too():
     problem = PROBLEMS["paper"]
-    layout = Layout.of(problem, slack_weights=True, model_parameters=("UA2",))
-    parameters = tune(problem, layout).parameters
+    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2",))
+    parameters = tune(problem, blocks).parameters
     np.testing.assert_array_equal(parameters["w_sigma"], problem.penalty_linear)
     np.testing.assert_array_equal(parameters["B_l"], tune(problem).parameters["B_l"])
 

@@ -5,7 +5,7 @@ import pytest
 from scalar import scalar_qp, solution
 from stored import prepared
 
-from controllers.qp.kink import settle
+from controllers.qp.enforced_action import multipliers_at_kink
 
 FREE = np.array([-10.0]), np.array([10.0])
 
@@ -19,13 +19,13 @@ def enforced(f, v):
 def test_away_from_the_kink_nothing_changes():
     qp = enforced(-3.0, 2.0)
     before = solution(2.0, -2.0, 3.0)
-    assert settle(qp, before, *FREE) is before
+    assert multipliers_at_kink(qp, before, *FREE) is before
 
 
 @pytest.mark.parametrize("lam", [0.0, 0.3, 1.0])
 def test_at_the_policy_the_multipliers_are_those_of_the_value(lam):
     # f = −1.5: the policy is v = 1 with λ = 0.5, ν = 0; any λ in [0, 1] solves Q(s, 1).
-    settled = settle(enforced(-1.5, 1.0), solution(1.0, 0.5 - lam, lam), *FREE)
+    settled = multipliers_at_kink(enforced(-1.5, 1.0), solution(1.0, 0.5 - lam, lam), *FREE)
     np.testing.assert_allclose(np.ravel(settled), [1.0, 0.0, 0.5], atol=1e-15)
 
 
@@ -37,13 +37,13 @@ def test_at_the_policy_the_multipliers_are_those_of_the_value(lam):
     ],
 )
 def test_elsewhere_the_multipliers_stay_within_their_range(f, expected):
-    settled = settle(enforced(f, 1.0), solution(1.0, -f - 1.0 - 0.3, 0.3), *FREE)
+    settled = multipliers_at_kink(enforced(f, 1.0), solution(1.0, -f - 1.0 - 0.3, 0.3), *FREE)
     np.testing.assert_allclose(np.ravel(settled), expected, atol=1e-15)
 
 
 def test_a_saturated_action_keeps_its_own_multiplier():
     # At the actuator's bound, dQ/da need not vanish, so nothing asks for λ > 0.
-    settled = settle(
+    settled = multipliers_at_kink(
         enforced(-1.5, 1.0), solution(1.0, 0.2, 0.3), np.array([-10.0]), np.array([1.0])
     )
     np.testing.assert_allclose(np.ravel(settled), [1.0, 0.5, 0.0], atol=1e-15)

@@ -11,14 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.blas import dasum
 
 from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.hessian import make_hessian
-from controllers.lagrangian import readout, sensitivities
-from controllers.ocp import embedding, preparation, qp_in_memory
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend, make_backend
-from controllers.qp.kink import settle
-from controllers.solution import Functions, LinearisationPoint, Prepared, RtiSolution
+from controllers.qp.enforced_action import multipliers_at_kink
+from controllers.rti.feedback import embedding, readout
+from controllers.rti.hessian import make_hessian
+from controllers.rti.preparation import preparation, qp_in_memory
+from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
+from controllers.sensitivities import sensitivities
 
 Vector = NDArray[np.float64]
 
@@ -53,15 +54,15 @@ class RtiNmpc:
     ) -> None:
         """Build the CasADi functions and the workspace of the backend; see the class."""
         self.problem = problem
-        layout = parameters.layout
+        blocks = parameters.blocks
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
         self._backend = self._make_backend()
-        self._prepare = preparation(problem, layout)
-        self._embed = embedding(problem, layout, self._prepare)
-        self._hessian = make_hessian(hessian, problem, layout, self._prepare)
-        gradient, policy = sensitivities(problem, layout, exact=hessian != "gauss-newton")
-        self._readout = readout(problem, layout, self._prepare)
+        self._prepare = preparation(problem, blocks)
+        self._embed = embedding(problem, blocks, self._prepare)
+        self._hessian = make_hessian(hessian, problem, blocks, self._prepare)
+        gradient, policy = sensitivities(problem, blocks, exact=hessian != "gauss-newton")
+        self._readout = readout(problem, blocks, self._prepare)
         self._functions = Functions(
             problem, self._prepare, self._embed, self._readout, gradient, policy
         )
@@ -80,7 +81,7 @@ class RtiNmpc:
     def parameters(self) -> Parameters:
         """Parameters θ; setting them keeps the guess and makes the next feedback prepare anew.
 
-        Raises ParameterError where the layout differs, a learned lower bound is not below the
+        Raises ParameterError where the blocks differ, a learned lower bound is not below the
         upper one or a slack weight is not positive.
         """
         return self._parameters
@@ -88,10 +89,10 @@ class RtiNmpc:
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
         current = getattr(self, "_parameters", parameters)
-        if parameters.layout != current.layout:
+        if parameters.blocks != current.blocks:
             raise ParameterError(
-                "θ has another layout than the controller was built with: "
-                f"{', '.join(parameters.layout.slices)}; build a new controller for it"
+                "θ has other blocks than the controller was built with: "
+                f"{', '.join(parameters.blocks.slices)}; build a new controller for it"
             )
         parameters.require_well_posed()
         problem, horizon = self.problem, self.problem.horizon
@@ -100,7 +101,7 @@ class RtiNmpc:
         for function in (self._prepare, self._embed, self._readout):
             function.inputs["theta"][:] = parameters.theta
         discounts = np.repeat(problem.discount ** np.arange(1, horizon + 1), problem.n_states)
-        learned = "w_sigma" in parameters.layout
+        learned = "w_sigma" in parameters.blocks
         w = parameters["w_sigma"] if learned else problem.penalty_linear
         W = parameters["W_sigma"] if learned else problem.penalty_quadratic
         self._qp.w = discounts * np.tile(w, horizon)
@@ -232,7 +233,9 @@ class RtiNmpc:
             )
         multipliers = self._backend.solve(qp)
         if a is not None:
-            multipliers = settle(qp, multipliers, self._action_lower[:m], self._action_upper[:m])
+            multipliers = multipliers_at_kink(
+                qp, multipliers, self._action_lower[:m], self._action_upper[:m]
+            )
         inputs = self._readout.inputs
         inputs["s"][:], inputs["constant"][0] = s, self._constant
         inputs["v"][:], inputs["lam"][:] = multipliers.v, multipliers.lam

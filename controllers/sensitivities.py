@@ -1,4 +1,4 @@
-"""The Lagrangian of the QP in CasADi: read-outs of a solution and their derivatives.
+"""Sensitivities of the QP: dV/dθ, dQ/dθ and, along the KKT adjoints, dπ/dθ.
 
 The QP's value has the gradient ∇θ of the QP's Lagrangian at the primal-dual solution y, and the
 derivative of y is minus the inverse KKT matrix times ∇θ∇_y of that Lagrangian (paper.tex, RTI
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import casadi as ca
 
 from controllers.buffered import StackedFunction, stacked
-from controllers.layout import Layout
-from controllers.ocp import SymbolicParameters, linearisation, sampled_jacobian
+from controllers.dynamics import linearisation, sampled_curvature
 from controllers.problem import Problem
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
 @dataclass(frozen=True)
@@ -45,106 +45,9 @@ class PrimalDual:
         return {prefix + name: getattr(self, name) for name in ("xi", "v", "t", "lam", "chi")}
 
 
-def sampled_curvature(
-    problem: Problem, symbols: SymbolicParameters, x: ca.SX, u: ca.SX, chi: ca.SX
-) -> list[ca.SX]:
-    """Second derivatives D_k of χ_{k+1}ᵀ f(x_k, u_k) with respect to (x, u), stage by stage."""
-    curvature = []
-    for k in range(problem.horizon):
-        point = ca.SX.sym("point", problem.n_states + problem.n_actions)
-        x_k, u_k = point[: problem.n_states], point[problem.n_states :]
-        x_next, _ = sampled_jacobian(problem, x_k, u_k, symbols.model_parameters)
-        costate = ca.SX.sym("costate", problem.n_states)
-        hessian, _ = ca.hessian(ca.dot(costate, x_next), point)
-        curvature.append(
-            ca.substitute(
-                hessian,
-                ca.vertcat(point, costate),
-                ca.vertcat(x[:, k], u[:, k], chi[:, k]),
-            )
-        )
-    return curvature
-
-
-def readout(problem: Problem, layout: Layout, prepared: StackedFunction) -> StackedFunction:
-    """States, slack, costates and value that belong to a solution (v, λ) of the condensed QP.
-
-    Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta; the QP's
-    A, B, r, L, q, L_N, q_N are read from the preparation's memory. Results: xi (n, N+1), t (n, N),
-    chi (n, N+1), value.
-    The costates χ solve the adjoint recursion, so χ_0 is the gradient of the value in s.
-    """
-    n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    symbols = SymbolicParameters.of(problem, layout)
-    blocks = symbols.blocks
-    x_s = ca.DM(problem.reference_state)
-    s, v, lam = ca.SX.sym("s", n), ca.SX.sym("v", m, horizon), ca.SX.sym("lam", n, horizon)
-    A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
-    r = ca.SX.sym("r", n, horizon)
-    L, q = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("q", n + m, horizon)
-    L_N, q_N, constant = ca.SX.sym("L_N", n, n), ca.SX.sym("q_N", n), ca.SX.sym("constant")
-
-    violation = ca.fmax(ca.fmax(problem.state_lower - s, s - problem.state_upper), 0)
-    known = ca.dot(problem.penalty_linear, violation) + ca.dot(
-        problem.penalty_quadratic, violation**2
-    )
-    xi = [s - x_s]
-    value = constant + known + blocks["c_lambda"]
-    value += ca.bilin(blocks["B_lambda"], xi[0]) + ca.dot(blocks["b_lambda"], xi[0])
-    t, weights = [], []
-    for k in range(horizon):
-        w = ca.vertcat(xi[k], v[:, k])
-        weights.append(L[:, k * (n + m) : (k + 1) * (n + m)])
-        value += ca.bilin(weights[k], w) / 2 + ca.dot(q[:, k], w)
-        columns = slice(k * n, (k + 1) * n)
-        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ v[:, k] + r[:, k])
-        outside = ca.fmax(blocks["x_l"] - x_s - xi[k + 1], xi[k + 1] - blocks["x_u"] + x_s)
-        t.append(ca.fmax(outside, 0))
-        value += gamma ** (k + 1) * (
-            ca.dot(blocks["w_sigma"], t[k]) + ca.dot(blocks["W_sigma"], t[k] ** 2)
-        )
-    value += ca.bilin(L_N, xi[horizon]) / 2 + ca.dot(q_N, xi[horizon])
-
-    chi = [L_N @ xi[horizon] + q_N + lam[:, horizon - 1]]
-    for k in reversed(range(horizon)):
-        w = ca.vertcat(xi[k], v[:, k])
-        costate = weights[k][:n, :] @ w + q[:n, k] + A[:, k * n : (k + 1) * n] @ chi[0]
-        if k == 0:
-            costate += 2 * blocks["B_lambda"] @ xi[0] + blocks["b_lambda"]
-            costate += ca.gradient(known, s)
-        else:
-            costate += lam[:, k - 1]
-        chi.insert(0, costate)
-    return stacked(
-        "readout",
-        {
-            "s": s,
-            "v": v,
-            "lam": lam,
-            "A": A,
-            "B": B,
-            "r": r,
-            "L": L,
-            "q": q,
-            "L_N": L_N,
-            "q_N": q_N,
-            "constant": constant,
-            "theta": symbols.theta,
-        },
-        {
-            "xi": ca.horzcat(*xi),
-            "t": ca.horzcat(*t),
-            "chi": ca.horzcat(*chi),
-            "value": value,
-        },
-        {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
-        | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N")},
-    )
-
-
 def _theta_part(
     problem: Problem,
-    symbols: SymbolicParameters,
+    symbols: SymbolicTheta,
     y: PrimalDual,
     x: ca.SX,
     u: ca.SX,
@@ -156,35 +59,34 @@ def _theta_part(
     stage's second-order term with respect to L_k, and χ̄ are the costates at which D_k was taken.
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    blocks = symbols.blocks
     x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
-    part = ca.bilin(blocks["B_lambda"], y.xi[:, 0]) + ca.dot(blocks["b_lambda"], y.xi[:, 0])
-    part += blocks["c_lambda"]
+    part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
+    part += symbols["c_lambda"]
     by_state, by_action, offset = linearisation(problem, symbols, x, u)
     curvature = sampled_curvature(problem, symbols, x, u, exact[1]) if exact else []
     for k in range(horizon):
         w = ca.vertcat(y.xi[:, k], y.v[:, k])
-        stage = ca.dot(blocks["b_l"], w)
+        stage = ca.dot(symbols["b_l"], w)
         if exact is None:
-            stage += ca.bilin(blocks["B_l"], w)
+            stage += ca.bilin(symbols["B_l"], w)
         else:
             at = ca.vertcat(x[:, k] - x_s, u[:, k] - u_s)
             columns = slice(k * (n + m), (k + 1) * (n + m))
             M = exact[0][:, columns]
-            stage += ca.bilin(blocks["B_l"], at, 2 * w - at) + 2 * ca.dot(M, blocks["B_l"])
+            stage += ca.bilin(symbols["B_l"], at, 2 * w - at) + 2 * ca.dot(M, symbols["B_l"])
             part += ca.dot(M, curvature[k])
         predicted = by_state[k] @ y.xi[:, k] + by_action[k] @ y.v[:, k] + offset[k]
         part += gamma**k * stage + ca.dot(y.chi[:, k + 1], predicted)
-        part += gamma ** (k + 1) * ca.dot(blocks["w_sigma"], y.t[:, k])
-        part += gamma ** (k + 1) * ca.dot(blocks["W_sigma"], y.t[:, k] ** 2)
-        part += ca.dot(ca.fmax(-y.lam[:, k], 0), blocks["x_l"])
-        part -= ca.dot(ca.fmax(y.lam[:, k], 0), blocks["x_u"])
+        part += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], y.t[:, k])
+        part += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], y.t[:, k] ** 2)
+        part += ca.dot(ca.fmax(-y.lam[:, k], 0), symbols["x_l"])
+        part -= ca.dot(ca.fmax(y.lam[:, k], 0), symbols["x_u"])
     end = y.xi[:, horizon]
-    return part + gamma**horizon * (ca.bilin(blocks["B_Vf"], end) + ca.dot(blocks["b_Vf"], end))
+    return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
 
 
 def sensitivities(
-    problem: Problem, layout: Layout, *, exact: bool
+    problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, StackedFunction]:
     """Gradient of the value in θ, and its directional derivatives along the KKT adjoints.
 
@@ -195,7 +97,7 @@ def sensitivities(
     second also dM, the directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    symbols = SymbolicParameters.of(problem, layout)
+    symbols = SymbolicTheta.of(problem, blocks)
     y = PrimalDual.symbols(problem)
     x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
     M = ca.SX.sym("M", n + m, horizon * (n + m))

@@ -5,33 +5,36 @@ import numpy as np
 import pytest
 from sampling import evaporator_problem, random_parameters, random_point, random_state
 
-from controllers import Layout
+from controllers import ThetaBlocks
+from controllers.dynamics import sampled_jacobian
 from controllers.model import discretise
-from controllers.ocp import SymbolicParameters, embedding, preparation, sampled_jacobian, symmetric
+from controllers.rti.feedback import embedding
+from controllers.rti.preparation import preparation
+from controllers.theta import SymbolicTheta, symmetric
 
 N, n, m = 10, 2, 2
 
 
 @pytest.fixture(scope="module")
-def layout():
-    return Layout.of(evaporator_problem(), slack_weights=True, model_parameters=("UA2", "h"))
+def blocks():
+    return ThetaBlocks.of(evaporator_problem(), slack_weights=True, model_parameters=("UA2", "h"))
 
 
 @pytest.fixture(scope="module")
-def functions(layout):
-    prepared = preparation(evaporator_problem(), layout)
-    return prepared, embedding(evaporator_problem(), layout, prepared)
+def functions(blocks):
+    prepared = preparation(evaporator_problem(), blocks)
+    return prepared, embedding(evaporator_problem(), blocks, prepared)
 
 
 @pytest.fixture
-def case(functions, layout, problem, rng):
+def case(functions, blocks, problem, rng):
     """Prepared with random stage costs at a random point; returns all that went in."""
     prepared, _ = functions
     root = rng.normal(size=(N, n + m, n + m))
     L = root @ root.transpose(0, 2, 1) + np.eye(n + m)
     q = rng.normal(size=(N, n + m)) * 10
     L_N, q_N = np.eye(n) * 3 + 0.5, rng.normal(size=n) * 10
-    parameters, point = random_parameters(problem, layout, rng), random_point(problem, rng)
+    parameters, point = random_parameters(problem, blocks, rng), random_point(problem, rng)
     for name, value in {
         "x": point.x, "u": point.u, "L": L, "q": q, "L_N": L_N, "q_N": q_N,
         "theta": parameters.theta,
@@ -77,11 +80,11 @@ def test_the_variational_steps_give_the_jacobian_of_the_discrete_map(problem, rn
         np.testing.assert_allclose(np.array(jacobian), np.array(exact(*arguments)), atol=1e-13)
 
 
-def test_model_parameters_in_theta_replace_the_nominal_ones(problem, layout):
-    symbols = SymbolicParameters.of(problem, layout)
+def test_model_parameters_in_theta_replace_the_nominal_ones(problem, blocks):
+    symbols = SymbolicTheta.of(problem, blocks)
     values = ca.Function("p", [symbols.theta], [symbols.model_parameters])
-    theta = np.zeros(layout.size)
-    theta[layout.slices["p"]] = 7.0, 0.2
+    theta = np.zeros(blocks.size)
+    theta[blocks.slices["p"]] = 7.0, 0.2
     expected = problem.model.nominal_parameters
     expected[problem.model.parameter_indices(("UA2", "h"))] = 7.0, 0.2
     np.testing.assert_array_equal(np.array(values(theta)).ravel(), expected)

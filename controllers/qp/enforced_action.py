@@ -11,7 +11,9 @@ Vector = NDArray[np.float64]
 TOLERANCE = 1e-8
 
 
-def settle(qp: SoftQp, solution: QpSolution, lower: Vector, upper: Vector) -> QpSolution:
+def multipliers_at_kink(
+    qp: SoftQp, solution: QpSolution, lower: Vector, upper: Vector
+) -> QpSolution:
     """Of all multipliers of Q(s, a) at a kink, those that make dQ/da as small as they can.
 
     With u_0 = a enforced, the state x_1 is known, and where it sits exactly on a soft bound Q has a

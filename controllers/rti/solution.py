@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from controllers.buffered import StackedFunction
 from controllers.errors import ControllerError
-from controllers.hessian import Spectrum
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp.active_set import kkt_solve
 from controllers.qp.problem import QpSolution, Residuals, SoftQp
+from controllers.rti.hessian import Spectrum
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -37,8 +37,8 @@ class LinearisationPoint(NamedTuple):
 class Functions:
     """The CasADi functions that a controller of the `problem` calls.
 
-    `preparation` and `embedding` make the QP (`controllers.ocp`), `readout` takes its value,
-    `gradient` and `policy` its derivatives in θ (`controllers.lagrangian`).
+    `preparation` and `embedding` make the QP, `readout` takes its value, `gradient` and `policy`
+    its derivatives in θ (`controllers.sensitivities`).
     """
 
     problem: Problem

@@ -1,0 +1,111 @@
+"""The feedback phase in CasADi: the state put into the prepared QP, and its solution read out."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from controllers.buffered import StackedFunction, stacked
+from controllers.problem import Problem
+from controllers.theta import SymbolicTheta, ThetaBlocks
+
+
+def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
+    """Initial value embedding: the vectors of the QP that depend on the state s.
+
+    Inputs: s; theta; the rest is read from the preparation's memory. Results: the gradient f, and
+    the lower and upper limits that the soft rows Γ V must respect.
+    """
+    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+    symbols = SymbolicTheta.of(problem, blocks)
+    s = ca.SX.sym("s", n)
+    x_s = ca.DM(problem.reference_state)
+    prior = {
+        "Phi": ca.SX.sym("Phi", n, horizon * n),
+        "g": ca.SX.sym("g", horizon * n),
+        "f": ca.SX.sym("f", horizon * m),
+        "F": ca.SX.sym("F", n, horizon * m),
+    }
+    free = prior["Phi"].T @ (s - x_s) + prior["g"]
+    lower = ca.repmat(symbols["x_l"] - x_s, horizon, 1) - free
+    upper = ca.repmat(symbols["x_u"] - x_s, horizon, 1) - free
+    return stacked(
+        "embedding",
+        {"s": s, "theta": symbols.theta, **prior},
+        {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
+        {name: prepared.stack[prepared.slices[name]] for name in prior},
+    )
+
+
+def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
+    """States, slack, costates and value that belong to a solution (v, λ) of the condensed QP.
+
+    Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta; the QP's
+    A, B, r, L, q, L_N, q_N are read from the preparation's memory. Results: xi (n, N+1), t (n, N),
+    chi (n, N+1), value.
+    The costates χ solve the adjoint recursion, so χ_0 is the gradient of the value in s.
+    """
+    n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
+    symbols = SymbolicTheta.of(problem, blocks)
+    x_s = ca.DM(problem.reference_state)
+    s, v, lam = ca.SX.sym("s", n), ca.SX.sym("v", m, horizon), ca.SX.sym("lam", n, horizon)
+    A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
+    r = ca.SX.sym("r", n, horizon)
+    L, q = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("q", n + m, horizon)
+    L_N, q_N, constant = ca.SX.sym("L_N", n, n), ca.SX.sym("q_N", n), ca.SX.sym("constant")
+
+    violation = ca.fmax(ca.fmax(problem.state_lower - s, s - problem.state_upper), 0)
+    known = ca.dot(problem.penalty_linear, violation) + ca.dot(
+        problem.penalty_quadratic, violation**2
+    )
+    xi = [s - x_s]
+    value = constant + known + symbols["c_lambda"]
+    value += ca.bilin(symbols["B_lambda"], xi[0]) + ca.dot(symbols["b_lambda"], xi[0])
+    t, weights = [], []
+    for k in range(horizon):
+        w = ca.vertcat(xi[k], v[:, k])
+        weights.append(L[:, k * (n + m) : (k + 1) * (n + m)])
+        value += ca.bilin(weights[k], w) / 2 + ca.dot(q[:, k], w)
+        columns = slice(k * n, (k + 1) * n)
+        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ v[:, k] + r[:, k])
+        outside = ca.fmax(symbols["x_l"] - x_s - xi[k + 1], xi[k + 1] - symbols["x_u"] + x_s)
+        t.append(ca.fmax(outside, 0))
+        value += gamma ** (k + 1) * (
+            ca.dot(symbols["w_sigma"], t[k]) + ca.dot(symbols["W_sigma"], t[k] ** 2)
+        )
+    value += ca.bilin(L_N, xi[horizon]) / 2 + ca.dot(q_N, xi[horizon])
+
+    chi = [L_N @ xi[horizon] + q_N + lam[:, horizon - 1]]
+    for k in reversed(range(horizon)):
+        w = ca.vertcat(xi[k], v[:, k])
+        costate = weights[k][:n, :] @ w + q[:n, k] + A[:, k * n : (k + 1) * n] @ chi[0]
+        if k == 0:
+            costate += 2 * symbols["B_lambda"] @ xi[0] + symbols["b_lambda"]
+            costate += ca.gradient(known, s)
+        else:
+            costate += lam[:, k - 1]
+        chi.insert(0, costate)
+    return stacked(
+        "readout",
+        {
+            "s": s,
+            "v": v,
+            "lam": lam,
+            "A": A,
+            "B": B,
+            "r": r,
+            "L": L,
+            "q": q,
+            "L_N": L_N,
+            "q_N": q_N,
+            "constant": constant,
+            "theta": symbols.theta,
+        },
+        {
+            "xi": ca.horzcat(*xi),
+            "t": ca.horzcat(*t),
+            "chi": ca.horzcat(*chi),
+            "value": value,
+        },
+        {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
+        | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N")},
+    )

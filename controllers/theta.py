@@ -18,7 +18,7 @@ Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Block:
+class ThetaBlock:
     """A named part of θ: a scalar, a vector or a symmetric matrix of the given dimension.
 
     `kind` says which of these it is. A symmetric matrix is packed as its upper triangle row by row,
@@ -87,7 +87,7 @@ class Block:
 class ThetaBlocks:
     """The blocks of θ, in order."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[ThetaBlock, ...]
 
     @cached_property
     def slices(self) -> dict[str, slice]:
@@ -125,7 +125,7 @@ class ThetaBlocks:
                 ]
         return tuple(names)
 
-    def __iter__(self) -> Iterator[Block]:
+    def __iter__(self) -> Iterator[ThetaBlock]:
         """The blocks, in order."""
         return iter(self.blocks)
 
@@ -133,7 +133,7 @@ class ThetaBlocks:
         """Whether θ has a block of this name."""
         return name in self.slices
 
-    def block(self, name: str) -> Block:
+    def block(self, name: str) -> ThetaBlock:
         """Block of this name; raises ParameterError where there is none."""
         for block in self.blocks:
             if block.name == name:
@@ -156,17 +156,17 @@ class ThetaBlocks:
         """
         n, m = problem.n_states, problem.n_actions
 
-        def symmetric(name: str, dimension: int, scale: float, meaning: str) -> Block:
+        def symmetric(name: str, dimension: int, scale: float, meaning: str) -> ThetaBlock:
             size = dimension * (dimension + 1) // 2
-            return Block(name, "symmetric", dimension, (scale,) * size, meaning)
+            return ThetaBlock(name, "symmetric", dimension, (scale,) * size, meaning)
 
-        def vector(name: str, dimension: int, scale: float, meaning: str) -> Block:
-            return Block(name, "vector", dimension, (scale,) * dimension, meaning)
+        def vector(name: str, dimension: int, scale: float, meaning: str) -> ThetaBlock:
+            return ThetaBlock(name, "vector", dimension, (scale,) * dimension, meaning)
 
         blocks = [
             symmetric("B_lambda", n, 1.0, "initial cost, quadratic"),
             vector("b_lambda", n, 10.0, "initial cost, linear"),
-            Block("c_lambda", "scalar", 1, (1e3,), "initial cost, constant"),
+            ThetaBlock("c_lambda", "scalar", 1, (1e3,), "initial cost, constant"),
             symmetric("B_Vf", n, 1.0, "terminal cost, quadratic"),
             vector("b_Vf", n, 10.0, "terminal cost, linear"),
             symmetric("B_l", n + m, 1.0, "stage cost, quadratic"),
@@ -182,7 +182,7 @@ class ThetaBlocks:
             indices = problem.model.parameter_indices(model_parameters)
             scale = tuple(0.1 * abs(problem.model.parameters[i].nominal) for i in indices)
             blocks.append(
-                Block(
+                ThetaBlock(
                     "p", "vector", len(indices), scale, "model parameters", tuple(model_parameters)
                 )
             )

@@ -10,12 +10,12 @@ from pydantic import Field
 
 from cosim.scenario import Scenario
 from learning.configuration import Configuration, Count, Positive
+from learning.constrained_step import ConstrainedStep
 from learning.critic import AdvantageRegression, lstdv
 from learning.exploration import Strategy
 from learning.fit import policy_gradient_fit
-from learning.protocols import LearnableController, Sample, Update
+from learning.protocols import LearnableController, Transition, Update
 from learning.schedule import Geometric
-from learning.step import ParameterStep
 
 Vector = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ class ActorCritic:
         self._configuration, self._strategy = configuration, strategy
         self._radius = Geometric(configuration.radius, configuration.radius_end, samples)
         self._discount = configuration.critic_discount
-        self._step = ParameterStep(controller, configuration)
+        self._step = ConstrainedStep(controller, configuration)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
         rows = configuration.batch_size
         self._batch = {
@@ -83,25 +83,25 @@ class ActorCritic:
         self.needs_action_value = False
         self.needs_points = False
 
-    def observe(self, sample: Sample) -> Update | None:
+    def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
         batch, row = self._batch, self._filled
-        batch["states"][row], batch["next_states"][row] = sample.s, sample.next_s
-        batch["reward"][row] = sample.stage_cost + self._discount * sample.next_penalty
-        batch["deviation"][row] = self._deviation(sample)
-        batch["jacobian"][row] = sample.policy.policy_jacobian
+        batch["states"][row], batch["next_states"][row] = transition.s, transition.next_s
+        batch["reward"][row] = transition.stage_cost + self._discount * transition.next_penalty
+        batch["deviation"][row] = self._deviation(transition)
+        batch["jacobian"][row] = transition.policy.policy_jacobian
         self._filled += 1
         if self._filled < self._configuration.batch_size:
             return None
         self._filled = 0
-        return self._update(sample.number)
+        return self._update(transition.number)
 
-    def _deviation(self, sample: Sample) -> Vector:
+    def _deviation(self, transition: Transition) -> Vector:
         """a − π(s) less its mean under saturated exploration, zero where the sample was greedy."""
-        if not sample.explored:
-            return np.zeros_like(sample.a)
-        action = sample.policy.action
-        return sample.a - action - np.nan_to_num(self._strategy.bias(action, sample.number))
+        if not transition.explored:
+            return np.zeros_like(transition.a)
+        action = transition.policy.action
+        return transition.a - action - np.nan_to_num(self._strategy.bias(action, transition.number))
 
     def _update(self, number: int) -> Update:
         settings, batch = self._configuration, self._batch

@@ -11,14 +11,14 @@ from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
 from cosim.scenario import Scenario
+from learning.average_cost import AverageCost
 from learning.configuration import Configuration, Count, Positive
+from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
 from learning.fit import Fit, damped, least_squares
-from learning.level import level
-from learning.protocols import LearnableController, Sample, Update
+from learning.protocols import LearnableController, Transition, Update
 from learning.q_configuration import FinalGain, Gain, QConfiguration
 from learning.replay import ReplayBuffer, Replayed
-from learning.step import ParameterStep
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -81,47 +81,52 @@ class BatchQLearning:
         self._controller, self._configuration = controller, configuration
         self._gain = configuration.gains(samples)
         self._moving = configuration.rule == "lstdq"
-        self._step = ParameterStep(controller, configuration)
-        self._level = level(configuration.discount, scenario, self._step)
+        self._step = ConstrainedStep(controller, configuration)
+        self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
         self._buffer = ReplayBuffer(configuration.buffer_size)
         self._radius = configuration.radius
         self._trial: Trial | None = None
         self.needs_action_value = False
         self.needs_points = True
 
-    def observe(self, sample: Sample) -> Update | None:
+    def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
-        self._buffer.add(sample)
-        if (sample.number + 1) % self._configuration.batch_size:
+        self._buffer.add(transition)
+        if (transition.number + 1) % self._configuration.batch_size:
             return None
         update: Update | None = None
         for _ in range(self._configuration.iterations):
-            replayed = self._buffer.replay(self._controller, self._level)
+            replayed = self._buffer.replay(self._controller, self._average_cost)
             if self._trial is not None and self._rose(self._trial, replayed):
                 self._controller.theta = self._trial.theta
-                self._level.mean_cost = float(self._trial.mean_cost)
-                replayed = self._buffer.replay(self._controller, self._level)
+                self._average_cost.mean_cost = float(self._trial.mean_cost)
+                replayed = self._buffer.replay(self._controller, self._average_cost)
             if not len(replayed.number):
                 break
-            update = self._iterate(replayed, self._gain(sample.number))
+            update = self._iterate(replayed, self._gain(transition.number))
         return update
 
     def _iterate(self, replayed: Replayed, gain: float) -> Update:
         gradient = replayed.gradient * self._step.scale
         change = gradient
         if self._moving:
-            change = gradient - self._level.discount * replayed.next_gradient * self._step.scale
+            change = (
+                gradient - self._average_cost.discount * replayed.next_gradient * self._step.scale
+            )
         fit = RULES[self._configuration.rule](
-            gradient, self._level.descent(change), replayed.td_error, self._configuration.ridge
+            gradient,
+            self._average_cost.descent(change),
+            replayed.td_error,
+            self._configuration.ridge,
         )
-        theta, mean_cost = self._controller.theta, np.array(self._level.mean_cost)
-        fit = self._level.take(fit.shrunk(gain).clipped(self._radius))
+        theta, mean_cost = self._controller.theta, np.array(self._average_cost.mean_cost)
+        fit = self._average_cost.take(fit.shrunk(gain).clipped(self._radius))
         update = self._step.take(fit, float(np.sqrt(np.mean(replayed.td_error**2))))
         predicted = replayed.td_error - change @ (
             (self._controller.theta - theta) / self._step.scale
         )
         if self._moving:
-            predicted -= self._level.mean_cost - mean_cost
+            predicted -= self._average_cost.mean_cost - mean_cost
         self._trial = Trial(
             theta, mean_cost, replayed.number, replayed.target, replayed.td_error**2, predicted**2
         )
@@ -149,7 +154,7 @@ class BatchQLearning:
         trial = {} if self._trial is None else self._trial._asdict()
         return {
             "radius": np.array(self._radius),
-            "mean_cost": np.array(self._level.mean_cost),
+            "mean_cost": np.array(self._average_cost.mean_cost),
             **{f"buffer_{name}": values for name, values in self._buffer.state().items()},
             **{f"trial_{name}": np.asarray(value) for name, value in trial.items()},
         }
@@ -157,7 +162,7 @@ class BatchQLearning:
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         self._radius = float(state["radius"])
-        self._level.mean_cost = float(state["mean_cost"])
+        self._average_cost.mean_cost = float(state["mean_cost"])
         part = {
             prefix: {
                 name.removeprefix(f"{prefix}_"): values

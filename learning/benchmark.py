@@ -10,7 +10,7 @@ from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 from learning.learner import Learner
 from learning.registry import load_algorithm
-from learning.run import Run
+from learning.training_run import TrainingRun
 
 ALGORITHMS = ("q-learning", "actor-critic", "batch-q-learning")
 SETTLING = 1000
@@ -46,7 +46,9 @@ def _learner(plant: FmuPlant, name: str, samples: int) -> Learner:
     """An algorithm in its loop with a plant, without log, evaluation and checkpoints."""
     algorithm = load_algorithm(name)
     configuration = algorithm.Configuration.from_dict({})
-    learner = Learner(Run(name, plant.scenario, samples, 0, configuration), algorithm, plant)
+    learner = Learner(
+        TrainingRun(name, plant.scenario, samples, 0, configuration), algorithm, plant
+    )
     learner.begin()
     return learner
 

@@ -14,15 +14,15 @@ from controllers.problem import Problem
 from cosim.protocols import Controller, Plant
 from cosim.simulation import simulate
 from learning.protocols import LearnableController
-from learning.run import Run
 from learning.starting_point import build_controller
+from learning.training_run import TrainingRun
 
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class HeldOutRuns:
     """Runs of `steps` samples of `plant` from the initial state, one for each of the `seeds`."""
 
     plant: Plant
@@ -53,12 +53,12 @@ class Judge:
     """
 
     def __init__(
-        self, run: Run, plant: Plant, start: Parameters, optimum: Controller | None
+        self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
     ) -> None:
         self._run, self._optimum = run, optimum
         self._problem = Problem.from_scenario(cast("Any", run.scenario))
         self._controller = self._build(start)
-        self._evaluation = Evaluation(plant, held_out(run.evaluation_seeds), run.evaluation_steps)
+        self._evaluation = HeldOutRuns(plant, held_out(run.evaluation_seeds), run.evaluation_steps)
 
     def _build(self, parameters: Parameters) -> LearnableController:
         run = self._run

@@ -13,7 +13,7 @@ from cosim.penalty import Penalty
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 from learning.exploration import Strategy
-from learning.protocols import Algorithm, LearnableController, LearnableSolution, Sample
+from learning.protocols import Algorithm, LearnableController, LearnableSolution, Transition
 
 Vector = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class Interaction:
         self._controller.reset()
         self._policy = self._solve()
 
-    def next(self) -> tuple[Sample | None, float]:
+    def next(self) -> tuple[Transition | None, float]:
         """One sample of the plant; returns it, or None after a failure, and its cost."""
         policy, point, s, number = self._policy, self._point, self.s, self.number
         a, explored = (self._applied, False) if policy is None else self._choose(policy.action)
@@ -86,7 +86,7 @@ class Interaction:
         if policy is None or action_value is None or self._policy is None:
             return None, cost
         keep = self._algorithm.needs_points
-        return Sample(
+        return Transition(
             number=number,
             s=s,
             a=a,

@@ -8,8 +8,8 @@ from controllers.problem import Problem
 from cosim.simulation import spawn_seeds
 from learning.interaction import ContinuablePlant, Interaction
 from learning.protocols import Algorithm, Update
-from learning.run import Run
 from learning.starting_point import build_controller, build_strategy, starting_parameters
+from learning.training_run import TrainingRun
 
 
 class Learner:
@@ -19,7 +19,9 @@ class Learner:
     `rng`, come from the run's.
     """
 
-    def __init__(self, run: Run, algorithm: type[Algorithm], plant: ContinuablePlant) -> None:
+    def __init__(
+        self, run: TrainingRun, algorithm: type[Algorithm], plant: ContinuablePlant
+    ) -> None:
         problem = Problem.from_scenario(cast("Any", run.scenario))
         self.start = starting_parameters(problem, run.configuration)
         self.controller = build_controller(run.controller, run.scenario, problem, self.start)
@@ -39,8 +41,8 @@ class Learner:
 
         Raises DivergenceError where the rule finds that θ means nothing any more.
         """
-        sample, cost = self.interaction.next()
-        update = None if sample is None else self.algorithm.observe(sample)
+        transition, cost = self.interaction.next()
+        update = None if transition is None else self.algorithm.observe(transition)
         if update is not None:
             self.interaction.failures += update.failures
             self.interaction.renew()

@@ -9,7 +9,7 @@ from math import inf, isnan
 
 from learning.protocols import Update
 
-Row = dict[str, float]
+LogRow = dict[str, float]
 COLUMNS = (
     "samples",
     "updates",
@@ -56,7 +56,7 @@ class Totals:
         self.refused += update.refused
         self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
 
-    def means(self, samples: float) -> Row:
+    def means(self, samples: float) -> LogRow:
         """Means over `samples` samples and their updates, NaN where there was none."""
         count = self.updates or float("nan")
         return {
@@ -69,7 +69,7 @@ class Totals:
         }
 
 
-def to_csv(rows: list[Row]) -> str:
+def to_csv(rows: list[LogRow]) -> str:
     """The log as CSV with exact decimals; what was not measured is left empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")

@@ -63,7 +63,7 @@ class LearnableController(Protocol):
         """Solve for V and π, or with the first action fixed for Q."""
 
 
-class Sample(NamedTuple):
+class Transition(NamedTuple):
     """One transition (s, a, ℓ, s₊) as the training loop saw it, all at one θ.
 
     `policy` is the solution for V(s) and π(s); `action_value` that for Q(s, a), the same object
@@ -118,11 +118,11 @@ class Algorithm(Protocol):
 
     @property
     def needs_action_value(self) -> bool:
-        """Whether `Sample.action_value` must be solved for where the sample explored."""
+        """Whether `Transition.action_value` must be solved for where the sample explored."""
 
     @property
     def needs_points(self) -> bool:
-        """Whether `Sample.point` and `Sample.next_point` must be kept."""
+        """Whether `Transition.point` and `Transition.next_point` must be kept."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class Algorithm(Protocol):
         strategy: Strategy,
     ) -> None: ...
 
-    def observe(self, sample: Sample) -> Update | None:
+    def observe(self, sample: Transition) -> Update | None:
         """Take one sample; move θ and say so, or return None."""
 
     def state(self) -> dict[str, NDArray[Any]]:

@@ -11,13 +11,13 @@ from pydantic import Field, model_validator
 
 from controllers.errors import QpError
 from cosim.scenario import Scenario
+from learning.average_cost import AverageCost
 from learning.configuration import Configuration, Count, Positive
+from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
 from learning.fit import Fit, least_squares, line_search, td_fit, td_step
-from learning.level import level
-from learning.protocols import LearnableController, Sample, Update
+from learning.protocols import LearnableController, Transition, Update
 from learning.q_configuration import QConfiguration
-from learning.step import ParameterStep
 
 Vector = NDArray[np.float64]
 
@@ -92,8 +92,8 @@ class QLearning:
     ) -> None:
         self._controller, self._configuration = controller, configuration
         self._gain = configuration.gains(samples)
-        self._step = ParameterStep(controller, configuration, scaled=configuration.scaled)
-        self._level = level(configuration.discount, scenario, self._step)
+        self._step = ConstrainedStep(controller, configuration, scaled=configuration.scaled)
+        self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
         size = self._step.scale.size
         self._information = np.zeros((size, size))
         self._gradient = np.zeros(size)
@@ -101,18 +101,18 @@ class QLearning:
         self.needs_action_value = True
         self.needs_points = configuration.line_search
 
-    def observe(self, sample: Sample) -> Update | None:
+    def observe(self, transition: Transition) -> Update | None:
         """Take one sample; each moves θ, or one in `update_every` under gauss-newton."""
-        target = self._level.target(sample.cost, sample.next_policy.value)
-        td_error = target - sample.action_value.value
-        gradient = sample.action_value.value_gradient * self._step.scale
+        target = self._average_cost.target(transition.cost, transition.next_policy.value)
+        td_error = target - transition.action_value.value
+        gradient = transition.action_value.value_gradient * self._step.scale
         settings = self._configuration
         if settings.rule == "gauss-newton":
-            return self._recursive(sample.number, td_error, gradient)
+            return self._recursive(transition.number, td_error, gradient)
         fit = ONE_SAMPLE[settings.rule](td_error, gradient, settings.step_size)
         if settings.line_search:
-            fit = fit.shrunk(line_search(self._error_along(sample, target, fit)))
-        return self._step.take(self._level.take(fit), abs(td_error))
+            fit = fit.shrunk(line_search(self._error_along(transition, target, fit)))
+        return self._step.take(self._average_cost.take(fit), abs(td_error))
 
     def _recursive(self, number: int, td_error: float, gradient: Vector) -> Update | None:
         settings = self._configuration
@@ -127,13 +127,15 @@ class QLearning:
         td_error = (self._squares / self._count) ** 0.5
         self._gradient[:] = 0.0
         self._squares, self._count = 0.0, 0
-        fit = self._level.take(fit.shrunk(self._gain(number)).clipped(settings.largest_step))
+        fit = self._average_cost.take(fit.shrunk(self._gain(number)).clipped(settings.largest_step))
         return self._step.take(fit, td_error)
 
-    def _error_along(self, sample: Sample, target: float, fit: Fit) -> Callable[[float], float]:
+    def _error_along(
+        self, transition: Transition, target: float, fit: Fit
+    ) -> Callable[[float], float]:
         """TD error of a sample with the step scaled by t, its target and its QP's guess held."""
         controller, theta = self._controller, self._controller.theta
-        point = sample.point
+        point = transition.point
         assert point is not None
 
         def error(t: float) -> float:
@@ -141,7 +143,7 @@ class QLearning:
             try:
                 controller.theta = new
                 controller.prepare_at(point)
-                return target - controller.feedback(sample.s, sample.a).value
+                return target - controller.feedback(transition.s, transition.a).value
             except QpError:
                 return float("nan")
             finally:
@@ -154,11 +156,11 @@ class QLearning:
         return {
             "information": self._information,
             "gradient": self._gradient,
-            "sums": np.array([self._squares, self._count, self._level.mean_cost]),
+            "sums": np.array([self._squares, self._count, self._average_cost.mean_cost]),
         }
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         self._information, self._gradient = state["information"], state["gradient"]
-        squares, count, self._level.mean_cost = (float(value) for value in state["sums"])
+        squares, count, self._average_cost.mean_cost = (float(value) for value in state["sums"])
         self._squares, self._count = squares, int(count)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from controllers.errors import QpError
 from controllers.rti.solution import LinearisationPoint
-from learning.level import Level
-from learning.protocols import LearnableController, LearnableSolution, Sample
+from learning.average_cost import AverageCost
+from learning.protocols import LearnableController, LearnableSolution, Transition
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -54,17 +54,17 @@ class ReplayBuffer:
         """Number of transitions kept."""
         return min(self._added, self._capacity)
 
-    def add(self, sample: Sample) -> None:
+    def add(self, transition: Transition) -> None:
         """Keep a transition in place of the oldest one."""
-        point, next_point = sample.point, sample.next_point
+        point, next_point = transition.point, transition.next_point
         assert point is not None and next_point is not None
         row: dict[str, Any] = {
-            "number": np.int64(sample.number),
-            "s": sample.s,
-            "a": sample.a,
-            "explored": np.bool_(sample.explored),
-            "cost": np.float64(sample.cost),
-            "next_s": sample.next_s,
+            "number": np.int64(transition.number),
+            "s": transition.s,
+            "a": transition.a,
+            "explored": np.bool_(transition.explored),
+            "cost": np.float64(transition.cost),
+            "next_s": transition.next_s,
         }
         row |= {f"point_{key}": value for key, value in point._asdict().items()}
         row |= {f"next_point_{key}": value for key, value in next_point._asdict().items()}
@@ -78,7 +78,7 @@ class ReplayBuffer:
             self._columns[name][position] = value
         self._added += 1
 
-    def replay(self, controller: LearnableController, level: Level) -> Replayed:
+    def replay(self, controller: LearnableController, average_cost: AverageCost) -> Replayed:
         """Solve for Q(s, a) and V(s₊) of every transition at the controller's θ, in time's order.
 
         A successor shares the linearisation, and where it was greedy the solution too: V(s₊) of one
@@ -104,7 +104,7 @@ class ReplayBuffer:
                 q[k], gradient[k] = value.value, value.value_gradient
                 controller.prepare_at(_point(columns, "next_point", row))
                 at, value = number + 1, controller.feedback(columns["next_s"][row])
-                target[k] = level.target(float(columns["cost"][row]), value.value)
+                target[k] = average_cost.target(float(columns["cost"][row]), value.value)
                 next_gradient[k] = value.value_gradient
             except QpError:
                 at = None

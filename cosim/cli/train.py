@@ -14,8 +14,8 @@ from cosim.cli.output import JsonOption, Output, Progressing, dump, open_folder,
 from cosim.cli.simulate import ScenarioOption
 
 if TYPE_CHECKING:
-    from learning.log import Row
-    from learning.run import Result, Run
+    from learning.log import LogRow
+    from learning.training_run import TrainingResult, TrainingRun
 
 # Columns of the log behind the progress bar: name, text, scale, format.
 FIGURES = (
@@ -99,14 +99,14 @@ def train(
         from cosim.cli.compose import import_from_here
         from cosim.scenario import Scenario
         from learning.registry import load_algorithm
-        from learning.run import Run
+        from learning.training_run import TrainingRun
 
         import_from_here()
         found = load_algorithm(algorithm)
         if explain:
             _explain(algorithm, found.Configuration.documentation(), out_)
             return
-        run = Run(
+        run = TrainingRun(
             algorithm=algorithm,
             scenario=Scenario.load(scenario),
             samples=samples,
@@ -132,16 +132,16 @@ def train(
 
 
 def _execute(
-    run: Run,
+    run: TrainingRun,
     algorithm: Any,
     folder: Path,
     optimum: str | None,
     resume: bool,
     record: bool,
     output: Output,
-) -> Result:
+) -> TrainingResult:
     from cosim.cli.compose import build_controller, build_plant
-    from learning.training import Training
+    from learning.training_loop import TrainingLoop
 
     recorder: Any = None
     if record:
@@ -153,7 +153,7 @@ def _execute(
         build_plant(run.scenario) as evaluation_plant,
         output.progress(run.algorithm, run.samples) as progress,
     ):
-        training = Training(
+        training = TrainingLoop(
             run,
             algorithm,
             plant,
@@ -163,16 +163,16 @@ def _execute(
             recorder=recorder,
         )
         result = training.go(resume=resume, progress=_remark(progress))
-    if training.obstacle:
-        output.note(f"left no checkpoint, --resume is not possible: {training.obstacle}")
+    if training.without_checkpoint:
+        output.note(f"left no checkpoint, --resume is not possible: {training.without_checkpoint}")
     return result
 
 
-def _remark(progress: Progressing) -> Callable[[int, Row | None], None]:
+def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:
     """Show J, TD error, gap closed and the smallest eigenvalue of the log's rows behind the bar."""
-    last: Row = {}
+    last: LogRow = {}
 
-    def update(done: int, row: Row | None) -> None:
+    def update(done: int, row: LogRow | None) -> None:
         if row is None:
             return
         last.update({name: value for name, value in row.items() if not isnan(value)})
@@ -186,7 +186,7 @@ def _remark(progress: Progressing) -> Callable[[int, Row | None], None]:
     return update
 
 
-def summarise(run: Run, result: Result) -> dict[str, Any]:
+def summarise(run: TrainingRun, result: TrainingResult) -> dict[str, Any]:
     """What `summary.json` says of a run, but for its timing."""
     from importlib.metadata import version
 
@@ -212,7 +212,7 @@ def summarise(run: Run, result: Result) -> dict[str, Any]:
     }
 
 
-def _write(folder: Path, run: Run, result: Result, summary: dict[str, Any]) -> None:
+def _write(folder: Path, run: TrainingRun, result: TrainingResult, summary: dict[str, Any]) -> None:
     from controllers.storage import write_atomically
     from learning.log import to_csv
 

@@ -50,7 +50,7 @@ class Parameters(Protocol):
 
 
 class TrainingRun(Protocol):
-    """What is trained; `learning.run.Run` is one."""
+    """What is trained; `learning.training_run.TrainingRun` is one."""
 
     @property
     def algorithm(self) -> str:

@@ -22,15 +22,15 @@ from controllers.problem import Problem
 from controllers.storage import write_atomically
 from cosim import FmuPlant, Scenario
 from learning import BatchQLearning
+from learning.average_cost import AverageCost
 from learning.batch_q_learning import BatchQLearningConfiguration
+from learning.constrained_step import ConstrainedStep
 from learning.fit import least_squares
 from learning.learner import Learner
-from learning.level import Level
 from learning.protocols import LearnableController
 from learning.replay import ReplayBuffer
-from learning.run import Run
 from learning.starting_point import build_controller
-from learning.step import ParameterStep
+from learning.training_run import TrainingRun
 
 SAMPLES, ITERATIONS, GAIN, RADIUS = 150, 6, 0.5, 1.0
 CONFIGURATION = BatchQLearningConfiguration.from_dict({})
@@ -38,7 +38,7 @@ CONFIGURATION = BatchQLearningConfiguration.from_dict({})
 
 def fill(scenario: Scenario) -> tuple[ReplayBuffer, Parameters]:
     """Transitions of the stochastic plant under RTI with exploration, and their θ."""
-    run = Run("batch-q-learning", scenario, SAMPLES, 0, CONFIGURATION)
+    run = TrainingRun("batch-q-learning", scenario, SAMPLES, 0, CONFIGURATION)
     buffer = ReplayBuffer(SAMPLES)
     with FmuPlant(scenario) as plant:
         learner = Learner(run, BatchQLearning, plant)
@@ -55,8 +55,8 @@ def learn(
 ) -> NDArray[np.float64]:
     """Change of θ, scaled, after all fits to the buffer."""
     start = controller.theta.copy()
-    step = ParameterStep(controller, CONFIGURATION)
-    level = Level(scenario.discount, 0, 1.0, 0.0)
+    step = ConstrainedStep(controller, CONFIGURATION)
+    level = AverageCost(scenario.discount, 0, 1.0, 0.0)
     for _ in range(ITERATIONS):
         replayed = buffer.replay(controller, level)
         gradient = replayed.gradient * step.scale

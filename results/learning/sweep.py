@@ -28,12 +28,12 @@ from cosim import FmuPlant, Scenario
 from cosim.cli.compose import build_controller
 from cosim.cli.train import summarise
 from cosim.evaluation.parallel import run_all
-from learning.evaluation import Evaluation, held_out
+from learning.evaluation import HeldOutRuns, held_out
 from learning.log import to_csv
 from learning.registry import load_algorithm
-from learning.run import Run
 from learning.starting_point import build_controller as learnable
-from learning.training import Training
+from learning.training_loop import TrainingLoop
+from learning.training_run import TrainingRun
 
 
 class Task(NamedTuple):
@@ -72,7 +72,7 @@ def train(task: Task, seed: int) -> str:
     """Train a case and evaluate the θ that it ends with."""
     scenario, case, folder = Scenario.load(task.scenario), CASES[task.name], task.folder
     algorithm = load_algorithm(case.algorithm)
-    run = Run(
+    run = TrainingRun(
         algorithm=case.algorithm,
         scenario=scenario,
         samples=case.samples,
@@ -84,7 +84,7 @@ def train(task: Task, seed: int) -> str:
     )
     begin = time.perf_counter(), time.process_time()
     with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        training = Training(run, algorithm, plant, other, out=folder)
+        training = TrainingLoop(run, algorithm, plant, other, out=folder)
         result = training.go(resume=(folder / "checkpoint.npz").exists())
         elapsed = time.perf_counter() - begin[0], time.process_time() - begin[1]
         summary = summarise(run, result) | {"commit": task.commit}
@@ -100,7 +100,7 @@ def train(task: Task, seed: int) -> str:
 def evaluate(folder: Path, plant: FmuPlant, controller: Any) -> None:
     """Write a controller's figures on each held-out seed; the last file of a task."""
     seeds = held_out(NOISE_SEEDS)
-    costs = Evaluation(plant, seeds, STEPS).costs(controller)
+    costs = HeldOutRuns(plant, seeds, STEPS).costs(controller)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(("seed", *FIGURES))

@@ -5,10 +5,10 @@ from hypothesis import strategies as st
 
 from controllers import ThetaBlocks
 from controllers.errors import ModelError, ParameterError
-from controllers.theta import Block
+from controllers.theta import ThetaBlock
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-MATRIX = Block("B", "symmetric", 3, (1.0,) * 6)
+MATRIX = ThetaBlock("B", "symmetric", 3, (1.0,) * 6)
 
 
 def test_the_papers_theta_has_its_blocks_in_order(problem):

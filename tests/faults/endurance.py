@@ -20,8 +20,8 @@ from pathlib import Path
 
 from cosim import FmuPlant, Scenario
 from learning.q_learning import QLearning
-from learning.run import Run
-from learning.training import Training
+from learning.training_loop import TrainingLoop
+from learning.training_run import TrainingRun
 
 TENTHS = 10
 PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -36,7 +36,7 @@ def endure(samples: int, folder: Path) -> dict[str, object]:
     """Train for `samples` samples with checkpoints; figures of each tenth of the run."""
     tenth = samples // TENTHS
     scenario = Scenario.load("paper")
-    run = Run(
+    run = TrainingRun(
         algorithm="q-learning",
         scenario=scenario,
         samples=tenth * TENTHS,
@@ -56,7 +56,7 @@ def endure(samples: int, folder: Path) -> dict[str, object]:
         failures.append(0 if row is None else int(row["failures"]))
 
     with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        training = Training(run, QLearning, plant, other, out=folder)
+        training = TrainingLoop(run, QLearning, plant, other, out=folder)
         look(0, None)
         result = training.go(progress=look)
     per_sample = [1e6 * (b - a) / tenth for a, b in pairwise(cpu)]

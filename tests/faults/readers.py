@@ -24,8 +24,8 @@ from learning.checkpoint import Checkpoint
 from learning.checkpoint import load as load_checkpoint
 from learning.errors import CheckpointError
 from learning.q_learning import QLearning
-from learning.run import Run
-from learning.training import Training
+from learning.training_loop import TrainingLoop
+from learning.training_run import TrainingRun
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def _run(folder: Path) -> None:
 
 def _train(folder: Path) -> None:
     scenario = Scenario.load("paper")
-    run = Run(
+    run = TrainingRun(
         algorithm="q-learning",
         scenario=scenario,
         samples=40,
@@ -87,7 +87,7 @@ def _train(folder: Path) -> None:
         evaluation_steps=10,
     )
     with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        Training(run, QLearning, plant, other, out=folder).go()
+        TrainingLoop(run, QLearning, plant, other, out=folder).go()
 
 
 def _seal(checkpoint: Checkpoint) -> str:

@@ -20,8 +20,8 @@ from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.errors import RecordingError
 from cosim.recording.reading import read_recording
 from learning.q_learning import QLearning
-from learning.run import Run
-from learning.training import Training
+from learning.training_loop import TrainingLoop
+from learning.training_run import TrainingRun
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "cosim"))
 from tank import build_tank, write_scenario
@@ -261,7 +261,7 @@ def test_an_evaluation_says_how_many_samples_failed(unreliable):
 def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, monkeypatch):
     monkeypatch.setattr("controllers.rti.nmpc.make_backend", lambda name: unreliable())
     scenario = Scenario.load("paper")
-    run = Run(
+    run = TrainingRun(
         algorithm="q-learning",
         scenario=scenario,
         samples=2000,
@@ -274,7 +274,7 @@ def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, mo
         evaluation_steps=1,
     )
     with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        result = Training(run, QLearning, plant, other).go()
+        result = TrainingLoop(run, QLearning, plant, other).go()
     assert result.status == "finished"
     failures = result.rows[-1]["failures"]
     # One-sample evaluations may fail too, and are not counted among the samples.

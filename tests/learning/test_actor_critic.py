@@ -4,7 +4,7 @@ from carrier import Carrier
 
 from controllers.parameters import Parameters
 from learning import ActorCritic
-from learning.protocols import Sample
+from learning.protocols import Transition
 from learning.starting_point import build_strategy
 
 
@@ -35,7 +35,7 @@ def feed(actor, carrier, rng, slope, action, *, noise=0.0, clip=None):
         s = rng.normal(size=2)
         cost = 6000.0 + slope @ (a - action) + noise * rng.normal()
         update = actor.observe(
-            Sample(
+            Transition(
                 number,
                 s,
                 a,
@@ -89,7 +89,7 @@ def test_only_a_full_batch_moves_theta(problem, scenario, rng):
     before = carrier.theta.copy()
     action = np.array([200.0, 200.0])
     solution = Solution(action, np.zeros((2, before.size)))
-    sample = Sample(
+    sample = Transition(
         0,
         np.ones(2),
         action,

@@ -4,16 +4,16 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant, simulate
 from learning import QLearning
-from learning.evaluation import HELD_OUT, Evaluation, Judge, gap_closed, held_out
-from learning.run import Run
+from learning.evaluation import HELD_OUT, HeldOutRuns, Judge, gap_closed, held_out
+from learning.training_run import TrainingRun
 
 
 def test_evaluation_is_the_closed_loop_on_the_held_out_seeds(scenario, problem, parameters):
     with FmuPlant(scenario) as plant:
         controller = RtiNmpc(problem, parameters)
-        costs = Evaluation(plant, held_out(2), 30).costs(controller)
+        costs = HeldOutRuns(plant, held_out(2), 30).costs(controller)
         runs = [simulate(plant, controller, 30, HELD_OUT + k).summary() for k in range(2)]
-        means = Evaluation(plant, held_out(2), 30).means(controller)
+        means = HeldOutRuns(plant, held_out(2), 30).means(controller)
     for name in costs:
         assert costs[name].tolist() == [run[name] for run in runs]
     assert means["J"] == pytest.approx(np.mean([run["J"] for run in runs]))
@@ -25,7 +25,7 @@ def test_gap_closed_is_zero_for_naive_and_one_for_the_optimum():
 
 
 def judge(plant, parameters, divergence=1.5, optimum=None):
-    run = Run(
+    run = TrainingRun(
         "q-learning", plant.scenario, 100, 0, QLearning.Configuration(), divergence=divergence,
         evaluation_seeds=1, evaluation_steps=30,
     )  # fmt: skip
@@ -36,7 +36,7 @@ def test_the_judge_sets_theta_and_evaluates_greedily(scenario, problem, paramete
     other = parameters.replace({"x_l": np.array([26.0, 40.0])})
     with FmuPlant(scenario) as plant:
         found = judge(plant, parameters).figures(other.theta)
-        assert found == Evaluation(plant, held_out(1), 30).means(RtiNmpc(problem, other))
+        assert found == HeldOutRuns(plant, held_out(1), 30).means(RtiNmpc(problem, other))
 
 
 def test_the_naive_controller_is_the_judges_zero_and_the_optimum_its_one(
@@ -46,7 +46,7 @@ def test_the_naive_controller_is_the_judges_zero_and_the_optimum_its_one(
     with FmuPlant(scenario) as plant:
         judged = judge(plant, parameters, optimum=other)
         naive = judged.figures(parameters.theta)["J"]
-        optimum = Evaluation(plant, held_out(1), 30).means(other)["J"]
+        optimum = HeldOutRuns(plant, held_out(1), 30).means(other)["J"]
         assert (judged.gap_closed(naive), judged.gap_closed(optimum)) == (0.0, 1.0)
         assert judged.limit == pytest.approx(1.5 * naive)
         assert np.isnan(judge(plant, parameters).gap_closed(naive))

@@ -5,7 +5,7 @@ from cosim import FmuPlant
 from learning import QLearning
 from learning.learner import Learner
 from learning.protocols import Update
-from learning.run import Run
+from learning.training_run import TrainingRun
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def plant(scenario):
 
 def make_run(scenario, seed=3):
     configuration = QLearning.Configuration.from_dict({"warm_up": 20})
-    return Run("q-learning", scenario, 100, seed, configuration)
+    return TrainingRun("q-learning", scenario, 100, seed, configuration)
 
 
 class Counting(QLearning):

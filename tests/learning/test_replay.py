@@ -4,8 +4,8 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import QLearning
+from learning.average_cost import AverageCost
 from learning.interaction import Interaction
-from learning.level import Level
 from learning.replay import ReplayBuffer
 from learning.starting_point import build_strategy, starting_parameters
 
@@ -26,8 +26,8 @@ def collected(scenario, problem):
     return controller, samples
 
 
-def level(scenario):
-    return Level(scenario.discount, 0, 1.0, 0.0)
+def average_cost(scenario):
+    return AverageCost(scenario.discount, 0, 1.0, 0.0)
 
 
 def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collected):
@@ -35,7 +35,7 @@ def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collecte
     buffer = ReplayBuffer(100)
     for sample in samples:
         buffer.add(sample)
-    replayed = buffer.replay(controller, level(scenario))
+    replayed = buffer.replay(controller, average_cost(scenario))
     q = [sample.action_value.value for sample in samples]
     target = [sample.cost + scenario.discount * sample.next_policy.value for sample in samples]
     assert replayed.number.tolist() == list(range(60))
@@ -54,7 +54,7 @@ def test_a_full_buffer_forgets_the_oldest(scenario, collected):
     for sample in samples:
         buffer.add(sample)
     assert len(buffer) == 20
-    assert buffer.replay(controller, level(scenario)).number.tolist() == list(range(40, 60))
+    assert buffer.replay(controller, average_cost(scenario)).number.tolist() == list(range(40, 60))
 
 
 def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, collected):
@@ -64,8 +64,8 @@ def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, colle
         whole.add(sample)
     for sample in samples[::3]:
         gaps.add(sample)
-    expected = whole.replay(controller, level(scenario))
-    found = gaps.replay(controller, level(scenario))
+    expected = whole.replay(controller, average_cost(scenario))
+    found = gaps.replay(controller, average_cost(scenario))
     assert found.td_error == pytest.approx(expected.td_error[::3], rel=1e-9, abs=1e-6)
 
 
@@ -74,7 +74,7 @@ def test_replay_sees_the_present_theta(scenario, collected):
     buffer = ReplayBuffer(100)
     for sample in samples:
         buffer.add(sample)
-    before = buffer.replay(controller, level(scenario))
+    before = buffer.replay(controller, average_cost(scenario))
     theta = controller.theta.copy()
     h = 1e-3
     position = controller.parameters.blocks.slices["b_l"].start
@@ -82,7 +82,7 @@ def test_replay_sees_the_present_theta(scenario, collected):
     moved[position] += h
     try:
         controller.theta = moved
-        after = buffer.replay(controller, level(scenario))
+        after = buffer.replay(controller, average_cost(scenario))
     finally:
         controller.theta = theta
     slope = (after.action_value - before.action_value) / h
@@ -98,8 +98,8 @@ def test_a_restored_buffer_replays_alike(scenario, collected):
     for sample in samples[30:35]:
         buffer.add(sample)
         other.add(sample)
-    first = buffer.replay(controller, level(scenario))
+    first = buffer.replay(controller, average_cost(scenario))
     controller.reset()
-    second = other.replay(controller, level(scenario))
+    second = other.replay(controller, average_cost(scenario))
     assert np.array_equal(first.number, second.number)
     assert first.td_error == pytest.approx(second.td_error, rel=1e-9, abs=1e-6)

@@ -21,26 +21,26 @@ from learning.definiteness import certificate
 from learning.errors import ConfigurationError, DivergenceError
 from learning.evaluation import Judge
 from learning.learner import Learner
-from learning.log import COLUMNS, Row, Totals, to_csv
+from learning.log import COLUMNS, LogRow, Totals, to_csv
 from learning.protocols import Algorithm
-from learning.run import Result, Run, TrainingRecorder
+from learning.training_run import TrainingRecorder, TrainingResult, TrainingRun
 
-Progress = Callable[[int, Row], None]
+Progress = Callable[[int, LogRow], None]
 """Gets the samples done and the last row of the log."""
 
 
-class Training:
+class TrainingLoop:
     """One run of one algorithm on one plant.
 
     `plant` and `evaluation_plant` are two plants of the run's scenario. `optimum` is a controller
     whose J on the held-out runs is J*, for the gap closed; without it the gap is NaN. With `out`,
     learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on; a plant
-    that cannot serialise its state leaves no checkpoint, and `obstacle` says so.
+    that cannot serialise its state leaves no checkpoint, and `without_checkpoint` says so.
     """
 
     def __init__(
         self,
-        run: Run,
+        run: TrainingRun,
         algorithm: type[Algorithm],
         plant: FmuPlant,
         evaluation_plant: FmuPlant,
@@ -53,12 +53,12 @@ class Training:
         self._learner = Learner(run, algorithm, plant)
         self._good = self._learner.start
         self._judge = Judge(run, cast("Any", evaluation_plant), self._good, optimum)
-        self._rows: list[Row] = []
+        self._rows: list[LogRow] = []
         self._totals = Totals()
-        self.obstacle: str | None = None
+        self.without_checkpoint: str | None = None
         """Why this run leaves no checkpoint, if it does not."""
 
-    def go(self, *, resume: bool = False, progress: Progress | None = None) -> Result:
+    def go(self, *, resume: bool = False, progress: Progress | None = None) -> TrainingResult:
         """Train to the end or to divergence.
 
         With `resume` the run goes on from its checkpoint, to the same digits as if it had never
@@ -78,7 +78,7 @@ class Training:
         finally:
             if self._recorder is not None:
                 self._recorder.close()
-        return Result(self._good, self._rows, self._judge.figures(self._good.theta), status)
+        return TrainingResult(self._good, self._rows, self._judge.figures(self._good.theta), status)
 
     def _loop(self, progress: Progress | None) -> str:
         run, learner = self._run, self._learner
@@ -107,11 +107,11 @@ class Training:
                 progress(number, row)
         return "finished"
 
-    def _row(self, number: int) -> Row:
+    def _row(self, number: int) -> LogRow:
         """A line of the log: what happened since the last one, and now and then an evaluation."""
         run, interaction = self._run, self._learner.interaction
         blocks, theta = self._good.blocks, self._learner.controller.theta
-        row: Row = dict.fromkeys(COLUMNS, float("nan"))
+        row: LogRow = dict.fromkeys(COLUMNS, float("nan"))
         row |= self._totals.means(number - (self._rows[-1]["samples"] if self._rows else 0))
         row |= {
             "samples": number,
@@ -131,7 +131,7 @@ class Training:
         self._totals = Totals()
         return row
 
-    def _trouble(self, row: Row) -> str | None:
+    def _trouble(self, row: LogRow) -> str | None:
         """Why the run must stop, or None."""
         where = f"at sample {int(row['samples'])}; the θ kept is the last one that evaluated well"
         if not np.isfinite(self._learner.controller.theta).all():
@@ -141,7 +141,7 @@ class Training:
             return f"diverged: greedy J = {greedy:.1f} exceeds {limit:.1f} {where}"
         return None
 
-    def _record(self, row: Row) -> None:
+    def _record(self, row: LogRow) -> None:
         assert self._recorder is not None
         blocks = self._good.blocks
         theta = np.array([row[f"theta {label}"] for label in blocks.labels])
@@ -158,7 +158,7 @@ class Training:
         try:
             plant = self._plant.serialise(self._plant.snapshot())
         except CapabilityError as error:
-            self.obstacle = str(error)
+            self.without_checkpoint = str(error)
             return
         numbers, arrays = learner.interaction.state()
         columns = list(self._rows[0]) if self._rows else []

@@ -17,7 +17,7 @@ from learning.protocols import LearnableController, Update
 Vector = NDArray[np.float64]
 
 
-class ParameterStep:
+class ConstrainedStep:
     """Moves a controller's θ by a fit under every constraint on θ.
 
     `scale` (n_θ,) are the coordinates of the fits: the layout's, or ones where the configuration

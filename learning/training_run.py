@@ -10,11 +10,11 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.log import Row
+from learning.log import LogRow
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """What identifies a training run; a checkpoint goes on only in the very same one.
 
     The `algorithm` by name, its `configuration`, the `scenario`, the kind of `controller` (`rti` or
@@ -60,10 +60,10 @@ class Run:
 class TrainingRecorder(Protocol):
     """Takes a training run row by row; `cosim.recording.TrainingRecorder` is one."""
 
-    def start(self, run: Run, parameters: Parameters) -> None:
+    def start(self, run: TrainingRun, parameters: Parameters) -> None:
         """Open the record."""
 
-    def record(self, row: Row, parameters: Parameters, controller: Controller) -> None:
+    def record(self, row: LogRow, parameters: Parameters, controller: Controller) -> None:
         """Append a row of the log with θ as it is."""
 
     def close(self) -> None:
@@ -71,13 +71,13 @@ class TrainingRecorder(Protocol):
 
 
 @dataclass(frozen=True)
-class Result:
+class TrainingResult:
     """What came of a run: θ, the log's `rows`, the greedy evaluation of θ, and how it ended.
 
     `status` is `finished` or `diverged: …`; then `parameters` is the last θ that evaluated well.
     """
 
     parameters: Parameters
-    rows: list[Row]
+    rows: list[LogRow]
     evaluation: dict[str, float]
     status: str

@@ -1,4 +1,4 @@
-"""The level of the TD error: a discount, or the mean cost per sample in its place."""
+"""The TD target: a discount, or the average cost per sample in its place."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.scenario import Scenario
+from learning.constrained_step import ConstrainedStep
 from learning.fit import Fit
-from learning.step import ParameterStep
 
 Matrix = NDArray[np.float64]
 
 
-class Level:
+class AverageCost:
     """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
 
     At γ = 1 the constant c_lambda cancels out of δ, and what the fit would have it do is to take
@@ -29,6 +29,17 @@ class Level:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
         self._position, self._scale = position, scale
+
+    @classmethod
+    def of(cls, discount: float | None, scenario: Scenario, step: ConstrainedStep) -> AverageCost:
+        """Target of a scenario's TD error; `discount` None is the scenario's own."""
+        position = step.blocks.slices["c_lambda"].start
+        return cls(
+            scenario.discount if discount is None else discount,
+            position,
+            float(step.scale[position]),
+            scenario.controller.reference_cost,
+        )
 
     def target(self, cost: float, next_value: float) -> float:
         """What Q(s, a) is fitted to."""
@@ -54,14 +65,3 @@ class Level:
         self.mean_cost += float(minimiser[self._position]) * self._scale
         minimiser[self._position] = 0.0
         return replace(fit, gradient=fit.metric() @ minimiser, minimiser=minimiser)
-
-
-def level(discount: float | None, scenario: Scenario, step: ParameterStep) -> Level:
-    """Level for a scenario; `discount` None is the scenario's own."""
-    position = step.blocks.slices["c_lambda"].start
-    return Level(
-        scenario.discount if discount is None else discount,
-        position,
-        float(step.scale[position]),
-        scenario.controller.reference_cost,
-    )

@@ -9,8 +9,8 @@ from cosim import FmuPlant
 from learning.errors import CheckpointError, ConfigurationError
 from learning.log import to_csv
 from learning.registry import load_algorithm
-from learning.run import Run
-from learning.training import Training
+from learning.training_loop import TrainingLoop
+from learning.training_run import TrainingRun
 
 SETTINGS = {
     "q-learning": {"warm_up": 20},
@@ -33,12 +33,14 @@ def make_run(scenario, name, **changes):
         "evaluation_seeds": 1,
         "evaluation_steps": 20,
     }
-    return Run(**{**values, **changes}), algorithm
+    return TrainingRun(**{**values, **changes}), algorithm
 
 
 def train(run, algorithm, out=None, *, resume=False, progress=None):
     with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
-        return Training(run, algorithm, plant, other, out=out).go(resume=resume, progress=progress)
+        return TrainingLoop(run, algorithm, plant, other, out=out).go(
+            resume=resume, progress=progress
+        )
 
 
 class Killed(BaseException):

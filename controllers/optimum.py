@@ -18,7 +18,7 @@ from controllers.dynamic_programming.plant import StochasticScenario, plant_law,
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum, Progress, solve
-from controllers.errors import OptimumError, QpError
+from controllers.errors import ModelError, OptimumError, QpError
 from controllers.problem import Problem
 
 Vector = NDArray[np.float64]
@@ -118,6 +118,22 @@ class OptimalPolicy:
             lambda: solve(problem, law, settings, parameters=parameters, progress=progress),
         )
         return cls(problem, law, optimum, parameters)
+
+    @classmethod
+    def stored(cls, scenario: StochasticScenario) -> OptimalPolicy | None:
+        """Optimal policy of a scenario if its solution is shipped or cached, else None.
+
+        None too where the scenario is none that could be solved. Raises OptimumError on a damaged
+        file.
+        """
+        try:
+            problem = Problem.from_scenario(scenario)
+            law, parameters = plant_law(scenario, problem), plant_parameters(scenario, problem)
+        except (ModelError, OptimumError):
+            return None
+        name = archive.key(problem, law, parameters, Settings())
+        path = archive.stored(name)
+        return None if path is None else cls(problem, law, archive.read(path, name), parameters)
 
     @property
     def gain(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite
 from typing import Any, cast
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from cosim.evaluation.statistics import Estimate, gap_closed, regret
 from cosim.protocols import Controller, Plant
 from cosim.simulation import simulate
 from learning.protocols import LearnableController
@@ -39,17 +41,41 @@ class HeldOutRuns:
 
     def means(self, controller: Controller) -> dict[str, float]:
         """Mean of each figure over the seeds; `failures` is their sum."""
-        costs = self.costs(controller)
-        figures: dict[str, Any] = {name: float(values.mean()) for name, values in costs.items()}
-        figures["failures"] = int(costs["failures"].sum())
-        return figures
+        return means(self.costs(controller))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A greedy policy on the held-out runs: means of its figures, regret and gap closed.
+
+    `regret` has its 95 % interval over the runs; it and `gap_closed` are NaN where J* is not known.
+    """
+
+    means: dict[str, float]
+    regret: Estimate
+    gap_closed: float
+
+    def row(self) -> dict[str, float]:
+        """The columns of a training's log."""
+        row = {f"greedy_{name}": value for name, value in self.means.items()}
+        return row | {"regret": self.regret.value, "gap_closed": self.gap_closed}
+
+    def summary(self) -> dict[str, Any]:
+        """The keys of a training's summary; None for what is not known."""
+        known = isfinite(self.regret.value)
+        relative = {
+            "regret": self.regret.value if known else None,
+            "regret_interval": self.regret.t,
+            "gap_closed": self.gap_closed if known else None,
+        }
+        return {**self.means, **relative}
 
 
 class Judge:
     """Judges a run's θ by its greedy policy on the held-out seeds.
 
     `start` is a θ of the run's blocks. `optimum` is a controller whose J on the same seeds is J*,
-    for the gap closed; without it the gap is NaN.
+    for the regret and the gap closed; without it they are NaN.
     """
 
     def __init__(
@@ -69,37 +95,41 @@ class Judge:
         self._controller.theta = theta
         return cast("Controller", self._controller)
 
-    def figures(self, theta: NDArray[np.float64]) -> dict[str, float]:
-        """Means of the indicators at θ (n_θ,)."""
-        return self._evaluation.means(self.controller(theta))
-
-    def gap_closed(self, cost: float) -> float:
-        """Share of the gap between the naive controller and the optimum, NaN without optimum."""
-        return gap_closed(cost, self._naive_cost, self._optimal_cost)
+    def verdict(self, theta: NDArray[np.float64]) -> Verdict:
+        """The greedy policy at θ (n_θ,), judged."""
+        costs = self._evaluation.costs(self.controller(theta))
+        return Verdict(
+            means(costs),
+            regret(costs["J"], self._optimal_cost),
+            gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value,
+        )
 
     @property
     def limit(self) -> float:
         """Greedy J above which a run has diverged."""
         # A cost may be negative, a profit say: the margin counts in its magnitude.
-        return self._naive_cost + (self._run.divergence - 1) * abs(self._naive_cost)
+        naive = float(self._naive_cost.mean())
+        return naive + (self._run.divergence - 1) * abs(naive)
 
     @cached_property
-    def _naive_cost(self) -> float:
+    def _naive_cost(self) -> NDArray[np.float64]:
         naive = self._build(Parameters.naive(self._problem))
-        return self._evaluation.means(cast("Controller", naive))["J"]
+        return self._evaluation.costs(cast("Controller", naive))["J"]
 
     @cached_property
-    def _optimal_cost(self) -> float:
+    def _optimal_cost(self) -> NDArray[np.float64]:
         if self._optimum is None:
-            return float("nan")
-        return self._evaluation.means(self._optimum)["J"]
+            return np.full(len(self._evaluation.seeds), np.nan)
+        return self._evaluation.costs(self._optimum)["J"]
+
+
+def means(costs: dict[str, NDArray[np.float64]]) -> dict[str, float]:
+    """Mean of each figure over the seeds; `failures` is their sum."""
+    figures: dict[str, Any] = {name: float(values.mean()) for name, values in costs.items()}
+    figures["failures"] = int(costs["failures"].sum())
+    return figures
 
 
 def held_out(count: int) -> tuple[int, ...]:
     """The first `count` held-out seeds."""
     return tuple(HELD_OUT + k for k in range(count))
-
-
-def gap_closed(cost: float, naive: float, optimum: float) -> float:
-    """(J_naive − J) / (J_naive − J*)."""
-    return (naive - cost) / (naive - optimum)

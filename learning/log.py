@@ -27,6 +27,7 @@ COLUMNS = (
     "greedy_mean_violation",
     "greedy_violating_share",
     "greedy_failures",
+    "regret",
     "gap_closed",
 )
 

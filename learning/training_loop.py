@@ -33,7 +33,7 @@ class TrainingLoop:
     """One run of one algorithm on one plant.
 
     `plant` and `evaluation_plant` are two plants of the run's scenario. `optimum` is a controller
-    whose J on the held-out runs is J*, for the gap closed; without it the gap is NaN. With `out`,
+    whose J on the held-out runs is J*; without it regret and gap closed are NaN. With `out`,
     learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on; a plant
     that cannot serialise its state leaves no checkpoint, and `without_checkpoint` says so.
     """
@@ -78,7 +78,8 @@ class TrainingLoop:
         finally:
             if self._recorder is not None:
                 self._recorder.close()
-        return TrainingResult(self._good, self._rows, self._judge.figures(self._good.theta), status)
+        verdict = self._judge.verdict(self._good.theta)
+        return TrainingResult(self._good, self._rows, verdict.summary(), status)
 
     def _loop(self, progress: Progress | None) -> str:
         run, learner = self._run, self._learner
@@ -124,9 +125,7 @@ class TrainingLoop:
             "saturated": interaction.saturated,
         }
         if number % run.evaluate_every == 0 or number == run.samples:
-            figures = self._judge.figures(theta)
-            row |= {f"greedy_{name}": value for name, value in figures.items()}
-            row["gap_closed"] = self._judge.gap_closed(figures["J"])
+            row |= self._judge.verdict(theta).row()
         row |= {f"theta {label}": float(v) for label, v in zip(blocks.labels, theta, strict=True)}
         self._totals = Totals()
         return row

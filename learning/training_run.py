@@ -74,10 +74,12 @@ class TrainingRecorder(Protocol):
 class TrainingResult:
     """What came of a run: θ, the log's `rows`, the greedy evaluation of θ, and how it ended.
 
+    `evaluation` is a `Verdict.summary`.
+
     `status` is `finished` or `diverged: …`; then `parameters` is the last θ that evaluated well.
     """
 
     parameters: Parameters
     rows: list[LogRow]
-    evaluation: dict[str, float]
+    evaluation: dict[str, Any]
     status: str

@@ -64,6 +64,19 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     )
 
 
+def has_stored_optimum(scenario: Scenario) -> bool:
+    """Whether `optimal` is J* of the scenario's plant and can be had without solving anything.
+
+    A foreign FMU may be another plant than the controller's model, whose optimum it is.
+    """
+    from controllers.optimum import OptimalPolicy
+    from cosim.plant.archive import SHIPPED
+
+    if scenario.plant.fmu not in SHIPPED:
+        return False
+    return OptimalPolicy.stored(cast("Any", scenario)) is not None
+
+
 def import_from_here() -> None:
     """Let `module:factory` name a module of the working directory too, after all others."""
     if (folder := str(Path.cwd())) not in sys.path:

@@ -51,7 +51,7 @@ def evaluate(
     """
     with output(json) as out_:
         from controllers.storage import write_atomically
-        from cosim.cli.compose import announce, build_controller
+        from cosim.cli.compose import announce, build_controller, has_stored_optimum
         from cosim.evaluation import evaluate as run
         from cosim.evaluation.parallel import cores
         from cosim.scenario import Scenario
@@ -62,13 +62,16 @@ def evaluate(
         options |= {"first-seed": first_seed} if first_seed else {}
         folder = open_folder(out)
         announce(task, out_)
-        units = len(named) * (seeds + 1)
+        optimum = partial(build_controller, "optimal") if has_stored_optimum(task) else None
+        extra = seeds if optimum is not None and "optimal" not in named else 0
+        units = len(named) * (seeds + 1) + extra
         with out_.progress(f"{', '.join(named)} on {task.name}", units) as progress:
             evaluation = run(
                 task,
                 {name: partial(build_controller, spec) for name, spec in named.items()},
                 range(first_seed, first_seed + seeds),
                 steps,
+                optimum=optimum,
                 folder=folder,
                 jobs=jobs or cores(),
                 scheduler=scheduler,
@@ -112,25 +115,41 @@ def _command(options: dict[str, Any]) -> str:
 
 def show(summary: dict[str, Any], output: Output) -> None:
     """Print the table of controllers and the paired comparisons."""
+    from cosim.evaluation.statistics import shown
+
     title = "{scenario}, {steps} samples × {count} seeds".format(
         **summary, count=len(summary["seeds"])
     )
     controllers = summary["controllers"].items()
     output.table(
         title,
-        ("controller", "economic cost", "violation", "violating %", "J", "gap closed %"),
+        (
+            "controller",
+            "economic cost",
+            "violation",
+            "violating %",
+            "J",
+            "regret %",
+            "gap closed %",
+        ),
         [
             (
                 name,
-                f"{row['economic_cost']:.1f}",
+                shown(row["economic_cost"], digits=6),
                 f"{row['mean_violation']:.5f}",
                 f"{100 * row['violating_share']:.2f}",
-                f"{row['J']:.1f}",
-                percent(row["gap_closed"]) if "gap_closed" in row else "",
+                shown(row["J"], digits=6),
+                percent(row["regret"]) if "regret" in row else "",
+                percent(row["gap_closed"], digits=4) if "gap_closed" in row else "",
             )
             for name, row in controllers
         ],
     )
+    if summary["optimum"] is not None:
+        output.note(
+            f"regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "
+            f"{shown(summary['optimal_J'], digits=6)}"
+        )
     output.table(
         "behaviour",
         ("controller", "input effort", "settling time s", "failures", "median step µs"),
@@ -149,12 +168,12 @@ def show(summary: dict[str, Any], output: Output) -> None:
         return
     output.table(
         "paired comparisons (95 % t interval over seeds)",
-        ("controller against reference", "ΔJ", "economic gain %"),
+        ("controller against reference", "ΔJ", "gain in J %"),
         [
             (
                 f"{row['controller']} − {row['reference']}",
                 interval(row["differences"]["J"]),
-                percent(row["economic_gain"]),
+                percent(row["gain_in_J"]),
             )
             for row in summary["comparisons"]
         ],
@@ -165,13 +184,13 @@ def _step_time(timing: dict[str, float]) -> float:
     return timing["prepare_median_us"] + timing["feedback_median_us"]
 
 
-def interval(estimate: dict[str, Any], scale: float = 1.0) -> str:
+def interval(estimate: dict[str, Any], scale: float = 1.0, digits: int = 3) -> str:
     """An estimate of a summary with its t interval."""
     from cosim.evaluation.statistics import shown
 
-    return shown(estimate["value"], estimate["t"], scale)
+    return shown(estimate["value"], estimate["t"], scale, digits)
 
 
-def percent(estimate: dict[str, Any]) -> str:
+def percent(estimate: dict[str, Any], digits: int = 3) -> str:
     """An estimate in per cent."""
-    return interval(estimate, 100.0)
+    return interval(estimate, 100.0, digits)

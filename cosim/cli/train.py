@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FIGURES = (
     ("J", "J", 1, ".0f"),
     ("greedy_J", "greedy", 1, ".0f"),
-    ("gap_closed", "gap closed %", 100, ".1f"),
+    ("regret", "regret %", 100, ".3g"),
     ("td_error", "TD", 1, ".3g"),
     ("smallest_eigenvalue", "λmin", 1, ".2g"),
 )
@@ -60,7 +60,10 @@ def train(
     ] = "rti",
     optimum: Annotated[
         str | None,
-        typer.Option("--optimum", help="Controller whose J is J* of the gap closed: optimal."),
+        typer.Option(
+            "--optimum",
+            help="Controller whose J is J*; default: optimal, where its solution is stored.",
+        ),
     ] = None,
     log_every: Annotated[
         int, typer.Option("--log-every", min=1, max=100_000_000, help="Samples per row.")
@@ -140,8 +143,11 @@ def _execute(
     record: bool,
     output: Output,
 ) -> TrainingResult:
-    from cosim.cli.compose import build_controller, build_plant
+    from cosim.cli.compose import build_controller, build_plant, has_stored_optimum
     from learning.training_loop import TrainingLoop
+
+    if optimum is None and has_stored_optimum(run.scenario):
+        optimum = "optimal"
 
     recorder: Any = None
     if record:
@@ -169,7 +175,7 @@ def _execute(
 
 
 def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:
-    """Show J, TD error, gap closed and the smallest eigenvalue of the log's rows behind the bar."""
+    """Show J, TD error, regret and the smallest eigenvalue of the log's rows behind the bar."""
     last: LogRow = {}
 
     def update(done: int, row: LogRow | None) -> None:
@@ -205,7 +211,6 @@ def summarise(run: TrainingRun, result: TrainingResult) -> dict[str, Any]:
         "evaluation_seeds": run.evaluation_seeds,
         "evaluation_steps": run.evaluation_steps,
         **result.evaluation,
-        "gap_closed": last.get("gap_closed"),
         "smallest_eigenvalue": last.get("smallest_eigenvalue"),
         "td_error": last.get("td_error"),
         "training_failures": last.get("failures"),
@@ -223,17 +228,20 @@ def _write(folder: Path, run: TrainingRun, result: TrainingResult, summary: dict
 
 
 def _show(summary: dict[str, Any], output: Output) -> None:
+    from cosim.evaluation.statistics import shown
+
     title = "{algorithm} on {scenario}, {samples} samples, seed {seed}: {status}".format(**summary)
-    gap = summary["gap_closed"]
+    regret, gap = summary["regret"], summary["gap_closed"]
     rows = [
-        ("greedy J on held-out noise", f"{summary['J']:.2f}"),
-        ("economic cost", f"{summary['economic_cost']:.2f}"),
+        ("greedy J on held-out noise", shown(summary["J"], digits=6)),
+        ("economic cost", shown(summary["economic_cost"], digits=6)),
         ("mean violation", f"{summary['mean_violation']:.6f}"),
         ("violating share", f"{100 * summary['violating_share']:.2f} %"),
         ("failures", str(summary["failures"])),
     ]
-    if gap is not None and gap == gap:  # noqa: PLR0124 (NaN where J* is not known)
-        rows.append(("gap closed", f"{100 * gap:.2f} %"))
+    if regret is not None:
+        rows.append(("regret %", shown(regret, summary["regret_interval"], 100, 3)))
+        rows.append(("gap closed %", shown(gap, None, 100, 4)))
     output.table(title, ("per sample", "value"), rows)
 
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from cosim.reproduction.readings import Reading
 
 STATE = "state.json"
-WINDOW = 10_000
 LOG_EVERY = 500
 
 
@@ -119,12 +118,12 @@ def figure(task: Training, folder: Path) -> str:
     """Draw the paper's figure for a training, PNG and SVG; returns the PNG's name."""
     import numpy as np
 
+    from cosim.evaluation.statistics import TD_WINDOW, td_error_mean
     from cosim.figures import plot_parameters_and_td_error
-    from cosim.reproduction.curves import increments, read_log, running_mean
+    from cosim.reproduction.curves import increments, read_log
 
     log = read_log(task.folder / "learning.csv")
-    # A row of the log holds the root mean square over its updates.
-    td_error = np.sqrt(running_mean(log["samples"], log["td_error"] ** 2, log["updates"], WINDOW))
+    td_error = td_error_mean(log["samples"], log["td_error"], log["updates"])
     samples = np.concatenate([[0.0], log["samples"]])
     moved = {
         block: np.vstack([np.zeros(values.shape[1]), values])
@@ -138,7 +137,7 @@ def figure(task: Training, folder: Path) -> str:
             log["samples"],
             td_error,
             folder / f"{name}.{suffix}",
-            window=WINDOW,
+            window=TD_WINDOW,
         )
     return f"{name}.png"
 

@@ -16,7 +16,7 @@ from cosim.evaluation.unit import Factory, Result, Unit, release, run
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 
-REFERENCE, OPTIMUM = "naive", "optimal"
+NAIVE, OPTIMUM = "naive", "optimal"
 
 
 def evaluate(
@@ -25,6 +25,7 @@ def evaluate(
     seeds: int | Sequence[int],
     steps: int,
     *,
+    optimum: Factory | None = None,
     folder: str | Path | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
@@ -45,16 +46,19 @@ def evaluate(
         one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
     seeds : the seeds, or their number S for 0 … S−1.
     steps : samples per run.
+    optimum : gives J* on the same seeds, without rows of its own, where no controller is named
+        `optimal`.
     folder : where finished work units are kept and found again; None keeps none.
     jobs : worker processes; 1 works in this process.
     scheduler : address of a Dask scheduler, used in place of `jobs`.
-    progress : called with the number of units done, of controllers × (seeds + 1) in all.
+    progress : called with the number of units done, of controllers × (seeds + 1) in all, and
+        `seeds` more for an `optimum`.
     command : the text of the column `command`.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
     _check(controllers, numbers, steps)
-    plan = _Plan(scenario, controllers, numbers, steps)
+    plan = _Plan(scenario, controllers, numbers, steps, optimum)
     store = Store(None if folder is None else Path(folder))
     results = {key: result for key in plan.units if (result := store.load(key)) is not None}
     report = progress or (lambda _: None)
@@ -93,8 +97,13 @@ class _Plan:
         controllers: Mapping[str, Factory],
         seeds: Sequence[int],
         steps: int,
+        optimum: Factory | None,
     ) -> None:
-        self._scenario, self._names, self._seeds = scenario, list(controllers), list(seeds)
+        self._names, self._seeds = list(controllers), list(seeds)
+        every = dict(controllers)
+        if optimum is not None:
+            every.setdefault(OPTIMUM, optimum)
+        self._optimum = OPTIMUM if OPTIMUM in every else None
         with FmuPlant(scenario) as plant:
             fmu = plant.fmu_sha256
         code = code_hash()
@@ -111,7 +120,7 @@ class _Plan:
         self._keys: dict[tuple[str, int | None], str] = {}
         self.units: dict[str, Unit] = {}
         session = secrets.token_hex(8)
-        for name, factory in controllers.items():
+        for name, factory in every.items():
             controller = factory(scenario)
             self._parameters[name] = parameters_hash(controller)
             facts = self._facts | {
@@ -120,7 +129,7 @@ class _Plan:
                 "controller_hash": controller_hash(controller),
                 "parameters_hash": self._parameters[name],
             }
-            for seed in (None, *seeds):
+            for seed in (None, *seeds) if name in controllers else seeds:
                 key = unit_key(facts | {"seed": seed})
                 self._keys[name, seed] = key
                 self.units[key] = Unit(session, name, factory, scenario, seed, steps, code)
@@ -131,15 +140,16 @@ class _Plan:
             controllers=names,
             seeds=self._seeds,
             results={
-                (name, seed): results[self._keys[name, seed]]
-                for name in names
-                for seed in self._seeds
+                (name, seed): results[key]
+                for (name, seed), key in self._keys.items()
+                if seed is not None
             },
             settling={
                 name: results[self._keys[name, None]].indicators["settling_time"] for name in names
             },
-            parameters=self._parameters,
+            parameters={name: self._parameters[name] for name in names},
             facts=self._facts | {"command": command},
-            reference=REFERENCE if REFERENCE in names else names[0],
-            optimum=OPTIMUM if OPTIMUM in names else None,
+            reference=NAIVE if NAIVE in names else names[0],
+            optimum=self._optimum,
+            naive=NAIVE if NAIVE in names else None,
         )

@@ -1,9 +1,15 @@
-"""Intervals over seeds, for means and for ratios of means, by two independent methods."""
+"""The project's statistics: regret, gap closed, gain in J; means and intervals over seeds.
+
+Every figure that a table, a log or a summary shows under one of these names comes from here. All
+arrays are paired: entry s of each belongs to seed s. Intervals are of 95 %, by two independent
+methods.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import floor, isfinite, log10
 from typing import Any
 
 import numpy as np
@@ -14,6 +20,8 @@ Array = NDArray[np.float64]
 
 LEVEL = 0.95
 RESAMPLES = 9999
+TD_WINDOW = 10_000
+"""Samples over which a TD error is averaged (paper.tex, fig. nmpc_learn)."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +52,7 @@ def mean(values: Array) -> Estimate:
 
 
 def ratio(numerator: Array, denominator: Array) -> Estimate:
-    """Ratio of the means of S paired values, (S,) each; e.g. an economic gain, or a gap closed.
+    """Ratio of the means of S paired values, (S,) each.
 
     The t interval is that of the linearised ratio (delta method): residuals (aₛ − r bₛ)/mean(b).
     NaN without intervals where the denominator's mean is zero.
@@ -62,19 +70,73 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     )
 
 
-def shown(value: float, ends: Sequence[float] | None, scale: float = 1.0, digits: int = 2) -> str:
-    """`value [low, high]` for tables, scaled and rounded; `value` where there is no interval."""
-    text = f"{scale * value:.{digits}f}"
+def regret(cost: Array, optimum: Array) -> Estimate:
+    """(J − J*)/|J*|, as a ratio of means; `cost` and `optimum` (S,) are J of each seed."""
+    return ratio(cost - optimum, _magnitude(optimum))
+
+
+def gain(cost: Array, reference: Array) -> Estimate:
+    """Gain in J over a reference, (J_ref − J)/|J_ref|, as a ratio of means; both (S,)."""
+    return ratio(reference - cost, _magnitude(reference))
+
+
+def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
+    """(J_naive − J)/(J_naive − J*), as a ratio of means; all (S,)."""
+    return ratio(naive - cost, naive - optimum)
+
+
+def td_error_mean(
+    samples: Array, td_error: Array, updates: Array, window: int = TD_WINDOW
+) -> Array:
+    """Root mean square TD error over the updates of the `window` samples up to each row, (K,).
+
+    `samples` (K,) is where a row of a training's log ends, `td_error` (K,) its root mean square
+    over its `updates` (K,); rows without updates count for nothing. The first rows average over
+    what there is; NaN where there is none.
+    """
+    counts = np.where(np.isfinite(td_error), updates, 0.0)
+    squares = np.where(counts > 0, td_error, 0.0) ** 2 * counts
+    total = np.concatenate([[0.0], np.cumsum(squares)])
+    count = np.concatenate([[0.0], np.cumsum(counts)])
+    first = np.searchsorted(np.concatenate([[0.0], samples]), samples - window, side="left")
+    last = np.arange(1, len(samples) + 1)
+    below = count[last] - count[first]
+    mean = np.maximum(total[last] - total[first], 0.0) / np.where(below > 0, below, 1.0)
+    return np.where(below > 0, np.sqrt(mean), np.nan)
+
+
+def shown(
+    value: float, ends: Sequence[float] | None = None, scale: float = 1.0, digits: int = 5
+) -> str:
+    """`value [low, high]` for tables, scaled; `value` alone where there is no interval.
+
+    Rounded so that the value keeps `digits` significant digits and the interval's half width two:
+    what two controllers differ by stays readable, whatever the size of J.
+    """
+    value *= scale
     if ends is None:
-        return text
-    low, high = (f"{scale * end:.{digits}f}" for end in ends)
-    return f"{text} [{low}, {high}]"
+        return f"{value:.{decimals(value, digits)}f}"
+    low, high = (scale * end for end in ends)
+    places = max(decimals(value, digits), decimals((high - low) / 2, 2))
+    return f"{value:.{places}f} [{low:.{places}f}, {high:.{places}f}]"
+
+
+def decimals(value: float, digits: int) -> int:
+    """Decimals, 0 to 9, with which a number shows `digits` significant digits."""
+    if not isfinite(value) or value == 0:
+        return 0
+    return min(max(digits - 1 - floor(log10(abs(value))), 0), 9)
 
 
 def quotient(numerator: Array, denominator: Array) -> float:
     """Ratio of the means alone; NaN where the denominator's is zero."""
     below = float(np.mean(denominator))
     return float(np.mean(numerator)) / below if below else float("nan")
+
+
+def _magnitude(reference: Array) -> Array:
+    """The reference with the sign that makes its mean positive: a cost may be a profit."""
+    return -reference if float(np.mean(reference)) < 0 else reference
 
 
 def _t_interval(residuals: Array, value: float) -> tuple[float, float] | None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cosim.evaluation.statistics import mean, ratio
+from cosim.evaluation.statistics import gain, gap_closed, mean, regret
 
 if TYPE_CHECKING:
     from cosim.evaluation.table import Evaluation
@@ -19,10 +19,11 @@ def summarise(evaluation: Evaluation) -> dict[str, Any]:
     """An evaluation as a JSON document: controllers, comparisons, provenance, timing.
 
     `controllers`: per controller the means over all seeds and samples, `failures` in total,
-    `settling_time` [s], `intervals` of each mean, and `gap_closed` = (J_ref − J)/(J_ref − J*) where
-    the optimum is among the controllers. `comparisons`: for each pair, the paired difference
-    controller − reference of each mean, and the economic gain (J_ref − J)/J_ref. Every interval is
-    of 95 %, over seeds, once by Student's t and once by BCa bootstrap.
+    `settling_time` [s], `intervals` of each mean, where J* is known the `regret` (J − J*)/|J*|,
+    and where the naive controller is there too `gap_closed` = (J_naive − J)/(J_naive − J*).
+    `comparisons`: for each pair, the paired difference controller − reference of each mean, and
+    `gain_in_J`, (J_ref − J)/|J_ref|. Every interval is of 95 %, paired over seeds, once by
+    Student's t and once by BCa bootstrap. `optimal_J` is J* on the same seeds.
     """
     names = list(evaluation.controllers)
     return {
@@ -30,6 +31,7 @@ def summarise(evaluation: Evaluation) -> dict[str, Any]:
         "seeds": list(evaluation.seeds),
         "reference": evaluation.reference,
         "optimum": evaluation.optimum,
+        "optimal_J": None if evaluation.optimum is None else float(np.mean(evaluation.optimal)),
         "controllers": {name: _controller(evaluation, name) for name in names},
         "comparisons": [
             _comparison(evaluation, name, reference)
@@ -52,12 +54,13 @@ def _controller(evaluation: Evaluation, name: str) -> dict[str, Any]:
             for key, estimate in estimates.items()
         },
     }
-    if evaluation.optimum is not None and evaluation.optimum != evaluation.reference:
-        reference = evaluation.column(evaluation.reference, "J")
-        document["gap_closed"] = ratio(
-            reference - evaluation.column(name, "J"),
-            reference - evaluation.column(evaluation.optimum, "J"),
-        ).to_dict()
+    if evaluation.optimum is None:
+        return document
+    cost = evaluation.column(name, "J")
+    document["regret"] = regret(cost, evaluation.optimal).to_dict()
+    if evaluation.naive is not None:
+        naive = evaluation.column(evaluation.naive, "J")
+        document["gap_closed"] = gap_closed(cost, naive, evaluation.optimal).to_dict()
     return document
 
 
@@ -70,7 +73,7 @@ def _comparison(evaluation: Evaluation, name: str, reference: str) -> dict[str, 
             key: mean(evaluation.column(name, key) - evaluation.column(reference, key)).to_dict()
             for key in COMPARED
         },
-        "economic_gain": ratio(base - cost, base).to_dict(),
+        "gain_in_J": gain(cost, base).to_dict(),
     }
 
 

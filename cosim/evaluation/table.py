@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from controllers.storage import write_atomically
+from cosim.evaluation.statistics import gain, gap_closed, regret
 from cosim.evaluation.summary import summarise
 from cosim.evaluation.unit import Result
 
@@ -28,8 +29,9 @@ NUMBERS = (
     "mean_violation",
     "violating_share",
     "J",
-    "economic_gain",
+    "regret",
     "gap_closed",
+    "gain_in_J",
     "input_effort",
     "settling_time",
 )
@@ -51,8 +53,9 @@ class Evaluation:
 
     `results` maps (controller, seed) to a unit's result; `settling` a controller to its settling
     time in s; `facts` are the columns that do not vary, `parameters` each controller's hash.
-    `reference` is the controller that gains are measured against, `optimum` the one that gives
-    J*, None if there is none.
+    `reference` is the controller that gains are measured against, `naive` the one that the gap is
+    measured from, `optimum` the one that gives J*, in `results` whether it is among the
+    `controllers` or not; None where there is none.
     """
 
     controllers: Sequence[str]
@@ -63,6 +66,14 @@ class Evaluation:
     facts: Mapping[str, Any]
     reference: str
     optimum: str | None
+    naive: str | None = None
+
+    @property
+    def optimal(self) -> Array:
+        """J of the optimum over the seeds, (S,), NaN where it is not known."""
+        if self.optimum is None:
+            return np.full(len(self.seeds), np.nan)
+        return self.column(self.optimum, "J")
 
     def column(self, controller: str, name: str) -> Array:
         """An indicator of a controller over the seeds, (S,)."""
@@ -86,15 +97,17 @@ class Evaluation:
         ]
 
     def _relative(self, controller: str, seed: int) -> dict[str, float]:
-        cost, reference = (
-            self.results[name, seed].indicators["J"] for name in (controller, self.reference)
-        )
-        gain = (reference - cost) / reference if reference else float("nan")
-        gap = float("nan")
-        if self.optimum is not None:
-            span = reference - self.results[self.optimum, seed].indicators["J"]
-            gap = (reference - cost) / span if span else float("nan")
-        return {"economic_gain": gain, "gap_closed": gap}
+        def cost(name: str | None) -> Array:
+            if name is None:
+                return np.array([np.nan])
+            return np.array([self.results[name, seed].indicators["J"]])
+
+        own, optimum = cost(controller), cost(self.optimum)
+        return {
+            "regret": regret(own, optimum).value,
+            "gap_closed": gap_closed(own, cost(self.naive), optimum).value,
+            "gain_in_J": gain(own, cost(self.reference)).value,
+        }
 
     def summary(self) -> dict[str, Any]:
         """Means, intervals, paired differences and ratios; see `summarise`."""
@@ -124,6 +137,8 @@ class Evaluation:
         names = list(next(iter(self.results.values())).timing)
         writer.writerow(["controller", "seed", *names])
         for (controller, seed), result in self.results.items():
+            if controller not in self.controllers:
+                continue
             cells = (f"{result.timing[name]:.6g}" for name in names)
             writer.writerow([controller, seed, *cells])
         return text.getvalue()

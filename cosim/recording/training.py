@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isfinite, nan, sqrt
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from cosim.evaluation.statistics import TD_WINDOW, td_error_mean
 from cosim.protocols import Controller
 from cosim.recording.blueprint import framed, sample_axis, series, union
 from cosim.recording.channels import Channel, escaped
@@ -22,7 +23,6 @@ from cosim.recording.text import drawable
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
-WINDOW = 10_000
 ROWS = 64
 _THETA = "theta "
 _TOGETHER = {
@@ -97,7 +97,7 @@ class TrainingRecorder:
         self._scalars: dict[str, Channel] = {}
         self._rows: list[Mapping[str, float]] = []
         self._thetas: list[Array] = []
-        self._recent: list[tuple[float, float]] = []
+        self._recent: list[tuple[float, float, float]] = []
         self._map: PolicyMap | None = None
         scenario, name = run.scenario, f"{run.algorithm} on {run.scenario.name}"
         stream = self._stream = Stream(self.path, name)
@@ -145,12 +145,12 @@ class TrainingRecorder:
             self._stream = None
 
     def _td_error_mean(self, row: Mapping[str, float]) -> float:
-        """Root mean square over the rows of the preceding `WINDOW` samples."""
+        """Root mean square TD error of the preceding 10 000 samples, as every table has it."""
         number = row["samples"]
-        self._recent.append((number, row.get("td_error", nan)))
-        self._recent = [entry for entry in self._recent if entry[0] > number - WINDOW]
-        squares = [error**2 for _, error in self._recent if isfinite(error)]
-        return sqrt(sum(squares) / len(squares)) if squares else nan
+        self._recent.append((number, row.get("td_error", nan), row.get("updates", nan)))
+        # The row before the window says where the first one within it begins.
+        self._recent = [entry for entry in self._recent if entry[0] >= number - TD_WINDOW]
+        return float(td_error_mean(*np.array(self._recent).T)[-1])
 
     def _send(self) -> None:
         if self._stream is None or not self._rows:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.evaluation import Evaluation
-from cosim.evaluation.statistics import Estimate, mean, quotient, ratio
+from cosim.evaluation.statistics import Estimate, gain, gap_closed, mean, regret
 
 Array = NDArray[np.float64]
 
@@ -26,8 +26,8 @@ class Row:
     """A controller, or several of one learner, against the baselines.
 
     `estimates` by name: J, economic cost, mean violation, violating share, gain over naive and
-    over tuned, gap closed. Their t intervals are over the noise seeds for one controller, over the
-    `training_seeds` for a learner; `worst_gap_closed` is that of its worst training seed.
+    over tuned, regret, gap closed. Their t intervals are over the noise seeds for one controller,
+    over the `training_seeds` for a learner; `worst_gap_closed` is that of its worst training seed.
     """
 
     controller: str
@@ -51,8 +51,7 @@ def rows(evaluation: Evaluation, learners: Mapping[str, Sequence[str]]) -> list[
 def _single(evaluation: Evaluation, name: str) -> Row:
     estimates = {figure: mean(evaluation.column(name, figure)) for figure in FIGURES}
     cost = evaluation.column(name, "J")
-    for label, (above, below) in _relative(evaluation, cost).items():
-        estimates[label] = ratio(above, below)
+    estimates |= _relative(evaluation, cost)
     gap = estimates.get("gap_closed")
     return Row(name, 0, estimates, gap.value if gap else float("nan"))
 
@@ -64,27 +63,26 @@ def _learner(evaluation: Evaluation, name: str, group: Sequence[str]) -> Row:
     }
     shares: dict[str, list[float]] = {}
     for one in group:
-        for label, (above, below) in _relative(evaluation, evaluation.column(one, "J")).items():
-            shares.setdefault(label, []).append(quotient(above, below))
+        for label, estimate in _relative(evaluation, evaluation.column(one, "J")).items():
+            shares.setdefault(label, []).append(estimate.value)
     estimates |= {label: mean(np.array(values)) for label, values in shares.items()}
     return Row(name, len(group), estimates, min(shares.get("gap_closed", [float("nan")])))
 
 
-def _relative(evaluation: Evaluation, cost: Array) -> dict[str, tuple[Array, Array]]:
-    """Numerator and denominator, (S,) each, of the gains and of the gap closed."""
+def _relative(evaluation: Evaluation, cost: Array) -> dict[str, Estimate]:
+    """Gains in J, regret and gap closed of J over the seeds, (S,)."""
     columns = {
         name: evaluation.column(name, "J")
         for name in (NAIVE, TUNED, OPTIMAL)
         if name in evaluation.controllers
     }
     found = {
-        label: (columns[name] - cost, columns[name])
-        for label, name in RELATIVE.items()
-        if name in columns
+        label: gain(cost, columns[name]) for label, name in RELATIVE.items() if name in columns
     }
+    if OPTIMAL in columns:
+        found["regret"] = regret(cost, columns[OPTIMAL])
     if NAIVE in columns and OPTIMAL in columns:
-        naive = columns[NAIVE]
-        found["gap_closed"] = (naive - cost, naive - columns[OPTIMAL])
+        found["gap_closed"] = gap_closed(cost, columns[NAIVE], columns[OPTIMAL])
     return found
 
 
@@ -103,7 +101,7 @@ class Table:
         for row in table:
             record = {name: _text(value) for name, value in (lead or {}).items()}
             record |= {"controller": row.controller, "training_seeds": str(row.training_seeds)}
-            for name in (*FIGURES, *RELATIVE, "gap_closed"):
+            for name in (*FIGURES, "regret", *RELATIVE, "gap_closed"):
                 record |= columns(name, row.estimates.get(name))
             record["worst_gap_closed"] = _text(row.worst_gap_closed)
             self.records.append(record)

@@ -34,19 +34,3 @@ def increments(log: dict[str, Array], start: dict[str, float]) -> dict[str, Arra
             label = name.removeprefix(THETA)
             blocks.setdefault(label.partition("[")[0], []).append(values - start[label])
     return {name: np.stack(columns, axis=1) for name, columns in blocks.items()}
-
-
-def running_mean(samples: Array, values: Array, weights: Array, window: int) -> Array:
-    """Weighted mean of what lies within the `window` samples up to each row; NaN before that.
-
-    `samples` (K,) is where a row ends, `values` (K,) its mean over `weights` (K,) updates; rows
-    without updates count for nothing.
-    """
-    total = np.concatenate([[0.0], np.cumsum(np.where(weights > 0, values * weights, 0.0))])
-    count = np.concatenate([[0.0], np.cumsum(weights)])
-    ends = np.concatenate([[0.0], samples])
-    first = np.searchsorted(ends, samples - window, side="left")
-    last = np.arange(1, len(samples) + 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (total[last] - total[first]) / (count[last] - count[first])
-    return np.where(samples >= window, mean, np.nan)

@@ -18,15 +18,16 @@ NEAR = 3.0
 
 def comparison_lines(summary: Mapping[str, Any]) -> Lines:
     """The paper's table, header first: gains over (a) and (b), and the distance to the optimum."""
-    header = ["controller", "trainings", "J", "violating %", "gain over (a) %", "gain over (b) %"]
-    lines = [[*header, "gap closed %", "worst %"]]
+    header = ["controller", "trainings", "J", "regret %", "violating %", "gain over (a) %"]
+    lines = [[*header, "gain over (b) %", "gap closed %", "worst %"]]
     for row in summary["comparison"]:
         seeds = int(row["training_seeds"])
         lines.append(
             [
                 row["controller"],
                 str(seeds or ""),
-                cell(row, "J", 1.0, 1),
+                cell(row, "J", 1.0, 6),
+                cell(row, "regret", 100.0, 3),
                 number(row["violating_share"], 100.0),
                 cell(row, "gain_over_naive", 100.0),
                 cell(row, "gain_over_tuned", 100.0),
@@ -41,7 +42,7 @@ def converged_lines(summary: Mapping[str, Any]) -> Lines:
     """RTI against converged NMPC, header first."""
     lines = [["θ", "J of RTI", "J converged − J RTI"]]
     for row in summary["converged"]:
-        lines.append([row["rti"], cell(row, "J_rti", 1.0, 1), cell(row, "J_difference", 1.0, 3)])
+        lines.append([row["rti"], cell(row, "J_rti", 1.0, 6), cell(row, "J_difference", 1.0, 3)])
     return lines
 
 
@@ -103,8 +104,9 @@ HEAD = """\
 
 Made by `cosim reproduce --budget {budget}`. J is the mean of economic cost + penalty per sample,
 on noise that no training met. Intervals are of 95 % (Student's t), over noise seeds for one
-controller and over training seeds for a learner. Gap closed = (J_naive − J)/(J_naive − J*), with
-J* the mean cost of the dynamic-programming optimum on the same noise.
+controller and over training seeds for a learner. Regret = (J − J*)/|J*| and gap closed =
+(J_naive − J)/(J_naive − J*), with J* the mean cost of the dynamic-programming optimum on the same
+noise.
 """
 
 
@@ -143,7 +145,7 @@ def markdown(lines: Lines) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (header, rule, *body))
 
 
-def cell(row: Mapping[str, str], name: str, scale: float, digits: int = 2) -> str:
+def cell(row: Mapping[str, str], name: str, scale: float, digits: int = 4) -> str:
     """`value [low, high]` of a figure, `value` where it has no interval, else nothing."""
     if not row[name]:
         return ""

@@ -20,8 +20,8 @@ eight digits and sorted rows; `cosim results check` makes the quick ones again a
 signal within the tolerance that `tolerances.toml` gives it, in the signal's unit.
 
 J is the mean of economic cost + penalty per sample; intervals are of 95 % (Student's t over
-paired seeds). Gap closed = (J_naive − J)/(J_naive − J*), with J* the mean cost of the
-dynamic-programming optimum on the same seeds.
+paired seeds). Regret = (J − J*)/|J*| and gap closed = (J_naive − J)/(J_naive − J*), with J* the
+mean cost of the dynamic-programming optimum on the same seeds.
 """
 
 
@@ -60,7 +60,8 @@ def _run(label: str, summary: dict[str, Any]) -> list[str]:
     if "J" not in summary:
         return []
     return [
-        f"`{label}`: J {summary['J']:.1f}, economic cost {summary['economic_cost']:.1f}, mean "
+        f"`{label}`: J {shown(summary['J'], digits=6)}, economic cost "
+        f"{shown(summary['economic_cost'], digits=6)}, mean "
         f"violation {summary['mean_violation']:.5f}, violating share "
         f"{100 * summary['violating_share']:.2f} %, failures {summary['failures']}."
     ]
@@ -68,30 +69,33 @@ def _run(label: str, summary: dict[str, Any]) -> list[str]:
 
 def _evaluation(summary: dict[str, Any]) -> list[str]:
     gains = {
-        (row["controller"], row["reference"]): row["economic_gain"]
-        for row in summary["comparisons"]
+        (row["controller"], row["reference"]): row["gain_in_J"] for row in summary["comparisons"]
     }
     references = [name for name in ("naive", "tuned") if name in summary["controllers"]]
-    head = ["controller", "economic cost", "violation", "violating %", "J"]
-    head += [f"gain over {name} %" for name in references] + ["gap closed %"]
+    head = ["controller", "economic cost", "violation", "violating %", "J", "regret %"]
+    head += [f"gain in J over {name} %" for name in references] + ["gap closed %"]
     lines = [_line(head), _line(["---"] + ["---:"] * (len(head) - 1))]
     for name, row in summary["controllers"].items():
         cells = [
             name,
-            f"{row['economic_cost']:.1f}",
+            shown(row["economic_cost"], digits=6),
             f"{row['mean_violation']:.5f}",
             f"{100 * row['violating_share']:.2f}",
-            shown(row["J"], row["intervals"]["J"]["t"], 1.0, 1),
+            shown(row["J"], row["intervals"]["J"]["t"], digits=6),
+            _percent(row.get("regret")),
         ]
         for reference in references:
             gain = gains.get((name, reference))
-            cells.append(shown(gain["value"], gain["t"], 100.0, 2) if gain else "")
-        gap = row.get("gap_closed")
-        cells.append(shown(gap["value"], gap["t"], 100.0, 2) if gap else "")
+            cells.append(_percent(gain))
+        cells.append(_percent(row.get("gap_closed"), 4))
         lines.append(_line(cells))
     seeds = summary["seeds"]
     runs = f"{len(seeds)} seeds ({seeds[0]} to {seeds[-1]}) × {summary['steps']} samples"
     return [f"Scenario `{summary['scenario']}`, {runs}:", "", *lines]
+
+
+def _percent(estimate: dict[str, Any] | None, digits: int = 3) -> str:
+    return shown(estimate["value"], estimate["t"], 100.0, digits) if estimate else ""
 
 
 def _line(cells: list[str]) -> str:

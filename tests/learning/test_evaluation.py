@@ -4,7 +4,7 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant, simulate
 from learning import QLearning
-from learning.evaluation import HELD_OUT, HeldOutRuns, Judge, gap_closed, held_out
+from learning.evaluation import HELD_OUT, HeldOutRuns, Judge, held_out
 from learning.training_run import TrainingRun
 
 
@@ -19,11 +19,6 @@ def test_evaluation_is_the_closed_loop_on_the_held_out_seeds(scenario, problem, 
     assert means["J"] == pytest.approx(np.mean([run["J"] for run in runs]))
 
 
-def test_gap_closed_is_zero_for_naive_and_one_for_the_optimum():
-    assert gap_closed(28_000.0, 28_000.0, 6300.0) == 0.0
-    assert gap_closed(6300.0, 28_000.0, 6300.0) == 1.0
-
-
 def judge(plant, parameters, divergence=1.5, optimum=None):
     run = TrainingRun(
         "q-learning", plant.scenario, 100, 0, QLearning.Configuration(), divergence=divergence,
@@ -35,7 +30,7 @@ def judge(plant, parameters, divergence=1.5, optimum=None):
 def test_the_judge_sets_theta_and_evaluates_greedily(scenario, problem, parameters):
     other = parameters.replace({"x_l": np.array([26.0, 40.0])})
     with FmuPlant(scenario) as plant:
-        found = judge(plant, parameters).figures(other.theta)
+        found = judge(plant, parameters).verdict(other.theta).means
         assert found == HeldOutRuns(plant, held_out(1), 30).means(RtiNmpc(problem, other))
 
 
@@ -45,8 +40,11 @@ def test_the_naive_controller_is_the_judges_zero_and_the_optimum_its_one(
     other = RtiNmpc(problem, parameters.replace({"x_l": np.array([26.0, 40.0])}))
     with FmuPlant(scenario) as plant:
         judged = judge(plant, parameters, optimum=other)
-        naive = judged.figures(parameters.theta)["J"]
-        optimum = HeldOutRuns(plant, held_out(1), 30).means(other)["J"]
-        assert (judged.gap_closed(naive), judged.gap_closed(optimum)) == (0.0, 1.0)
-        assert judged.limit == pytest.approx(1.5 * naive)
-        assert np.isnan(judge(plant, parameters).gap_closed(naive))
+        naive, optimum = judged.verdict(parameters.theta), judged.verdict(other.theta)
+        assert (naive.gap_closed, optimum.gap_closed) == (0.0, 1.0)
+        best = HeldOutRuns(plant, held_out(1), 30).means(other)["J"]
+        assert naive.regret.value == pytest.approx(naive.means["J"] / best - 1)
+        assert optimum.regret.value == 0.0
+        assert judged.limit == pytest.approx(1.5 * naive.means["J"])
+        unknown = judge(plant, parameters).verdict(parameters.theta)
+        assert np.isnan([unknown.gap_closed, unknown.regret.value]).all()

@@ -42,6 +42,17 @@ def test_the_gap_closed_is_known_where_the_optimum_is(cosim, tmp_path):
     assert json.loads(out)["gap_closed"] is not None
 
 
+def test_the_regret_is_known_without_naming_the_optimum(cosim, tmp_path):
+    code, out, _ = cosim(*SHORT, "--out", "run", "--json")
+    assert code == 0
+    assert json.loads(out)["regret"] is not None
+    code, out, _ = cosim("evaluate", "-c", "tuned", "--seeds", 2, "-n", 20, "-j", 1, "--json")
+    assert code == 0
+    summary = json.loads(out)
+    assert summary["optimum"] == "optimal"
+    assert summary["controllers"]["tuned"]["regret"]["value"] is not None
+
+
 def test_a_recording_is_written(cosim, tmp_path):
     assert cosim(*SHORT, "--out", "run", "--record")[0] == 0
     assert (tmp_path / "run/training.rrd").stat().st_size > 10_000

@@ -48,7 +48,7 @@ def test_rows_are_what_single_runs_give(paper):
 def test_a_controller_against_itself_differs_by_nothing(paper):
     evaluation = evaluate(paper, {"a": proportional, "b": proportional}, 4, 50)
     (comparison,) = evaluation.summary()["comparisons"]
-    for estimate in (*comparison["differences"].values(), comparison["economic_gain"]):
+    for estimate in (*comparison["differences"].values(), comparison["gain_in_J"]):
         assert estimate == {"value": 0.0, "t": (0.0, 0.0), "bootstrap": (0.0, 0.0)}
 
 
@@ -60,11 +60,30 @@ def test_gain_and_gap_are_taken_against_naive_and_optimal(paper):
     assert gap == pytest.approx({"optimal": 1.0, "naive": 0.0, "mine": 1.0})
     cost = {name: np.mean(evaluation.column(name, "J")) for name in named}
     gain = next(
-        c["economic_gain"]["value"]
+        c["gain_in_J"]["value"]
         for c in summary["comparisons"]
         if (c["controller"], c["reference"]) == ("mine", "naive")
     )
     assert gain == pytest.approx(1.0 - cost["mine"] / cost["naive"], rel=1e-12)
+
+
+def test_the_optimum_need_not_be_named_for_the_regret(paper):
+    named = {"mine": hold}
+    evaluation = evaluate(paper, named, 3, 40, optimum=proportional)
+    beside = evaluate(paper, named | {"optimal": proportional}, 3, 40).summary()
+    summary = evaluation.summary()
+    assert {row["controller"] for row in evaluation.rows} == {"mine"}
+    assert list(summary["controllers"]) == ["mine"]
+    assert summary["optimal_J"] == beside["optimal_J"] == beside["controllers"]["optimal"]["J"]
+    assert summary["controllers"]["mine"]["regret"] == beside["controllers"]["mine"]["regret"]
+    assert "gap_closed" not in summary["controllers"]["mine"], "there is no naive controller"
+
+
+def test_each_row_has_the_regret_of_its_seed(paper):
+    evaluation = evaluate(paper, BOTH, 2, 40, optimum=hold)
+    for row in evaluation.rows:
+        optimum = evaluation.results["hold", row["seed"]].indicators["J"]
+        assert row["regret"] == pytest.approx((row["J"] - optimum) / optimum, abs=1e-15)
 
 
 def test_parquet_holds_the_table_of_the_csv(paper):

@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
 
-from cosim.evaluation.statistics import mean, ratio
+from cosim.evaluation.statistics import (
+    gain,
+    gap_closed,
+    mean,
+    ratio,
+    regret,
+    shown,
+    td_error_mean,
+)
 
 
 def test_t_interval_of_a_textbook_sample():
@@ -63,3 +71,55 @@ def test_a_value_that_is_not_finite_leaves_no_interval():
     estimate = mean(np.array([1.0, np.nan, 2.0]))
     assert np.isnan(estimate.value)
     assert (estimate.t, estimate.bootstrap) == (None, None)
+
+
+def test_regret_gap_and_gain_are_ratios_of_means():
+    naive, tuned, optimum = np.array([110.0, 90.0]), np.array([85.0, 75.0]), np.array([60.0, 40.0])
+    assert regret(tuned, optimum).value == pytest.approx(30 / 50)
+    assert gain(tuned, naive).value == pytest.approx(20 / 100)
+    assert gap_closed(tuned, naive, optimum).value == pytest.approx(20 / 50)
+
+
+def test_a_worse_controller_shows_a_loss_where_the_cost_is_a_profit():
+    # The CSTR's J is negative: naive −5.929, a learner −5.699, which is dearer by 3.87 %.
+    naive, learner = np.full(3, -5.929), np.full(3, -5.699)
+    assert gain(learner, naive).value == pytest.approx(-0.0388, abs=1e-4)
+    assert regret(learner, naive).value == pytest.approx(0.0388, abs=1e-4)
+
+
+def test_pairing_makes_the_interval_of_a_constant_regret_a_point():
+    optimum = np.array([10.0, 40.0, 20.0])
+    assert regret(1.02 * optimum, optimum).t == pytest.approx((0.02, 0.02), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "ends", "digits", "text"),
+    [
+        (-5.929, None, 4, "-5.929"),
+        (-5.938, (-6.0, -5.9), 4, "-5.938 [-6.000, -5.900]"),
+        (28643.5, (27000.0, 30000.0), 5, "28644 [27000, 30000]"),
+        (0.0341234, (0.0331, 0.0351), 3, "0.0341 [0.0331, 0.0351]"),
+        (6347.6, (6347.58, 6347.62), 5, "6347.600 [6347.580, 6347.620]"),
+        (0.0, (0.0, 0.0), 3, "0 [0, 0]"),
+        (float("nan"), None, 3, "nan"),
+    ],
+)
+def test_figures_show_significant_digits(value, ends, digits, text):
+    assert shown(value, ends, digits=digits) == text
+
+
+def test_the_td_mean_is_that_of_the_updates_within_the_window():
+    rng = np.random.default_rng(0)
+    samples = np.arange(1, 41) * 500.0
+    updates = rng.integers(0, 6, 40).astype(float)
+    errors = np.where(updates > 0, rng.normal(size=40), np.nan)
+    found = td_error_mean(samples, errors, updates, 10_000)
+    for k in range(40):
+        inside = (samples > samples[k] - 10_000) & (samples <= samples[k])
+        each = np.repeat(errors[inside], updates[inside].astype(int))
+        assert found[k] == pytest.approx(np.sqrt(np.mean(each**2)), rel=1e-12)
+
+
+def test_the_td_mean_of_rows_without_updates_is_undefined():
+    nothing = td_error_mean(np.array([500.0]), np.array([np.nan]), np.array([0.0]))
+    assert np.isnan(nothing).all()

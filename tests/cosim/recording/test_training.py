@@ -30,7 +30,13 @@ def training_run(scenario):
 
 
 def row(samples, td_error=1.0, greedy=nan):
-    return {"samples": samples, "td_error": td_error, "greedy_J": greedy, "theta c": 1.0}
+    return {
+        "samples": samples,
+        "td_error": td_error,
+        "updates": 1,
+        "greedy_J": greedy,
+        "theta c": 1.0,
+    }
 
 
 def recorded(path, scenario, rows, thetas, controller=None):

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import ComparisonError
-from cosim.trajectory import Signal, read_signals
+from cosim.trajectory import Signal
 from cosim.validation import suggestion
 
 Array = NDArray[np.float64]
-TRAJECTORY = "trajectory.csv"
-# Read off the clock: two equal runs differ in them.
-_MEASURED = ("prepare_time", "feedback_time")
 # Itself an error, of the size of rounding: no share of it is a tolerance.
 _ERROR = "residual"
 
 
 @dataclass(frozen=True)
-class Run:
+class RunSignals:
     """A run's `signals` by name, all of K samples, and the status of each ([] if not known)."""
 
     name: str
@@ -109,7 +105,11 @@ class Comparison:
 
 
 def compare(
-    a: Run, b: Run, tolerances: Mapping[str, float] | None = None, *, relative: float = 0.0
+    a: RunSignals,
+    b: RunSignals,
+    tolerances: Mapping[str, float] | None = None,
+    *,
+    relative: float = 0.0,
 ) -> Comparison:
     """Compare two runs; two NaN are equal.
 
@@ -172,31 +172,6 @@ def _first(differs: Sequence[bool] | NDArray[np.bool_]) -> int | None:
 
 def _with_unit(value: float, unit: str) -> str:
     return f"{value:.6g} {unit}".rstrip() if unit != "1" else f"{value:.6g}"
-
-
-def load_run(path: str | Path) -> Run:
-    """Load a run from a folder that holds trajectory.csv, from such a CSV, or from a `.rrd` file.
-
-    Raises
-    ------
-    ComparisonError : nothing of the kind there; TrajectoryError, RecordingError : not readable.
-    """
-    path = Path(path)
-    if path.is_dir():
-        path = path / TRAJECTORY
-    if not path.is_file():
-        raise ComparisonError(f"there is no run at '{path}'; give a run's folder, CSV or .rrd")
-    if path.suffix != ".rrd":
-        return Run(str(path), *read_signals(path))
-    from cosim.recording import read_recording  # noqa: PLC0415 - half a second, for .rrd only
-
-    recording = read_recording(path)
-    signals = {
-        name: Signal(name, recording.units[name], values)
-        for name, values in recording.signals.items()
-        if values.ndim == 1 and name not in _MEASURED
-    }
-    return Run(str(path), signals, recording.status)
 
 
 def as_document(comparison: Comparison) -> dict[str, Any]:

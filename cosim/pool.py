@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cosim.errors import PlantError
 from cosim.plant import FmuPlant
-from cosim.plant.closing import Closing
+from cosim.plant.resource import Resource
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 
@@ -30,7 +30,7 @@ class Steps(NamedTuple):
     disturbance: Array
 
 
-class PlantPool(Closing):
+class PlantPool(Resource):
     """A fixed number of independent plants over one unpacked FMU, stepped together.
 
     The instances live in this process: a call costs a few µs, less than handing it to a thread.

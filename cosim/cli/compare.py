@@ -40,8 +40,9 @@ def compare(
     """
     with output(json) as out_:
         from cosim import comparison
+        from cosim.stored_run import load_run
 
-        runs = comparison.load_run(a), comparison.load_run(b)
+        runs = load_run(a), load_run(b)
         result = comparison.compare(*runs, _tolerances(tolerance or []), relative=relative)
         if record is not None:
             from cosim.recording import record_comparison

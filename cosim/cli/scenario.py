@@ -17,8 +17,8 @@ def scenario(
 ) -> None:
     """List the presets, or print a scenario with every field written out, as TOML."""
     with output(json) as out_:
-        from cosim.documents import presets
         from cosim.scenario import Scenario
+        from cosim.scenario.loading import presets
 
         if name is None:
             loaded = [Scenario.load(preset) for preset in presets()]

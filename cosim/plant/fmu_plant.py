@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from cosim.errors import CapabilityError, PlantError
 from cosim.penalty import Penalty
 from cosim.plant.archive import SHIPPED, unpack
-from cosim.plant.closing import Closing
 from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
+from cosim.plant.resource import Resource
 from cosim.plant.snapshot import Memory, Snapshot, packed, unpacked
 from cosim.plant.wiring import Wirer, seed_words
 from cosim.protocols import Step
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 _NOT_STARTED = -1
 
 
-class FmuPlant(Closing):
+class FmuPlant(Resource):
     """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
 
     At sample k, time k·h: the action is written, ℓ(x_k, u_k, d_k) and d_k are read, the FMU steps

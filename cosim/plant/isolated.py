@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from cosim import errors
 from cosim.errors import CosimError, PlantError
-from cosim.plant.closing import Closing
 from cosim.plant.fmu_plant import FmuPlant
+from cosim.plant.resource import Resource
 from cosim.plant.snapshot import Snapshot
 from cosim.protocols import Step
 from cosim.scenario import Scenario
@@ -41,7 +41,7 @@ class IsolatedSnapshot:
         self.plant.dropped.append(self.number)
 
 
-class IsolatedPlant(Closing):
+class IsolatedPlant(Resource):
     """`FmuPlant` in a spawned process: the same calls, except `serialise`, at about 0.1 ms a step.
 
     Use it for foreign FMUs that may crash. Raises the errors of `FmuPlant`, and PlantError if the

@@ -1,9 +1,9 @@
 """Rerun recordings: of runs, of training and of comparisons; the only importer of rerun."""
 
 from cosim.recording.overlay import record_comparison
-from cosim.recording.reading import Recording, read_recording, read_signals, summarise
-from cosim.recording.run import RerunRecorder
-from cosim.recording.training import TrainingRecorder
+from cosim.recording.reader import Recording, read_recording, read_signals, summarise
+from cosim.recording.run_recorder import RerunRecorder
+from cosim.recording.training_recorder import TrainingRecorder
 from cosim.recording.viewer import open_viewer, render
 
 __all__ = [

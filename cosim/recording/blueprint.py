@@ -9,8 +9,8 @@ import rerun.blueprint as rrb
 
 from cosim.recording import diagram, horizon
 from cosim.recording.channels import Channel, Range
+from cosim.recording.glyphs import drawable
 from cosim.recording.stream import TIME
-from cosim.recording.text import drawable
 
 GROUPS = ("states", "actions", "disturbances", "costs", "step_time")
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import rerun as rr
 
+from cosim.recording.glyphs import drawable
 from cosim.recording.palette import FRAME, SERIES, packed_all
 from cosim.recording.stream import Stream
-from cosim.recording.text import drawable
 from cosim.scenario import Scenario
 
 ENTITY = "signal_flow"

@@ -9,9 +9,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from cosim.recording.glyphs import drawable
 from cosim.recording.palette import BOUND, FRAME, REFERENCE, packed, packed_all
 from cosim.recording.stream import Stream
-from cosim.recording.text import drawable
 
 ENTITY = "prediction"
 WIDTH, HEIGHT, GAP = 4.0, 1.0, 0.5

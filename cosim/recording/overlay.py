@@ -10,17 +10,19 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from cosim.comparison import Comparison, Run
+from cosim.comparison import Comparison, RunSignals
 from cosim.recording.blueprint import framed, series, time_axis, union
 from cosim.recording.channels import Channel
+from cosim.recording.glyphs import drawable
 from cosim.recording.palette import SERIES
 from cosim.recording.stream import Stream, line, sample_times
-from cosim.recording.text import drawable
 
 _SIDES = ("A", "B")
 
 
-def record_comparison(path: str | Path, a: Run, b: Run, comparison: Comparison) -> None:
+def record_comparison(
+    path: str | Path, a: RunSignals, b: RunSignals, comparison: Comparison
+) -> None:
     """Write a recording with runs A and B overlaid, and A − B; raises RecordingError.
 
     Entities are `A/<signal>`, `B/<signal>` and `difference/<signal>`.
@@ -48,14 +50,14 @@ def record_comparison(path: str | Path, a: Run, b: Run, comparison: Comparison) 
     stream.close()
 
 
-def _channels(name: str, runs: tuple[Run, Run]) -> list[Channel]:
+def _channels(name: str, runs: tuple[RunSignals, RunSignals]) -> list[Channel]:
     return [
         Channel(side, name, run.signals[name].unit, color).with_values(run.signals[name].values)
         for side, run, color in zip(_SIDES, runs, SERIES, strict=False)
     ]
 
 
-def _difference(name: str, a: Run, b: Run) -> tuple[Channel, np.ndarray]:
+def _difference(name: str, a: RunSignals, b: RunSignals) -> tuple[Channel, np.ndarray]:
     common = min(len(a), len(b))
     with np.errstate(invalid="ignore"):
         values = a.signals[name].values[:common] - b.signals[name].values[:common]
@@ -63,7 +65,7 @@ def _difference(name: str, a: Run, b: Run) -> tuple[Channel, np.ndarray]:
     return channel, values
 
 
-def _time(run: Run) -> np.ndarray:
+def _time(run: RunSignals) -> np.ndarray:
     return run.signals["time"].values if "time" in run.signals else np.arange(float(len(run)))
 
 
@@ -97,7 +99,7 @@ def _blueprint(
     )
 
 
-def _text(a: Run, b: Run, comparison: Comparison) -> str:
+def _text(a: RunSignals, b: RunSignals, comparison: Comparison) -> str:
     found = comparison.lines() or ["no signal differs by more than its tolerance"]
     rows = "\n".join(
         f"| {d.name} | {d.unit or '-'} | {_number(d.maximum)} | {d.at} | {d.tolerance:.6g} |"

@@ -11,9 +11,9 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from cosim.protocols import Controller, is_solver_failure
+from cosim.recording.glyphs import drawable
 from cosim.recording.palette import BOUND, FRAME, packed
 from cosim.recording.stream import SAMPLE, Stream, mark
-from cosim.recording.text import drawable
 from cosim.scenario import Scenario
 
 ENTITY = "policy"

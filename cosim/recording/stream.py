@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from cosim.errors import RecordingError
 from cosim.recording.channels import Channel, Range
+from cosim.recording.glyphs import drawable
 from cosim.recording.palette import packed_all
-from cosim.recording.text import drawable
 
 APPLICATION = "rti-cosim"
 SIGNAL = "cosim.Signal"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from cosim.comparison import Run, compare
+from cosim.comparison import RunSignals, compare
 from cosim.errors import ResultsError
 from cosim.results.experiments import TOLERANCES, Experiment, Tolerance
 from cosim.results.tidy import DIGITS, LARGEST, RUN, Tidy, read
@@ -51,8 +51,8 @@ def differences(
         return [f"{name}: the row {_row(now, extra[0])} is computed but not stored"]
     allowed = {signal: _tolerance(signal, stored, tolerances) for signal in stored.signals}
     found = compare(
-        Run("stored", stored.signals),
-        Run("now", now.signals),
+        RunSignals("stored", stored.signals),
+        RunSignals("now", now.signals),
         {signal: tolerance.absolute for signal, tolerance in allowed.items()},
     )
     lines = []

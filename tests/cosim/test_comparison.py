@@ -8,9 +8,10 @@ from loop import Proportional
 
 from cosim import FmuPlant, simulate
 from cosim.cli.output import dump
-from cosim.comparison import Run, as_document, compare, load_run
+from cosim.comparison import RunSignals, as_document, compare
 from cosim.errors import ComparisonError, RecordingError, TrajectoryError
 from cosim.recording import RerunRecorder
+from cosim.stored_run import load_run
 from cosim.trajectory import Signal
 
 values = st.one_of(st.floats(-1e3, 1e3), st.just(float("nan")), st.just(float("inf")))
@@ -18,7 +19,7 @@ values = st.one_of(st.floats(-1e3, 1e3), st.just(float("nan")), st.just(float("i
 
 def run(status=(), **signals):
     table = {name: Signal(name, "kPa", np.array(v, dtype=float)) for name, v in signals.items()}
-    return Run("run", table, status)
+    return RunSignals("run", table, status)
 
 
 def test_equal_runs_are_equal():

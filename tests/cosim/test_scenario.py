@@ -5,9 +5,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from cosim.documents import presets
 from cosim.errors import ScenarioError
 from cosim.scenario import Scenario
+from cosim.scenario.loading import presets
 
 
 def test_presets_are_those_that_the_design_names():

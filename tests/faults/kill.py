@@ -32,7 +32,7 @@ import numpy as np
 from controllers import Parameters, Problem
 from cosim import Scenario
 from cosim.errors import RecordingError
-from cosim.recording.reading import read_recording
+from cosim.recording.reader import read_recording
 from learning.checkpoint import load as load_checkpoint
 
 ROOT = Path(__file__).parents[2]

@@ -17,7 +17,7 @@ from cosim.evaluation.store import Store
 from cosim.evaluation.unit import Result
 from cosim.plant.archive import unpack
 from cosim.recording import RerunRecorder
-from cosim.recording.reading import read_recording
+from cosim.recording.reader import read_recording
 from cosim.trajectory import read_csv
 from fmus import path as shipped
 from learning.checkpoint import Checkpoint

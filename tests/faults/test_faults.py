@@ -18,7 +18,7 @@ from controllers.factories import naive
 from controllers.qp.daqp_backend import DaqpBackend
 from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.errors import RecordingError
-from cosim.recording.reading import read_recording
+from cosim.recording.reader import read_recording
 from learning.q_learning import QLearning
 from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun

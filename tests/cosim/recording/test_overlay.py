@@ -1,13 +1,13 @@
 import numpy as np
 from rerun.chunk import RrdReader
 
-from cosim.comparison import Run, compare
+from cosim.comparison import RunSignals, compare
 from cosim.recording import record_comparison
 from cosim.trajectory import Signal
 
 
 def run(name, **signals):
-    return Run(name, {key: Signal(key, "kPa", np.array(v)) for key, v in signals.items()})
+    return RunSignals(name, {key: Signal(key, "kPa", np.array(v)) for key, v in signals.items()})
 
 
 def scalars(path):

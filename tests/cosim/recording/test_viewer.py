@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from blocks import random_block
 from matplotlib.image import imread
-from test_run import recorded
+from test_run_recorder import recorded
 
 from cosim.errors import RecordingError
 from cosim.recording import open_viewer, render, viewer

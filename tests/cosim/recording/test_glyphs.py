@@ -1,4 +1,4 @@
-from cosim.recording.text import drawable
+from cosim.recording.glyphs import drawable
 
 
 def test_letters_that_the_viewer_has_stay():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from blocks import random_block
-from test_run import recorded
+from test_run_recorder import recorded
 
 from cosim.errors import RecordingError
 from cosim.recording import read_recording, read_signals, summarise

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import isfinite
 
 from cosim.recording.channels import Channel
-from cosim.recording.text import drawable
+from cosim.recording.glyphs import drawable
 from cosim.scenario import Scenario
 
 

@@ -13,14 +13,14 @@ import rerun as rr
 from cosim.penalty import Penalty
 from cosim.protocols import Block, Controller, controller_name
 from cosim.recording import diagram
-from cosim.recording.about import describe
 from cosim.recording.blocks import joined
 from cosim.recording.blueprint import run_blueprint
 from cosim.recording.channels import Channel, run_channels, run_columns
+from cosim.recording.description import describe
+from cosim.recording.glyphs import drawable
 from cosim.recording.horizon import Horizon, Strip
 from cosim.recording.palette import BOUND, GOOD, SERIES, packed
 from cosim.recording.stream import Stream, line, lines, mark, sample_times
-from cosim.recording.text import drawable
 from cosim.scenario import Scenario
 
 ROWS = 2000

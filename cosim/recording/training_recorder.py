@@ -16,10 +16,10 @@ from cosim.evaluation.statistics import TD_WINDOW, td_error_mean
 from cosim.protocols import Controller
 from cosim.recording.blueprint import framed, sample_axis, series, union
 from cosim.recording.channels import Channel, escaped
+from cosim.recording.glyphs import drawable
 from cosim.recording.palette import SERIES, packed, packed_all
 from cosim.recording.policy_map import PolicyMap
 from cosim.recording.stream import SAMPLE, Stream, line, mark
-from cosim.recording.text import drawable
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]

@@ -14,9 +14,9 @@ import tomli_w
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from cosim.documents import merged, read
 from cosim.errors import ScenarioError
-from cosim.tables import (
+from cosim.scenario.loading import merged, read
+from cosim.scenario.tables import (
     BoundsTable,
     ControllerTable,
     DisturbanceTable,

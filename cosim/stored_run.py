@@ -1,0 +1,38 @@
+"""Reads a stored run back, from a folder, a CSV file or a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cosim.comparison import RunSignals
+from cosim.errors import ComparisonError
+from cosim.trajectory import Signal, read_signals
+
+TRAJECTORY = "trajectory.csv"
+# Read off the clock: two equal runs differ in them.
+_MEASURED = ("prepare_time", "feedback_time")
+
+
+def load_run(path: str | Path) -> RunSignals:
+    """Load a run from a folder that holds trajectory.csv, from such a CSV, or from a `.rrd` file.
+
+    Raises
+    ------
+    ComparisonError : nothing of the kind there; TrajectoryError, RecordingError : not readable.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / TRAJECTORY
+    if not path.is_file():
+        raise ComparisonError(f"there is no run at '{path}'; give a run's folder, CSV or .rrd")
+    if path.suffix != ".rrd":
+        return RunSignals(str(path), *read_signals(path))
+    from cosim.recording.reader import read_recording  # noqa: PLC0415 - half a second, for .rrd only
+
+    recording = read_recording(path)
+    signals = {
+        name: Signal(name, recording.units[name], values)
+        for name, values in recording.signals.items()
+        if values.ndim == 1 and name not in _MEASURED
+    }
+    return RunSignals(str(path), signals, recording.status)

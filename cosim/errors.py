@@ -43,3 +43,7 @@ class EvaluationError(CosimError):
 
 class ResultsError(CosimError):
     """Stored results that are missing, malformed, or differ from what is computed now."""
+
+
+class StudyError(CosimError):
+    """A study file that cannot be read, or a study that cannot be run or reported."""

@@ -66,9 +66,9 @@ def evaluation(
     with output(json) as out_:
         from functools import partial
 
-        from cosim.cli.compose import build_controller
         from cosim.cli.evaluate import named_controllers
         from cosim.evaluation.benchmark import measure
+        from cosim.lookup import build_controller
         from cosim.scenario import Scenario
 
         factories = {

@@ -51,10 +51,12 @@ def evaluate(
     """
     with output(json) as out_:
         from controllers.storage import write_atomically
-        from cosim.cli.compose import announce, build_controller, has_stored_optimum
+        from cosim.cli.compose import announce
         from cosim.evaluation import evaluate as run
         from cosim.evaluation.parallel import cores
+        from cosim.lookup import build_controller
         from cosim.scenario import Scenario
+        from learning.optimum import has_stored_optimum
 
         task = Scenario.load(scenario)
         named = named_controllers(controllers)

@@ -140,7 +140,7 @@ def _run(
 
 
 def _factory(name: str) -> Any:
-    from cosim.cli.compose import build_controller
+    from cosim.lookup import build_controller
 
     return partial(build_controller, name)
 

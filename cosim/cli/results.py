@@ -125,7 +125,7 @@ def _policy() -> Policy:
 
     import numpy as np
 
-    from cosim.cli.compose import build_controller
+    from cosim.lookup import build_controller
     from cosim.scenario import Scenario
 
     def policy(run: Path) -> Any:

@@ -32,7 +32,8 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     the summary's `timing`; all other bytes are the same for the same command and seed.
     """
     from controllers.storage import write_atomically
-    from cosim.cli.compose import announce, build_controller
+    from cosim.cli.compose import announce
+    from cosim.lookup import build_controller
     from cosim.plant import FmuPlant, IsolatedPlant
     from cosim.scenario import Scenario
     from cosim.simulation import simulate

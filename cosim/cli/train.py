@@ -99,7 +99,7 @@ def train(
     Exit code 1: learning diverged; the files then hold the last good θ and the summary says why.
     """
     with output(json) as out_:
-        from cosim.cli.compose import import_from_here
+        from cosim.lookup import import_from_here
         from cosim.scenario import Scenario
         from learning.registry import load_algorithm
         from learning.training_run import TrainingRun
@@ -143,7 +143,9 @@ def _execute(
     record: bool,
     output: Output,
 ) -> TrainingResult:
-    from cosim.cli.compose import build_controller, build_plant, has_stored_optimum
+    from cosim.cli.compose import build_plant
+    from cosim.lookup import build_controller
+    from learning.optimum import has_stored_optimum
     from learning.training_loop import TrainingLoop
 
     if optimum is None and has_stored_optimum(run.scenario):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, Future, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib import import_module
@@ -30,70 +31,101 @@ def cores() -> int:
 def run_all(
     function: Callable[[Task], Outcome],
     tasks: Mapping[str, Task],
-    done: Callable[[str, Outcome], None],
+    done: Callable[[str, Outcome], Mapping[str, Task] | None],
     *,
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> None:
     """Call `done(key, function(task))` for every task, as they finish, in no certain order.
 
-    `done` runs in this process, so what it stores survives whatever becomes of the workers. With
-    `scheduler` the tasks go to that Dask cluster; else to `jobs` processes, or none for one job.
-    A worker that dies takes down only the tasks it had not finished; they are given out again.
+    What `done` returns are further tasks, which come before those that wait. `done` runs in this
+    process, so what it stores survives whatever becomes of the workers. With `scheduler` the tasks
+    go to that Dask cluster; else to `jobs` processes, or none for one job. Only as many are given
+    out as keep the workers busy. A worker that dies takes down only the tasks it had not finished;
+    they are given out again.
 
     Raises EvaluationError if the cluster cannot be reached, or if the workers die `ROUNDS` times
     without finishing anything; the first exception of a task ends the run and is raised.
     """
     if jobs < 1:
         raise EvaluationError(f"jobs must be at least 1, not {jobs}")
-    if scheduler is None and (jobs == 1 or len(tasks) < 2):
-        for key, task in tasks.items():
-            done(key, function(task))
+    waiting = deque(tasks.items())
+    if scheduler is None and jobs == 1:
+        while waiting:
+            key, task = waiting.popleft()
+            _put_first(waiting, done(key, function(task)))
         return
-    left = dict(tasks)
     fruitless = 0
-    while left:
-        before = len(left)
+    while waiting:
+        finished = False
+
+        def count(key: str, outcome: Outcome) -> Mapping[str, Task] | None:
+            nonlocal finished
+            finished = True
+            return done(key, outcome)
+
         try:
-            with _executor(min(jobs, before), scheduler) as executor:
-                futures = {executor.submit(function, task): key for key, task in left.items()}
-                _collect(futures, left, done)
+            with _executor(jobs, scheduler) as (executor, workers):
+                _feed(executor, workers, function, waiting, count)
         except BrokenProcessPool as error:
-            fruitless = fruitless + 1 if len(left) == before else 0
+            fruitless = 0 if finished else fruitless + 1
             if fruitless == ROUNDS:
                 raise EvaluationError(
-                    f"the workers died {ROUNDS} times without finishing one of {before} work units "
-                    f"({error}); run with --jobs 1 to see why"
+                    f"the workers died {ROUNDS} times without finishing one of {len(waiting)} work "
+                    f"units ({error}); run with --jobs 1 to see why"
                 ) from None
 
 
-def _collect(
-    futures: Mapping[Future[Any], str], left: dict[str, Any], done: Callable[[str, Any], None]
+def _put_first(waiting: deque[tuple[str, Any]], more: Mapping[str, Any] | None) -> None:
+    waiting.extendleft(reversed(list((more or {}).items())))
+
+
+def _feed(
+    executor: Executor,
+    workers: Callable[[], int],
+    function: Callable[[Any], Any],
+    waiting: deque[tuple[str, Any]],
+    done: Callable[[str, Any], Mapping[str, Any] | None],
 ) -> None:
+    """Give out tasks, a few more than there are workers; what was not finished waits again."""
+    given: dict[Future[Any], tuple[str, Any]] = {}
     broken: BrokenProcessPool | None = None
-    for future in as_completed(futures):
-        try:
-            outcome = future.result()
-        except BrokenProcessPool as error:
-            # Futures that finished before the pool broke still come and still count.
-            broken = error
-            continue
-        key = futures[future]
-        done(key, outcome)
-        del left[key]
+    try:
+        while given or (waiting and broken is None):
+            limit = 2 * workers() if broken is None else 0
+            while waiting and len(given) < limit:
+                key, task = waiting.popleft()
+                given[executor.submit(function, task)] = (key, task)
+            finished, _ = wait(given, return_when=FIRST_COMPLETED)
+            for future in finished:
+                key, task = given.pop(future)
+                try:
+                    outcome = future.result()
+                except BrokenProcessPool as error:
+                    # Futures that finished before the pool broke still come and still count.
+                    broken = error
+                    waiting.appendleft((key, task))
+                    continue
+                _put_first(waiting, done(key, outcome))
+    except BrokenProcessPool as error:  # of submit: the pool broke while nothing was awaited
+        broken = error
+        waiting.appendleft((key, task))
+        for key, task in given.values():
+            waiting.appendleft((key, task))
     if broken is not None:
         raise broken
 
 
 @contextmanager
-def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor]:
+def _executor(jobs: int, scheduler: str | None) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """An executor, and a function that says how many workers it has now."""
     if scheduler is not None:
-        with _cluster(scheduler) as executor:
-            yield executor
+        with _cluster(scheduler) as cluster:
+            yield cluster
         return
     executor = loky.ProcessPoolExecutor(max_workers=jobs, env=ENVIRONMENT | _inherited())
     try:
-        yield executor
+        yield executor, lambda: jobs
     except BaseException:
         executor.shutdown(wait=True, kill_workers=True)
         raise
@@ -106,7 +138,7 @@ def _inherited() -> dict[str, str]:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
+def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
     try:
         dask: Any = import_module("distributed")
     except ImportError:
@@ -118,7 +150,8 @@ def _cluster(address: str) -> Iterator[Executor]:
     except (OSError, ValueError, TimeoutError) as error:
         raise EvaluationError(f"no Dask scheduler answers at '{address}': {error}") from None
     try:
-        yield client.get_executor(pure=False)
+        # A cluster without workers is given something to do: one may come.
+        yield client.get_executor(pure=False), lambda: max(1, sum(client.nthreads().values()))
     except dask.KilledWorker as error:
         raise EvaluationError(f"workers of the cluster died again and again: {error}") from None
     finally:

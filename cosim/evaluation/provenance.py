@@ -14,8 +14,9 @@ from cosim.protocols import Controller
 
 DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
 PACKAGES = ("fmus", "cosim", "controllers")
+SUFFIXES = (".py", ".toml", ".fmu", ".npz")
 # Nothing that these folders hold bears on an indicator.
-ASIDE = {"cli", "figures", "recording", "__pycache__"}
+ASIDE = {"cli", "figures", "recording", "experiments", "__pycache__"}
 
 
 @cache
@@ -41,7 +42,7 @@ def code_hash(packages: tuple[str, ...] = PACKAGES) -> str:
         root = Path(spec.origin).parent
         for path in sorted(root.rglob("*")):
             relative = path.relative_to(root)
-            wanted = path.suffix in (".py", ".toml", ".fmu") and not ASIDE & set(relative.parts)
+            wanted = path.suffix in SUFFIXES and not ASIDE & set(relative.parts)
             if wanted and path.is_file():
                 digest.update(f"{package}/{relative.as_posix()}\0".encode())
                 digest.update(hashlib.sha256(path.read_bytes()).digest())
@@ -59,6 +60,38 @@ def controller_hash(controller: Controller) -> str:
     except (OSError, TypeError):
         source = type(controller).__qualname__
     return hashlib.sha256(source.encode()).hexdigest()[:16]
+
+
+def source_hashes(target: str) -> dict[str, str]:
+    """Hashes by name of the foreign files behind a parameters file's path or a `module:attribute`.
+
+    A module's package counts as a whole, a module without one alone; this package's own modules
+    are in `code_hash`. What cannot be found is left to whoever imports it.
+    """
+    if (path := Path(target)).is_file():
+        return {path.name: _digest([path])}
+    module, colon, _ = target.partition(":")
+    package = module.partition(".")[0]
+    if not colon or package in (*PACKAGES, "learning"):
+        return {}
+    try:
+        top, own = find_spec(package), find_spec(module)
+    except (ImportError, ValueError):
+        return {}
+    if top is not None and top.origin is not None and top.submodule_search_locations:
+        root = Path(top.origin).parent
+        return {package: _digest(sorted(root.rglob("*.py")))}
+    if own is None or own.origin is None:
+        return {}
+    return {module: _digest([Path(own.origin)])}
+
+
+def _digest(paths: list[Path]) -> str:
+    """First 16 hex digits of the SHA-256 of files, names apart."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
 
 
 def parameters_hash(controller: Controller) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
@@ -57,11 +58,22 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     # A document nested without end exhausts the parser's stack.
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
+    return resolved(document, origin, folder, (*seen, str(path.resolve()))), origin
+
+
+def resolved(
+    document: Mapping[str, Any], origin: str, folder: Path | None, seen: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """The document with what it `extends`, its paths made absolute as seen from `folder`.
+
+    `seen` are the files that led here. Raises ScenarioError.
+    """
+    result = copy.deepcopy(dict(document))
     if folder is not None:
-        _anchor_fmu(document, folder)
-    if (base := document.pop("extends", None)) is not None:
-        document = merged(_extended(base, origin, folder, (*seen, str(path.resolve()))), document)
-    return document, origin
+        _anchor_fmu(result, folder)
+    if (base := result.pop("extends", None)) is not None:
+        result = merged(_extended(base, origin, folder, seen), result)
+    return result
 
 
 def _text(path: Path, origin: str) -> str:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from stored import SCENARIOS, rows
 
 from cosim import FmuPlant, Scenario
-from cosim.cli.compose import build_controller
 from cosim.figures import plot_learning_curves
+from cosim.lookup import build_controller
 from learning.evaluation import Evaluation, held_out
 
 Array = NDArray[np.float64]

@@ -25,9 +25,9 @@ from stored import BASELINES, FIGURES, SCENARIOS
 from controllers.problem import Problem
 from controllers.storage import write_atomically
 from cosim import FmuPlant, Scenario
-from cosim.cli.compose import build_controller
 from cosim.cli.train import summarise
 from cosim.evaluation.parallel import run_all
+from cosim.lookup import build_controller
 from learning.evaluation import HeldOutRuns, held_out
 from learning.log import to_csv
 from learning.registry import load_algorithm

@@ -3,8 +3,8 @@ import pytest
 from loop import Hold, Proportional
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.cli.compose import build_controller
 from cosim.kpis import displaced, indicators, input_effort, settling_time
+from cosim.lookup import build_controller
 from cosim.trajectory import Signal, Trajectory, signal_names
 
 

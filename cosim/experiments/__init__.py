@@ -1,0 +1,1 @@
+"""Experiments: one engine for cases × scenarios × training seeds, from a TOML file to a report."""

@@ -1,0 +1,151 @@
+"""The tables of a study file, each with its fields, types and ranges."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cosim.errors import StudyError
+from cosim.validation import describe
+
+Count = Annotated[int, Field(ge=1, le=100_000_000)]
+Seed = Annotated[int, Field(ge=0)]
+Name = Annotated[str, Field(min_length=1, pattern=r"^[\w.+-]+$")]
+Source = Annotated[str, Field(min_length=1)]
+PerScenario = Count | dict[str, Count]
+"""One number for all scenarios, or one for each by its name; `default` is that of the others."""
+DEFAULT = "default"
+
+
+class Table(BaseModel):
+    """A table whose fields are all known, checked strictly and never changed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, populate_by_name=True)
+
+
+class SeedsTable(Table):
+    """Training seeds: `count` of them from `first` on."""
+
+    first: Seed = 0
+    count: Count = 10
+
+    @property
+    def seeds(self) -> range:
+        """The seeds."""
+        return range(self.first, self.first + self.count)
+
+
+class EvaluationTable(Table):
+    """Noise on which controllers and learnt θ are compared, the same for all of them."""
+
+    first_seed: Seed = 100_000
+    """First noise seed; no training and no curve may meet it."""
+    seeds: PerScenario = 50
+    """Number of noise seeds."""
+    steps: PerScenario = 1000
+    """Samples on each."""
+
+
+class CurvesTable(Table):
+    """Learning curves: greedy evaluations of θ while training goes on."""
+
+    points: Count = 20
+    """Greedy evaluations of each training, evenly over its samples."""
+    seeds: PerScenario = 4
+    """Held-out runs of each evaluation."""
+    steps: PerScenario = 500
+    """Samples of each of them."""
+
+
+class CaseTable(Table):
+    """A table `[[case]]`: an algorithm to train, or a controller to evaluate as it is.
+
+    In `settings`, and for `samples`, `start` and `nmpc`, a list stands for a grid; where a setting
+    takes a list itself, a list of lists does.
+    """
+
+    name: Name | None = None
+    """What tables call it; a controller's own name, if it is left out."""
+    algorithm: Source | None = None
+    """A registered algorithm, or `module:Class`."""
+    controller: Source | list[Source] | None = None
+    """A registered controller, `module:factory` or a parameters file; a list is several cases."""
+    samples: Count | list[Count] = 40_000
+    """Plant samples of a training."""
+    start: Source | list[Source] = "naive"
+    """θ at the start: `naive`, `tuned`, or a parameters file."""
+    nmpc: Literal["rti", "converged"] | list[Literal["rti", "converged"]] = "rti"
+    """What carries θ."""
+    settings: dict[str, Any] = {}
+    """The algorithm's hyperparameters."""
+    training: dict[str, Any] = {}
+    """Options of the training loop, by their names in `cosim train`."""
+    scenarios: list[Source] | None = None
+    """Those of the study's scenarios that it runs on; all, if left out."""
+    training_seeds: SeedsTable | None = None
+    """Its own training seeds, in place of the study's."""
+    group: Name | None = None
+    """Which panel of the figures shows it; the algorithm's name, if left out."""
+    title: str = ""
+    """A few words for readers."""
+
+    @model_validator(mode="after")
+    def _is_one_of_two(self) -> Self:
+        if (self.algorithm is None) == (self.controller is None):
+            raise ValueError(f"{self._where()}: needs either algorithm or controller")
+        if self.algorithm is not None and self.name is None:
+            raise ValueError(f"{self._where()}: a case with an algorithm needs a name")
+        if self.controller is not None and (
+            set_there := self.model_fields_set
+            & {"samples", "start", "nmpc", "settings", "training", "training_seeds"}
+        ):
+            raise ValueError(
+                f"{self._where()}: {', '.join(sorted(set_there))} is for an algorithm; a "
+                "controller is evaluated without training"
+            )
+        return self
+
+    def _where(self) -> str:
+        return f"case '{self.name or self.algorithm or self.controller or ''}'"
+
+
+class StudyTable(Table):
+    """A study file."""
+
+    schema_version: Annotated[Literal[1], Field(alias="schema")]
+    name: Name
+    title: str = ""
+    description: str = ""
+    scenarios: Annotated[list[Source], Field(min_length=1)]
+    """Presets, scenario files, or names of the file's own `[[scenario]]` tables."""
+    scenario: list[dict[str, Any]] = []
+    """Scenarios as they stand in their own files, `extends` and all."""
+    training_seeds: SeedsTable = SeedsTable()
+    evaluation: EvaluationTable = EvaluationTable()
+    curves: CurvesTable = CurvesTable()
+    case: Annotated[list[CaseTable], Field(min_length=1)]
+
+
+def read(path: str | Path) -> StudyTable:
+    """Read and validate a study file; raises StudyError with file, field and allowed values."""
+    origin = f"study file '{path}'"
+    try:
+        document = tomllib.loads(Path(path).read_text("utf-8"))
+    except FileNotFoundError:
+        raise StudyError(f"{origin} does not exist") from None
+    except OSError as error:
+        raise StudyError(f"{origin} cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise StudyError(f"{origin} is not valid TOML: {error}") from None
+    return validate(document, origin)
+
+
+def validate(document: Any, origin: str) -> StudyTable:
+    """Validate a study's document; raises StudyError."""
+    try:
+        return StudyTable.model_validate(document)
+    except ValidationError as error:
+        raise StudyError(f"{origin}: {describe(error, StudyTable)}") from None

@@ -1,0 +1,161 @@
+"""Runs a study: gives out units, stores what they give, and says how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from cosim.errors import StudyError
+from cosim.evaluation.parallel import run_all
+from cosim.experiments.plan import BLOCK, Plan, Run
+from cosim.experiments.protocols import Progress
+from cosim.experiments.store import EVALUATION, RunStore
+from cosim.experiments.units import (
+    Advance,
+    Evaluate,
+    Evaluated,
+    Failure,
+    Learnt,
+    Outcome,
+    Place,
+    Unit,
+    perform,
+    release,
+)
+
+SLICE = 5.0
+"""Seconds of a training after which a worker hands over its next checkpoint."""
+
+
+@dataclass(frozen=True)
+class State:
+    """How far a study is: plant samples and runs, done and in all, and what failed."""
+
+    samples: int
+    all_samples: int
+    runs: int
+    all_runs: int
+    failed: int
+
+
+Report = Callable[[State, str], None]
+"""Gets the state and a line for what just happened; the line is empty for mere progress."""
+
+
+class Runner:
+    """One go at a study. `out` holds what was finished before; see `RunStore`."""
+
+    def __init__(self, plan: Plan, out: Path, report: Report) -> None:
+        definition = plan.definition
+        self._plan, self._report = plan, report
+        folders = (str(definition.folder), str(Path.cwd()))
+        self._place = Place(
+            definition.trainer, tuple(dict.fromkeys(folders)), plan.provenance["code_hash"]
+        )
+        self._runs = {str(run.key): run for run in plan.runs}
+        self._stores = {name: RunStore(out, run.key, run.facts) for name, run in self._runs.items()}
+        self._done: dict[str, int] = {}
+        self._finished: set[str] = set()
+        self.failures: dict[str, Failure] = {}
+        """What failed, by run."""
+
+    def go(self, jobs: int, scheduler: str | None) -> None:
+        """Do all that is not done; raises EvaluationError where no worker can work."""
+        tasks: dict[str, Unit] = {}
+        for name, run in self._runs.items():
+            tasks |= self._next(name, run)
+        self._tell("")
+        try:
+            run_all(perform, tasks, self._take, jobs=jobs, scheduler=scheduler)
+        finally:
+            release()
+
+    def _next(self, name: str, run: Run) -> dict[str, Unit]:
+        """What a run needs next: a piece of its training, or its evaluation."""
+        store = self._stores[name]
+        progress = store.progress()
+        self._done[name] = 0
+        if run.training is not None:
+            self._done[name] = run.training.samples if progress.ended else progress.samples
+            if not progress.ended:
+                unit = Advance(self._place, run.training, progress.checkpoint, SLICE)
+                return {f"{name}: training": unit}
+        return self._evaluations(name, run, progress)
+
+    def _evaluations(self, name: str, run: Run, progress: Progress) -> dict[str, Unit]:
+        controller: str | Learnt = run.case.controller or ""
+        if run.training is not None:
+            controller = Learnt(run.training, progress.parameters)
+        units: dict[str, Unit] = {}
+        for file, (seeds, steps) in run.noise.items():
+            known = self._stores[name].indicators(file, steps)
+            missing = [seed for seed in seeds if seed not in known]
+            self._done[name] += (len(seeds) - len(missing)) * steps
+            size = max(1, BLOCK // steps)
+            for first in range(0, len(missing), size):
+                block = tuple(missing[first : first + size])
+                scenario = self._plan.definition.scenarios[run.key.scenario]
+                units[f"{name}: {file} {block[0]}"] = Evaluate(
+                    self._place, name, scenario, controller, block, steps
+                )
+        if not units:
+            self._finished.add(name)
+        return units
+
+    def _take(self, task: str, outcome: Outcome) -> Mapping[str, Unit] | None:
+        """Store what a unit gave and say so; returns what can be done now."""
+        name, _, what = task.rpartition(": ")
+        run, store = self._runs[name], self._stores[name]
+        if isinstance(outcome, Failure):
+            self.failures.setdefault(name, outcome)
+            store.fail(outcome.trace)
+            self._tell(f"failed: {name}: {outcome.message}")
+            return None
+        if isinstance(outcome, Progress):
+            before = store.progress().wall_seconds
+            store.advance(replace(outcome, wall_seconds=before + outcome.wall_seconds))
+            more = self._next(name, run)
+            ended = outcome.status if outcome.status not in ("", "finished") else ""
+            self._tell(f"{name}: {ended}" if ended else "")
+            return more
+        assert isinstance(outcome, Evaluated)
+        file = what.split()[0]
+        _, steps = run.noise[file]
+        store.evaluate(file, steps, outcome.indicators)
+        self._done[name] += len(outcome.indicators) * steps
+        self._tell(self._finish(name, run))
+        return None
+
+    def _finish(self, name: str, run: Run) -> str:
+        """A line for a run whose last evaluation just came, else nothing."""
+        store, costs = self._stores[name], []
+        for file, (seeds, steps) in run.noise.items():
+            found = store.indicators(file, steps)
+            if any(seed not in found for seed in seeds):
+                return ""
+            if file == EVALUATION:
+                costs = [found[seed]["J"] for seed in seeds]
+        self._finished.add(name)
+        status = store.progress().status
+        cost = sum(costs) / len(costs)
+        return f"{name}: J {cost:.6g}{f', {status}' if status else ''}"
+
+    def _tell(self, line: str) -> None:
+        state = State(
+            sum(self._done.values()),
+            self._plan.samples,
+            len(self._finished),
+            len(self._runs),
+            len(self.failures),
+        )
+        self._report(state, line)
+
+    def raise_failures(self) -> None:
+        """Raise StudyError where runs failed."""
+        if not self.failures:
+            return
+        name, failure = next(iter(self.failures.items()))
+        more = len(self.failures) - 1
+        others = f" ({more} more run{'s' if more > 1 else ''} failed)" if more else ""
+        raise StudyError(f"{name}: {failure.message}{others}; run again to try them anew")

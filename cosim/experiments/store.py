@@ -1,0 +1,180 @@
+"""What a study has finished, on disk: a folder for each run, readable and found again.
+
+    OUT/runs/SCENARIO/CASE/SEED/   run.json  checkpoint.npz | learning.csv parameters.toml
+                                   evaluation.csv  greedy.csv
+
+Only the process that runs the study writes, so workers need no shared disk.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from controllers.storage import write_atomically
+from cosim.errors import StudyError
+from cosim.experiments.protocols import Progress
+
+RUNS = "runs"
+RUN, CHECKPOINT = "run.json", "checkpoint.npz"
+LOG, PARAMETERS = "learning.csv", "parameters.toml"
+EVALUATION, GREEDY, FAILURE = "evaluation.csv", "greedy.csv", "failure.txt"
+INDICATORS = (
+    "J",
+    "economic_cost",
+    "mean_violation",
+    "violating_share",
+    "input_effort",
+    "failures",
+)
+Indicators = dict[int, dict[str, float]]
+"""Indicators of a controller by noise seed."""
+
+
+@dataclass(frozen=True)
+class RunKey:
+    """A run of a study: scenario, case, and training seed (None for a controller)."""
+
+    scenario: str
+    case: str
+    seed: int | None
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are, relative to the study's folder."""
+        parts = [_safe(self.scenario), _safe(self.case)]
+        return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
+
+    def __str__(self) -> str:
+        """As messages name it."""
+        seed = "" if self.seed is None else f", seed {self.seed}"
+        return f"{self.case} on {self.scenario}{seed}"
+
+
+def _safe(name: str) -> str:
+    """A folder's name on any system."""
+    return re.sub(r"[^\w.+=()\[\]-]", "_", name)
+
+
+class RunStore:
+    """The files of one run; `facts` say all that its results depend on.
+
+    What is there of other facts is dropped, never mixed in.
+    """
+
+    def __init__(self, out: Path, key: RunKey, facts: Mapping[str, Any]) -> None:
+        self.folder = out / key.folder
+        self._facts = json.loads(json.dumps(facts))
+        self.other_code = False
+        (self.folder / FAILURE).unlink(missing_ok=True)
+        if not self._belongs():
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._write(RUN, _json({"facts": self._facts, "status": ""}))
+
+    def _belongs(self) -> bool:
+        found = self._document().get("facts")
+        if found is None:
+            return False
+        self.other_code = found.get("code") != self._facts["code"]
+        return bool(found == self._facts)
+
+    def _document(self) -> dict[str, Any]:
+        path = self.folder / RUN
+        if not path.is_file():
+            return {}
+        try:
+            document: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        except (OSError, ValueError, RecursionError):
+            raise StudyError(f"'{path}' is damaged; delete its folder to run it again") from None
+        return document
+
+    def progress(self) -> Progress:
+        """Where the run's training stands."""
+        document = self._document()
+        if status := document.get("status", ""):
+            return Progress(
+                int(document["samples"]),
+                status,
+                log=self._read(LOG),
+                parameters=self._read(PARAMETERS),
+                plant_samples=int(document["plant_samples"]),
+                wall_seconds=float(document["timing"]["wall_seconds"]),
+            )
+        path = self.folder / CHECKPOINT
+        if not path.is_file():
+            return Progress(0)
+        return Progress(
+            int(document.get("samples", 0)),
+            checkpoint=path.read_bytes(),
+            wall_seconds=float(document.get("timing", {}).get("wall_seconds", 0.0)),
+        )
+
+    def advance(self, progress: Progress) -> None:
+        """Store how far a training has come; run.json last, so that what it says is there."""
+        if progress.ended:
+            self._write(LOG, progress.log)
+            self._write(PARAMETERS, progress.parameters)
+        else:
+            self._write(CHECKPOINT, progress.checkpoint)
+        document = {
+            "facts": self._facts,
+            "status": progress.status,
+            "samples": progress.samples,
+            "plant_samples": progress.plant_samples,
+            "timing": {"wall_seconds": progress.wall_seconds},
+        }
+        self._write(RUN, _json(document))
+        if progress.ended:
+            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+
+    def indicators(self, file: str, steps: int) -> Indicators:
+        """Indicators by noise seed that a file holds of runs of `steps` samples."""
+        path = self.folder / file
+        if not path.is_file():
+            return {}
+        try:
+            with path.open(newline="", encoding="utf-8") as stream:
+                return {
+                    int(row["seed"]): {name: float(row[name]) for name in INDICATORS}
+                    for row in csv.DictReader(stream)
+                    if int(row["steps"]) == steps
+                }
+        except (OSError, UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError):
+            raise StudyError(f"'{path}' is damaged; delete it to evaluate again") from None
+
+    def evaluate(self, file: str, steps: int, fresh: Indicators) -> None:
+        """Add indicators to a file."""
+        known = self.indicators(file, steps) | fresh
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(("seed", "steps", *INDICATORS))
+        for seed, values in sorted(known.items()):
+            writer.writerow((seed, steps, *(repr(values[name]) for name in INDICATORS)))
+        self._write(file, stream.getvalue())
+
+    def fail(self, trace: str) -> None:
+        """Keep the traceback of what failed."""
+        self._write(FAILURE, trace)
+
+    def _read(self, name: str) -> str:
+        try:
+            return (self.folder / name).read_text("utf-8")
+        except (OSError, UnicodeDecodeError):
+            raise StudyError(
+                f"'{self.folder / name}' is damaged; delete the folder to run it again"
+            ) from None
+
+    def _write(self, name: str, content: str | bytes) -> None:
+        write_atomically(self.folder / name, content)
+
+
+def _json(document: Mapping[str, Any]) -> str:
+    return json.dumps(document, indent=1, sort_keys=True) + "\n"

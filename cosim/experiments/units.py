@@ -1,0 +1,153 @@
+"""Work units: pieces of a training, and controllers on noise; done wherever a worker is free."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections import OrderedDict
+from dataclasses import dataclass
+from time import perf_counter
+
+from cosim.errors import StudyError
+from cosim.evaluation.provenance import code_hash
+from cosim.experiments.protocols import Progress, Trainer, Training
+from cosim.experiments.store import INDICATORS, Indicators
+from cosim.kpis import indicators
+from cosim.plant import FmuPlant
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.simulation import simulate
+
+PACKAGES = ("fmus", "cosim", "controllers", "learning")
+KEPT = 4
+"""Controllers and plants that a worker keeps: building one costs more than a short run."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """What every unit needs: who trains, where foreign modules are, and the code's hash."""
+
+    trainer: Trainer
+    folders: tuple[str, ...]
+    code: str
+
+    def enter(self) -> None:
+        """Let foreign modules be imported; raises StudyError where the code is another."""
+        for folder in self.folders:
+            if folder not in sys.path:
+                sys.path.append(folder)
+        if (here := code_hash(PACKAGES)) != self.code:
+            raise StudyError(
+                f"a worker runs other code ({here}) than the study ({self.code}); install the same "
+                "version of rti-cosim everywhere"
+            )
+
+
+@dataclass(frozen=True)
+class Advance:
+    """A piece of a training: from a checkpoint to the first one after `seconds`."""
+
+    place: Place
+    training: Training
+    checkpoint: bytes
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """The θ that a training ended with, as text."""
+
+    training: Training
+    parameters: str
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """A controller, by name or learnt, on `seeds` of `steps` samples each.
+
+    `key` is the same for units of one controller: a worker builds it once for all of them.
+    """
+
+    place: Place
+    key: str
+    scenario: Scenario
+    controller: str | Learnt
+    seeds: tuple[int, ...]
+    steps: int
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """Indicators by seed, and the wall time that they took."""
+
+    indicators: Indicators
+    wall_seconds: float
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A unit that raised: its message, and the traceback for whoever looks for the cause."""
+
+    message: str
+    trace: str
+
+
+Unit = Advance | Evaluate
+Outcome = Progress | Evaluated | Failure
+
+
+def perform(unit: Unit) -> Outcome:
+    """Do a unit; what it gives depends on nothing but the unit. Any error becomes a Failure."""
+    try:
+        unit.place.enter()
+        if isinstance(unit, Advance):
+            return unit.place.trainer.advance(unit.training, unit.checkpoint, unit.seconds)
+        return _evaluate(unit)
+    except Exception as error:
+        text = " ".join(f"{error}".split()) or type(error).__name__
+        return Failure(f"{type(error).__name__}: {text}", traceback.format_exc())
+
+
+_controllers: OrderedDict[str, Controller] = OrderedDict()
+_plants: OrderedDict[str, FmuPlant] = OrderedDict()
+
+
+def release() -> None:
+    """Close what this process keeps."""
+    _controllers.clear()
+    while _plants:
+        _plants.popitem()[1].close()
+
+
+def _evaluate(unit: Evaluate) -> Evaluated:
+    begin = perf_counter()
+    plant, controller = _plant(unit.scenario), _controller(unit)
+    found = {}
+    for seed in unit.seeds:
+        figures = indicators(simulate(plant, controller, unit.steps, seed))
+        found[seed] = {name: figures[name] for name in INDICATORS}
+    return Evaluated(found, perf_counter() - begin)
+
+
+def _plant(scenario: Scenario) -> FmuPlant:
+    key = f"{scenario.hash} {scenario.plant.fmu}"
+    if key not in _plants:
+        if len(_plants) == KEPT:
+            _plants.popitem(last=False)[1].close()
+        _plants[key] = FmuPlant(scenario)
+    _plants.move_to_end(key)
+    return _plants[key]
+
+
+def _controller(unit: Evaluate) -> Controller:
+    if unit.key not in _controllers:
+        if len(_controllers) == KEPT:
+            _controllers.popitem(last=False)
+        trainer = unit.place.trainer
+        _controllers[unit.key] = (
+            trainer.policy(unit.controller.training, unit.controller.parameters)
+            if isinstance(unit.controller, Learnt)
+            else trainer.controller(unit.controller, unit.scenario)
+        )
+    _controllers.move_to_end(unit.key)
+    return _controllers[unit.key]

@@ -1,0 +1,78 @@
+"""Controllers by name: registered ones, files of parameters, and anyone's `module:factory`."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from contextlib import suppress
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from cosim.errors import ControllerLookupError
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.validation import suggestion
+
+GROUP = "cosim.controllers"
+FILES = "cosim.controller_files"
+PARAMETERS = EntryPoint("toml", "controllers.factories:from_file", FILES)
+"""What a parameters file is read by, unless another package registers its own reader."""
+
+
+def build_controller(name: str, scenario: Scenario) -> Controller:
+    """Build a controller for a scenario; raises ControllerLookupError and the controller's own.
+
+    `name` is an entry point of the group `cosim.controllers`; the path of a file, θ of the RTI-NMPC
+    (TOML) or one whose suffix is an entry point, factory(scenario, path), of the group
+    `cosim.controller_files`; or a `module:factory` with factory(scenario) -> Controller,
+    importable from the Python path or the working directory.
+    """
+    import_from_here()
+    known = {point.name: point for point in entry_points(group=GROUP)}
+    if name in known:
+        return _made(name, known[name].value, scenario)
+    suffix = Path(name).suffix.removeprefix(".")
+    files = {point.name: point for point in (PARAMETERS, *entry_points(group=FILES))}
+    if suffix in files:
+        controller: Controller = files[suffix].load()(scenario, name)
+        return _named(controller, Path(name).stem)
+    if ":" in name:
+        return _made(name, name, scenario)
+    raise ControllerLookupError(
+        f"unknown controller '{name}'{suggestion(name, known)}; give one of "
+        f"{', '.join(sorted(known))}, a parameters file (.toml), or module:factory"
+    )
+
+
+def import_from_here() -> None:
+    """Let `module:factory` name a module of the working directory too, after all others."""
+    if (folder := str(Path.cwd())) not in sys.path:
+        sys.path.append(folder)
+
+
+def _made(name: str, target: str, scenario: Scenario) -> Controller:
+    module, _, attribute = target.partition(":")
+    try:
+        factory: Any = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ControllerLookupError(f"controller '{name}' cannot be imported: {error}") from None
+    try:
+        controller = factory(scenario)
+    except TypeError as error:
+        raise ControllerLookupError(
+            f"controller '{name}' is not a factory of one scenario: {error}"
+        ) from error
+    if not isinstance(controller, Controller):
+        raise ControllerLookupError(
+            f"controller '{name}' made a {type(controller).__name__}, which lacks reset, prepare "
+            "or feedback"
+        )
+    return _named(controller, name)
+
+
+def _named(controller: Controller, name: str) -> Controller:
+    """Let tables and recordings call the controller what the user called it."""
+    with suppress(AttributeError):
+        setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
+    return controller

@@ -1,0 +1,149 @@
+"""The trainer of `cosim study`: trainings in pieces, as the engine's protocol asks for them."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, cast, get_args, get_origin
+
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from cosim.evaluation.provenance import source_hashes
+from cosim.experiments.protocols import Progress, Training
+from cosim.lookup import GROUP as CONTROLLERS
+from cosim.lookup import build_controller as controller_by_name
+from cosim.lookup import import_from_here
+from cosim.plant import FmuPlant
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from learning.errors import ConfigurationError
+from learning.log import LogRow, to_csv
+from learning.optimum import has_stored_optimum
+from learning.registry import GROUP as ALGORITHMS
+from learning.registry import load_algorithm
+from learning.starting_point import build_controller
+from learning.training_loop import TrainingLoop
+from learning.training_run import TrainingRun
+
+CHECKPOINT = "checkpoint.npz"
+OPTIMUM = "optimal"
+SEQUENCES = (list, tuple, set, frozenset)
+
+
+class _HandOver(Exception):
+    """Ends a piece of a training at a checkpoint."""
+
+
+class Trainer:
+    """Trains with the registered algorithms, and anyone's `module:Class`."""
+
+    def check(self, training: Training) -> None:
+        """Raise LearningError, in one line, where this training cannot begin."""
+        _run(training)
+
+    def takes_list(self, algorithm: str, setting: str) -> bool:
+        """Whether a hyperparameter is a list itself; raises AlgorithmLookupError."""
+        import_from_here()
+        field = load_algorithm(algorithm).Configuration.model_fields.get(setting)
+        return field is not None and _is_sequence(field.annotation)
+
+    def advance(self, training: Training, checkpoint: bytes, seconds: float) -> Progress:
+        """Train from a checkpoint (b"": the start) to the first one after `seconds`, or the end."""
+        run, begin = _run(training), time.perf_counter()
+        reached = 0
+
+        def hand_over(samples: int, _: LogRow) -> None:
+            nonlocal reached
+            reached = samples
+            at_checkpoint = samples % run.checkpoint_every == 0 and samples < run.samples
+            late = time.perf_counter() - begin >= seconds
+            # A plant that leaves no checkpoint is trained in one piece.
+            if at_checkpoint and late and (folder / CHECKPOINT).is_file():
+                raise _HandOver
+
+        with tempfile.TemporaryDirectory(prefix="cosim-training-") as name:
+            folder = Path(name)
+            if checkpoint:
+                (folder / CHECKPOINT).write_bytes(checkpoint)
+            with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
+                learner = TrainingLoop(run, load_algorithm(run.algorithm), plant, other, out=folder)
+                try:
+                    result = learner.go(resume=bool(checkpoint), progress=hand_over)
+                except _HandOver:
+                    return Progress(
+                        reached,
+                        checkpoint=(folder / CHECKPOINT).read_bytes(),
+                        wall_seconds=time.perf_counter() - begin,
+                    )
+            result.parameters.save(folder / "parameters.toml")
+            samples = int(result.rows[-1]["samples"]) if result.rows else reached
+            return Progress(
+                samples,
+                result.status,
+                log=to_csv(result.rows),
+                parameters=(folder / "parameters.toml").read_text("utf-8"),
+                plant_samples=samples,
+                wall_seconds=time.perf_counter() - begin,
+            )
+
+    def policy(self, training: Training, parameters: str) -> Controller:
+        """The greedy controller of a training's θ."""
+        problem = Problem.from_scenario(cast("Any", training.scenario))
+        with tempfile.TemporaryDirectory(prefix="cosim-theta-") as name:
+            path = Path(name, "parameters.toml")
+            path.write_text(parameters, "utf-8")
+            theta = Parameters.load(path, problem)
+        found = build_controller(training.nmpc, training.scenario, problem, theta)
+        return cast("Controller", found)
+
+    def controller(self, name: str, scenario: Scenario) -> Controller:
+        """A controller by name, parameters file or `module:factory`; ControllerLookupError."""
+        return controller_by_name(name, scenario)
+
+    def optimum(self, scenario: Scenario) -> str | None:
+        """`optimal` where the scenario's optimal policy is stored."""
+        return OPTIMUM if has_stored_optimum(scenario) else None
+
+    def sources(self, target: str) -> Mapping[str, str]:
+        """Hashes of the foreign files that an algorithm or a controller is made of."""
+        import_from_here()
+        for group in (CONTROLLERS, ALGORITHMS):
+            for point in entry_points(group=group):
+                if point.name == target:
+                    return source_hashes(point.value)
+        return source_hashes(target)
+
+
+def _run(training: Training) -> TrainingRun:
+    import_from_here()
+    algorithm = load_algorithm(training.algorithm)
+    if training.start != "naive":
+        raise ConfigurationError(f"start '{training.start}' is not known; there is naive")
+    try:
+        return TrainingRun(
+            algorithm=training.algorithm,
+            scenario=training.scenario,
+            samples=training.samples,
+            seed=training.seed,
+            configuration=algorithm.Configuration.from_dict(dict(training.settings)),
+            controller=training.nmpc,
+            log_every=training.log_every,
+            evaluate_every=training.evaluate_every,
+            checkpoint_every=training.checkpoint_every,
+            evaluation_seeds=training.evaluation_seeds,
+            evaluation_steps=training.evaluation_steps,
+            **training.options,
+        )
+    except TypeError as error:
+        raise ConfigurationError(f"training: {error}") from None
+
+
+def _is_sequence(annotation: Any) -> bool:
+    """Whether a type is a sequence, or may be one."""
+    origin = get_origin(annotation)
+    if origin in SEQUENCES or annotation in SEQUENCES:
+        return True
+    return any(_is_sequence(part) for part in get_args(annotation) if part is not Ellipsis)

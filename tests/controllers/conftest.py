@@ -1,12 +1,7 @@
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from sampling import evaporator_problem
+from tests.helpers.sampling import evaporator_problem
 
 
 @pytest.fixture(scope="session")

@@ -2,12 +2,17 @@
 
 import numpy as np
 import pytest
-from differences import assert_close, derivative, natural_scale
-from sampling import evaporator_problem, random_action, random_parameters, random_state
 
 from controllers import ConvergedNmpc, LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import QpError
 from controllers.nlp import IpoptNmpc
+from tests.helpers.differences import assert_close, derivative, natural_scale
+from tests.helpers.sampling import (
+    evaporator_problem,
+    random_action,
+    random_parameters,
+    random_state,
+)
 
 WHOLE = {"all": slice(None)}
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from sampling import evaporator_problem, random_parameters, random_point, random_state
 
 from controllers import ThetaBlocks
 from controllers.model import discretise
 from controllers.nlp import IpoptNmpc, merit
+from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 
 
 @pytest.fixture(scope="module")

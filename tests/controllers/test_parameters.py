@@ -2,10 +2,10 @@ import re
 
 import numpy as np
 import pytest
-from sampling import evaporator_problem, random_parameters
 
 from controllers import Parameters, ThetaBlocks
 from controllers.errors import ParameterError
+from tests.helpers.sampling import evaporator_problem, random_parameters
 
 BLOCKS = {
     "paper": {},

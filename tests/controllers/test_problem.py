@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sampling import evaporator_problem
 
 from controllers import Problem
 from controllers.errors import ModelError
 from controllers.problem import load_model
+from tests.helpers.sampling import evaporator_problem
 
 BAD = {
     "short bound": ({"state_lower": [25]}, "state_lower must be 2 finite numbers"),

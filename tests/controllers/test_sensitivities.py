@@ -5,19 +5,19 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-import stored
-from differences import Feedback, assert_close, derivative, natural_scale
-from sampling import (
+
+from controllers import LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
+from controllers.errors import ControllerError
+from controllers.qp import QpSolution
+from tests.helpers import stored
+from tests.helpers.differences import Feedback, assert_close, derivative, natural_scale
+from tests.helpers.sampling import (
     evaporator_problem,
     random_action,
     random_parameters,
     random_point,
     random_state,
 )
-
-from controllers import LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
-from controllers.errors import ControllerError
-from controllers.qp import QpSolution
 
 BLOCKS = {
     "paper": {},

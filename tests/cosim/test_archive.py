@@ -2,12 +2,12 @@ import stat
 import zipfile
 
 import pytest
-from tank import edited
 
 import fmus
 from cosim.errors import PlantError
 from cosim.plant import archive
 from cosim.plant.archive import unpack
+from tests.helpers.tank import edited
 
 
 def test_a_shipped_fmu_is_found_by_name_and_unpacked_once():

@@ -2,10 +2,10 @@ import json
 import resource
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from tank import build_tank, write_scenario
+
+from tests.helpers.tank import build_tank, write_scenario
 
 
 def test_demo_writes_all_that_it_names(cosim, tmp_path):
@@ -122,10 +122,7 @@ def test_an_isolated_run_writes_the_same_bytes(cosim, tmp_path):
 def test_a_crashing_fmu_ends_an_isolated_run_with_one_message(cosim, tmp_path):
     scenario = write_scenario(tmp_path, build_tank(tmp_path, saves=False), fault=5)
     arguments = ["-s", scenario, "-c", "tank_controller:make", "--steps", 5, "--isolate"]
-    (tmp_path / "tank_controller.py").write_text(
-        f"import sys\nsys.path.append({str(Path(__file__).parent)!r})\n"
-        "from loop import hold as make\n"
-    )
+    (tmp_path / "tank_controller.py").write_text("from tests.helpers.loop import hold as make\n")
     code, out, err = cosim("simulate", *arguments, "--json")
     assert (code, out) == (2, "")
     assert "died by SIGABRT at step 0" in err
@@ -239,9 +236,8 @@ def test_bad_input_gives_one_clear_message_and_exit_code_2(case, cosim, tmp_path
         (tmp_path / f"{name}.toml").write_text(f'extends = "paper"\n{text}\n')
     (tmp_path / "corrupt.fmu").write_bytes(b"PK\x03\x04 no")
     (tmp_path / "bad.py").write_text(
-        "import sys, numpy as np\n"
-        f"sys.path.append({str(Path(__file__).parent)!r})\n"
-        "from loop import Hold\n"
+        "import numpy as np\n"
+        "from tests.helpers.loop import Hold\n"
         "def nan(scenario): return Hold([float('nan'), 200.])\n"
         "def short(scenario): return Hold([200.])\n"
     )

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from loop import Proportional
 
 from cosim import FmuPlant, simulate
 from cosim.cli.output import dump
@@ -13,6 +12,7 @@ from cosim.errors import ComparisonError, RecordingError, TrajectoryError
 from cosim.recording import RerunRecorder
 from cosim.stored_run import load_run
 from cosim.trajectory import Signal
+from tests.helpers.loop import Proportional
 
 values = st.one_of(st.floats(-1e3, 1e3), st.just(float("nan")), st.just(float("inf")))
 

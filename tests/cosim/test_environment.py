@@ -4,12 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from loop import Proportional
 
 import cosim.environment  # noqa: F401 (registers the environment)
 from cosim import FmuPlant, simulate
 from cosim.environment import PlantEnv, PlantVectorEnv
 from cosim.errors import PlantError
+from tests.helpers.loop import Proportional
 
 # Actions are in physical units on purpose; the checker recommends a normalised space.
 NORMALISED = "ignore:.*symmetric and normalized space.*:UserWarning"

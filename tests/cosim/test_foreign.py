@@ -7,12 +7,12 @@ import sys
 
 import numpy as np
 import pytest
-from loop import Hold
-from tank import build_tank, edited, without_attribute, write_scenario
 
 import fmus
 from cosim import FmuPlant, PlantPool, Scenario, simulate
 from cosim.errors import CapabilityError, PlantError
+from tests.helpers.loop import Hold
+from tests.helpers.tank import build_tank, edited, without_attribute, write_scenario
 
 
 @pytest.fixture(scope="module")
@@ -129,9 +129,9 @@ def test_after_a_fatal_error_every_call_is_refused(tanks, tmp_path):
 def test_a_chatty_fmu_does_not_spoil_json(tanks, tmp_path):
     scenario = write_scenario(tmp_path, tanks[True], fault=4)
     command = [sys.executable, "-m", "cosim", "simulate", "--scenario", str(scenario)]
-    command += ["--controller", "loop:hold", "--steps", "3", "--json"]
+    command += ["--controller", "tests.helpers.loop:hold", "--steps", "3", "--json"]
     command += ["--out", str(tmp_path / "out")]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd="tests/cosim")
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["samples"] == 3
     assert "a chatty FMU" in result.stderr

@@ -3,12 +3,12 @@ import signal
 
 import numpy as np
 import pytest
-from loop import Hold, Proportional
-from tank import build_tank, write_scenario
 
 from cosim import FmuPlant, simulate
 from cosim.errors import CapabilityError, PlantError
 from cosim.plant import IsolatedPlant
+from tests.helpers.loop import Hold, Proportional
+from tests.helpers.tank import build_tank, write_scenario
 
 ACTIONS = np.random.default_rng(7).uniform(100, 400, (10, 2))
 

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from loop import Hold, Proportional
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.kpis import displaced, indicators, input_effort, settling_time
 from cosim.lookup import build_controller
 from cosim.trajectory import Signal, Trajectory, signal_names
+from tests.helpers.loop import Hold, Proportional
 
 
 def run_with_states(scenario, time, states):

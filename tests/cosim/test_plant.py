@@ -94,8 +94,7 @@ def test_every_bit_of_the_seed_counts(plant):
 
 def test_another_process_repeats_the_run(plant):
     code = (
-        "import sys; sys.path.insert(0, 'tests/cosim')\n"
-        "from cosim import FmuPlant; from test_plant import run; import hashlib\n"
+        "from cosim import FmuPlant; from tests.cosim.test_plant import run; import hashlib\n"
         f"plant = FmuPlant('paper', {plant.fmu_path.stem!r})\n"
         "print(hashlib.sha256(run(plant, 21)).hexdigest())"
     )

@@ -2,13 +2,13 @@ from time import process_time
 
 import numpy as np
 import pytest
-from loop import Answer, Failing, Hold, Proportional
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import CosimError, PlantError
 from cosim.protocols import Step
 from cosim.simulation import BLOCK, spawn_seeds
 from cosim.trajectory import FALLBACK
+from tests.helpers.loop import Answer, Failing, Hold, Proportional
 
 
 @pytest.fixture

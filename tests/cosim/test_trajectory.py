@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from loop import Proportional
 
 from cosim import FmuPlant, simulate
 from cosim.errors import TrajectoryError
 from cosim.trajectory import Signal, Trajectory, read_csv, signal_names
+from tests.helpers.loop import Proportional
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,8 @@
 import sys
 
 import pytest
-from code_blocks import COVERED, FENCE, ROOT, SMALLER, Session, blocks, is_slow, pages
+
+from tests.helpers.code_blocks import COVERED, FENCE, ROOT, SMALLER, Session, blocks, is_slow, pages
 
 
 def parameters():

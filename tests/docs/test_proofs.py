@@ -7,7 +7,8 @@ import subprocess
 import sys
 
 import pytest
-from code_blocks import ROOT, pages
+
+from tests.helpers.code_blocks import ROOT, pages
 
 HEADER = "| proved by |"
 # What a page writes for the sake of its table's width.

@@ -1,17 +1,14 @@
 """Outsiders in the benchmark's table, as their stored weights and θ."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cosim import Scenario, evaluate
+from examples.outsiders import policy
 
 FOLDER = Path(__file__).parents[2] / "examples" / "outsiders"
-sys.path.insert(0, str(FOLDER.parents[1]))
-
-from examples.outsiders import policy  # noqa: E402
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kill import JOBS, campaign
 
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.factories import naive
@@ -22,9 +21,8 @@ from cosim.recording.reader import read_recording
 from learning.q_learning import QLearning
 from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "cosim"))
-from tank import build_tank, write_scenario
+from tests.faults.kill import JOBS, campaign
+from tests.helpers.tank import build_tank, write_scenario
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2
 COSIM = (sys.executable, "-m", "cosim")

@@ -1,24 +1,18 @@
 """Regenerate tests/controllers/data/qps.npz: QPs from closed-loop runs of scenario `paper`.
 
-Run `python tests/integration/record_qps.py`. Naive, tuned-like, greedy and learned-like
+Run `python -m tests.integration.record_qps`. Naive, tuned-like, greedy and learned-like
 θ, explored and with either Hessian, start on the constraint, far above it and far below it; every
 third sample is kept, as V and as Q in turns.
 """
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "controllers"))
-
-from sampling import evaporator_problem, random_action, random_parameters
-from stored import PATH, StoredQp, blocks, write
 
 from controllers import Parameters, RtiNmpc
 from cosim import FmuPlant
+from tests.helpers.sampling import evaporator_problem, random_action, random_parameters
+from tests.helpers.stored import PATH, StoredQp, blocks, write
 
 SAMPLES, EVERY = 90, 3
 

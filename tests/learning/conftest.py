@@ -1,16 +1,10 @@
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from linear_quadratic import LinearQuadratic
 
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from cosim.scenario import Scenario
+from tests.helpers.linear_quadratic import LinearQuadratic
 
 
 @pytest.fixture(scope="session")

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from carrier import Carrier
 
 from controllers.parameters import Parameters
 from learning import ActorCritic
 from learning.protocols import Transition
 from learning.starting_point import build_strategy
+from tests.helpers.carrier import Carrier
 
 
 class Solution:

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from carrier import Carrier
 
 from controllers.parameters import Parameters
 from controllers.theta import ThetaBlocks
@@ -8,6 +7,7 @@ from learning.configuration import Configuration
 from learning.constrained_step import ConstrainedStep, unscaled
 from learning.errors import DivergenceError
 from learning.fit import Fit
+from tests.helpers.carrier import Carrier
 
 
 @pytest.fixture

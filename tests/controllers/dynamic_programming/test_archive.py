@@ -2,14 +2,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from linear import SCALAR
-from sampling import evaporator_problem
 
 from controllers.dynamic_programming import archive
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import solve
 from controllers.errors import OptimumError
+from tests.helpers.linear_plant import SCALAR
+from tests.helpers.sampling import evaporator_problem
 
 PROBLEM = evaporator_problem()
 LAW = DisturbanceLaw("uniform", PROBLEM.model.nominal_disturbance, np.ones(4))

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from sampling import evaporator_problem
 from scipy.integrate import solve_ivp
 
 from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
@@ -9,6 +8,7 @@ from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings, accurate_substeps
 from controllers.errors import OptimumError
 from controllers.model import discretise, economic_cost
+from tests.helpers.sampling import evaporator_problem
 
 PROBLEM = evaporator_problem()
 P = PROBLEM.model.nominal_parameters

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from linear import PLANE, SCALAR, LinearPlant
 
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import refine, solve
 from controllers.errors import OptimumError
+from tests.helpers.linear_plant import PLANE, SCALAR, LinearPlant
 
 
 def solved(plant, level, criterion="average", **settings):

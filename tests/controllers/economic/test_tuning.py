@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from sampling import evaporator_problem
 
 from controllers import LinearisationPoint, Model, Quantity, RtiNmpc, ThetaBlocks
 from controllers.economic import tune
@@ -13,6 +12,7 @@ from controllers.economic.local_feedback import local_feedback
 from controllers.economic.steady_state import optimal_steady_state
 from controllers.errors import TuningError
 from controllers.model import discretise, economic_cost
+from tests.helpers.sampling import evaporator_problem
 
 PROBLEMS = {
     "paper": evaporator_problem(),

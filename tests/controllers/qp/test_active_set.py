@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from scalar import CASES, scalar_qp, solution
-from stored import solve
 
 from controllers.qp import QpSolution
 from controllers.qp.active_set import kkt_solve, polish
+from tests.helpers.scalar import CASES, scalar_qp, solution
+from tests.helpers.stored import solve
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -4,11 +4,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from scalar import CASES, scalar_qp
-from stored import qps, solve
 
 from controllers.errors import ControllerError, QpError
 from controllers.qp import make_backend
+from tests.helpers.scalar import CASES, scalar_qp
+from tests.helpers.stored import qps, solve
 
 PERSISTENT = ["daqp", "proxqp"]
 QPSOLVERS = [f"qpsolvers:{solver}" for solver in ("clarabel", "daqp", "proxqp", "quadprog", "piqp")]

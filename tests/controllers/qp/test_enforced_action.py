@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from scalar import scalar_qp, solution
-from stored import prepared
 
 from controllers.qp.enforced_action import multipliers_at_kink
+from tests.helpers.scalar import scalar_qp, solution
+from tests.helpers.stored import prepared
 
 FREE = np.array([-10.0]), np.array([10.0])
 

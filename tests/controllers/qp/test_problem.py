@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from scalar import CASES, scalar_qp, solution
-from stored import qps, solve
 
 from controllers.errors import QpError
 from controllers.qp import QpSolution, SoftQp
+from tests.helpers.scalar import CASES, scalar_qp, solution
+from tests.helpers.stored import qps, solve
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,13 @@
 import casadi as ca
 import numpy as np
 import pytest
-from sampling import evaporator_problem, random_parameters, random_point
 
 from controllers import ThetaBlocks
 from controllers.errors import ControllerError
 from controllers.model import discretise
 from controllers.rti.hessian import Exact, Spectrum, make_hessian
 from controllers.rti.preparation import preparation
+from tests.helpers.sampling import evaporator_problem, random_parameters, random_point
 
 N, n, m = 10, 2, 2
 DISCOUNTS = 0.99 ** np.arange(N)

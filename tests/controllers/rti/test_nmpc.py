@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
-from sampling import (
+
+from controllers import LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
+from controllers.errors import ControllerError, ParameterError, QpError
+from tests.helpers.sampling import (
     evaporator_problem,
     random_action,
     random_parameters,
     random_point,
     random_state,
 )
-
-from controllers import LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
-from controllers.errors import ControllerError, ParameterError, QpError
 
 EXTENDED = {"slack_weights": True}
 

@@ -3,7 +3,6 @@
 import casadi as ca
 import numpy as np
 import pytest
-from sampling import evaporator_problem, random_parameters, random_point, random_state
 
 from controllers import ThetaBlocks
 from controllers.dynamics import sampled_jacobian
@@ -11,6 +10,7 @@ from controllers.model import discretise
 from controllers.rti.feedback import embedding
 from controllers.rti.preparation import preparation
 from controllers.theta import SymbolicTheta, symmetric
+from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 
 N, n, m = 10, 2, 2
 

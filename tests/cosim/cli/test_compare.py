@@ -1,9 +1,9 @@
 import json
 
 import pytest
-from loop import Proportional
 
 from cosim import FmuPlant, Scenario, simulate
+from tests.helpers.loop import Proportional
 
 
 @pytest.fixture(scope="module")

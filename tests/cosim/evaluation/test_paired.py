@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from loop import Proportional, hold, proportional
-from workers import LEDGER, die, mortal, noting
 
 from cosim import FmuPlant, evaluate, simulate
 from cosim.errors import EvaluationError
 from cosim.evaluation.parallel import run_all
+from tests.helpers.loop import Proportional, hold, proportional
+from tests.helpers.workers import LEDGER, die, mortal, noting
 
 BOTH = {"proportional": proportional, "hold": hold}
 
@@ -168,12 +168,12 @@ def test_a_killed_worker_loses_nothing(paper, tmp_path, ledger):
 
 
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
-    here = Path(__file__).parent
-    paths = os.pathsep.join(map(str, (here, here.parent)))
-    environment = os.environ | {LEDGER: str(tmp_path / "ledger"), "PYTHONPATH": paths}
+    root = str(Path(__file__).parents[3])
+    environment = os.environ | {LEDGER: str(tmp_path / "ledger"), "PYTHONPATH": root}
 
     def command(out):
-        arguments = f"evaluate -c workers:slow --seeds 6 --steps 100 --jobs 1 --out {out}"
+        controllers = "slow=tests.helpers.workers:slow"
+        arguments = f"evaluate -c {controllers} --seeds 6 --steps 100 --jobs 1 --out {out}"
         return [sys.executable, "-m", "cosim", *arguments.split()]
 
     out = tmp_path / "out"

@@ -1,8 +1,8 @@
 import pytest
-from workers import die, die_once, refuse_three, square
 
 from cosim.errors import EvaluationError
 from cosim.evaluation.parallel import run_all
+from tests.helpers.workers import die, die_once, refuse_three, square
 
 
 def collect(function, tasks, **options):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from loop import Failing, Proportional
 from scipy.stats import t as student
 
 from cosim import FmuPlant, Scenario, simulate
@@ -20,6 +19,7 @@ from cosim.figures import (
     trajectory_figure,
 )
 from cosim.figures.pareto import half_width, nondominated
+from tests.helpers.loop import Failing, Proportional
 
 
 @pytest.fixture

@@ -48,7 +48,7 @@ def test_the_tail_leaves_outliers_out_of_view():
 
 
 def test_channels_and_columns_cover_the_trajectorys_signals(paper, units, rng):
-    from blocks import random_block
+    from tests.helpers.blocks import random_block
 
     channels = run_channels(paper, units)
     violation = Penalty(

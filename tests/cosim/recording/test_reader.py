@@ -5,11 +5,11 @@ import warnings
 import numpy as np
 import pytest
 import rerun as rr
-from blocks import random_block
-from test_run_recorder import recorded
 
 from cosim.errors import RecordingError
 from cosim.recording import read_recording, read_signals, summarise
+from tests.cosim.recording.test_run_recorder import recorded
+from tests.helpers.blocks import random_block
 
 
 def test_read_signals_gives_the_recordings_signals(tmp_path, paper, rng):

@@ -5,8 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from blocks import random_block
-from loop import Failing, Proportional
 from rerun.chunk import RrdReader
 
 from controllers.factories import naive
@@ -14,6 +12,8 @@ from cosim import FmuPlant, simulate
 from cosim.errors import RecordingError
 from cosim.recording import RerunRecorder, read_recording
 from cosim.trajectory import read_csv
+from tests.helpers.blocks import random_block
+from tests.helpers.loop import Failing, Proportional
 
 CONTROLLER = SimpleNamespace(name="mine", parameters=SimpleNamespace(hash="0123456789abcdef"))
 

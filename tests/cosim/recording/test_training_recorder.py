@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from loop import Answer, Proportional, SolverFailed
 
 from cosim.errors import RecordingError
 from cosim.recording import TrainingRecorder, read_recording
+from tests.helpers.loop import Answer, Proportional, SolverFailed
 
 LABELS = ("b[0]", "b[1]", "c", "B[0,0]", "B[0,1]", "B[1,1]")
 BLOCKS = SimpleNamespace(

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from blocks import random_block
 from matplotlib.image import imread
-from test_run_recorder import recorded
 
 from cosim.errors import RecordingError
 from cosim.recording import open_viewer, render, viewer
+from tests.cosim.recording.test_run_recorder import recorded
+from tests.helpers.blocks import random_block
 
 slow = pytest.mark.slow
 

@@ -1,6 +1,6 @@
 """The stored set of QPs from real closed-loop runs: θ, state, action, linearisation point.
 
-`python tests/integration/record_qps.py` regenerates it.
+`python -m tests.integration.record_qps` regenerates it.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from sampling import evaporator_problem
 
 from controllers import LinearisationPoint, Parameters, RtiNmpc, RtiSolution, ThetaBlocks
+from tests.helpers.sampling import evaporator_problem
 
-PATH = Path(__file__).parent / "data" / "qps.npz"
+PATH = Path(__file__).parents[1] / "controllers" / "data" / "qps.npz"
 HESSIANS = ("gauss-newton", "exact")
 
 

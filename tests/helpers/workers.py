@@ -6,7 +6,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from loop import Proportional
+from tests.helpers.loop import Proportional
 
 LEDGER = "COSIM_TEST_LEDGER"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -74,14 +75,41 @@ def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
         raise typer.Exit(DIFFERENT)
 
 
+class Platforms(StrEnum):
+    """For which platforms a build makes binaries."""
+
+    HERE = "here"
+    ALL = "all"
+
+
 @app.command()
 def build(
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the FMUs.", show_default=False)
+    folder: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder with modelDescription.xml and C sources of a plant of your own.",
+            show_default="the evaporator",
+        ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for the FMUs; with FOLDER the .fmu file.",
+            show_default=False,
+        ),
+    ] = None,
+    platforms: Annotated[
+        Platforms,
+        typer.Option(
+            help="here: by the local C compiler ($CC, else cc); all: 64-bit Linux and macOS on x86 "
+            "and ARM, Windows on x86, by pip install 'rti-cosim\\[cross]'."
+        ),
+    ] = Platforms.HERE,
     check: Annotated[
         bool,
-        typer.Option("--check", help="Build and compare with the shipped files byte for byte."),
+        typer.Option("--check", help="Build for all and compare with the shipped files."),
     ] = False,
     in_place: Annotated[
         bool,
@@ -89,7 +117,7 @@ def build(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Build both FMUs from their C sources: needs a C compiler ($CC, else cc).
+    """Build FMUs from C sources: both evaporators, or a plant of your own.
 
     One of --out, --check and --in-place must be given. With the same compiler the bytes repeat;
     --check exits with code 1 if they differ from those shipped.
@@ -98,9 +126,13 @@ def build(
         from fmus.build import build as build_fmus
         from fmus.build import build_in_place, compare_with_shipped
         from fmus.errors import BuildError
+        from fmus.own import build_folder
 
+        every = platforms is Platforms.ALL
         if (out is not None) + check + in_place != 1:
             raise BuildError("give one of --out DIR, --check and --in-place")
+        if folder is not None and (out is None or out.suffix != ".fmu"):
+            raise BuildError("an FMU of your own is built by FOLDER --out FILE.fmu")
         if check:
             differing = compare_with_shipped()
             for name, members in differing.items():
@@ -109,7 +141,13 @@ def build(
             if any(differing.values()):
                 raise typer.Exit(DIFFERENT)
             return
-        built = build_in_place() if out is None else build_fmus(open_folder(out))
+        if out is None:
+            built = build_in_place()
+        elif folder is not None:
+            open_folder(out.parent)
+            built = [build_folder(folder, out, every_platform=every)]
+        else:
+            built = build_fmus(open_folder(out), every_platform=every)
         for path in built:
             out_.note(f"built {path}")
         out_.json({"built": [str(path) for path in built]})

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -13,11 +14,17 @@ import numpy as np
 import pytest
 
 import fmus
-from fmus import build
+from fmus import build, compiler, crosscheck
+from fmus.archive import write_archive
 from fmus.errors import BuildError
+from fmus.own import compilers
+from fmus.platforms import PLATFORMS, present
 
 HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
 needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="there is no C compiler")
+needs_zig = pytest.mark.skipif(
+    importlib.util.find_spec("ziglang") is None, reason="the extra 'cross' is not installed"
+)
 
 
 def shipped_record(name: str = "evaporator") -> dict:
@@ -25,32 +32,45 @@ def shipped_record(name: str = "evaporator") -> dict:
         return json.loads(container.read(build.BUILD_FILE))
 
 
-@pytest.fixture(scope="module")
-def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def build_elsewhere(root: Path, every_platform: bool) -> Path:
     """Both FMUs, built by a copy of the package in another folder."""
-    root = tmp_path_factory.mktemp("clean checkout")
     ignored = shutil.ignore_patterns("__pycache__", "*.fmu", "variables.h")
     shutil.copytree(build.PACKAGE, root / "fmus", ignore=ignored)
-    code = "from pathlib import Path; from fmus.build import build; build(Path('out'))"
+    code = f"import pathlib, fmus.build; fmus.build.build(pathlib.Path('out'), {every_platform})"
     subprocess.run([sys.executable, "-c", code], cwd=root, check=True)
     return root / "out"
 
 
-@needs_compiler
-def test_clean_build_elsewhere_equals_the_shipped_files(rebuilt: Path) -> None:
+@needs_zig
+@pytest.mark.slow
+def test_clean_build_elsewhere_equals_the_shipped_files(tmp_path: Path) -> None:
+    """Every platform's binary, byte for byte."""
+    used = [each.version for each in compilers(every_platform=True)]
+    if used != [entry["compiler"] for entry in shipped_record()["platforms"].values()]:
+        pytest.skip("another cross-compiler than the one of the shipped binaries")
+    built = build_elsewhere(tmp_path, every_platform=True)
     for name in fmus.NAMES:
-        differing = build.differences(rebuilt / f"{name}.fmu", fmus.path(name))
-        if json.loads(build.build_record())["compiler"] != shipped_record()["compiler"]:
-            binary = {build.BUILD_FILE, *(n for n in differing if n.startswith("binaries/"))}
-            assert set(differing) <= binary
-            pytest.skip("another compiler than the one of the shipped binary")
-        assert differing == []
+        assert build.differences(built / f"{name}.fmu", fmus.path(name)) == []
 
 
 @needs_compiler
-def test_two_builds_are_byte_identical(rebuilt: Path, tmp_path: Path) -> None:
-    for path in build.build(tmp_path):
-        assert path.read_bytes() == (rebuilt / path.name).read_bytes()
+def test_two_local_builds_are_byte_identical(tmp_path: Path) -> None:
+    """And differ from the shipped files in nothing but binaries and the record of the build."""
+    elsewhere = build_elsewhere(tmp_path / "clean checkout", every_platform=False)
+    for path in build.build(tmp_path / "here"):
+        assert path.read_bytes() == (elsewhere / path.name).read_bytes()
+        differing = build.differences(path, fmus.path(path.stem))
+        assert {name for name in differing if not name.startswith("binaries/")} == {
+            build.BUILD_FILE
+        }
+
+
+@needs_compiler
+def test_local_build_gives_the_shipped_results(tmp_path: Path, version: int) -> None:
+    """Another compiler, the same bits: the seeded normal law with fouling among them."""
+    build.build(tmp_path)
+    own = tmp_path / f"{fmus.NAMES[version - 2]}.fmu"
+    assert [str(d) for d in crosscheck.deviations(own)] == []
 
 
 @needs_compiler
@@ -58,7 +78,7 @@ def test_library_exports_the_fmi_functions_only(folders: dict[int, Path]) -> Non
     if shutil.which("nm") is None:
         pytest.skip("there is no nm")
     for version, folder in folders.items():
-        (library,) = folder.glob("binaries/*/evaporator.so")
+        library = folder / "binaries" / present().folder(f"{version}.0") / "evaporator.so"
         listing = subprocess.run(
             ["nm", "-D", "--defined-only", str(library)], capture_output=True, text=True, check=True
         ).stdout
@@ -121,7 +141,8 @@ def test_fmi2_file_has_no_terminals_and_no_header_of_the_standard() -> None:
 
 def test_record_names_the_compiler() -> None:
     record = shipped_record()
-    assert record["compiler"]
+    assert list(record["platforms"]) == [platform.tuple for platform in PLATFORMS]
+    assert all("clang" in entry["compiler"] for entry in record["platforms"].values())
     assert "-ffp-contract=off" in record["compiler_flags"]
     assert record["model_token"] == build.model_token()
 
@@ -135,14 +156,14 @@ def test_missing_compiler_is_an_error_that_says_what_to_do(monkeypatch, tmp_path
 
 @needs_compiler
 def test_compiler_error_is_told(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(build, "COMPILER_FLAGS", ("--no-such-flag",))
+    monkeypatch.setattr(compiler, "COMPILER_FLAGS", ("--no-such-flag",))
     with pytest.raises(BuildError, match="no-such-flag"):
         build.build(tmp_path)
 
 
 def test_difference_names_the_member(tmp_path: Path) -> None:
-    build.archive({"a": b"1", "b": b"2"}, tmp_path / "one")
-    build.archive({"a": b"1", "b": b"3", "c": b""}, tmp_path / "two")
+    write_archive({"a": b"1", "b": b"2"}, tmp_path / "one")
+    write_archive({"a": b"1", "b": b"3", "c": b""}, tmp_path / "two")
     assert build.differences(tmp_path / "one", tmp_path / "two") == ["b", "c"]
     with pytest.raises(BuildError, match="missing"):
         build.differences(tmp_path / "one", tmp_path / "three")

@@ -77,7 +77,7 @@ def test_build_check_tells_what_differs(cosim, monkeypatch):
 def test_reference_signals_are_reproduced(cosim):
     code, _, err = cosim("fmu", "reference")
     assert code == 0
-    assert "3 cases, identical" in err
+    assert "4 cases, identical" in err
 
 
 BAD_INPUT = {
@@ -87,6 +87,8 @@ BAD_INPUT = {
     "check of no FMU": (["check", "text.fmu"], "text.fmu is not an FMU"),
     "build without a target": (["build"], "give one of --out DIR, --check and --in-place"),
     "build with two": (["build", "--check", "--out", "x"], "give one of --out DIR"),
+    "own plant into a folder": (["build", ".", "--out", "x"], "FOLDER --out FILE.fmu"),
+    "own plant without a description": (["build", ".", "--out", "x.fmu"], "No such file"),
     "reference of no FMU": (["reference", "text.fmu"], "text.fmu is not an FMU"),
     "build into a file": (["build", "--out", "text.fmu"], "text.fmu"),
 }

@@ -11,7 +11,8 @@ from decimal import Decimal, getcontext, localcontext
 import numpy as np
 import pytest
 
-from fmus.build import SOURCES, compile_library
+from fmus.build import SOURCES
+from fmus.compiler import local_compiler
 
 pytestmark = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
@@ -30,8 +31,9 @@ double own_sin(double x) { double c, s; cosine_and_sine(x, &c, &s); return s; }
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     header = (SOURCES / "elementary.h").read_bytes()
+    files = {"wrapper.c": WRAPPER, "elementary.h": header}
     path = tmp_path_factory.mktemp("elementary") / "elementary.so"
-    path.write_bytes(compile_library({"wrapper.c": WRAPPER, "elementary.h": header}, path.name))
+    path.write_bytes(local_compiler().library(files, "elementary"))
     loaded = ctypes.CDLL(str(path))
     for name in ("own_log", "own_exp", "own_cos", "own_sin"):
         getattr(loaded, name).restype = ctypes.c_double

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
+    from cosim.experiments.results import StudyResults as StudyResults
+    from cosim.experiments.study import Study as Study
     from cosim.plant import FmuPlant as FmuPlant
     from cosim.pool import PlantPool as PlantPool
     from cosim.scenario import Scenario as Scenario
@@ -20,10 +22,22 @@ _HOMES = {
     "PlantPool": "cosim.pool",
     "Scenario": "cosim.scenario",
     "Trajectory": "cosim.trajectory",
+    "Study": "cosim.experiments.study",
+    "StudyResults": "cosim.experiments.results",
     "simulate": "cosim.simulation",
 }
 
-__all__ = ["Evaluation", "FmuPlant", "PlantPool", "Scenario", "Trajectory", "evaluate", "simulate"]
+__all__ = [
+    "Evaluation",
+    "FmuPlant",
+    "PlantPool",
+    "Scenario",
+    "Study",
+    "StudyResults",
+    "Trajectory",
+    "evaluate",
+    "simulate",
+]
 
 
 def __getattr__(name: str) -> Any:

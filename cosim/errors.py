@@ -47,3 +47,7 @@ class ResultsError(CosimError):
 
 class StudyError(CosimError):
     """A study file that cannot be read, or a study that cannot be run or reported."""
+
+
+class FailedRunsError(StudyError):
+    """Runs of a study that failed, while all others were done."""

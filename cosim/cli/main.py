@@ -18,6 +18,7 @@ from cosim.cli import (
     results,
     scenario,
     simulate,
+    study,
     train,
     tuning,
     view,
@@ -42,6 +43,7 @@ app.command("optimum")(optimum.optimum)
 app.command("tuning")(tuning.tuning)
 app.command("scenario")(scenario.scenario)
 app.add_typer(benchmark.app, name="benchmark")
+app.add_typer(study.app, name="study")
 app.command("reproduce")(reproduce.reproduce)
 app.add_typer(results.app, name="results")
 app.add_typer(fmu.app, name="fmu", no_args_is_help=True)

@@ -36,12 +36,13 @@ class Output:
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
         self._stdout = -1
+        self._live: Console | None = None
 
     def console(self) -> Console:
-        """Console of standard error, for progress and notes."""
+        """Console of standard error, for progress and notes; a note goes above a bar."""
         from rich.console import Console
 
-        return Console(stderr=True)
+        return self._live or Console(stderr=True)
 
     def note(self, text: str) -> None:
         """Print a line on standard error, unless JSON was asked for."""
@@ -103,7 +104,11 @@ class Output:
             def update(done: int, remark: str = "") -> None:
                 bar.update(task, completed=done, remark=remark)
 
-            yield update
+            self._live = console
+            try:
+                yield update
+            finally:
+                self._live = None
 
 
 def _is_number(cell: str) -> bool:

@@ -85,6 +85,45 @@ def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
     return ratio(naive - cost, naive - optimum)
 
 
+def interquartile_mean(values: Array, axis: int = -1) -> Any:
+    """Mean of the middle half of R values along an axis, (R,) -> scalar.
+
+    Quarters of R that are no whole numbers count with their share of an entry, so that one to four
+    runs have one too. Source: Agarwal et al., Deep RL at the Edge of the Statistical Precipice.
+    """
+    ordered = np.sort(values, axis=axis)
+    count = ordered.shape[axis]
+    edges = np.arange(count + 1)
+    upper, lower = np.minimum(edges[1:], 0.75 * count), np.maximum(edges[:-1], 0.25 * count)
+    weight = np.maximum(upper - lower, 0.0)
+    shape = [1] * ordered.ndim
+    shape[axis] = count
+    with np.errstate(invalid="ignore"):
+        share = np.where(weight.reshape(shape) > 0, ordered, 0.0) * weight.reshape(shape)
+    return share.sum(axis=axis) / weight.sum()
+
+
+def over_runs(strata: Sequence[Array]) -> Estimate:
+    """Interquartile mean over training runs, each of `strata` (R_i,) one scenario's.
+
+    The bootstrap interval resamples the runs of each stratum by themselves (percentiles); there is
+    no t interval. None where a run is not finite, or where there is only one.
+    """
+    value = float(interquartile_mean(np.concatenate(list(strata))))
+    if any(len(runs) < 2 for runs in strata) or not all(np.isfinite(r).all() for r in strata):
+        return Estimate(value, None, None)
+    interval = stats.bootstrap(
+        tuple(strata),
+        lambda *resampled, axis: interquartile_mean(np.concatenate(resampled, axis=axis), axis),
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        confidence_level=LEVEL,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return Estimate(value, None, (float(interval.low), float(interval.high)))
+
+
 def td_error_mean(
     samples: Array, td_error: Array, updates: Array, window: int = TD_WINDOW
 ) -> Array:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cosim.errors import StudyError
 from cosim.evaluation.parallel import run_all
 from cosim.experiments.plan import BLOCK, Plan, Run
 from cosim.experiments.protocols import Progress
@@ -54,7 +53,7 @@ class Runner:
             definition.trainer, tuple(dict.fromkeys(folders)), plan.provenance["code_hash"]
         )
         self._runs = {str(run.key): run for run in plan.runs}
-        self._stores = {name: RunStore(out, run.key, run.facts) for name, run in self._runs.items()}
+        self.stores = {name: RunStore(out, run.key, run.facts) for name, run in self._runs.items()}
         self._done: dict[str, int] = {}
         self._finished: set[str] = set()
         self.failures: dict[str, Failure] = {}
@@ -73,7 +72,7 @@ class Runner:
 
     def _next(self, name: str, run: Run) -> dict[str, Unit]:
         """What a run needs next: a piece of its training, or its evaluation."""
-        store = self._stores[name]
+        store = self.stores[name]
         progress = store.progress()
         self._done[name] = 0
         if run.training is not None:
@@ -89,7 +88,7 @@ class Runner:
             controller = Learnt(run.training, progress.parameters)
         units: dict[str, Unit] = {}
         for file, (seeds, steps) in run.noise.items():
-            known = self._stores[name].indicators(file, steps)
+            known = self.stores[name].indicators(file, steps)
             missing = [seed for seed in seeds if seed not in known]
             self._done[name] += (len(seeds) - len(missing)) * steps
             size = max(1, BLOCK // steps)
@@ -106,7 +105,7 @@ class Runner:
     def _take(self, task: str, outcome: Outcome) -> Mapping[str, Unit] | None:
         """Store what a unit gave and say so; returns what can be done now."""
         name, _, what = task.rpartition(": ")
-        run, store = self._runs[name], self._stores[name]
+        run, store = self._runs[name], self.stores[name]
         if isinstance(outcome, Failure):
             self.failures.setdefault(name, outcome)
             store.fail(outcome.trace)
@@ -129,7 +128,7 @@ class Runner:
 
     def _finish(self, name: str, run: Run) -> str:
         """A line for a run whose last evaluation just came, else nothing."""
-        store, costs = self._stores[name], []
+        store, costs = self.stores[name], []
         for file, (seeds, steps) in run.noise.items():
             found = store.indicators(file, steps)
             if any(seed not in found for seed in seeds):
@@ -150,12 +149,3 @@ class Runner:
             len(self.failures),
         )
         self._report(state, line)
-
-    def raise_failures(self) -> None:
-        """Raise StudyError where runs failed."""
-        if not self.failures:
-            return
-        name, failure = next(iter(self.failures.items()))
-        more = len(self.failures) - 1
-        others = f" ({more} more run{'s' if more > 1 else ''} failed)" if more else ""
-        raise StudyError(f"{name}: {failure.message}{others}; run again to try them anew")

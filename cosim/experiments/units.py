@@ -119,13 +119,18 @@ def release() -> None:
         _plants.popitem()[1].close()
 
 
+def simulated(
+    scenario: Scenario, controller: Controller, steps: int, seed: int
+) -> dict[str, float]:
+    """Indicators of a run of a controller on a scenario's plant, which this process keeps."""
+    figures = indicators(simulate(_plant(scenario), controller, steps, seed))
+    return {name: figures[name] for name in INDICATORS}
+
+
 def _evaluate(unit: Evaluate) -> Evaluated:
     begin = perf_counter()
-    plant, controller = _plant(unit.scenario), _controller(unit)
-    found = {}
-    for seed in unit.seeds:
-        figures = indicators(simulate(plant, controller, unit.steps, seed))
-        found[seed] = {name: figures[name] for name in INDICATORS}
+    controller = _controller(unit)
+    found = {s: simulated(unit.scenario, controller, unit.steps, s) for s in unit.seeds}
     return Evaluated(found, perf_counter() - begin)
 
 

@@ -1,0 +1,144 @@
+"""`cosim study`: cases × scenarios × training seeds from one file, and the report of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cosim.cli.evaluate import JobsOption
+from cosim.cli.output import JsonOption, Output, dump, open_folder, output
+
+if TYPE_CHECKING:
+    from cosim.experiments.results import StudyResults
+    from cosim.experiments.runner import State
+
+app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
+
+FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+
+
+@app.command()
+def run(
+    file: FileArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
+        "cosim-study"
+    ),
+    jobs: JobsOption = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs."),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Train and evaluate every case on every scenario with every training seed.
+
+    Writes evaluation.csv, curves.csv, runs.csv, summary.csv, study.json, summary.json, timing.csv.
+    Run again with the same --out to go on after an interruption, a failure or a change of the
+    file: what is finished is not done again. Exit code 1: some runs failed, all others are done.
+    """
+    with output(json) as out_:
+        from cosim.errors import FailedRunsError
+        from cosim.evaluation.parallel import cores
+        from cosim.experiments.study import Study
+
+        study = Study.load(file)
+        folder = open_folder(out)
+        for scenario in study.scenarios.values():
+            _announce(scenario, out_)
+        planned = study.plan()
+        failure: str | None = None
+        with out_.progress(
+            f"{study.name}, thousands of samples", _thousands(planned.samples)
+        ) as bar:
+
+            def report(state: State, line: str) -> None:
+                failed = f", {state.failed} failed" if state.failed else ""
+                runs = f"{state.runs}/{state.all_runs} runs{failed}"
+                bar(_thousands(state.samples), runs)
+                if line:
+                    out_.note(f"{runs}  {line}")
+
+            try:
+                results = study.run(
+                    folder,
+                    jobs=jobs or cores(),
+                    scheduler=scheduler,
+                    report=report,
+                    planned=planned,
+                )
+            except FailedRunsError as error:
+                failure = str(error)
+        if failure is not None:
+            out_.note(f"failed: {failure}")
+            raise typer.Exit(1)
+        summary = _write_summary(results)
+        show(results, out_)
+        out_.note(f"tables are in {folder.resolve()}; cosim study report {out} draws them")
+        out_.json(summary)
+
+
+@app.command()
+def plan(file: FileArgument, json: JsonOption = False) -> None:
+    """Show what a study will do, and about how long: nothing is trained or written."""
+    with output(json) as out_:
+        from cosim.experiments.estimate import estimate
+        from cosim.experiments.study import Study
+
+        planned = Study.load(file).plan()
+        rows, seconds = estimate(planned)
+        out_.table(
+            f"{planned.definition.name}: {len(planned.runs)} runs, {planned.samples} plant samples",
+            ("scenario", "case", "runs", "training samples", "evaluation samples", "CPU minutes"),
+            [
+                (
+                    row.scenario,
+                    row.case,
+                    str(row.runs),
+                    str(row.training_samples),
+                    str(row.evaluation_samples),
+                    f"{row.seconds / 60:.1f}",
+                )
+                for row in rows
+            ],
+        )
+        out_.note(f"about {seconds / 3600:.2f} h of one core, as fast as this one is now")
+        out_.json(
+            {
+                "runs": len(planned.runs),
+                "samples": planned.samples,
+                "timing": {"estimated_seconds": seconds},
+            }
+        )
+
+
+def _announce(scenario: Any, out_: Output) -> None:
+    from cosim.cli.compose import announce
+
+    announce(scenario, out_)
+
+
+def _thousands(samples: int) -> int:
+    return round(samples / 1000)
+
+
+def _write_summary(results: StudyResults) -> dict[str, Any]:
+    from controllers.storage import write_atomically
+    from cosim.experiments.summary import aggregate_rows, summary_rows
+
+    document = {
+        **results.about,
+        "summary": summary_rows(results),
+        "aggregate": aggregate_rows(results),
+    }
+    write_atomically(results.folder / "summary.json", dump(document))
+    return document
+
+
+def show(results: StudyResults, out_: Output) -> None:
+    """Print a table for each scenario."""
+    from cosim.experiments.layout import HEADER, lines
+
+    for scenario in results.scenarios:
+        out_.table(f"{results.name}: {scenario}", HEADER, lines(results, scenario))

@@ -1,0 +1,138 @@
+"""From what a run of a study stored to its results and tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.storage import write_atomically
+from cosim.experiments.plan import Plan, Run
+from cosim.experiments.records import CURVE, EVALUATED, RunResult
+from cosim.experiments.results import ABOUT, SCHEMA, StudyResults
+from cosim.experiments.store import EVALUATION, GREEDY, INDICATORS, RunStore
+from cosim.experiments.summary import (
+    AGGREGATE_COLUMNS,
+    COLUMNS,
+    RUN_COLUMNS,
+    aggregate_rows,
+    run_rows,
+    summary_rows,
+)
+from cosim.experiments.tables import CURVES, RUNS, TIMING, curves_csv, evaluation_csv, to_csv
+
+Array = NDArray[np.float64]
+SUMMARY, AGGREGATE = "summary.csv", "aggregate.csv"
+
+
+def collect(plan: Plan, out: Path, stores: Mapping[str, RunStore]) -> StudyResults:
+    """The finished runs of a plan, in the order of scenarios, cases and training seeds."""
+    definition = plan.definition
+    cases = [*definition.references, *definition.cases]
+    scenarios, names = list(definition.scenarios), [case.name for case in cases]
+    found = [
+        result for run in plan.runs if (result := _result(run, stores[str(run.key)])) is not None
+    ]
+    found.sort(
+        key=lambda run: (
+            scenarios.index(run.scenario),
+            names.index(run.case),
+            -1 if run.seed is None else run.seed,
+        )
+    )
+    about = {
+        "schema": SCHEMA,
+        "name": definition.name,
+        "title": definition.table.title,
+        "description": definition.table.description,
+        "scenarios": scenarios,
+        "cases": [
+            {
+                "name": case.name,
+                "group": case.group,
+                "target": _relative(case.target, definition.folder),
+                "trained": case.algorithm is not None,
+                "samples": case.samples,
+                "start": _relative(case.start, definition.folder),
+                "nmpc": case.nmpc,
+                "settings": dict(case.settings),
+                "scenarios": list(case.scenarios),
+            }
+            for case in cases
+        ],
+        "optimum": definition.optima,
+        "naive": dict.fromkeys(scenarios, definition.naive),
+        "runs": len(plan.runs),
+        "made_with": plan.provenance,
+    }
+    return StudyResults(out, json.loads(json.dumps(about)), found)
+
+
+def _relative(path: str, folder: Path) -> str:
+    """A file's path as the study names it: no result depends on where the checkout lies."""
+    if not path.endswith(".toml"):
+        return path
+    return Path(path).relative_to(folder).as_posix() if folder in Path(path).parents else path
+
+
+def _result(run: Run, store: RunStore) -> RunResult | None:
+    """The run's result; None while it is not finished."""
+    noise = {file: store.indicators(file, steps) for file, (_, steps) in run.noise.items()}
+    if any(seed not in noise[file] for file, (seeds, _) in run.noise.items() for seed in seeds):
+        return None
+    progress = store.progress()
+    if run.training is not None and not progress.ended:
+        return None
+    seeds, steps = run.noise[EVALUATION]
+    greedy = [noise[GREEDY][seed]["J"] for seed in run.noise[GREEDY][0]] if run.greedy else []
+    return RunResult(
+        scenario=run.key.scenario,
+        case=run.key.case,
+        seed=run.key.seed,
+        status=progress.status or EVALUATED,
+        samples=progress.samples,
+        plant_samples=progress.plant_samples,
+        seeds=seeds,
+        steps=steps,
+        indicators={
+            name: np.array([noise[EVALUATION][seed][name] for seed in seeds]) for name in INDICATORS
+        },
+        curve=_curve(progress.log) if progress.log else {},
+        greedy_J=float(np.mean(greedy)) if greedy else float("nan"),
+    )
+
+
+def _curve(log: str) -> dict[str, Array]:
+    rows = list(csv.DictReader(io.StringIO(log)))
+    return {
+        name: np.array([float(row.get(name) or "nan") for row in rows], dtype=np.float64)
+        for name in CURVE
+    }
+
+
+def write(results: StudyResults, stores: Mapping[str, RunStore]) -> None:
+    """Write the tables, each whole or not at all; study.json last, so that all of it is there."""
+    out = results.folder
+    write_atomically(out / EVALUATION, evaluation_csv(results.runs))
+    write_atomically(out / CURVES, curves_csv(results.runs))
+    write_atomically(out / RUNS, to_csv(RUN_COLUMNS, run_rows(results)))
+    write_atomically(out / SUMMARY, to_csv(COLUMNS, summary_rows(results)))
+    aggregate = aggregate_rows(results)
+    if aggregate:
+        write_atomically(out / AGGREGATE, to_csv(AGGREGATE_COLUMNS, aggregate))
+    write_atomically(out / TIMING, _timing(stores))
+    write_atomically(out / ABOUT, json.dumps(results.about, indent=1, sort_keys=True) + "\n")
+
+
+def _timing(stores: Mapping[str, RunStore]) -> str:
+    rows: list[dict[str, Any]] = [
+        {"run": name, "training_seconds": store.progress().wall_seconds}
+        for name, store in stores.items()
+    ]
+    return to_csv(("run", "training_seconds"), rows)

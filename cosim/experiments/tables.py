@@ -1,0 +1,125 @@
+"""The tables of a study as CSV, written and read back: a row says what it is of, then figures."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.errors import StudyError
+from cosim.experiments.records import CURVE, RunResult
+from cosim.experiments.store import INDICATORS
+
+Row = Mapping[str, Any]
+
+EVALUATION, CURVES, RUNS, TIMING = "evaluation.csv", "curves.csv", "runs.csv", "timing.csv"
+KEYS = ("scenario", "case", "training_seed")
+RUN = (*KEYS, "status", "samples", "plant_samples")
+
+
+def to_csv(columns: Sequence[str], rows: Iterable[Row]) -> str:
+    """Rows as CSV; floats read back to the same bits, what is undefined is empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([cell(row.get(name)) for name in columns] for row in rows)
+    return stream.getvalue()
+
+
+def cell(value: Any) -> str:
+    """Text of a cell."""
+    if value is None or (isinstance(value, float) and np.isnan(value)):
+        return ""
+    if isinstance(value, float):
+        return repr(float(value))
+    return str(value)
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Rows of a table; raises StudyError."""
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            return list(csv.DictReader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise StudyError(f"'{path}' cannot be read: {error}") from None
+
+
+def evaluation_csv(runs: Sequence[RunResult]) -> str:
+    """A row for each run and noise seed."""
+    rows = (
+        _key(run)
+        | {"seed": seed, "steps": run.steps}
+        | {name: float(run.indicators[name][i]) for name in INDICATORS}
+        for run in runs
+        for i, seed in enumerate(run.seeds)
+    )
+    return to_csv((*KEYS, "seed", "steps", *INDICATORS), rows)
+
+
+def curves_csv(runs: Sequence[RunResult]) -> str:
+    """A row for each row of a training's log; one, without samples, for each controller."""
+    rows: list[dict[str, Any]] = []
+    for run in runs:
+        if run.seed is None and not np.isnan(run.greedy_J):
+            rows.append(_key(run) | {"greedy_J": run.greedy_J})
+        for i in range(len(run.curve["samples"]) if run.curve else 0):
+            values = {name: float(run.curve[name][i]) for name in CURVE}
+            rows.append(_key(run) | values | {"samples": int(values["samples"])})
+    return to_csv((*KEYS, *CURVE), rows)
+
+
+def _key(run: RunResult) -> dict[str, Any]:
+    return {"scenario": run.scenario, "case": run.case, "training_seed": run.seed}
+
+
+def read_runs(folder: Path) -> list[RunResult]:
+    """The runs that a folder's tables hold, in their order; raises StudyError."""
+    try:
+        return _read_runs(folder)
+    except (KeyError, TypeError, ValueError) as error:
+        raise StudyError(f"the tables in '{folder}' are damaged: {error!r}") from None
+
+
+def _read_runs(folder: Path) -> list[RunResult]:
+    evaluations = _grouped(read_csv(folder / EVALUATION))
+    curves = _grouped(read_csv(folder / CURVES))
+    found = []
+    for row in read_csv(folder / RUNS):
+        key = tuple(row[name] for name in KEYS)
+        noise, log = evaluations[key], curves.get(key, [])
+        trained = bool(row["training_seed"])
+        found.append(
+            RunResult(
+                scenario=row["scenario"],
+                case=row["case"],
+                seed=int(row["training_seed"]) if trained else None,
+                status=row["status"],
+                samples=int(row["samples"]),
+                plant_samples=int(row["plant_samples"]),
+                seeds=tuple(int(one["seed"]) for one in noise),
+                steps=int(noise[0]["steps"]),
+                indicators={
+                    name: np.array([_number(one[name]) for one in noise]) for name in INDICATORS
+                },
+                curve={name: np.array([_number(one[name]) for one in log]) for name in CURVE}
+                if trained
+                else {},
+                greedy_J=float("nan") if trained or not log else _number(log[0]["greedy_J"]),
+            )
+        )
+    return found
+
+
+def _grouped(rows: list[dict[str, str]]) -> dict[tuple[str, ...], list[dict[str, str]]]:
+    found: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in KEYS), []).append(row)
+    return found
+
+
+def _number(text: str) -> float:
+    return float(text) if text else float("nan")

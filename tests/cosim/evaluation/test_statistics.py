@@ -1,10 +1,13 @@
 import numpy as np
 import pytest
+from scipy.stats import trim_mean
 
 from cosim.evaluation.statistics import (
     gain,
     gap_closed,
+    interquartile_mean,
     mean,
+    over_runs,
     ratio,
     regret,
     shown,
@@ -123,3 +126,31 @@ def test_the_td_mean_is_that_of_the_updates_within_the_window():
 def test_the_td_mean_of_rows_without_updates_is_undefined():
     nothing = td_error_mean(np.array([500.0]), np.array([np.nan]), np.array([0.0]))
     assert np.isnan(nothing).all()
+
+
+@pytest.mark.parametrize("runs", [4, 8, 12])
+def test_the_interquartile_mean_is_the_mean_of_the_middle_half(runs):
+    values = np.random.default_rng(runs).normal(size=(3, runs))
+    assert interquartile_mean(values) == pytest.approx(trim_mean(values, 0.25, axis=-1))
+
+
+def test_the_interquartile_mean_counts_shares_of_runs():
+    assert interquartile_mean(np.array([5.0])) == 5.0
+    # Of five runs 1.25 are cut on either side: a quarter of the second and of the fourth.
+    assert interquartile_mean(np.array([0.0, 1.0, 2.0, 4.0, 99.0])) == pytest.approx(
+        (0.75 * 1 + 2 + 0.75 * 4) / 2.5
+    )
+
+
+def test_one_run_without_end_does_not_move_the_interquartile_mean():
+    assert interquartile_mean(np.array([1.0, 2.0, 3.0, np.inf])) == pytest.approx(2.5)
+
+
+def test_the_bootstrap_over_runs_stays_within_its_strata():
+    """Strata without spread leave nothing to resample, however far apart they are."""
+    strata = [np.full(5, 1.0), np.full(5, 100.0)]
+    assert over_runs(strata).bootstrap == pytest.approx((over_runs(strata).value,) * 2)
+    spread = np.random.default_rng(1).normal(size=20)
+    low, high = over_runs([spread]).bootstrap
+    assert low < over_runs([spread]).value < high
+    assert (low, high) == over_runs([spread]).bootstrap

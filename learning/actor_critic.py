@@ -64,6 +64,7 @@ class ActorCritic:
         configuration: ActorCriticConfiguration,
         samples: int,
         strategy: Strategy,
+        rng: np.random.Generator,
     ) -> None:
         self._configuration, self._strategy = configuration, strategy
         self._radius = Geometric(configuration.radius, configuration.radius_end, samples)
@@ -117,8 +118,10 @@ class ActorCritic:
             floor = settings.ridge * float(np.trace(fisher)) / weights.size
             metric = fisher + (floor + np.finfo(float).tiny) * np.eye(weights.size)
         fit = policy_gradient_fit(gradient, settings.step_size, metric)
-        moved = float(fit.minimiser @ fisher @ fit.minimiser) ** 0.5
-        fit = fit.shrunk(min(1.0, self._radius(number) / moved) if moved > 0 else 0.0)
+        # A step that the policy does not feel has no length here, and is none to take.
+        if not fit.minimiser @ fisher @ fit.minimiser > 0:
+            fit = fit.shrunk(0.0)
+        fit = fit.within(self._radius(number), lambda d: float(max(d @ fisher @ d, 0.0)) ** 0.5)
         return self._step.take(fit, float(np.sqrt(np.mean(errors * errors))))
 
     def state(self) -> dict[str, NDArray[Any]]:

@@ -77,6 +77,7 @@ class BatchQLearning:
         configuration: BatchQLearningConfiguration,
         samples: int,
         strategy: Strategy,
+        rng: np.random.Generator,
     ) -> None:
         self._controller, self._configuration = controller, configuration
         self._gain = configuration.gains(samples)

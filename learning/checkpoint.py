@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from controllers.storage import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
-SCHEMA = 2
+SCHEMA = 3
 Array = NDArray[Any]
 
 
@@ -47,8 +47,10 @@ def save(path: Path, checkpoint: Checkpoint) -> Path:
     return write_atomically(path, stream.getvalue())
 
 
-def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
-    """Read a checkpoint; with `run`, refuse one that another run wrote.
+def load(
+    path: Path, run: Mapping[str, Any] | None = None, *, but: Collection[str] = ()
+) -> Checkpoint:
+    """Read a checkpoint; with `run`, refuse one of a run that differs in more than `but` says.
 
     Raises CheckpointError where the file is missing, damaged, of another schema or another run.
     """
@@ -65,7 +67,7 @@ def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
     if run is not None:
         # Both sides through JSON, where tuples are lists.
         wanted = json.loads(json.dumps(dict(run)))
-        for key in sorted(wanted.keys() | found.keys()):
+        for key in sorted((wanted.keys() | found.keys()) - set(but)):
             if wanted.get(key) != found.get(key):
                 raise CheckpointError(
                     f"{path}: the checkpoint is of another run: {key} is {found.get(key)!r} there "

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from cosim.scenario import Scenario
 from cosim.validation import describe, suggestion
 from learning.errors import ConfigurationError
 
@@ -28,8 +29,11 @@ ExplorationDeviation = Annotated[
 class Configuration(BaseModel):
     """Hyperparameters that every algorithm has; an algorithm adds its own in a subclass.
 
-    A field's description is its documentation (`documentation`). Scaled coordinates are
-    θ / blocks.scale, so that one step size fits all entries.
+    What a scenario states of exploration and c_lambda's start takes the place of an algorithm's
+    defaults, but not of what the user set (`for_scenario`). A field `x_end` beside `x` makes a
+    schedule over the run's samples. A field's description is its documentation
+    (`documentation`). Scaled coordinates are θ / blocks.scale, so that one step size fits all
+    entries.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -39,7 +43,8 @@ class Configuration(BaseModel):
         description="θ of the paper, or that and the slack weights of the predicted stages",
     )
     value_offset: Literal["stage-cost", "discounted"] = Field(
-        "discounted", description="c_lambda at the start: ℓ_s (paper) or ℓ_s/(1−γ)"
+        "discounted",
+        description="c_lambda at the start: ℓ_s (paper) or ℓ_s/(1−γ), unless the scenario says",
     )
     slack_linear_weight: Positive = Field(
         100.0, description="w_sigma at the start, extended θ; exact relaxation needs more than 60.3"
@@ -48,16 +53,19 @@ class Configuration(BaseModel):
         61.0, description="lower limit of w_sigma, just above the exactness threshold"
     )
     slack_quadratic_weight: Positive = Field(1e3, description="W_sigma at the start, extended θ")
+    model_parameters: tuple[str, ...] = Field(
+        (), description="parameters of the controller's model that θ has, in its block p"
+    )
     definiteness: Literal["lmi", "projection", "cholesky"] = Field(
         "lmi", description="how B_l and B_Vf are kept positive definite"
     )
     smallest_eigenvalue: Positive = Field(
         1e-3, description="least eigenvalue that B_l and B_Vf may have"
     )
-    exploration: Literal["additive", "literal", "perturbed-cost", "scenario"] = Field(
+    exploration: Literal["additive", "literal", "perturbed-cost", "none"] = Field(
         "additive",
         description="a = sat(π+e), a = sat(e), a = π of a cost with a random linear term in u, "
-        "or what the scenario says",
+        "or always a = π; this and what follows: unless the scenario has a table [exploration]",
     )
     exploration_probability: ExplorationProbability = 1.0
     exploration_probability_end: Share | None = Field(
@@ -95,6 +103,31 @@ class Configuration(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             raise ConfigurationError(f"hyperparameters: {describe(error, cls)}") from None
+
+    def for_scenario(self, scenario: Scenario) -> Self:
+        """Copy with what the scenario states in place of every default that it states."""
+        stated: dict[str, Any] = {}
+        if (table := scenario.exploration) is not None:
+            stated = {
+                "exploration": table.kind,
+                "exploration_probability": table.probability,
+                "exploration_probability_end": None,
+                "exploration_deviation": table.standard_deviation or (0.0,),
+                "exploration_deviation_end": None,
+            }
+        if scenario.controller.value_offset is not None:
+            stated["value_offset"] = scenario.controller.value_offset
+        chosen = self.model_fields_set
+        return self.model_copy(update={k: v for k, v in stated.items() if k not in chosen})
+
+    def depends_on_samples(self) -> list[str]:
+        """Names of what changes over the run, so that a longer run would not begin as this one."""
+        return [
+            name
+            for name in type(self).model_fields
+            if (end := getattr(self, f"{name}_end", None)) is not None
+            and end != getattr(self, name)
+        ]
 
     @classmethod
     def documentation(cls) -> list[tuple[str, str, str]]:

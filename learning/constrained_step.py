@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.parameters import Parameters
 from controllers.theta import ThetaBlocks
 from learning.configuration import Configuration
 from learning.definiteness import Certificate, certificate, enforcement
@@ -21,7 +22,9 @@ class ConstrainedStep:
     """Moves a controller's θ by a fit under every constraint on θ.
 
     `scale` (n_θ,) are the coordinates of the fits: the layout's, or ones where the configuration
-    says `scaled = false`. Raises DivergenceError on a step that is not finite.
+    says `scaled = false`. The least eigenvalue that the Hessians may have is the configuration's,
+    or half of the start's where that is less: an economically tuned cost is flat. Raises
+    DivergenceError on a step that is not finite.
     """
 
     def __init__(
@@ -32,17 +35,29 @@ class ConstrainedStep:
         self.blocks = blocks if scaled else unscaled(blocks)
         self.scale: Vector = self.blocks.scale
         self._enforce = enforcement(
-            configuration.definiteness, self.blocks, configuration.smallest_eigenvalue
+            configuration.definiteness,
+            self.blocks,
+            least_eigenvalue(configuration, controller.parameters),
         )
         self._weight_minimum = configuration.slack_linear_minimum
 
     def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
-        """The new θ that a fit leads to, and its certificate; the controller stays as it is."""
+        """The new θ that a fit leads to, and its certificate; the controller stays as it is.
+
+        A step that definiteness corrects beyond the fit's cap or trust region is scaled back: the
+        θ with definite Hessians are a convex set, in which the whole way lies.
+        """
         theta = self._controller.theta
         if not np.isfinite(fit.minimiser).all():
             raise DivergenceError("the step of θ is not finite")
         new, vouched = self._enforce(theta, fit)
         new = self._admissible(new)
+        reach = 0.0 if fit.reach is None else fit.reach((new - theta) / self.scale)
+        if reach > 1.0:
+            new = theta + (new - theta) / reach
+            vouched = dataclasses.replace(
+                certificate(self.blocks, new), corrected=vouched.corrected
+            )
         lower, upper = self.blocks.slices["x_l"], self.blocks.slices["x_u"]
         if not (new[lower] < new[upper]).all():
             return theta, dataclasses.replace(
@@ -63,6 +78,14 @@ class ConstrainedStep:
             refused=vouched.refused,
         )
 
+    def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
+        """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), and say so.
+
+        Nearest in the scaled coordinates where definiteness is kept by the LMI.
+        """
+        step = (theta - self._controller.theta) / self.scale
+        return self.take(Fit(step, step, lambda: np.eye(step.size)), td_error)
+
     def _admissible(self, theta: Vector) -> Vector:
         """Keep learned slack weights above what exactness (linear) and convexity ask for."""
         if "w_sigma" not in self.blocks:
@@ -72,6 +95,16 @@ class ConstrainedStep:
             where = self.blocks.slices[name]
             theta[where] = np.maximum(theta[where], minimum)
         return theta
+
+
+def least_eigenvalue(configuration: Configuration, start: Parameters) -> float:
+    """ε of B ⪰ εI for a run that begins at `start`."""
+    own = certificate(start.blocks, start.theta).smallest
+    return (
+        min(configuration.smallest_eigenvalue, own / 2)
+        if own > 0
+        else (configuration.smallest_eigenvalue)
+    )
 
 
 def unscaled(blocks: ThetaBlocks) -> ThetaBlocks:

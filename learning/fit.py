@@ -23,12 +23,15 @@ Matrix = NDArray[np.float64]
 class Fit:
     """The problem min_d dᵀMd − 2bᵀd.
 
-    `gradient` is b (n,), `minimiser` M⁻¹b (n,), `metric()` M (n, n).
+    `gradient` is b (n,), `minimiser` M⁻¹b (n,), `metric()` M (n, n). `reach(d)` says how far a
+    step goes, as a multiple of the cap or trust region that the fit keeps: a step that a constraint
+    on θ corrects must still have at most 1.
     """
 
     gradient: Vector
     minimiser: Vector
     metric: Callable[[], Matrix]
+    reach: Callable[[Vector], float] | None = None
 
     def shrunk(self, factor: float) -> Fit:
         """The fit whose minimiser is `factor` times this one's, with the same metric."""
@@ -41,10 +44,25 @@ class Fit:
 
         Entries are cut one by one: the level c_lambda has far to go, and must not hold up the rest.
         """
-        if float(np.abs(self.minimiser).max()) <= largest:
-            return self
+
+        def reach(step: Vector) -> float:
+            return float(np.abs(step).max()) / largest
+
+        if reach(self.minimiser) <= 1.0:
+            return replace(self, reach=reach)
         minimiser = np.clip(self.minimiser, -largest, largest)
-        return Fit(self.metric() @ minimiser, minimiser, self.metric)
+        return Fit(self.metric() @ minimiser, minimiser, self.metric, reach)
+
+    def within(self, radius: float, size: Callable[[Vector], float]) -> Fit:
+        """The fit whose minimiser is this one's, shortened to `size(d)` ≤ `radius`, same metric.
+
+        `size` must be a norm of the step.
+        """
+
+        def reach(step: Vector) -> float:
+            return size(step) / radius
+
+        return replace(self.shrunk(1.0 / max(1.0, reach(self.minimiser))), reach=reach)
 
 
 def td_fit(td_error: float, gradient: Vector, step_size: float) -> Fit:

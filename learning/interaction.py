@@ -16,6 +16,9 @@ from learning.exploration import Strategy
 from learning.protocols import Algorithm, LearnableController, LearnableSolution, Transition
 
 Vector = NDArray[np.float64]
+CHECKED_EVERY = 10
+"""The flags of a solution cost as much as a feedback; of this many samples one pays for them."""
+COUNTS = ("number", "failures", "explored", "saturated", "weakly_active", "licq_failed")
 
 
 class ContinuablePlant(Protocol):
@@ -37,6 +40,8 @@ class Interaction:
 
     `next` gives a sample, or None where the controller failed: then the last applied action is
     applied once more, `failures` counts it and the controller starts from its reference.
+    `weakly_active` and `licq_failed` count, of every tenth sample, the policies whose derivatives
+    are one-sided and those whose active constraints are linearly dependent.
     """
 
     def __init__(
@@ -65,6 +70,8 @@ class Interaction:
         self.failures = 0
         self.explored = 0
         self.saturated = 0
+        self.weakly_active = 0
+        self.licq_failed = 0
 
     def start(self, seed: int) -> None:
         """Begin the episode: reset plant and controller, solve for the first state."""
@@ -79,6 +86,9 @@ class Interaction:
         action_value = policy
         if explored and self._algorithm.needs_action_value:
             action_value = self._action_value(s, a)
+        if policy is not None and number % CHECKED_EVERY == 0:
+            self.weakly_active += policy.weakly_active
+            self.licq_failed += not policy.licq
         step = self._plant.step(a)
         self._applied, self.s, self.number = a, step.s, number + 1
         self._policy = self._solve()
@@ -143,8 +153,7 @@ class Interaction:
         arrays = {"s": self.s, "applied": self._applied}
         if self._point is not None:
             arrays |= {f"point_{key}": value for key, value in self._point._asdict().items()}
-        counts = ("number", "failures", "explored", "saturated")
-        return {name: getattr(self, name) for name in counts}, arrays
+        return {name: getattr(self, name) for name in COUNTS}, arrays
 
     def resume(self, numbers: dict[str, int], arrays: dict[str, Vector]) -> None:
         """Take back what `state` gave; the plant must have been restored before."""

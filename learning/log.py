@@ -22,6 +22,11 @@ COLUMNS = (
     "failures",
     "explored",
     "saturated",
+    "weakly_active",
+    "licq_failed",
+    "plant_samples",
+    "validated_J",
+    "accepted",
     "greedy_J",
     "greedy_economic_cost",
     "greedy_mean_violation",
@@ -36,11 +41,12 @@ COLUMNS = (
 class Totals:
     """Sums since the last line of the log.
 
-    `cost` over the samples; `updates`, and over these `squares` of the TD error, norms of the
+    `cost` over the `samples`; `updates`, and over these `squares` of the TD error, norms of the
     `step`, flags `corrected` and `refused`; `smallest_eigenvalue` is the least of all.
     """
 
     cost: float = 0.0
+    samples: int = 0
     updates: int = 0
     squares: float = 0.0
     step: float = 0.0
@@ -57,11 +63,11 @@ class Totals:
         self.refused += update.refused
         self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
 
-    def means(self, samples: float) -> LogRow:
-        """Means over `samples` samples and their updates, NaN where there was none."""
+    def means(self) -> LogRow:
+        """Means over the samples and their updates, NaN where there was none."""
         count = self.updates or float("nan")
         return {
-            "J": self.cost / samples,
+            "J": self.cost / (self.samples or float("nan")),
             "updates": self.updates,
             "td_error": (self.squares / count) ** 0.5,
             "step": self.step / count,

@@ -36,6 +36,14 @@ class LearnableSolution(Protocol):
     def policy_jacobian(self) -> Matrix:
         """dπ/dθ, (m, n_θ)."""
 
+    @property
+    def weakly_active(self) -> bool:
+        """Whether a constraint is about to change its activity: derivatives are one-sided."""
+
+    @property
+    def licq(self) -> bool:
+        """Whether the active constraints' gradients are linearly independent."""
+
 
 class LearnableController(Protocol):
     """A controller with parameters θ; `RtiNmpc` and `ConvergedNmpc` are."""
@@ -94,7 +102,8 @@ class Update(NamedTuple):
 
     `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
     step, `smallest_eigenvalue` the certificate's; `corrected` and `refused` are its flags;
-    `failures` counts QPs of its own that failed.
+    `failures` counts QPs of its own that failed. With `episode` the loop goes on with a new
+    episode, from the scenario's initial state and with this seed of the plant's noise.
     """
 
     td_error: float
@@ -103,6 +112,7 @@ class Update(NamedTuple):
     corrected: bool = False
     refused: bool = False
     failures: int = 0
+    episode: int | None = None
 
 
 class Algorithm(Protocol):
@@ -110,8 +120,19 @@ class Algorithm(Protocol):
 
     `Configuration` is the class of its hyperparameters. The loop constructs it with a controller
     that it may move (`controller.theta`), calls `observe` once per sample, and evaluates anew the
-    policy whenever `observe` returned an Update. `state` and `restore` carry all else that it
-    remembers, as arrays, through a checkpoint.
+    policy whenever `observe` returned an Update. `rng` is a generator of its own, spawned from the
+    run's seed. `state` and `restore` carry all else that it remembers, as arrays, through a
+    checkpoint, the generator's state excepted, which the loop keeps.
+
+    Optional, looked up by name:
+
+    - `theta` (n_θ,), a property: the θ that the run would hand over now, where that is another one
+      than it behaves with. Evaluation, log, parameters.toml and summary show it.
+    - `first_episode`, int: seed of the plant's noise in the first episode, in place of the run's.
+    - `failed(cost) -> Update | None`: called in place of `observe` on a sample at which the
+      controller failed, with the sample's share of J.
+    - `validated(accepted, theta)`: called after each validation run, with whether the θ handed
+      over is better than the incumbent and which θ is the incumbent now.
     """
 
     Configuration: ClassVar[type[Configuration]]
@@ -131,6 +152,7 @@ class Algorithm(Protocol):
         configuration: Any,
         samples: int,
         strategy: Strategy,
+        rng: np.random.Generator,
     ) -> None: ...
 
     def observe(self, sample: Transition) -> Update | None:

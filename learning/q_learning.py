@@ -26,7 +26,9 @@ AS_PRINTED: dict[str, Any] = {
     "rule": "fit",
     "step_size": 1e-3,
     "scaled": False,
-    "exploration": "scenario",
+    "exploration": "additive",
+    "exploration_probability": 0.1,
+    "exploration_deviation": [3.1622776601683795],
     "value_offset": "stage-cost",
     "parametrisation": "paper",
 }
@@ -89,6 +91,7 @@ class QLearning:
         configuration: QLearningConfiguration,
         samples: int,
         strategy: Strategy,
+        rng: np.random.Generator,
     ) -> None:
         self._controller, self._configuration = controller, configuration
         self._gain = configuration.gains(samples)

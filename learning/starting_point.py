@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from controllers.converged import ConvergedNmpc
+from controllers.economic.tuning import tune
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
@@ -16,26 +18,80 @@ from learning.exploration import Strategy, strategy
 from learning.protocols import LearnableController
 from learning.schedule import linear
 
+Vector = NDArray[np.float64]
 CONTROLLERS = ("rti", "converged")
 
 
-def starting_parameters(problem: Problem, configuration: Configuration) -> Parameters:
-    """The paper's naive θ; with the extended one, the slack weights of the configuration too."""
-    offset = None
-    if configuration.value_offset == "discounted" and problem.discount < 1:
-        offset = problem.reference_cost / (1 - problem.discount)
-    extended = configuration.parametrisation == "extended"
-    blocks = ThetaBlocks.of(problem, slack_weights=extended)
-    parameters = Parameters.naive(problem, blocks, value_offset=offset)
-    if not extended:
-        return parameters
-    ones = np.ones(problem.n_states)
-    return parameters.replace(
-        {
-            "w_sigma": configuration.slack_linear_weight * ones,
-            "W_sigma": configuration.slack_quadratic_weight * ones,
-        }
+def starting_parameters(
+    problem: Problem, configuration: Configuration, start: str = "naive"
+) -> Parameters:
+    """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
+
+    `start` is `naive`, `tuned` or the path of a parameters file. `naive` and `tuned` take c_lambda
+    and, with the extended θ, the slack weights from the configuration; blocks that a file has
+    stand as they are, those of the configuration's parametrisation that it lacks start as with
+    `naive`. Raises ConfigurationError where the file has slack weights and the parametrisation
+    none, ParameterError on a bad file, TuningError where the tuning fails.
+    """
+    blocks = ThetaBlocks.of(
+        problem,
+        slack_weights=configuration.parametrisation == "extended",
+        model_parameters=configuration.model_parameters,
     )
+    offset = _value_offset(problem, configuration)
+    naive = Parameters.naive(problem, blocks, value_offset=offset)
+    if start == "naive":
+        return naive.replace(_slack_weights(problem, configuration))
+    if start == "tuned":
+        tuned = tune(problem, blocks, value_offset=offset).parameters
+        return tuned.replace(_slack_weights(problem, configuration))
+    return _extended(problem, configuration, start)
+
+
+def _value_offset(problem: Problem, configuration: Configuration) -> float | None:
+    """c_lambda at the start, None for ℓ_s; the level of V is that of the TD error's discount."""
+    chosen: float | None = getattr(configuration, "discount", None)
+    discount = problem.discount if chosen is None else chosen
+    if configuration.value_offset == "discounted" and discount < 1:
+        return problem.reference_cost / (1 - discount)
+    return None
+
+
+def _slack_weights(problem: Problem, configuration: Configuration) -> dict[str, Vector]:
+    """The configured slack weights by block, none for the paper's θ."""
+    if configuration.parametrisation != "extended":
+        return {}
+    ones = np.ones(problem.n_states)
+    return {
+        "w_sigma": configuration.slack_linear_weight * ones,
+        "W_sigma": configuration.slack_quadratic_weight * ones,
+    }
+
+
+def _extended(problem: Problem, configuration: Configuration, path: str) -> Parameters:
+    """θ of a file, with the blocks that it lacks."""
+    found = Parameters.load(path, problem)
+    learned = "w_sigma" in found.blocks
+    if learned and configuration.parametrisation == "paper":
+        raise ConfigurationError(
+            f"{path}: θ has slack weights, which the parametrisation 'paper' has not; set "
+            "parametrisation=extended"
+        )
+    names = found.blocks.block("p").labels if "p" in found.blocks else ()
+    more = tuple(name for name in configuration.model_parameters if name not in names)
+    blocks = ThetaBlocks.of(
+        problem,
+        slack_weights=configuration.parametrisation == "extended",
+        model_parameters=(*names, *more),
+    )
+    values: dict[str, ArrayLike] = {block.name: found[block.name] for block in found.blocks}
+    if not learned:
+        values |= _slack_weights(problem, configuration)
+    if more:
+        chosen = problem.model.parameter_indices(more)
+        nominal = problem.model.nominal_parameters[chosen]
+        values["p"] = np.concatenate([values.get("p", np.empty(0)), nominal])
+    return Parameters.naive(problem, blocks).replace(values)
 
 
 def build_controller(
@@ -58,15 +114,8 @@ def build_strategy(configuration: Configuration, scenario: Scenario, samples: in
     probability_end = configuration.exploration_probability_end
     deviation: tuple[float, ...] = configuration.exploration_deviation
     deviation_end = configuration.exploration_deviation_end
-    if kind == "scenario":
-        table = scenario.exploration
-        if table.kind == "none":
-            raise ConfigurationError(
-                f"scenario '{scenario.name}' has no exploration; choose additive, literal or "
-                "perturbed-cost"
-            )
-        kind, probability, deviation = table.kind, table.probability, table.standard_deviation
-        probability_end = deviation_end = None
+    if kind == "none":
+        kind, probability, probability_end = "additive", 0.0, None
     return strategy(
         kind,
         scenario.action_lower,

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
-from math import isnan
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.parameters import Parameters
 from controllers.storage import write_atomically
 from cosim.errors import CapabilityError
+from cosim.evaluation.statistics import shown
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from learning import checkpoint
 from learning.checkpoint import Checkpoint
 from learning.definiteness import certificate
-from learning.errors import ConfigurationError, DivergenceError
+from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.evaluation import Judge
 from learning.learner import Learner
 from learning.log import COLUMNS, LogRow, Totals, to_csv
 from learning.protocols import Algorithm
-from learning.training_run import TrainingRecorder, TrainingResult, TrainingRun
+from learning.training_run import VALIDATION, TrainingRecorder, TrainingResult, TrainingRun
+from learning.validation import Validation
 
 Progress = Callable[[int, LogRow], None]
 """Gets the samples done and the last row of the log."""
@@ -36,6 +38,8 @@ class TrainingLoop:
     whose J on the held-out runs is J*; without it regret and gap closed are NaN. With `out`,
     learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on; a plant
     that cannot serialise its state leaves no checkpoint, and `without_checkpoint` says so.
+
+    Log, evaluations and files show the θ that the run would end with if it ended there.
     """
 
     def __init__(
@@ -51,8 +55,15 @@ class TrainingLoop:
     ) -> None:
         self._run, self._plant, self._out, self._recorder = run, plant, out, recorder
         self._learner = Learner(run, algorithm, plant)
-        self._good = self._learner.start
-        self._judge = Judge(run, cast("Any", evaluation_plant), self._good, optimum)
+        self._judge = Judge(run, cast("Any", evaluation_plant), self._learner.start, optimum)
+        self._validation: Validation | None = None
+        if run.validate_every:
+            self._validation = Validation(
+                cast("Any", evaluation_plant),
+                self._judge.controller,
+                int(run.spawned(VALIDATION).generate_state(1, np.uint64)[0]),
+                run.validation_samples,
+            )
         self._rows: list[LogRow] = []
         self._totals = Totals()
         self.without_checkpoint: str | None = None
@@ -62,15 +73,17 @@ class TrainingLoop:
         """Train to the end or to divergence.
 
         With `resume` the run goes on from its checkpoint, to the same digits as if it had never
-        stopped; raises CheckpointError where there is none that fits.
+        stopped; raises CheckpointError where there is none that fits. A run that was to end sooner
+        is given more samples where it would have begun in the same way.
         """
         if resume:
             self._resume()
         else:
             self._learner.begin()
+            self._validate()
             self._checkpoint()
         if self._recorder is not None:
-            self._recorder.start(self._run, self._good)
+            self._recorder.start(self._run, self._learner.start)
             for row in self._rows:
                 self._record(row)
         try:
@@ -78,8 +91,37 @@ class TrainingLoop:
         finally:
             if self._recorder is not None:
                 self._recorder.close()
-        verdict = self._judge.verdict(self._good.theta)
-        return TrainingResult(self._good, self._rows, verdict.summary(), status)
+        verdict = self._judge.verdict(self._answer.theta)
+        return TrainingResult(
+            self._answer,
+            self._rows,
+            verdict.summary(),
+            status,
+            self._plant_samples,
+            0 if self._validation is None else self._validation.samples,
+        )
+
+    @property
+    def _answer(self) -> Parameters:
+        """The θ that the run would hand over now."""
+        parameters = self._learner.parameters
+        if self._validation is None or self._validation.theta is None:
+            return parameters
+        return parameters.with_theta(self._validation.theta)
+
+    @property
+    def _plant_samples(self) -> int:
+        validated = 0 if self._validation is None else self._validation.samples
+        return self._learner.interaction.number + validated
+
+    def _validate(self) -> float:
+        """Validate what the algorithm hands over; its J, NaN without validation."""
+        if self._validation is None:
+            return float("nan")
+        accepted, cost = self._validation.consider(self._learner.parameters.theta)
+        if hook := getattr(self._learner.algorithm, "validated", None):
+            hook(accepted, self._validation.theta)
+        return cost
 
     def _loop(self, progress: Progress | None) -> str:
         run, learner = self._run, self._learner
@@ -87,33 +129,40 @@ class TrainingLoop:
             try:
                 cost, update = learner.advance()
             except DivergenceError as error:
+                self._append(self._row(number + 1, judged=True))
                 return f"diverged: {error} at sample {number + 1}"
             number += 1
             self._totals.cost += cost
+            self._totals.samples += 1
             if update is not None:
                 self._totals.add(update)
             if number % run.log_every and number < run.samples:
                 continue
-            row = self._row(number)
-            self._rows.append(row)
-            if self._recorder is not None:
-                self._record(row)
+            ends = number == run.samples
+            row = self._row(number, judged=number % run.evaluate_every == 0 or ends)
+            self._append(row)
             if trouble := self._trouble(row):
                 return trouble
-            if not isnan(row["greedy_J"]):
-                self._good = learner.controller.parameters
             if number % run.checkpoint_every == 0 or number == run.samples:
                 self._checkpoint()
             if progress is not None:
                 progress(number, row)
         return "finished"
 
-    def _row(self, number: int) -> LogRow:
-        """A line of the log: what happened since the last one, and now and then an evaluation."""
+    def _append(self, row: LogRow) -> None:
+        self._rows.append(row)
+        if self._recorder is not None:
+            self._record(row)
+
+    def _row(self, number: int, *, judged: bool) -> LogRow:
+        """A line of the log: what happened since the last one, with an evaluation if `judged`."""
         run, interaction = self._run, self._learner.interaction
-        blocks, theta = self._good.blocks, self._learner.controller.theta
+        every = run.validate_every
+        validated = bool(every) and (number % every == 0 or number == run.samples)
+        cost = self._validate() if validated else float("nan")
+        blocks, theta = self._learner.start.blocks, self._answer.theta
         row: LogRow = dict.fromkeys(COLUMNS, float("nan"))
-        row |= self._totals.means(number - (self._rows[-1]["samples"] if self._rows else 0))
+        row |= self._totals.means()
         row |= {
             "samples": number,
             # The least certificate of the updates since the last row, whichever step gave it.
@@ -123,8 +172,13 @@ class TrainingLoop:
             "failures": interaction.failures,
             "explored": interaction.explored,
             "saturated": interaction.saturated,
+            "weakly_active": interaction.weakly_active,
+            "licq_failed": interaction.licq_failed,
+            "plant_samples": self._plant_samples,
+            "validated_J": cost,
+            "accepted": float("nan") if self._validation is None else self._validation.accepted,
         }
-        if number % run.evaluate_every == 0 or number == run.samples:
+        if judged:
             row |= self._judge.verdict(theta).row()
         row |= {f"theta {label}": float(v) for label, v in zip(blocks.labels, theta, strict=True)}
         self._totals = Totals()
@@ -132,19 +186,17 @@ class TrainingLoop:
 
     def _trouble(self, row: LogRow) -> str | None:
         """Why the run must stop, or None."""
-        where = f"at sample {int(row['samples'])}; the θ kept is the last one that evaluated well"
-        if not np.isfinite(self._learner.controller.theta).all():
-            return f"diverged: θ is not finite {where}"
         greedy, limit = row["greedy_J"], self._judge.limit
         if greedy > limit:
-            return f"diverged: greedy J = {greedy:.1f} exceeds {limit:.1f} {where}"
+            where = f"at sample {int(row['samples'])}"
+            return f"diverged: greedy J = {shown(greedy)} exceeds {shown(limit)} {where}"
         return None
 
     def _record(self, row: LogRow) -> None:
         assert self._recorder is not None
-        blocks = self._good.blocks
-        theta = np.array([row[f"theta {label}"] for label in blocks.labels])
-        self._recorder.record(row, self._good.with_theta(theta), self._judge.controller(theta))
+        start = self._learner.start
+        theta = np.array([row[f"theta {label}"] for label in start.blocks.labels])
+        self._recorder.record(row, start.with_theta(theta), self._judge.controller(theta))
 
     def _checkpoint(self) -> None:
         """Write the state to disk and start the solver afresh, as a resumed run will."""
@@ -153,7 +205,7 @@ class TrainingLoop:
         if self._out is None:
             return
         write_atomically(self._out / "learning.csv", to_csv(self._rows))
-        self._good.save(self._out / "parameters.toml")
+        self._answer.save(self._out / "parameters.toml")
         try:
             plant = self._plant.serialise(self._plant.snapshot())
         except CapabilityError as error:
@@ -163,9 +215,11 @@ class TrainingLoop:
         columns = list(self._rows[0]) if self._rows else []
         stored = {f"interaction {name}": value for name, value in arrays.items()}
         stored |= {f"algorithm {name}": value for name, value in learner.algorithm.state().items()}
+        if self._validation is not None:
+            kept = self._validation.state()
+            stored |= {f"validation {name}": value for name, value in kept.items()}
         stored |= {
             "theta": learner.controller.theta,
-            "good": self._good.theta,
             "plant": np.frombuffer(plant, dtype=np.uint8),
             "rows": np.array([[row[name] for name in columns] for row in self._rows]),
         }
@@ -173,6 +227,7 @@ class TrainingLoop:
             "interaction": numbers,
             "totals": asdict(self._totals),
             "generator": checkpoint.generator_state(learner.rng),
+            "algorithm_generator": checkpoint.generator_state(learner.algorithm_rng),
             "columns": columns,
         }
         checkpoint.save(
@@ -182,19 +237,47 @@ class TrainingLoop:
     def _resume(self) -> None:
         if self._out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
-        found = checkpoint.load(self._out / "checkpoint.npz", self._run.identity())
+        path = self._out / "checkpoint.npz"
+        found = checkpoint.load(path, self._run.identity(), but=("samples",))
+        self._require_same_beginning(path, int(found.run["samples"]))
         learner, state, arrays = self._learner, found.state, found.arrays
         checkpoint.restore_generator(learner.rng, state["generator"])
+        checkpoint.restore_generator(learner.algorithm_rng, state["algorithm_generator"])
         self._rows = [
             dict(zip(state["columns"], (float(v) for v in row), strict=True))
             for row in arrays["rows"]
         ]
         self._totals = Totals(**state["totals"])
         learner.controller.theta = arrays["theta"]
-        self._good = self._good.with_theta(arrays["good"])
+        if self._validation is not None:
+            self._validation.restore(_group(arrays, "validation"))
         self._plant.restore(self._plant.deserialise(arrays["plant"].tobytes()))
         learner.algorithm.restore(_group(arrays, "algorithm"))
         learner.interaction.resume(state["interaction"], _group(arrays, "interaction"))
+
+    def _require_same_beginning(self, path: Path, samples: int) -> None:
+        """Raise CheckpointError where a run of `samples` samples was no part of this one."""
+        run = self._run
+        if samples == run.samples:
+            return
+        if samples > run.samples:
+            raise CheckpointError(
+                f"{path}: the checkpoint is of a run of {samples} samples; it cannot be made a "
+                f"run of {run.samples}"
+            )
+        if schedules := run.configuration.depends_on_samples():
+            raise CheckpointError(
+                f"{path}: a run of {samples} samples cannot be given more, since "
+                f"{', '.join(schedules)} would have gone another way from the first one: train "
+                "anew, or in future without a schedule"
+            )
+        for name in ("evaluate_every", "checkpoint_every", "validate_every"):
+            every = getattr(run, name)
+            if every and samples % every:
+                raise CheckpointError(
+                    f"{path}: a run of {samples} samples cannot be given more, since it ended "
+                    f"between two multiples of {name} = {every}, where a longer run does not stop"
+                )
 
 
 def _group(arrays: dict[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
+
+import numpy as np
 
 from controllers.parameters import Parameters
 from cosim.protocols import Controller
@@ -11,6 +15,9 @@ from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.log import LogRow
+
+PLANT, EXPLORATION, ALGORITHM, VALIDATION = range(4)
+"""Children of the run's seed sequence, by what they are for."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,12 @@ class TrainingRun:
     `log_every`, `evaluate_every`, `checkpoint_every` in samples; `evaluation_seeds` held-out runs
     of `evaluation_steps` samples. A greedy J that is worse than the naive one's by more than
     (`divergence` − 1) of its magnitude ends the run.
+
+    `start` is where θ starts: `naive`, `tuned` or the path of a parameters file. With
+    `validate_every` the θ handed over is validated that often, in samples, by a greedy run of
+    `validation_samples` samples, and the run ends with the best of them (`Validation`).
+
+    The configuration is completed by what the scenario states (`Configuration.for_scenario`).
     """
 
     algorithm: str
@@ -36,13 +49,24 @@ class TrainingRun:
     evaluation_seeds: int = 4
     evaluation_steps: int = 500
     divergence: float = 1.5
+    start: str = "naive"
+    validate_every: int = 0
+    validation_samples: int = 1000
 
     def __post_init__(self) -> None:
-        """Raise ConfigurationError on counts that make no run."""
-        for name in ("samples", "log_every", "evaluate_every", "checkpoint_every"):
+        """Complete the configuration; raise ConfigurationError on counts that make no run."""
+        completed = self.configuration.for_scenario(self.scenario)
+        object.__setattr__(self, "configuration", completed)
+        for name in (
+            "samples",
+            "log_every",
+            "evaluate_every",
+            "checkpoint_every",
+            "validation_samples",
+        ):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("evaluate_every", "checkpoint_every"):
+        for name in ("evaluate_every", "checkpoint_every", "validate_every"):
             if getattr(self, name) % self.log_every:
                 raise ConfigurationError(
                     f"{name} = {getattr(self, name)} must be a multiple of log_every = "
@@ -54,7 +78,13 @@ class TrainingRun:
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         values["scenario"] = self.scenario.hash
         values["configuration"] = self.configuration.model_dump(mode="json")
+        if (file := Path(self.start)).is_file():
+            values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
         return values
+
+    def spawned(self, purpose: int) -> np.random.SeedSequence:
+        """Child of the run's seed sequence for a purpose, `ALGORITHM` or `VALIDATION` say."""
+        return np.random.SeedSequence(self.seed).spawn(purpose + 1)[purpose]
 
 
 class TrainingRecorder(Protocol):
@@ -74,12 +104,15 @@ class TrainingRecorder(Protocol):
 class TrainingResult:
     """What came of a run: θ, the log's `rows`, the greedy evaluation of θ, and how it ended.
 
-    `evaluation` is a `Verdict.summary`.
-
-    `status` is `finished` or `diverged: …`; then `parameters` is the last θ that evaluated well.
+    θ is what the run would hand over: the algorithm's last one, or the best validated one where
+    there was validation. `evaluation` is a `Verdict.summary`; `status` is `finished` or
+    `diverged: …`, which changes nothing of what θ is; `plant_samples` counts those of training
+    and validation, `validated` those of the latter.
     """
 
     parameters: Parameters
     rows: list[LogRow]
     evaluation: dict[str, Any]
     status: str
+    plant_samples: int
+    validated: int

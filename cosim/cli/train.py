@@ -49,12 +49,36 @@ def train(
         "cosim-train"
     ),
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the folder's checkpoint.")
+        bool,
+        typer.Option(
+            "--resume", help="Go on from the folder's checkpoint, to more --samples if you like."
+        ),
     ] = False,
     assignments: Annotated[
         list[str] | None,
         typer.Option("--set", help="Hyperparameter as name=value; may be repeated."),
     ] = None,
+    start: Annotated[
+        str, typer.Option("--start", help="Where θ starts: naive, tuned or a parameters file.")
+    ] = "naive",
+    validate_every: Annotated[
+        int,
+        typer.Option(
+            "--validate-every",
+            min=0,
+            max=100_000_000,
+            help="Samples per validation run, which chooses among θ; 0: none.",
+        ),
+    ] = 0,
+    validation_samples: Annotated[
+        int,
+        typer.Option(
+            "--validation-samples",
+            min=1,
+            max=100_000_000,
+            help="Samples of each validation run; they count as plant samples.",
+        ),
+    ] = 1000,
     controller: Annotated[
         str, typer.Option("--controller", help="What carries θ: rti or converged.")
     ] = "rti",
@@ -96,7 +120,7 @@ def train(
 ) -> None:
     """Train a controller's θ and write parameters.toml, learning.csv and summary.json.
 
-    Exit code 1: learning diverged; the files then hold the last good θ and the summary says why.
+    Exit code 1: learning diverged; the files hold the run's own last θ and the summary says why.
     """
     with output(json) as out_:
         from cosim.lookup import import_from_here
@@ -121,6 +145,9 @@ def train(
             checkpoint_every=checkpoint_every,
             evaluation_seeds=evaluation_seeds,
             evaluation_steps=evaluation_steps,
+            start=start,
+            validate_every=validate_every,
+            validation_samples=validation_samples,
         )
         folder = open_folder(out)
         begin = time.perf_counter()
@@ -205,7 +232,10 @@ def summarise(run: TrainingRun, result: TrainingResult) -> dict[str, Any]:
         "scenario": run.scenario.name,
         "scenario_hash": run.scenario.hash,
         "controller": run.controller,
+        "start": run.start,
         "samples": int(last.get("samples", 0)),
+        "plant_samples": result.plant_samples,
+        "validation": _validation(run, result),
         "seed": run.seed,
         "status": result.status,
         "hyperparameters": run.configuration.model_dump(mode="json"),
@@ -216,6 +246,20 @@ def summarise(run: TrainingRun, result: TrainingResult) -> dict[str, Any]:
         "smallest_eigenvalue": last.get("smallest_eigenvalue"),
         "td_error": last.get("td_error"),
         "training_failures": last.get("failures"),
+        "weakly_active": last.get("weakly_active"),
+        "licq_failed": last.get("licq_failed"),
+    }
+
+
+def _validation(run: TrainingRun, result: TrainingResult) -> dict[str, int] | None:
+    """How θ was chosen among those of the run, None where it is simply the last one."""
+    if not run.validate_every:
+        return None
+    return {
+        "validate_every": run.validate_every,
+        "validation_samples": run.validation_samples,
+        "samples": result.validated,
+        "accepted": int(result.rows[-1]["accepted"]) if result.rows else 0,
     }
 
 
@@ -240,6 +284,7 @@ def _show(summary: dict[str, Any], output: Output) -> None:
         ("mean violation", f"{summary['mean_violation']:.6f}"),
         ("violating share", f"{100 * summary['violating_share']:.2f} %"),
         ("failures", str(summary["failures"])),
+        ("plant samples", str(summary["plant_samples"])),
     ]
     if regret is not None:
         rows.append(("regret %", shown(regret, summary["regret_interval"], 100, 3)))

@@ -17,7 +17,7 @@ def draw(stream: Stream, scenario: Scenario, controller: str, theta: str | None)
     plant = f"plant: {scenario.plant.fmu.rsplit('/', 1)[-1]} (FMU)"
     law = scenario.disturbance.law
     policy = f"controller: {controller}" + (f"\nθ {theta}" if theta else "")
-    explore = scenario.exploration.kind
+    explore = "none" if scenario.exploration is None else scenario.exploration.kind
     boxes = {
         "noise": (f"disturbance: {law}", (-250.0, 0.0), SERIES[4]),
         "plant": (plant, (0.0, 0.0), SERIES[0]),

@@ -12,7 +12,8 @@ LITERAL = (
     "rule=fit",
     "step_size=1e-3",
     "scaled=false",
-    "exploration=scenario",
+    "exploration_probability=0.1",
+    "exploration_deviation=[3.1622776601683795]",
     "value_offset=stage-cost",
     "parametrisation=paper",
 )

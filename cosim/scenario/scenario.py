@@ -55,8 +55,8 @@ class Scenario(Table):
     """Table `[bounds]`: the true bounds."""
     penalty: PenaltyTable
     """Table `[penalty]`: the price of a violation."""
-    exploration: ExplorationTable = ExplorationTable()
-    """Table `[exploration]`: exploration where an algorithm asks for the scenario's."""
+    exploration: ExplorationTable | None = None
+    """Table `[exploration]`: how training explores; without it that is left to the algorithm."""
     controller: ControllerTable
     """Table `[controller]`: what the controller is told."""
 
@@ -77,7 +77,6 @@ class Scenario(Table):
             ("bounds.action_upper", m, "action", False),
             ("penalty.linear", n, "state", False),
             ("penalty.quadratic", n, "state", False),
-            ("exploration.standard_deviation", m, "action", self.exploration.kind == "none"),
             ("controller.reference_state", n, "state", False),
             ("controller.reference_action", m, "action", False),
         ):
@@ -89,6 +88,13 @@ class Scenario(Table):
                     table,
                     f"must have one entry per {of} (plant.{of}s has {size}), not {len(value)}",
                 )
+        explored = self.exploration
+        deviations = () if explored is None else explored.standard_deviation
+        if explored is not None and explored.kind != "none" and len(deviations) != m:
+            raise _misfit(
+                "exploration.standard_deviation",
+                f"must have one entry per action (plant.actions has {m}), not {len(deviations)}",
+            )
         for kind in ("state", "action"):
             lower = getattr(self.bounds, f"{kind}_lower")
             upper = getattr(self.bounds, f"{kind}_upper")

@@ -19,7 +19,9 @@ def algorithm(problem, scenario, **settings):
     )
     carrier = Carrier(Parameters.naive(problem))
     strategy = build_strategy(configuration, scenario, 4000)
-    return carrier, ActorCritic(carrier, scenario, configuration, 4000, strategy)
+    return carrier, ActorCritic(
+        carrier, scenario, configuration, 4000, strategy, np.random.default_rng(0)
+    )
 
 
 def feed(actor, carrier, rng, slope, action, *, noise=0.0, clip=None):

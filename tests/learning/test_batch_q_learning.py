@@ -63,7 +63,7 @@ class Bench:
         self.controller = controller or RtiNmpc(task.problem, task.wrong())
         strategy = build_strategy(configuration, task.scenario, 1000)
         self.algorithm = BatchQLearning(
-            self.controller, task.scenario, configuration, 1000, strategy
+            self.controller, task.scenario, configuration, 1000, strategy, np.random.default_rng(0)
         )
         self.interaction = Interaction(
             task.plant(noise), self.controller, self.algorithm, strategy, np.random.default_rng(2)

@@ -61,3 +61,47 @@ def test_unscaled_coordinates_are_theta_itself(controller):
     step.take(towards(step.blocks, c_lambda=2.0), 0.0)
     assert controller.parameters["c_lambda"] == pytest.approx(6210.384509575885 + 2.0)
     assert unscaled(controller.parameters.blocks).labels == controller.parameters.blocks.labels
+
+
+def test_caps_and_trust_regions_hold_after_the_lmi(controller, rng):
+    """The corrected step stays within the cap, and B ⪰ εI with it."""
+    step = ConstrainedStep(controller, Configuration())
+    size, least = step.scale.size, Configuration().smallest_eigenvalue
+    corrected = 0
+    for _ in range(40):
+        # Ill conditioned, as information is: what the free step leaves out is cheap to move.
+        factor = rng.normal(size=(size, size)) * np.geomspace(1.0, 1e-4, size)
+        metric = factor @ factor.T + 1e-8 * np.eye(size)
+        minimiser = rng.normal(size=size) * 3.0
+        fit = Fit(metric @ minimiser, minimiser, lambda metric=metric: metric)
+        before = controller.theta.copy()
+        for limited, reach in (
+            (fit.clipped(0.5), lambda d: np.abs(d).max() / 0.5),
+            (fit.within(0.5, np.linalg.norm), lambda d: np.linalg.norm(d) / 0.5),
+        ):
+            new, vouched = step.proposal(limited)
+            assert reach((new - before) / step.scale) <= 1 + 1e-9
+            assert vouched.smallest >= least * (1 - 1e-9)
+            corrected += vouched.corrected
+            controller.theta = new
+            before = new
+    assert corrected > 20, "the test must meet corrected steps"
+
+
+def test_a_flat_start_is_not_lifted(problem):
+    flat = Carrier(Parameters.naive(problem).replace({"B_l": np.diag([1.0, 1.0, 1e-4, 1.0])}))
+    step = ConstrainedStep(flat, Configuration())
+    update = step.take(towards(step.blocks, x_l=[0.1, 0.0]), 0.0)
+    assert not update.corrected
+    assert flat.parameters["B_l"][2, 2] == 1e-4
+
+
+def test_a_projection_keeps_what_is_admissible_and_mends_the_rest(controller):
+    step = ConstrainedStep(controller, Configuration())
+    theta = controller.theta.copy()
+    theta[step.blocks.slices["x_l"]] = [26.0, 41.0]
+    assert not step.move(theta).corrected
+    assert np.array_equal(controller.theta, theta)
+    theta[step.blocks.slices["B_Vf"]] = [-1.0, 0.0, 2.0]
+    assert step.move(theta).corrected
+    assert controller.parameters["B_Vf"] == pytest.approx(np.diag([1e-3, 2.0]), abs=1e-5)

@@ -22,7 +22,9 @@ def train(task, cls, samples, noise, controller=None, **settings):
     )
     controller = controller or RtiNmpc(task.problem, task.wrong())
     strategy = build_strategy(configuration, task.scenario, samples)
-    algorithm = cls(controller, task.scenario, configuration, samples, strategy)
+    algorithm = cls(
+        controller, task.scenario, configuration, samples, strategy, np.random.default_rng(0)
+    )
     interaction = Interaction(
         task.plant(noise), controller, algorithm, strategy, np.random.default_rng(1)
     )

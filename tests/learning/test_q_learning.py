@@ -17,7 +17,9 @@ class Bench:
         configuration = QLearning.Configuration.from_dict(settings)
         self.controller = RtiNmpc(problem, starting_parameters(problem, configuration))
         strategy = build_strategy(configuration, self.scenario, 1000)
-        self.algorithm = QLearning(self.controller, self.scenario, configuration, 1000, strategy)
+        self.algorithm = QLearning(
+            self.controller, self.scenario, configuration, 1000, strategy, np.random.default_rng(0)
+        )
         self.interaction = Interaction(
             plant, self.controller, self.algorithm, strategy, np.random.default_rng(0)
         )

@@ -18,7 +18,9 @@ def collected(scenario, problem):
     )
     controller = RtiNmpc(problem, starting_parameters(problem, configuration))
     strategy = build_strategy(configuration, scenario, 100)
-    algorithm = QLearning(controller, scenario, configuration, 100, strategy)
+    algorithm = QLearning(
+        controller, scenario, configuration, 100, strategy, np.random.default_rng(0)
+    )
     with FmuPlant(scenario) as plant:
         interaction = Interaction(plant, controller, algorithm, strategy, np.random.default_rng(0))
         interaction.start(5)

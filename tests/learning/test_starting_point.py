@@ -2,9 +2,14 @@ import numpy as np
 import pytest
 
 from controllers.converged import ConvergedNmpc
+from controllers.economic import tune
+from controllers.parameters import Parameters
 from controllers.rti import RtiNmpc
+from controllers.theta import ThetaBlocks
+from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
+from learning.exploration import Literal
 from learning.starting_point import build_controller, build_strategy, starting_parameters
 
 
@@ -31,15 +36,75 @@ def test_controllers_by_name(scenario, problem, parameters):
         build_controller("mpc", scenario, problem, parameters)
 
 
-def test_exploration_as_the_scenario_says(scenario):
-    strategy = build_strategy(Configuration(exploration="scenario"), scenario, 100)
-    assert strategy.probability(0) == 0.1
-    assert strategy.deviation(0) == pytest.approx(np.sqrt([10.0, 10.0]))
+STATED = {
+    "exploration": {"kind": "literal", "probability": 0.2, "standard_deviation": [3.0, 4.0]},
+    "controller": {"value_offset": "stage-cost"},
+}
 
 
-def test_a_scenario_without_exploration_says_so(scenario):
-    silent = scenario.replace(
-        {"exploration": {"kind": "none", "standard_deviation": [], "probability": 0.0}}
+def test_what_the_scenario_states_takes_the_place_of_defaults(scenario):
+    configuration = QLearning.Configuration().for_scenario(scenario.replace(STATED))
+    strategy = build_strategy(configuration, scenario, 100)
+    assert type(strategy) is Literal
+    assert (strategy.probability(0), strategy.deviation(0).tolist()) == (0.2, [3.0, 4.0])
+    assert configuration.value_offset == "stage-cost"
+
+
+def test_what_the_user_sets_stands_against_the_scenario(scenario):
+    chosen = Configuration(value_offset="discounted", exploration_probability=0.7)
+    configuration = chosen.for_scenario(scenario.replace(STATED))
+    assert (configuration.value_offset, configuration.exploration_probability) == (
+        "discounted",
+        0.7,
     )
-    with pytest.raises(ConfigurationError, match="has no exploration"):
-        build_strategy(Configuration(exploration="scenario"), silent, 100)
+    assert configuration.exploration == "literal"
+
+
+def test_a_scenario_that_leaves_them_open_changes_nothing(scenario):
+    configuration = QLearning.Configuration()
+    assert configuration.for_scenario(scenario) == configuration
+
+
+def test_no_exploration_is_greedy(scenario, rng):
+    strategy = build_strategy(Configuration(exploration="none"), scenario, 100)
+    action = scenario.reference_action
+    assert all(strategy(action, rng, k, None) is action for k in range(20))
+
+
+def test_the_level_of_the_value_follows_the_discount_of_the_td_error(problem):
+    configuration = QLearning.Configuration(discount=0.9)
+    theta = starting_parameters(problem, configuration)
+    assert theta["c_lambda"] == pytest.approx(10 * problem.reference_cost)
+
+
+def test_a_tuned_start_has_the_configured_slack_weights_and_level(problem):
+    start = starting_parameters(problem, Configuration(), "tuned")
+    expected = tune(problem, start.blocks).parameters
+    assert np.array_equal(start["B_l"], expected["B_l"])
+    assert start["w_sigma"].tolist() == [100.0, 100.0]
+    assert start["c_lambda"] == pytest.approx(100 * problem.reference_cost)
+
+
+def test_a_file_keeps_its_blocks_and_gets_those_it_lacks(problem, tmp_path):
+    mine = Parameters.naive(problem).replace({"x_l": [27.0, 41.0], "c_lambda": 5.0})
+    path = str(mine.save(tmp_path / "mine.toml"))
+    start = starting_parameters(problem, Configuration(model_parameters=("UA2",)), path)
+    assert start["x_l"].tolist() == [27.0, 41.0] and start["c_lambda"] == 5.0
+    assert start["w_sigma"].tolist() == [100.0, 100.0]
+    assert start["p"].tolist() == [6.84]
+    literal = starting_parameters(problem, Configuration(parametrisation="paper"), path)
+    assert np.array_equal(literal.theta, mine.theta)
+
+
+def test_a_file_keeps_its_own_slack_weights_and_model_parameters(problem, tmp_path):
+    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2",))
+    mine = Parameters.naive(problem, blocks).replace({"w_sigma": [200.0, 300.0], "p": [5.2]})
+    path = str(mine.save(tmp_path / "mine.toml"))
+    start = starting_parameters(problem, Configuration(model_parameters=("M", "UA2")), path)
+    assert start["w_sigma"].tolist() == [200.0, 300.0]
+    assert dict(zip(start.blocks.block("p").labels, start["p"], strict=True)) == {
+        "UA2": 5.2,
+        "M": 20.0,
+    }
+    with pytest.raises(ConfigurationError, match="parametrisation=extended"):
+        starting_parameters(problem, Configuration(parametrisation="paper"), path)

@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 import time
@@ -5,9 +6,15 @@ import time
 import numpy as np
 import pytest
 
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.rti import RtiNmpc
+from controllers.rti.solution import RtiSolution
 from cosim import FmuPlant
 from learning.errors import CheckpointError, ConfigurationError
+from learning.evaluation import HeldOutRuns, held_out
 from learning.log import to_csv
+from learning.protocols import Update
 from learning.registry import load_algorithm
 from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun
@@ -107,13 +114,17 @@ def test_the_log_keeps_the_least_certificate_of_all_updates(scenario):
             assert row["smallest_eigenvalue"] == min(part)
 
 
-def test_divergence_stops_early_and_keeps_the_last_good_theta(scenario, tmp_path):
+def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
     run, algorithm = make_run(scenario, "actor-critic", divergence=1e-3)
     result = train(run, algorithm, tmp_path)
     assert result.status.startswith("diverged: greedy J")
     assert "at sample 100" in result.status
-    assert len(result.rows) == 2
-    assert np.array_equal(result.parameters.theta, train_start(run))
+    last = result.rows[-1]
+    assert len(result.rows) == 2 and last["samples"] == 100
+    own = [last[f"theta {label}"] for label in result.parameters.blocks.labels]
+    assert result.parameters.theta.tolist() == own
+    assert not np.array_equal(result.parameters.theta, train_start(run))
+    assert result.evaluation["J"] == last["greedy_J"]
 
 
 def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
@@ -125,7 +136,157 @@ def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
 
     result = train(run, Broken)
     assert result.status.startswith("diverged: TD errors or gradients are not finite")
-    assert np.isfinite(result.parameters.theta).all()
+    assert result.rows[-1]["samples"] == 220, "the row of the sample at which it broke"
+    assert result.rows[-1]["greedy_J"] == result.evaluation["J"]
+    assert not np.array_equal(result.parameters.theta, train_start(run))
+
+
+class Reporting(load_algorithm("q-learning")):
+    """Behaves with one θ and hands over another; draws from the generator of its own."""
+
+    def __init__(self, controller, *rest):
+        super().__init__(controller, *rest)
+        self._rng, self._blocks = rest[-1], controller.parameters.blocks
+        self.theta = controller.theta.copy()
+
+    def observe(self, sample):
+        self.theta[self._blocks.slices["x_l"]] = [25.0 + self._rng.random(), 40.0]
+        return super().observe(sample)
+
+
+def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tmp_path):
+    run, _ = make_run(scenario, "q-learning", samples=200)
+    result = train(run, Reporting, tmp_path)
+    stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
+    assert 25.0 < result.parameters["x_l"][0] < 26.0
+    assert np.array_equal(stored.theta, result.parameters.theta)
+    assert result.rows[-1]["theta x_l[0]"] == result.parameters["x_l"][0]
+    with FmuPlant(scenario) as plant:
+        own = RtiNmpc(Problem.from_scenario(scenario), result.parameters)
+        assert result.evaluation["J"] == HeldOutRuns(plant, held_out(1), 20).means(own)["J"]
+
+
+def test_the_runs_seed_reaches_the_algorithm(scenario):
+    ends = [
+        train(make_run(scenario, "q-learning", samples=50, seed=seed)[0], Reporting).parameters
+        for seed in (3, 3, 4)
+    ]
+    assert ends[0].hash == ends[1].hash != ends[2].hash
+
+
+def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):
+    run, _ = make_run(scenario, "q-learning", samples=300)
+    whole = train(run, Reporting)
+
+    def die(done, row):
+        if done == 250:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(run, Reporting, tmp_path, progress=die)
+    resumed = train(run, Reporting, tmp_path, resume=True)
+    assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
+
+
+CONSTANT = {**SETTINGS["q-learning"], "gain": 0.1, "gain_end": 0.1}
+
+
+def constant_run(scenario, samples, **changes):
+    configuration = load_algorithm("q-learning").Configuration.from_dict(CONSTANT)
+    return make_run(scenario, "q-learning", samples=samples, configuration=configuration, **changes)
+
+
+def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
+    run, algorithm = constant_run(scenario, 400)
+    whole = train(run, algorithm)
+    train(constant_run(scenario, 200)[0], algorithm, tmp_path)
+    more = train(run, algorithm, tmp_path, resume=True)
+    assert to_csv(more.rows) == to_csv(whole.rows)
+    assert np.array_equal(more.parameters.theta, whole.parameters.theta)
+
+
+@pytest.mark.parametrize(
+    ("first", "message"),
+    [
+        (lambda s: make_run(s, "q-learning", samples=200), "gain would have gone another way"),
+        (lambda s: constant_run(s, 250), "between two multiples of evaluate_every = 100"),
+        (lambda s: constant_run(s, 500), "cannot be made a run of 400"),
+    ],
+)
+def test_a_run_that_began_otherwise_is_given_no_more_samples(scenario, tmp_path, first, message):
+    run, algorithm = first(scenario)
+    train(run, algorithm, tmp_path)
+    longer = dataclasses.replace(run, samples=400)
+    with pytest.raises(CheckpointError, match=message):
+        train(longer, algorithm, tmp_path, resume=True)
+
+
+class Worsening(load_algorithm("q-learning")):
+    """Lowers the back-off that a good start has, step by step."""
+
+    def __init__(self, controller, *rest):
+        super().__init__(controller, *rest)
+        self._carrier, self.heard = controller, []
+
+    def observe(self, sample):
+        parameters = self._carrier.parameters
+        self._carrier.parameters = parameters.replace({"x_l": parameters["x_l"] - [0.05, 0.0]})
+        return Update(td_error=0.0, step=0.05, smallest_eigenvalue=1.0)
+
+    def validated(self, accepted, theta):
+        self.heard.append(accepted)
+
+
+def test_validation_keeps_a_good_start_and_counts_its_samples(scenario, problem, tmp_path):
+    start = Parameters.naive(problem).replace({"x_l": [27.5, 40.0]}).save(tmp_path / "start.toml")
+    changes = {"samples": 200, "start": str(start), "validate_every": 50, "validation_samples": 60}
+    run, _ = make_run(scenario, "q-learning", **changes)
+    result = train(run, Worsening)
+    lost = train(dataclasses.replace(run, validate_every=0), Worsening)
+    assert result.parameters["x_l"].tolist() == [27.5, 40.0]
+    assert lost.parameters["x_l"][0] < 20.0 and lost.plant_samples == 200
+    assert result.plant_samples == 200 + 5 * 60 and result.validated == 5 * 60
+    assert [row["plant_samples"] for row in result.rows] == [170, 280, 390, 500]
+    assert all(row["validated_J"] > 6000 for row in result.rows)
+    assert result.rows[-1]["accepted"] == 0
+
+
+def test_validation_resumes_to_the_same_digits(scenario, tmp_path):
+    run, algorithm = make_run(
+        scenario, "q-learning", samples=300, validate_every=50, validation_samples=40
+    )
+    whole = train(run, algorithm)
+
+    def die(done, row):
+        if done == 250:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(run, algorithm, tmp_path, progress=die)
+    resumed = train(run, algorithm, tmp_path, resume=True)
+    assert to_csv(resumed.rows) == to_csv(whole.rows)
+    assert resumed.rows[-1]["accepted"] >= 1
+
+
+def test_scenarios_that_differ_in_open_points_train_differently(scenario):
+    run, algorithm = make_run(scenario, "q-learning", samples=60)
+    theta = {train(run, algorithm).parameters.hash}
+    for stated in (
+        {"exploration": {"kind": "additive", "probability": 0.1, "standard_deviation": [3.0, 3.0]}},
+        {"controller": {"value_offset": "stage-cost"}},
+    ):
+        other = dataclasses.replace(run, scenario=scenario.replace(stated))
+        theta.add(train(other, algorithm).parameters.hash)
+    assert len(theta) == 3
+
+
+def test_the_log_counts_flags_of_the_policies(scenario, monkeypatch):
+    run, algorithm = make_run(scenario, "q-learning", samples=100)
+    monkeypatch.setattr(RtiSolution, "weakly_active", True)
+    monkeypatch.setattr(RtiSolution, "licq", False)
+    rows = train(run, algorithm).rows
+    assert [row["weakly_active"] for row in rows] == [5, 10]
+    assert [row["licq_failed"] for row in rows] == [5, 10]
 
 
 @pytest.mark.parametrize(

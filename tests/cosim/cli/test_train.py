@@ -53,6 +53,20 @@ def test_the_regret_is_known_without_naming_the_optimum(cosim, tmp_path):
     assert summary["controllers"]["tuned"]["regret"]["value"] is not None
 
 
+def test_training_starts_from_tuned_and_from_a_file(cosim, tmp_path):
+    code, out, _ = cosim(*SHORT, "--start", "tuned", "--out", "one", "--json")
+    assert code == 0 and json.loads(out)["start"] == "tuned"
+    code, out, _ = cosim(
+        *SHORT, "--start", "one/parameters.toml", "--validate-every", 100,
+        "--validation-samples", 30, "--out", "two", "--json",
+    )  # fmt: skip
+    summary = json.loads(out)
+    assert code == 0 and summary["plant_samples"] == 200 + summary["validation"]["samples"]
+    assert summary["validation"]["samples"] == 3 * 30
+    code, _, err = cosim(*SHORT, "--start", "none.toml", "--out", "three")
+    assert code == 2 and "there is no such parameters file" in err
+
+
 def test_a_recording_is_written(cosim, tmp_path):
     assert cosim(*SHORT, "--out", "run", "--record")[0] == 0
     assert (tmp_path / "run/training.rrd").stat().st_size > 10_000

@@ -81,7 +81,7 @@ class Judge:
     def __init__(
         self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
     ) -> None:
-        self._run, self._optimum = run, optimum
+        self._run, self._start, self._optimum = run, start, optimum
         self._problem = Problem.from_scenario(cast("Any", run.scenario))
         self._controller = self._build(start)
         self._evaluation = HeldOutRuns(plant, held_out(run.evaluation_seeds), run.evaluation_steps)
@@ -108,13 +108,17 @@ class Judge:
     def limit(self) -> float:
         """Greedy J above which a run has diverged."""
         # A cost may be negative, a profit say: the margin counts in its magnitude.
-        naive = float(self._naive_cost.mean())
-        return naive + (self._run.divergence - 1) * abs(naive)
+        worst = max(float(self._naive_cost.mean()), float(self._start_cost.mean()))
+        return worst + (self._run.divergence - 1) * abs(worst)
 
     @cached_property
     def _naive_cost(self) -> NDArray[np.float64]:
         naive = self._build(Parameters.naive(self._problem))
         return self._evaluation.costs(cast("Controller", naive))["J"]
+
+    @cached_property
+    def _start_cost(self) -> NDArray[np.float64]:
+        return self._evaluation.costs(cast("Controller", self._build(self._start)))["J"]
 
     @cached_property
     def _optimal_cost(self) -> NDArray[np.float64]:

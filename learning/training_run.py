@@ -27,8 +27,8 @@ class TrainingRun:
     The `algorithm` by name, its `configuration`, the `scenario`, the kind of `controller` (`rti` or
     `converged`) that learns from `samples` samples with this `seed` of noise and exploration.
     `log_every`, `evaluate_every`, `checkpoint_every` in samples; `evaluation_seeds` held-out runs
-    of `evaluation_steps` samples. A greedy J that is worse than the naive one's by more than
-    (`divergence` − 1) of its magnitude ends the run.
+    of `evaluation_steps` samples. A greedy J that is worse than that of the naive θ and that of
+    the start by more than (`divergence` − 1) of its magnitude ends the run.
 
     `start` is where θ starts: `naive`, `tuned` or the path of a parameters file. With
     `validate_every` the θ handed over is validated that often, in samples, by a greedy run of

@@ -54,10 +54,11 @@ def test_the_regret_is_known_without_naming_the_optimum(cosim, tmp_path):
 
 
 def test_training_starts_from_tuned_and_from_a_file(cosim, tmp_path):
-    code, out, _ = cosim(*SHORT, "--start", "tuned", "--out", "one", "--json")
+    slow = (*SHORT, "--set", "gain=1e-3", "--set", "gain_end=1e-3")
+    code, out, _ = cosim(*slow, "--start", "tuned", "--out", "one", "--json")
     assert code == 0 and json.loads(out)["start"] == "tuned"
     code, out, _ = cosim(
-        *SHORT, "--start", "one/parameters.toml", "--validate-every", 100,
+        *slow, "--start", "one/parameters.toml", "--validate-every", 100,
         "--validation-samples", 30, "--out", "two", "--json",
     )  # fmt: skip
     summary = json.loads(out)

@@ -23,6 +23,8 @@ from cosim.cli import (
     tuning,
     view,
 )
+from cosim.cli.streams import open_streams
+from cosim.lifetime import Terminated, ignore_sigterm, unwind_on_sigterm
 
 app = typer.Typer(
     name="cosim",
@@ -49,7 +51,9 @@ app.add_typer(results.app, name="results")
 app.add_typer(fmu.app, name="fmu", no_args_is_help=True)
 
 EXIT_BAD_INPUT = 2
+EXIT_UNFORESEEN = 70
 EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 # Looked up only among modules that are loaded: an error's class cannot come from another one.
 _ERRORS = (
     ("fmus.errors", "FmuError"),
@@ -90,7 +94,13 @@ def options(
 
 
 def main() -> None:
-    """Run the command line; bad input ends in one line on standard error and exit code 2."""
+    """Run the command line.
+
+    Bad input ends in one line on standard error and exit code 2, what nobody foresaw in one line,
+    a report with the traceback and exit code 70.
+    """
+    open_streams()
+    unwind_on_sigterm()
     try:
         app()
     except tuple(_known_errors()) as error:
@@ -105,6 +115,12 @@ def main() -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
+    except Terminated:
+        ignore_sigterm()
+        print("terminated", file=sys.stderr)
+        sys.exit(EXIT_TERMINATED)
+    except Exception as error:
+        _report(error)
 
 
 def _known_errors() -> list[type[Exception]]:
@@ -114,3 +130,24 @@ def _known_errors() -> list[type[Exception]]:
 def _fail(message: str) -> None:
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(EXIT_BAD_INPUT)
+
+
+def _report(error: Exception) -> None:
+    """Leave the traceback in a file, and say in a line where and what to do with it."""
+    import tempfile
+    import traceback
+    from importlib.metadata import version
+
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="cosim-report-", suffix=".txt", delete=False, encoding="utf-8"
+    ) as file:
+        print(f"rti-cosim {version('rti-cosim')}, Python {sys.version}, {sys.platform}", file=file)
+        print(f"arguments: {sys.argv[1:]}\n", file=file)
+        traceback.print_exception(error, file=file)
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    print(
+        f"error: unforeseen, a mistake in cosim or in a plug-in: {text}; the report is in "
+        f"{file.name}: please send it to the maintainers with the command",
+        file=sys.stderr,
+    )
+    sys.exit(EXIT_UNFORESEEN)

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import loky
 
 from cosim.errors import EvaluationError
+from cosim.lifetime import follow_parent
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
@@ -123,7 +124,9 @@ def _executor(jobs: int, scheduler: str | None) -> Iterator[tuple[Executor, Call
         with _cluster(scheduler) as cluster:
             yield cluster
         return
-    executor = loky.ProcessPoolExecutor(max_workers=jobs, env=ENVIRONMENT | _inherited())
+    executor = loky.ProcessPoolExecutor(
+        max_workers=jobs, env=ENVIRONMENT | _inherited(), initializer=follow_parent
+    )
     try:
         yield executor, lambda: jobs
     except BaseException:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cosim import errors
 from cosim.errors import CosimError, PlantError
+from cosim.lifetime import follow_parent
 from cosim.plant.fmu_plant import FmuPlant
 from cosim.plant.resource import Resource
 from cosim.plant.snapshot import Snapshot
@@ -175,6 +176,7 @@ def _serve(pipe: Connection, scenario: str, fmu: str | None) -> None:
     """Answer the other process's calls until it closes the pipe."""
     # Ctrl-C reaches the whole group; the parent decides what becomes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    follow_parent()  # an FMU that hangs never sees the pipe close
     try:
         plant = FmuPlant(Scenario.from_dict(tomllib.loads(scenario)), fmu)
     except CosimError as error:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -18,9 +16,13 @@ from rerun.experimental import ViewerClient
 
 from controllers.storage import write_atomically
 from cosim.errors import RecordingError
+from cosim.lifetime import end_guarded, start_guarded
 from cosim.recording.stream import SAMPLE, TIME
 
 LOOPBACK = "127.0.0.1"
+_NOWHERE = f"http://{LOOPBACK}:9"
+_PROXIES = ("http_proxy", "https_proxy", "all_proxy")
+_LOUD = ("FORCE_RERUN_ANALYTICS",)
 _NO_DRIVER = ("No graphics adapter", "Failed to get render context")
 
 
@@ -34,8 +36,12 @@ def open_viewer(path: str | Path) -> None:
     command = [*_viewer(), "--port", "auto", str(_existing(path))]
     if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
         raise RecordingError(f"no display to show {path} on; draw it with --png FILE instead")
-    quiet = {"RUST_LOG": "warn"} | os.environ
-    if subprocess.run(command, check=False, env=quiet).returncode not in (0, 130):
+    viewer = start_guarded(command, env={"RUST_LOG": "warn"} | _silent())
+    try:
+        code = viewer.wait()
+    finally:
+        end_guarded(viewer)
+    if code not in (0, 130):
         raise RecordingError(f"the viewer could not show {path}; its messages are above")
 
 
@@ -93,25 +99,29 @@ def _viewer() -> list[str]:
     return [sys.executable, "-m", "rerun", "--bind", LOOPBACK]
 
 
+def _silent() -> dict[str, str]:
+    """Environment in which the viewer calls nobody.
+
+    Its usage statistics are off where it finds itself in continuous integration; its look for a
+    newer version has no switch, but goes through a proxy, and nothing listens at this one.
+    """
+    environment = {name: value for name, value in os.environ.items() if name not in _LOUD}
+    proxies = dict.fromkeys((*_PROXIES, *(name.upper() for name in _PROXIES)), _NOWHERE)
+    return environment | proxies | {"CI": "true", "NO_PROXY": LOOPBACK, "no_proxy": LOOPBACK}
+
+
 @contextmanager
 def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
     """A viewer process without a window, ended on exit."""
     port = _free_port()
     options = ["--headless", "--hide-welcome-screen", "--port", str(port)]
     window = ["--window-size", f"{size[0]}x{size[1]}"]
-    # The viewer leaves its temporary files behind when it is ended: they go to a folder of ours.
-    with (
-        tempfile.TemporaryFile() as log,
-        tempfile.TemporaryDirectory(prefix="cosim-viewer-") as temporary,
-    ):
-        # A session of its own: the command is a shim, and ending it alone would leave the viewer.
-        process = subprocess.Popen(
+    with tempfile.TemporaryFile() as log:
+        process = start_guarded(
             [*_viewer(), *options, *window],
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
+            log=log,
             # Messages below an error would be drawn over the views.
-            env=os.environ | {"RUST_LOG": "error", "TMPDIR": temporary},
+            env=_silent() | {"RUST_LOG": "error"},
         )
 
         def answers() -> bool:
@@ -128,9 +138,7 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
             except (ConnectionError, RuntimeError) as error:
                 raise RecordingError(_complaint(log.fileno())) from error
         finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGTERM)
-            process.wait()
+            end_guarded(process)
 
 
 def _settled(client: ViewerClient, deadline: float) -> bytes:

@@ -1,0 +1,78 @@
+"""Runs a command for as long as somebody holds the other end of standard input.
+
+A program of its own, run by its path with nothing but the standard library, so that it starts in
+some milliseconds: `python guardian.py COMMAND ARGUMENT…`. The parent keeps the pipe open; whatever
+ends the parent closes it, even a SIGKILL, and the command's whole process group ends then. Its
+temporary files go to a folder that ends with it.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from types import FrameType
+
+PATIENCE = 2.0
+"""Seconds that a process group has to end by itself."""
+
+
+def end(child: "subprocess.Popen[bytes]") -> None:
+    """End the child and what it started: politely, then at once."""
+    if sys.platform == "win32":
+        subprocess.run(
+            ["taskkill", "/T", "/F", "/PID", str(child.pid)], check=False, capture_output=True
+        )
+        return
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        try:
+            os.killpg(child.pid, number)
+        except ProcessLookupError:
+            return
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            child.poll()
+            try:
+                os.killpg(child.pid, 0)
+            except ProcessLookupError:
+                return
+            time.sleep(0.02)
+
+
+def main() -> int:
+    """Run the command of the arguments; its exit code, 128 + n where signal n ended it."""
+    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
+        return run(sys.argv[1:], temporary)
+
+
+def run(command: list[str], temporary: str) -> int:
+    """Run the command with its temporary files in a folder; its exit code."""
+    child = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        start_new_session=sys.platform != "win32",
+        env=os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temporary),
+    )
+
+    def follow() -> None:
+        while os.read(0, 4096):
+            pass
+        end(child)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        end(child)
+
+    # Ctrl-C reaches the whole foreground group; the parent decides what becomes of it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, stop)
+    threading.Thread(target=follow, daemon=True).start()
+    code = child.wait()
+    if sys.platform != "win32":
+        end(child)  # what it left behind
+    return 128 - code if code < 0 else code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""Ends what a command started when the command itself ends, by whatever signal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from multiprocessing import parent_process
+from multiprocessing.connection import wait
+from pathlib import Path
+from types import FrameType
+from typing import IO
+
+from cosim import guardian
+
+POLL = 0.5
+"""Seconds between two looks at the parent where nothing announces its end."""
+
+
+AGAIN = 1.0
+"""Seconds after which a SIGTERM whose exception was lost comes again."""
+
+
+class Terminated(BaseException):
+    """SIGTERM was received; raised so that a command unwinds as it does on Ctrl-C."""
+
+
+def unwind_on_sigterm() -> None:
+    """Let SIGTERM raise `Terminated` in this process's main thread, until that has unwound.
+
+    An exception out of a signal handler is lost where C code clears errors that it did not expect,
+    in an import for instance; so the signal comes again until the exception is on its way.
+    """
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        again = threading.Timer(AGAIN, signal.raise_signal, [signal.SIGTERM])
+        again.daemon = True
+        again.start()
+        if not isinstance(sys.exc_info()[1], Terminated):
+            raise Terminated
+
+    signal.signal(signal.SIGTERM, terminate)
+
+
+def ignore_sigterm() -> None:
+    """Take no more notice of SIGTERM: the process is ending."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+def follow_parent() -> None:
+    """End this worker process, without further ado, as soon as the process that started it ends.
+
+    To be called once in a worker, whose work is lost with its parent anyway.
+    """
+    parent = parent_process()
+    sentinel = None if parent is None else parent.sentinel
+    number = os.getppid()
+
+    def watch() -> None:
+        if sentinel is not None:
+            wait([sentinel])
+        else:
+            while os.getppid() == number:
+                time.sleep(POLL)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="follow-parent", daemon=True).start()
+
+
+def start_guarded(
+    command: Sequence[str],
+    *,
+    env: Mapping[str, str] | None = None,
+    log: IO[bytes] | None = None,
+) -> subprocess.Popen[bytes]:
+    """Start a command, and all that it starts, in a group that ends when this process does.
+
+    `env` is its environment, `log` takes what it prints (default: where this process prints).
+    The process returned is the guard: its exit code is the command's, and `end_guarded` ends it.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-I", str(Path(guardian.__file__)), *command],
+        stdin=subprocess.PIPE,
+        stdout=log,
+        stderr=log,
+        env=dict(env) if env is not None else None,
+    )
+
+
+def end_guarded(process: subprocess.Popen[bytes]) -> None:
+    """End a guarded command and wait until it has ended."""
+    if process.stdin is not None:
+        with suppress(OSError):
+            process.stdin.close()
+    process.wait()

@@ -116,6 +116,7 @@ def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
     options = ["--controller", "naive", "--steps", "2000000", "--out", str(tmp_path / "out")]
     with subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True) as process:
         assert eventually((tmp_path / "out").is_dir)
+        time.sleep(1.0)  # into the run
         process.terminate()
         _, words = process.communicate(timeout=60)
     assert process.returncode == 143

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 
 from fmus.variables import VARIABLES, Kind, Type, Variable
 
@@ -25,23 +26,27 @@ _KINDS = {
 _SEED_MAX = 4294967295.0
 
 
-def c_header(token: str) -> str:
+def c_header(
+    token: str,
+    variables: Sequence[Variable] = VARIABLES,
+    origin: str = "from fmus/variables.py by `cosim fmu build --in-place`",
+) -> str:
     """The header's text: value references, types, starts and ranges, and the model's `token`."""
-    references = "\n".join(f"    VR_{v.identifier} = {i}," for i, v in enumerate(VARIABLES))
-    rows = "\n".join(f"    {_row(variable)}," for variable in VARIABLES)
+    references = "\n".join(f"    VR_{v.identifier} = {i}," for i, v in enumerate(variables))
+    rows = "\n".join(f"    {_row(variable)}," for variable in variables)
     return f"""\
-/* Generated from fmus/variables.py by `cosim fmu build --in-place`; do not edit. */
+/* Generated {origin}; do not edit. */
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
 #define MODEL_TOKEN "{token}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
-#define LAYOUT_DIGEST UINT64_C(0x{_layout_digest()})
+#define LAYOUT_DIGEST UINT64_C(0x{_layout_digest(variables)})
 
 enum {{
 {references}
-    N_VARIABLES = {len(VARIABLES)}
+    N_VARIABLES = {len(variables)}
 }};
 
 typedef enum {{ {", ".join(_TYPES.values())} }} VariableType;
@@ -63,8 +68,8 @@ static const VariableInfo VARIABLES[N_VARIABLES] = {{
 """
 
 
-def _layout_digest() -> str:
-    names = "\n".join(variable.name for variable in VARIABLES)
+def _layout_digest(variables: Sequence[Variable]) -> str:
+    names = "\n".join(variable.name for variable in variables)
     return hashlib.sha256(names.encode()).hexdigest()[:16]
 
 

@@ -54,8 +54,7 @@ static Status check_value(const Instance *instance, const char *function, unsign
 
 static void set_value(State *state, unsigned vr, double value) {
     state->v[vr] = value;
-    state->outputs_current = 0;
-    if (VARIABLES[vr].kind == FIXED) state->drawn = 0;
+    note_change(state, vr);
 }
 
 static Status get_values(Instance *instance, const char *function, VariableType type,

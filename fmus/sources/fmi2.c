@@ -1,4 +1,4 @@
-/* The FMI 2.0 face of the evaporator: co-simulation and model exchange. */
+/* The FMI 2.0 face of a model: co-simulation, and model exchange where it offers that. */
 #include "fmi2Functions.h"
 
 #include "derivatives.h"

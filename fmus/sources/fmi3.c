@@ -1,9 +1,10 @@
-/* The FMI 3.0 face of the evaporator: co-simulation and model exchange. */
+/* The FMI 3.0 face of a model: co-simulation, and model exchange where it offers that. */
 #include "fmi3Functions.h"
 
 #include "adjoint.h"
 #include "derivatives.h"
 #include "events.h"
+#include "seed.h"
 #include "simulation.h"
 #include "snapshot.h"
 
@@ -143,8 +144,7 @@ fmi3Status fmi3GetUInt64(GETTER_ARGUMENTS(UInt64)) {
     CHECK_ARRAYS;
     for (size_t i = 0; i < nValues; i++)
         TRY(check_reference(self, __func__, valueReferences[i], SEED));
-    for (size_t i = 0; i < nValues; i++)
-        values[i] = ((uint64_t)self->state.v[VR_seedHigh] << 32) | (uint64_t)self->state.v[VR_seed];
+    for (size_t i = 0; i < nValues; i++) values[i] = seed_value(&self->state);
     return fmi3OK;
 }
 
@@ -155,10 +155,7 @@ fmi3Status fmi3SetUInt64(SETTER_ARGUMENTS(UInt64)) {
         TRY(check_reference(self, __func__, valueReferences[i], SEED));
         TRY(check_value(self, __func__, valueReferences[i], 0.0));
     }
-    for (size_t i = 0; i < nValues; i++) {
-        set_value(&self->state, VR_seed, (double)(values[i] & UINT32_MAX));
-        set_value(&self->state, VR_seedHigh, (double)(values[i] >> 32));
-    }
+    for (size_t i = 0; i < nValues; i++) set_seed(&self->state, values[i]);
     return fmi3OK;
 }
 

@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "disturbance.h"
+#include "model_state.h"
 #include "variables.h"
 
 typedef enum { OK, WARNING, DISCARD, ERROR } Status; /* numbered as in FMI 2.0 and 3.0 */
@@ -38,7 +38,7 @@ static const char *const CATEGORY_NAMES[N_CATEGORIES] = {
     "logEvents", "logStatusWarning", "logStatusDiscard", "logStatusError"};
 
 #define STATE_MAGIC LAYOUT_DIGEST
-#define STATE_VERSION 1
+#define STATE_VERSION 2
 
 typedef struct {
     uint64_t magic;
@@ -48,11 +48,10 @@ typedef struct {
     int32_t mode;
     int32_t experiment_defined;
     int32_t outputs_current;
-    int64_t sample; /* index k of the disturbance in force */
-    int64_t drawn;  /* whether `draws` is that of `sample` */
+    int64_t sample; /* index k of the sample in force */
     double start_time;
     double stop_time; /* INFINITY when the importer gave none */
-    double draws[N_DISTURBANCES];
+    ModelState model;
     double v[N_VARIABLES];
     uint64_t checksum; /* set in serialised states only */
 } State;
@@ -107,6 +106,8 @@ static char *copy_string(const char *text) {
     return copy;
 }
 
+static void start_model(State *state); /* the model's part of a reset */
+
 static void reset_state(State *state, Interface interface) {
     memset(state, 0, sizeof *state);
     state->magic = STATE_MAGIC;
@@ -116,8 +117,7 @@ static void reset_state(State *state, Interface interface) {
     state->mode = INSTANTIATED;
     state->stop_time = INFINITY;
     for (int vr = 0; vr < N_VARIABLES; vr++) state->v[vr] = VARIABLES[vr].start;
-    state->v[VR_X2] = state->v[VR_X2_start];
-    state->v[VR_P2] = state->v[VR_P2_start];
+    start_model(state);
 }
 
 static void free_instance(Instance *instance) {
@@ -144,6 +144,8 @@ static Instance *open_instance(const char *name, Interface interface, const char
     else if (!token || strcmp(token, MODEL_TOKEN) != 0)
         report(instance, ERROR, "instantiation: the token differs from the model's, %s.",
                MODEL_TOKEN);
+    else if (interface == MODEL_EXCHANGE && !OFFERS_MODEL_EXCHANGE)
+        report(instance, ERROR, "instantiation: the model is for co-simulation only.");
     else
         return instance;
     free_instance(instance);

@@ -30,14 +30,14 @@ static void realise_disturbances(State *state) {
             v[DISTURBANCES[i].realised] = v[DISTURBANCES[i].nominal];
         return;
     }
-    if (!state->drawn) {
+    if (!state->model.drawn) {
         const uint32_t key[2] = {(uint32_t)v[VR_seed], (uint32_t)v[VR_seedHigh]};
-        standard_draws(key, state->sample, (int)v[VR_law], state->draws);
-        state->drawn = 1;
+        standard_draws(key, state->sample, (int)v[VR_law], state->model.draws);
+        state->model.drawn = 1;
     }
     for (int i = 0; i < N_DISTURBANCES; i++)
         v[DISTURBANCES[i].realised] =
-            v[DISTURBANCES[i].nominal] + v[DISTURBANCES[i].range] * state->draws[i];
+            v[DISTURBANCES[i].nominal] + v[DISTURBANCES[i].range] * state->model.draws[i];
 }
 
 /* All that is held in a sample: the realised disturbances and the condenser's present state. */
@@ -47,21 +47,46 @@ static void realise(State *state) {
 }
 
 static void move_to_sample(State *state, int64_t sample) {
-    if (sample == state->sample && state->drawn) return;
+    if (sample == state->sample && state->model.drawn) return;
     state->sample = sample;
-    state->drawn = 0;
+    state->model.drawn = 0;
     state->outputs_current = 0;
+}
+
+static void start_model(State *state) {
+    state->v[VR_X2] = state->v[VR_X2_start];
+    state->v[VR_P2] = state->v[VR_P2_start];
+}
+
+/* What a new value of a variable makes out of date. */
+static void note_change(State *state, unsigned vr) {
+    state->outputs_current = 0;
+    if (VARIABLES[vr].kind == FIXED) state->model.drawn = 0;
+}
+
+static Grid model_grid(const State *state) { return make_grid(state->v[VR_sampling_time]); }
+
+/* Whether the part of a state that only the model knows could be its own. */
+static int plausible_model(const State *state) {
+    for (unsigned vr = 0; vr < N_VARIABLES; vr++)
+        if (VARIABLES[vr].type != REAL && state->v[vr] != floor(state->v[vr])) return 0;
+    return 1;
+}
+
+/* After a state came from bytes: what can be computed anew is not trusted. */
+static void distrust(State *state) {
+    state->outputs_current = 0;
+    state->model.drawn = 0;
 }
 
 /* Bring every calculated variable up to date. */
 static void refresh(State *state) {
     if (state->outputs_current) return;
     if (state->mode & (INSTANTIATED | INITIALIZATION)) {
-        const Grid grid = make_grid(state->v[VR_sampling_time]);
-        state->drawn = 0;
+        const Grid grid = model_grid(state);
+        state->model.drawn = 0;
         state->sample = sample_of(grid, locate(grid, state->v[VR_time]).point);
-        state->v[VR_X2] = state->v[VR_X2_start];
-        state->v[VR_P2] = state->v[VR_P2_start];
+        start_model(state);
     }
     realise(state);
     evaluate(state->v);

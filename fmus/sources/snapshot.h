@@ -89,9 +89,8 @@ static int plausible(const State *state) {
         if ((variable->kind == INPUT || variable->kind == FIXED || variable->kind == TUNABLE) &&
             !(value >= variable->min && value <= variable->max))
             return 0;
-        if (variable->type != REAL && value != floor(value)) return 0;
     }
-    return on_grid_range(make_grid(state->v[VR_sampling_time]), state->v[VR_time]);
+    return plausible_model(state) && on_grid_range(model_grid(state), state->v[VR_time]);
 }
 
 static Status deserialise(Instance *instance, const char *function, const unsigned char *bytes,
@@ -107,8 +106,7 @@ static Status deserialise(Instance *instance, const char *function, const unsign
     if (status != OK) return status;
     if (copy.checksum != checksum(&copy) || !plausible(&copy))
         return report(instance, ERROR, "%s: the serialised state is corrupt.", function);
-    copy.outputs_current = 0;
-    copy.drawn = 0;
+    distrust(&copy);
     copy.checksum = 0;
     if (!*handle) *handle = malloc(sizeof(State));
     if (!*handle) return report(instance, ERROR, "%s: out of memory.", function);

@@ -1,0 +1,15 @@
+/* What the evaporator keeps beside its variables. */
+#ifndef MODEL_STATE_H
+#define MODEL_STATE_H
+
+#include "disturbance.h"
+
+typedef struct {
+    int64_t drawn; /* whether `draws` is that of the sample in force */
+    double draws[N_DISTURBANCES];
+} ModelState;
+
+/* Interfaces beside co-simulation. */
+enum { OFFERS_MODEL_EXCHANGE = 1 };
+
+#endif

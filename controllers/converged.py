@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import QpError
-from controllers.nlp import merit
+from controllers.ocp import merit
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp

@@ -33,30 +33,35 @@ PARAMETERS = (
 )
 
 
-def _flows(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Product flow F2, vapour flow F4, condensate flow F5 and steam flow F100 in kg/min."""
-    concentration, pressure = ca.vertsplit(x)
-    steam_pressure, coolant_flow = ca.vertsplit(u)
-    _, feed, feed_temperature, coolant_temperature = ca.vertsplit(d)
-    a, b, c, slope, e, f, g, h, _, _, ua2, cp, latent, latent_steam, circulation = ca.vertsplit(p)
-    boiling = a * pressure + b * concentration + c
-    condensing = slope * pressure + e
-    steam = f * steam_pressure + g
-    steam_duty = h * (feed + circulation) * (steam - boiling)
-    vapour = (steam_duty - feed * cp * (boiling - feed_temperature)) / latent
-    condenser_duty = ua2 * (condensing - coolant_temperature) / (1 + ua2 / (2 * cp * coolant_flow))
-    return feed - vapour, vapour, condenser_duty / latent, steam_duty / latent_steam
+def _flows(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Product F2, vapour F4, condensate F5 and steam F100 in kg/min."""
+    X2, P2 = ca.vertsplit(x)
+    P100, F200 = ca.vertsplit(u)
+    _, F1, T1, T200 = ca.vertsplit(w)
+    a, b, c, d, e, f, g, h, _, _, UA2, Cp, lambda_, lambda_s, F3 = ca.vertsplit(p)
+    T2 = a * P2 + b * X2 + c
+    T3 = d * P2 + e
+    T100 = f * P100 + g
+    UA1 = h * (F1 + F3)
+    Q100 = UA1 * (T100 - T2)
+    F4 = (Q100 - F1 * Cp * (T2 - T1)) / lambda_
+    Q200 = UA2 * (T3 - T200) / (1 + UA2 / (2 * Cp * F200))
+    return F1 - F4, F4, Q200 / lambda_, Q100 / lambda_s
 
 
-def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
-    product, vapour, condensate, _ = _flows(x, u, d, p)
-    holdup, capacity = p[8], p[9]
-    return ca.vertcat((d[1] * d[0] - product * x[0]) / holdup, (vapour - condensate) / capacity)
+def _ode(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
+    """Rates of X2 and P2: M X2' = F1 X1 − F2 X2 and C P2' = F4 − F5."""
+    X2, (X1, F1, _, _) = x[0], ca.vertsplit(w)
+    M, C = p[8], p[9]
+    F2, F4, F5, _ = _flows(x, u, w, p)
+    return ca.vertcat((F1 * X1 - F2 * X2) / M, (F4 - F5) / C)
 
 
-def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
-    product, _, _, steam = _flows(x, u, d, p)
-    return 10.09 * (product + p[14]) + 600 * steam + 0.6 * u[1]
+def _economic_cost(x: ca.SX, u: ca.SX, w: ca.SX, p: ca.SX) -> ca.SX:
+    """Cost 10.09 (F2 + F3) + 600 F100 + 0.6 F200 per minute."""
+    F200, F3 = u[1], p[14]
+    F2, _, _, F100 = _flows(x, u, w, p)
+    return 10.09 * (F2 + F3) + 600 * F100 + 0.6 * F200
 
 
 def model() -> Model:

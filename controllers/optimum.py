@@ -72,15 +72,6 @@ class OptimalPolicy:
             (corner, sum(s for s, high in zip(self._strides, corner, strict=True) if high))
             for corner in itertools.product((False, True), repeat=len(self._axes))
         ]
-        self._limits = list(
-            zip(
-                problem.state_lower.tolist(),
-                problem.state_upper.tolist(),
-                problem.penalty_linear.tolist(),
-                problem.penalty_quadratic.tolist(),
-                strict=True,
-            )
-        )
 
     @classmethod
     def solve(
@@ -160,7 +151,7 @@ class OptimalPolicy:
         row, clamped = self._lookup(state)
         status = "clamped" if clamped else "solved"
         if a is None:
-            value = row.pop() + self._penalty(state)
+            value = row.pop() + self.problem.penalty(state)
             return OptimalSolution(np.array(row), value, status)
         action = np.array(a, dtype=np.float64)
         return OptimalSolution(action, self.action_value(state, action), status)
@@ -185,7 +176,7 @@ class OptimalPolicy:
         optimum = self.optimum
         smooth = self._operator.values(state, action, optimum.grid, optimum.W)[0]
         baseline = optimum.gain if optimum.discount == 1.0 else 0.0
-        return float(smooth) - baseline + self._penalty(state[0].tolist())
+        return float(smooth) - baseline + self.problem.penalty(state[0].tolist())
 
     @cached_property
     def _operator(self) -> BellmanOperator:
@@ -216,10 +207,3 @@ class OptimalPolicy:
                 for i, entry in enumerate(self._table[base + offset]):
                     row[i] += weight * entry
         return row, clamped
-
-    def _penalty(self, state: list[float]) -> float:
-        total = 0.0
-        for x, (low, high, linear, quadratic) in zip(state, self._limits, strict=True):
-            violation = max(low - x, x - high, 0.0)
-            total += (linear + quadratic * violation) * violation
-        return total

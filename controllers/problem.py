@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError
 from controllers.model import Model
+from controllers.penalty import StatePenalty
 
 Vector = NDArray[np.float64]
 
@@ -139,12 +141,11 @@ class Problem:
         """Number of actions m."""
         return len(self.model.actions)
 
-    def penalty(self, s: ArrayLike) -> float:
-        """Penalty of state s by the true bounds, Σ_i linear_i v_i + quadratic_i v_i²."""
-        s = np.asarray(s, dtype=np.float64)
-        violation = np.maximum(np.maximum(self.state_lower - s, s - self.state_upper), 0.0)
-        return float(
-            self.penalty_linear @ violation + self.penalty_quadratic @ (violation * violation)
+    @cached_property
+    def penalty(self) -> StatePenalty:
+        """Penalty of a state by the true bounds."""
+        return StatePenalty(
+            self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
         )
 
     @classmethod

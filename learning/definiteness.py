@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import clarabel
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.linalg import solve_triangular
 
+from controllers import sdp
 from controllers.theta import ThetaBlocks
 from learning.errors import DefinitenessError
 from learning.fit import Fit
@@ -22,7 +21,6 @@ from learning.fit import Fit
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 HESSIANS = ("B_l", "B_Vf")
-SOLVED = ("Solved", "AlmostSolved")
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class LinearMatrixInequality:
 
     def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
         self._blocks, self._smallest = blocks, smallest
-        self._rows = {name: _triangle_rows(blocks, name) for name in HESSIANS}
+        self._rows = {name: sdp.svec_order(blocks.block(name).dimension) for name in HESSIANS}
 
     def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
         """Step of the constrained fit; a failure of the solver refuses the step."""
@@ -101,23 +99,17 @@ class LinearMatrixInequality:
             rows[np.arange(block.size), where.start + order] = -weight * blocks.scale[where][order]
             matrices.append(rows)
             offsets.append(weight * block.pack(shifted)[order])
-            cones.append(clarabel.PSDTriangleConeT(block.dimension))
+            cones.append(sdp.semidefinite(block.dimension))
         # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
         metric = fit.metric()
         unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
-        settings = clarabel.DefaultSettings()
-        settings.verbose = False
-        solution = clarabel.DefaultSolver(
-            sparse.csc_matrix(np.triu(2 * metric / unit)),
+        return sdp.solve(
+            2 * metric / unit,
             -2 * fit.gradient / unit,
-            sparse.csc_matrix(np.vstack(matrices)),
+            np.vstack(matrices),
             np.concatenate(offsets),
             cones,
-            settings,
-        ).solve()
-        if str(solution.status) not in SOLVED:
-            return None
-        return np.array(solution.x)
+        ).x
 
 
 class EigenvalueProjection:
@@ -189,20 +181,6 @@ def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vec
             matrix = (vectors * values) @ vectors.T
             theta[blocks.slices[name]] = blocks.block(name).pack((matrix + matrix.T) / 2)
     return theta
-
-
-def _triangle_rows(blocks: ThetaBlocks, name: str) -> tuple[NDArray[np.intp], Vector]:
-    """Order and weights that turn a packed block into Clarabel's scaled triangle.
-
-    Clarabel stacks the upper triangle column by column with √2 on the off-diagonal.
-    """
-    dimension = blocks.block(name).dimension
-    position = np.zeros((dimension, dimension), dtype=np.intp)
-    position[np.triu_indices(dimension)] = np.arange(blocks.block(name).size)
-    pairs = [(i, j) for j in range(dimension) for i in range(j + 1)]
-    order = np.array([position[i, j] for i, j in pairs], dtype=np.intp)
-    weight = np.array([1.0 if i == j else np.sqrt(2.0) for i, j in pairs])
-    return order, weight
 
 
 ENFORCEMENTS: dict[str, type] = {

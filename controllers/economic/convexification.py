@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import clarabel
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
+from controllers import sdp
 from controllers.errors import TuningError
 
 Array = NDArray[np.float64]
@@ -54,9 +53,9 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     basis = [("α", H)]
     basis += [("δP", rotation(A, B, e)) for e in _symmetric_basis(n)]
     basis += [("F", C.T @ e @ C) for e in _symmetric_basis(n_c)]
-    columns = np.stack([_svec(matrix) for _, matrix in basis], axis=1)
+    columns = np.stack([sdp.svec(matrix) for _, matrix in basis], axis=1)
     count, triangle = columns.shape[1], columns.shape[0]
-    identity = _svec(np.eye(size))[:, None]
+    identity = sdp.svec(np.eye(size))[:, None]
     # Variables: α, δP, F, β, t with t ≥ ‖F‖.
     n_F = n_c * (n_c + 1) // 2
     zeros = np.zeros((triangle, 1))
@@ -75,35 +74,20 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
         ]
     )
     offset = np.concatenate([np.zeros(2 + n_F), -identity[:, 0], np.zeros(triangle)])
-    cones = [
-        clarabel.NonnegativeConeT(1),
-        clarabel.SecondOrderConeT(1 + n_F),
-        clarabel.PSDTriangleConeT(size),
-        clarabel.PSDTriangleConeT(size),
-    ]
+    cones = [sdp.nonnegative(1), sdp.second_order(1 + n_F)]
+    cones += [sdp.semidefinite(size), sdp.semidefinite(size)]
     objective = np.zeros(count + 2)
     objective[-2:] = 1.0, weight
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.max_iter = 500
-    solver = clarabel.DefaultSolver(
-        sparse.csc_matrix((count + 2, count + 2)),
-        objective,
-        sparse.csc_matrix(constraints),
-        offset,
-        cones,
-        settings,
+    z, status = sdp.solve(
+        np.zeros((count + 2, count + 2)), objective, constraints, offset, cones, iterations=500
     )
-    solution = solver.solve()
-    status = str(solution.status)
-    alpha = float(solution.x[0]) if status in {"Solved", "AlmostSolved"} else 0.0
-    if not alpha > 0:
+    if z is None or not z[0] > 0:
         raise TuningError(
             f"no convex cost has the local optimum of the economic one (Clarabel: {status}) with "
             f"{n_c} active constraint{'' if n_c == 1 else 's'}: the steady state is not optimally "
             "operated under them"
         )
-    z = np.array(solution.x)
+    alpha = float(z[0])
     delta_P = sum_of(z[1 : count - n_F], n) / alpha
     F = sum_of(z[count - n_F : count], n_c) / alpha
     hessian = H + rotation(A, B, delta_P) + C.T @ F @ C
@@ -132,11 +116,3 @@ def sum_of(weights: Array, size: int) -> Array:
     for weight, element in zip(weights, _symmetric_basis(size), strict=True):
         matrix += weight * element
     return matrix
-
-
-def _svec(matrix: Array) -> Array:
-    """Clarabel's vector of a symmetric matrix: upper triangle by columns, off-diagonals ·√2."""
-    rows, columns = np.triu_indices(len(matrix))
-    order = np.lexsort((rows, columns))
-    rows, columns = rows[order], columns[order]
-    return np.where(rows == columns, 1.0, np.sqrt(2.0)) * matrix[rows, columns]

@@ -22,8 +22,7 @@ class EconomicTuning:
     """Tuned θ with its certificate.
 
     `economic` is the local optimum of the economic cost itself (γ = 1, active constraints kept),
-    `tuned` that of the convexified one; `stage_hessian` (n+m, n+m) is the tuned ℓ_θ's and
-    `terminal_hessian` (n, n) that of V^f_θ.
+    `tuned` that of the convexified one.
     """
 
     parameters: Parameters
@@ -31,8 +30,6 @@ class EconomicTuning:
     convexification: Convexification
     economic: LocalFeedback
     tuned: LocalFeedback
-    stage_hessian: Array
-    terminal_hessian: Array
 
     @property
     def gain_error(self) -> float:
@@ -106,8 +103,6 @@ def tune(
         convexification=convex,
         economic=economic,
         tuned=tuned,
-        stage_hessian=M,
-        terminal_hessian=P,
     )
 
 

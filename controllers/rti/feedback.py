@@ -53,10 +53,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     L, q = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("q", n + m, horizon)
     L_N, q_N, constant = ca.SX.sym("L_N", n, n), ca.SX.sym("q_N", n), ca.SX.sym("constant")
 
-    violation = ca.fmax(ca.fmax(problem.state_lower - s, s - problem.state_upper), 0)
-    known = ca.dot(problem.penalty_linear, violation) + ca.dot(
-        problem.penalty_quadratic, violation**2
-    )
+    known = problem.penalty.symbolic(s)
     xi = [s - x_s]
     value = constant + known + symbols["c_lambda"]
     value += ca.bilin(symbols["B_lambda"], xi[0]) + ca.dot(symbols["b_lambda"], xi[0])

@@ -17,7 +17,7 @@ import qpsolvers
 
 from controllers import LinearisationPoint, Problem, RtiNmpc
 from controllers.factories import naive_parameters
-from controllers.nlp import IpoptNmpc
+from controllers.ipopt import IpoptNmpc
 from controllers.qp import QpBackend, QpSolution, SoftQp
 from controllers.qp.daqp_backend import DaqpBackend
 from controllers.qp.qpsolvers_backend import full_space

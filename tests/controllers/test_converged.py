@@ -5,7 +5,7 @@ import pytest
 
 from controllers import ConvergedNmpc, LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import QpError
-from controllers.nlp import IpoptNmpc
+from controllers.ipopt import IpoptNmpc
 from tests.helpers.differences import assert_close, derivative, natural_scale
 from tests.helpers.sampling import (
     evaporator_problem,

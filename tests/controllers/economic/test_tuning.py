@@ -95,7 +95,7 @@ def test_certificate_holds(tuning):
     assert convex.eigenvalues[0] >= (1 - 1e-5) / convex.alpha
     assert convex.eigenvalues[-1] <= (1 + 1e-5) * convex.beta / convex.alpha
     assert np.linalg.eigvalsh(steady.hessian)[0] < -1.0
-    assert np.linalg.eigvalsh(result.terminal_hessian)[0] > 0
+    assert np.linalg.eigvalsh(result.parameters["B_Vf"])[0] > 0
     assert result.gain_error < 1e-8
     assert "X2 ≥ 25 %" in str(result)
 

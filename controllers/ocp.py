@@ -20,9 +20,10 @@ Vector = NDArray[np.float64]
 class Ocp:
     """Symbols and expressions of paper.tex eq. param_nmpc with x_0 = s put in.
 
-    x (n, N) are the states x_1 … x_N in absolute units, u (m, N) the controls; `cost` is all but
-    the penalty of the predicted states; `defects` (n, N) are f_θ(x_k, u_k) − x_{k+1}; `outside`
-    (n, N) is max(x_l − x_k, x_k − x_u), whose positive part is the least slack.
+    `s` (n,) is the measured state, `x` (n, N) are the states x_1 … x_N, absolute, `u` (m, N) the
+    controls; `cost` is all but the penalty of the predicted states; `defects` (n, N) are
+    f_θ(x_k, u_k) − x_{k+1}; `outside` (n, N) is max(x_l − x_k, x_k − x_u), whose positive part is
+    the least slack. `symbols` are those of θ, `problem` is what the programme was written for.
     """
 
     s: ca.SX

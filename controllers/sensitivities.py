@@ -19,7 +19,7 @@ from controllers.theta import SymbolicTheta, ThetaBlocks
 
 @dataclass(frozen=True)
 class PrimalDual:
-    """Symbols of a solution: ξ (n, N+1), v (m, N), slack t and λ (n, N), χ (n, N+1)."""
+    """Symbols of a solution: `xi`, `chi` (n, N+1), `v` (m, N), slack `t` and `lam` (n, N)."""
 
     xi: ca.SX
     v: ca.SX

@@ -202,7 +202,11 @@ def symmetric(packed: ca.SX, dimension: int) -> ca.SX:
 
 @dataclass(frozen=True)
 class SymbolicTheta:
-    """θ as one symbol; `symbols["B_l"]` is a whole block, or the problem's constant without one."""
+    """θ as one symbol; `symbols["B_l"]` is a whole block, or the problem's constant without one.
+
+    `theta` (n_θ,) is the symbol, `unpacked` holds the blocks by name, and `model_parameters` (n_p,)
+    are the model's, with θ's own in their places.
+    """
 
     theta: ca.SX
     unpacked: dict[str, ca.SX]

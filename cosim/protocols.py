@@ -93,10 +93,10 @@ class Controller(Protocol):
         """Solve for the measured state s (n,), with the first action fixed to a (m,) if given."""
 
 
-Exploration = Callable[[Array, np.random.Generator], Array]
-"""Maps the policy's action (m,) and a generator to the action to apply.
+Exploration = Callable[[Array, np.random.Generator], Array | None]
+"""Maps the policy's action (m,) and a generator to the action that explores, None to stay greedy.
 
-Return the very same array to leave the sample greedy. The loop saturates the result.
+The loop saturates the result.
 """
 
 

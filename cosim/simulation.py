@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import CosimError
-from cosim.penalty import Penalty
 from cosim.protocols import (
     Block,
     Controller,
@@ -110,7 +109,7 @@ class _Run:
 
     def go(self, record: Callable[[Block], None], progress: Callable[[int], None] | None) -> None:
         keeps_predictions = record is not _no_record
-        lower, upper = self._scenario.action_lower, self._scenario.action_upper
+        shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
         plant_seed, rng = spawn_seeds(self._seed)
         s = self._plant.reset(plant_seed)
         self._controller.reset()
@@ -122,15 +121,15 @@ class _Run:
             if exploration is not None:
                 explored = exploration(action, rng)
                 # A failed sample draws its noise too, so that paired runs stay in step.
-                if solution is not None:
-                    self._explored[k] = explored is not action
+                if solution is not None and explored is not None:
+                    self._explored[k] = True
                     action = explored
-            if action.shape != lower.shape:
+            if action.shape != shape:
                 raise CosimError(
                     f"{controller_name(self._controller)} gave an action of shape {action.shape}, "
-                    f"not {lower.shape}, at step {k}"
+                    f"not {shape}, at step {k}"
                 )
-            applied = np.maximum(np.minimum(action, upper), lower)
+            applied = saturate(action)
             self._states[k] = s
             self._actions[k] = applied
             begin = perf_counter()
@@ -205,12 +204,7 @@ class _Run:
     def trajectory(self) -> Trajectory:
         scenario, table = self._scenario, self._scenario.plant
         cost_unit = self._plant.units[table.stage_cost]
-        violation = Penalty(
-            scenario.state_lower,
-            scenario.state_upper,
-            scenario.penalty_linear,
-            scenario.penalty_quadratic,
-        ).violation(self._states)
+        violation = scenario.state_penalty.violation(self._states)
         columns = [
             self._time,
             *self._states.T,

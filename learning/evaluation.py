@@ -82,7 +82,7 @@ class Judge:
         self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
     ) -> None:
         self._run, self._start, self._optimum = run, start, optimum
-        self._problem = Problem.from_scenario(cast("Any", run.scenario))
+        self._problem = Problem.from_scenario(run.scenario)
         self._controller = self._build(start)
         self._evaluation = HeldOutRuns(plant, held_out(run.evaluation_seeds), run.evaluation_steps)
 
@@ -93,7 +93,7 @@ class Judge:
     def controller(self, theta: NDArray[np.float64]) -> Controller:
         """The greedy controller at θ (n_θ,); the same one, moved, at every call."""
         self._controller.theta = theta
-        return cast("Controller", self._controller)
+        return self._controller
 
     def verdict(self, theta: NDArray[np.float64]) -> Verdict:
         """The greedy policy at θ (n_θ,), judged."""
@@ -114,7 +114,7 @@ class Judge:
     @cached_property
     def _naive_cost(self) -> NDArray[np.float64]:
         naive = self._build(Parameters.naive(self._problem))
-        return self._evaluation.costs(cast("Controller", naive))["J"]
+        return self._evaluation.costs(naive)["J"]
 
     @cached_property
     def _start_cost(self) -> NDArray[np.float64]:

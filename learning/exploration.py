@@ -1,7 +1,7 @@
 """Exploration of the actions: additive, literal, by a perturbed cost; and what saturation does.
 
 A strategy maps (π(s), generator) to the action to apply, which the loop saturates to the actuators'
-bounds. It returns the very array it was given where the sample stays greedy.
+bounds; it returns None where the sample stays greedy.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Strategy(Protocol):
 
     def __call__(
         self, action: Vector, rng: np.random.Generator, sample: int, perturbed: PerturbedPolicy
-    ) -> Vector:
-        """Action to apply at a sample, (m,)."""
+    ) -> Vector | None:
+        """Action that explores at a sample, (m,), or None."""
 
     def bias(self, action: Vector, sample: int) -> Vector:
         """E[a − π | explored], (m,): zero but for saturation; NaN where it is not known."""
@@ -71,10 +71,10 @@ class Additive(Exploration):
 
     def __call__(
         self, action: Vector, rng: np.random.Generator, sample: int, perturbed: PerturbedPolicy
-    ) -> Vector:
-        """Action to apply, (m,)."""
+    ) -> Vector | None:
+        """Action that explores, (m,), or None."""
         e = self.noise(rng, sample)
-        return action if e is None else action + e
+        return None if e is None else action + e
 
     def bias(self, action: Vector, sample: int) -> Vector:
         """Mean of sat(π + e) − π, (m,)."""
@@ -87,10 +87,9 @@ class Literal(Exploration):
 
     def __call__(
         self, action: Vector, rng: np.random.Generator, sample: int, perturbed: PerturbedPolicy
-    ) -> Vector:
-        """Action to apply, (m,)."""
-        e = self.noise(rng, sample)
-        return action if e is None else e
+    ) -> Vector | None:
+        """Action that explores, (m,), or None."""
+        return self.noise(rng, sample)
 
     def bias(self, action: Vector, sample: int) -> Vector:
         """Mean of sat(e) − π, (m,)."""
@@ -107,10 +106,10 @@ class PerturbedCost(Exploration):
 
     def __call__(
         self, action: Vector, rng: np.random.Generator, sample: int, perturbed: PerturbedPolicy
-    ) -> Vector:
-        """Action to apply, (m,)."""
+    ) -> Vector | None:
+        """Action that explores, (m,), or None."""
         d = self.noise(rng, sample)
-        return action if d is None else perturbed(d)
+        return None if d is None else perturbed(d)
 
     def bias(self, action: Vector, sample: int) -> Vector:
         """Not known in closed form: NaN, (m,)."""

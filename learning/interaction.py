@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from controllers.errors import QpError
 from controllers.rti.solution import LinearisationPoint
-from cosim.penalty import Penalty
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 from learning.exploration import Strategy
@@ -56,12 +55,7 @@ class Interaction:
         self._plant, self._controller, self._rng = plant, controller, rng
         self._strategy, self._algorithm = strategy, algorithm
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
-        self._penalty = Penalty(
-            scenario.state_lower,
-            scenario.state_upper,
-            scenario.penalty_linear,
-            scenario.penalty_quadratic,
-        )
+        self._penalty, self._saturate = scenario.state_penalty, scenario.saturate
         self._applied = scenario.reference_action
         self._policy: LearnableSolution | None = None
         self._point: LinearisationPoint | None = None
@@ -115,17 +109,17 @@ class Interaction:
     def _choose(self, action: Vector) -> tuple[Vector, bool]:
         """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
         try:
-            a = self._strategy(action, self._rng, self.number, self._perturbed)
+            explored = self._strategy(action, self._rng, self.number, self._perturbed)
         except QpError:  # of the perturbed cost; the policy itself was solved for
             self.failures += 1
-            a = action
-        explored = a is not action
+            explored = None
         # The QP keeps bounds to its tolerance, the actuator exactly.
-        a = np.minimum(np.maximum(a, self._lower), self._upper)
-        if explored:
-            self.explored += 1
-            self.saturated += bool(((a == self._lower) | (a == self._upper)).any())
-        return a, explored
+        if explored is None:
+            return self._saturate(action), False
+        a = self._saturate(explored)
+        self.explored += 1
+        self.saturated += bool(((a == self._lower) | (a == self._upper)).any())
+        return a, True
 
     def renew(self) -> None:
         """Solve once more for the present state, at the guess as it was: θ has moved."""

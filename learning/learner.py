@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import numpy as np
 
 from controllers.parameters import Parameters
@@ -25,7 +23,7 @@ class Learner:
     def __init__(
         self, run: TrainingRun, algorithm: type[Algorithm], plant: ContinuablePlant
     ) -> None:
-        problem = Problem.from_scenario(cast("Any", run.scenario))
+        problem = Problem.from_scenario(run.scenario)
         self.start = starting_parameters(problem, run.configuration, run.start)
         self.controller = build_controller(run.controller, run.scenario, problem, self.start)
         strategy = build_strategy(run.configuration, run.scenario, run.samples)

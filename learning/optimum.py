@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 from controllers.optimum import OptimalPolicy
 from cosim.plant.archive import SHIPPED
 from cosim.scenario import Scenario
@@ -16,4 +14,4 @@ def has_stored_optimum(scenario: Scenario) -> bool:
     """
     if scenario.plant.fmu not in SHIPPED:
         return False
-    return OptimalPolicy.stored(cast("Any", scenario)) is not None
+    return OptimalPolicy.stored(scenario) is not None

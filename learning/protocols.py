@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from controllers.rti.solution import LinearisationPoint
+from cosim.protocols import Controller, Solution
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.exploration import Strategy
@@ -17,16 +18,8 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 
 
-class LearnableSolution(Protocol):
+class LearnableSolution(Solution, Protocol):
     """V or Q with its sensitivities to θ; `controllers.rti.RtiSolution` is one."""
-
-    @property
-    def action(self) -> Vector:
-        """Action, (m,)."""
-
-    @property
-    def value(self) -> float:
-        """V(s), or Q(s, a) when an action was enforced."""
 
     @property
     def value_gradient(self) -> Vector:
@@ -45,7 +38,7 @@ class LearnableSolution(Protocol):
         """Whether the active constraints' gradients are linearly independent."""
 
 
-class LearnableController(Protocol):
+class LearnableController(Controller, Protocol):
     """A controller with parameters θ; `RtiNmpc` and `ConvergedNmpc` are."""
 
     theta: Vector
@@ -57,12 +50,6 @@ class LearnableController(Protocol):
     @property
     def linearisation_point(self) -> LinearisationPoint:
         """Where the QP was linearised, copies."""
-
-    def reset(self) -> None:
-        """Forget every earlier sample."""
-
-    def prepare(self) -> None:
-        """Shift the last solution and linearise there."""
 
     def prepare_at(self, point: LinearisationPoint) -> None:
         """Linearise at a point, at the present θ."""

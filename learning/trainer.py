@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, cast, get_args, get_origin
+from typing import Any, get_args, get_origin
 
 from controllers.parameters import Parameters
 from controllers.problem import Problem
@@ -91,13 +91,13 @@ class Trainer:
 
     def policy(self, training: Training, parameters: str) -> Controller:
         """The greedy controller of a training's θ."""
-        problem = Problem.from_scenario(cast("Any", training.scenario))
+        problem = Problem.from_scenario(training.scenario)
         with tempfile.TemporaryDirectory(prefix="cosim-theta-") as name:
             path = Path(name, "parameters.toml")
             path.write_text(parameters, "utf-8")
             theta = Parameters.load(path, problem)
         found = build_controller(training.nmpc, training.scenario, problem, theta)
-        return cast("Controller", found)
+        return found
 
     def controller(self, name: str, scenario: Scenario) -> Controller:
         """A controller by name, parameters file or `module:factory`; ControllerLookupError."""

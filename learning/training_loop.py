@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,11 +55,11 @@ class TrainingLoop:
     ) -> None:
         self._run, self._plant, self._out, self._recorder = run, plant, out, recorder
         self._learner = Learner(run, algorithm, plant)
-        self._judge = Judge(run, cast("Any", evaluation_plant), self._learner.start, optimum)
+        self._judge = Judge(run, evaluation_plant, self._learner.start, optimum)
         self._validation: Validation | None = None
         if run.validate_every:
             self._validation = Validation(
-                cast("Any", evaluation_plant),
+                evaluation_plant,
                 self._judge.controller,
                 int(run.spawned(VALIDATION).generate_state(1, np.uint64)[0]),
                 run.validation_samples,

@@ -17,8 +17,13 @@ Vector = NDArray[np.float64]
 class StochasticScenario(ScenarioLike, Protocol):
     """The part of a scenario that tells the law of the plant (`cosim.Scenario` has it)."""
 
-    plant: Any
-    disturbance: Any
+    @property
+    def plant(self) -> Any:
+        """The true plant."""
+
+    @property
+    def disturbance(self) -> Any:
+        """The law of its disturbances."""
 
 
 def plant_law(scenario: StochasticScenario, problem: Problem) -> DisturbanceLaw:

@@ -68,11 +68,9 @@ def optimum(
 def _solve(
     name: str, criterion: Criterion, refine: bool, recompute: bool, out_: Output
 ) -> tuple[list[Row], dict[str, Any]]:
-    from typing import cast
 
     from controllers.dynamic_programming import archive
     from controllers.dynamic_programming.plant import (
-        StochasticScenario,
         plant_law,
         plant_parameters,
     )
@@ -82,7 +80,7 @@ def _solve(
     from controllers.problem import Problem
     from cosim.scenario import Scenario
 
-    scenario = cast(StochasticScenario, Scenario.load(name))
+    scenario = Scenario.load(name)
     problem = Problem.from_scenario(scenario)
     law, parameters = plant_law(scenario, problem), plant_parameters(scenario, problem)
     settings = Settings(criterion=criterion.value)

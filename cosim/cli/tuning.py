@@ -24,14 +24,12 @@ def tuning(
     cost's Hessian, and the local feedback gain of both.
     """
     with output(json) as out_:
-        from typing import cast
-
         from controllers.economic import tune
         from controllers.factories import value_offset
-        from controllers.problem import Problem, ScenarioLike
+        from controllers.problem import Problem
         from cosim.scenario import Scenario
 
-        loaded = cast(ScenarioLike, Scenario.load(scenario))
+        loaded = Scenario.load(scenario)
         problem = Problem.from_scenario(loaded)
         result = tune(problem, value_offset=value_offset(loaded, problem))
         steady, convex = result.steady_state, result.convexification

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import CapabilityError, PlantError
-from cosim.penalty import Penalty
 from cosim.plant.archive import SHIPPED, unpack
 from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
@@ -64,12 +63,7 @@ class FmuPlant(Resource):
         self.units = wirer.units()
         lower, upper = wirer.state_range()
         self.state_range = (np.array(lower), np.array(upper))
-        self.penalty = Penalty(
-            self.scenario.state_lower,
-            self.scenario.state_upper,
-            self.scenario.penalty_linear,
-            self.scenario.penalty_quadratic,
-        )
+        self.penalty = self.scenario.state_penalty
         self._seeds = wirer.seeds()
         self._initial = wirer.initial_states()
         self._elsewhere = False

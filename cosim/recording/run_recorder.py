@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from cosim.penalty import Penalty
 from cosim.protocols import Block, Controller, controller_name
 from cosim.recording import diagram
 from cosim.recording.blocks import joined
@@ -54,12 +53,7 @@ class RerunRecorder:
         theta = str(getattr(getattr(controller, "parameters", None), "hash", "none"))
         self._duration = steps * scenario.sampling_time
         self._channels = run_channels(scenario, units)
-        self._violation = Penalty(
-            scenario.state_lower,
-            scenario.state_upper,
-            scenario.penalty_linear,
-            scenario.penalty_quadratic,
-        ).violation
+        self._violation = scenario.state_penalty.violation
         self._horizon: Horizon | None = None
         self._status: str | None = None
         stream = Stream(self.path, f"{name} on {scenario.name}, seed {seed}")

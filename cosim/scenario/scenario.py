@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from cosim.errors import ScenarioError
+from cosim.penalty import Penalty
 from cosim.scenario.loading import merged, read
 from cosim.scenario.tables import (
     BoundsTable,
@@ -192,6 +193,17 @@ class Scenario(Table):
     def penalty_quadratic(self) -> NDArray[np.float64]:
         """Quadratic weights B (diagonal) of the violation, (n,)."""
         return _frozen(self.penalty.quadratic)
+
+    @cached_property
+    def state_penalty(self) -> Penalty:
+        """Penalty of a state beyond the bounds."""
+        return Penalty(
+            self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
+        )
+
+    def saturate(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the actuators make of actions (…, m): the nearest within their bounds."""
+        return np.minimum(np.maximum(action, self.action_lower), self.action_upper)
 
     @cached_property
     def reference_state(self) -> NDArray[np.float64]:

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from cosim.experiments.results import StudyResults as StudyResults
     from cosim.experiments.study import Study as Study
     from cosim.plant import FmuPlant as FmuPlant
-    from cosim.pool import PlantPool as PlantPool
     from cosim.scenario import Scenario as Scenario
     from cosim.simulation import simulate as simulate
     from cosim.trajectory import Trajectory as Trajectory
@@ -19,7 +18,6 @@ _HOMES = {
     "Evaluation": "cosim.evaluation",
     "evaluate": "cosim.evaluation",
     "FmuPlant": "cosim.plant",
-    "PlantPool": "cosim.pool",
     "Scenario": "cosim.scenario",
     "Trajectory": "cosim.trajectory",
     "Study": "cosim.experiments.study",
@@ -30,7 +28,6 @@ _HOMES = {
 __all__ = [
     "Evaluation",
     "FmuPlant",
-    "PlantPool",
     "Scenario",
     "Study",
     "StudyResults",

@@ -104,8 +104,8 @@ class TrainingRecorder(Protocol):
 class TrainingResult:
     """What came of a run: θ, the log's `rows`, the greedy evaluation of θ, and how it ended.
 
-    θ is what the run would hand over: the algorithm's last one, or the best validated one where
-    there was validation. `evaluation` is a `Verdict.summary`; `status` is `finished` or
+    `parameters` are what the run would hand over: the algorithm's last ones, or the best validated
+    ones where there was validation. `evaluation` is a `Verdict.summary`; `status` is `finished` or
     `diverged: …`, which changes nothing of what θ is; `plant_samples` counts those of training
     and validation, `validated` those of the latter.
     """

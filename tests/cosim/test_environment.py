@@ -7,7 +7,7 @@ from gymnasium.utils.env_checker import check_env
 
 import cosim.environment  # noqa: F401 (registers the environment)
 from cosim import FmuPlant, simulate
-from cosim.environment import PlantEnv, PlantVectorEnv
+from cosim.environment import PlantEnv
 from cosim.errors import PlantError
 from tests.helpers.loop import Proportional
 
@@ -89,10 +89,7 @@ def test_a_nan_action_is_refused(env):
 
 
 def test_the_vector_form_is_many_single_ones():
-    vector = gymnasium.make_vec(
-        "cosim/Evaporator-v0", num_envs=3, vectorization_mode="vector_entry_point"
-    )
-    assert isinstance(vector, PlantVectorEnv)
+    vector = gymnasium.make_vec("cosim/Evaporator-v0", num_envs=3)
     singles = [PlantEnv() for _ in range(3)]
     states, _ = vector.reset(seed=5)
     for i, single in enumerate(singles):
@@ -114,7 +111,7 @@ def test_the_vector_form_is_many_single_ones():
 
 
 def test_the_vector_form_starts_a_new_episode_in_the_step_after_truncation():
-    vector = PlantVectorEnv(2, max_episode_steps=2)
+    vector = gymnasium.make_vec("cosim/Evaporator-v0", num_envs=2, max_episode_steps=2)
     first, _ = vector.reset(seed=1)
     action = np.full((2, 2), 200.0)
     assert not vector.step(action)[3].any()
@@ -123,7 +120,7 @@ def test_the_vector_form_starts_a_new_episode_in_the_step_after_truncation():
     np.testing.assert_array_equal(states, first)
     np.testing.assert_array_equal(rewards, 0.0)
     assert not truncated.any()
-    assert not info["_stage_cost"].any()
+    assert "stage_cost" not in info
     after = vector.step(action)
     assert after[4]["_stage_cost"].all()
     vector.close()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fmus
-from cosim import FmuPlant, PlantPool, Scenario, simulate
+from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import CapabilityError, PlantError
 from tests.helpers.loop import Hold
 from tests.helpers.tank import build_tank, edited, without_attribute, write_scenario
@@ -86,8 +86,6 @@ def test_one_instance_per_process_is_kept_to(tmp_path, paper):
         plant.reset(0)
         with pytest.raises(CapabilityError, match="only once per process"):
             FmuPlant(paper, path)
-    with pytest.raises(CapabilityError, match="only once per process"):
-        PlantPool(paper, 2, path)
     FmuPlant(paper, path).close()
 
 

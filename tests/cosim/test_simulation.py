@@ -71,7 +71,7 @@ def test_actuators_saturate_what_controller_and_exploration_ask_for(evaporator, 
 
 def test_only_changed_samples_count_as_explored(evaporator, paper):
     def explore(action, rng):
-        return action + 1.0 if rng.random() < 0.3 else action
+        return action + 1.0 if rng.random() < 0.3 else None
 
     trajectory = simulate(evaporator, Hold([200.0, 200.0]), 200, seed=4, exploration=explore)
     moved = (trajectory.actions != 200.0).all(axis=1)

@@ -96,12 +96,12 @@ def test_every_field_in_the_reference_has_a_meaning():
 
 
 def test_a_field_without_a_meaning_is_seen(monkeypatch):
-    import cosim.pool
+    import cosim.protocols
 
-    monkeypatch.setattr(cosim.pool.Steps, "__doc__", "One step: s and stage_cost.")
-    assert set(without_meaning(cosim.pool)) == {
-        "cosim.pool.Steps.penalty",
-        "cosim.pool.Steps.disturbance",
+    monkeypatch.setattr(cosim.protocols.Step, "__doc__", "One step: s and stage_cost.")
+    assert set(without_meaning(cosim.protocols)) == {
+        "cosim.protocols.Step.penalty",
+        "cosim.protocols.Step.disturbance",
     }
 
 

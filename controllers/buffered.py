@@ -32,6 +32,10 @@ class BufferedFunction:
         self.outputs = {
             function.name_out(i): np.zeros(function.numel_out(i)) for i in range(function.n_out())
         }
+        self.bind(function)
+
+    def bind(self, function: ca.Function) -> None:
+        """Let another function of the same arguments and results do the work, a compiled one."""
         self._buffer, self._evaluate = function.buffer()
         for i, array in enumerate(self.inputs.values()):
             self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]

@@ -1,0 +1,250 @@
+"""CasADi functions compiled by the machine's own C compiler, once, and kept in the user's cache."""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import casadi as ca
+import filelock
+
+from controllers.buffered import BufferedFunction
+from controllers.cache import read_own, sweep, trusted_folder
+from controllers.code_generation import c_source
+from controllers.errors import ControllerError
+
+FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+KIND = "compiled"
+SWITCH = "COSIM_COMPILE"
+CHOICES = ("auto", "never", "now")
+INTERPRETED, COMPILED = "interpreted", "compiled"
+LOOK, WORTH, POLL = 50, 2000, 200
+"""Calls after which a stored library is looked for, one is compiled, and each look at its end."""
+
+
+class Compiler(NamedTuple):
+    """A C compiler: its `path`, and what tells it from others, in one line."""
+
+    path: str
+    identity: str
+
+
+@cache
+def find_compiler(chosen: str | None = None) -> Compiler | None:
+    """The compiler `chosen`, else the first of cc, gcc and clang; None where there is none."""
+    for name in [chosen] if chosen else ["cc", "gcc", "clang"]:
+        found = shutil.which(name)
+        if found is None or (sys.platform == "darwin" and not _has_command_line_tools()):
+            continue
+        path = Path(found).resolve()
+        status = path.stat()
+        identity = f"{path} {status.st_size} {status.st_mtime_ns} {platform.machine()}"
+        return Compiler(found, identity)
+    return None
+
+
+def _has_command_line_tools() -> bool:
+    """Whether macOS has a compiler behind its `cc`, which else asks the user to install one."""
+    answer = subprocess.run(["xcode-select", "-p"], capture_output=True, check=False)
+    return answer.returncode == 0
+
+
+def switch() -> str:
+    """`auto`, `never` or `now`, as the environment's COSIM_COMPILE says.
+
+    Raises ControllerError on another word.
+    """
+    chosen = os.environ.get(SWITCH) or CHOICES[0]
+    if chosen not in CHOICES:
+        raise ControllerError(f"{SWITCH} is '{chosen}'; it must be {', '.join(CHOICES)} or not set")
+    return chosen
+
+
+def description() -> str:
+    """Which of compiler and interpreter a long run uses here, in a few words."""
+    if switch() == "never":
+        return f"{INTERPRETED} ({SWITCH}=never)"
+    compiler = find_compiler(os.environ.get("CC"))
+    if compiler is None:
+        return f"{INTERPRETED} (no C compiler found)"
+    return f"{COMPILED} by {compiler.path} {' '.join(FLAGS)}, kept in {trusted_folder(KIND)}"
+
+
+class _Build:
+    """A compiler at work on a source, in a folder of its own; the lock keeps others from it."""
+
+    def __init__(self, compiler: Compiler, source: str, name: str, folder: Path) -> None:
+        self._name, self._folder = name, folder
+        self._lock = filelock.FileLock(folder / f"{name}.lock", blocking=False)
+        self._lock.acquire()
+        try:
+            self._own = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
+            (self._own / "functions.c").write_text(source, encoding="utf-8")
+            command = [compiler.path, *FLAGS, "-o", "library", "functions.c", "-lm"]
+            self._process = subprocess.Popen(
+                command,
+                cwd=self._own,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        except BaseException:
+            self._lock.release()
+            raise
+        atexit.register(self.close)
+
+    def done(self, *, wait: bool = False) -> bool:
+        """Whether the compiler has ended."""
+        return (self._process.wait() if wait else self._process.poll()) is not None
+
+    def publish(self) -> Path | None:
+        """Put the library in its place, whole; None where the compiler failed."""
+        try:
+            if self._process.returncode:
+                return None
+            made = self._own / "library"
+            made.chmod(0o700)
+            content = made.read_bytes()
+            path = self._folder / f"{self._name}.{hashlib.sha256(content).hexdigest()}"
+            made.replace(path)
+            return path
+        except OSError:
+            return None
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End the compiler and leave nothing behind."""
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        shutil.rmtree(self._own, ignore_errors=True)
+        self._lock.release()
+        atexit.unregister(self.close)
+
+
+def find(name: str, folder: Path) -> Path | None:
+    """The stored library of this name whose bytes are those that were stored, or None."""
+    for path in sorted(folder.glob(f"{name}.*")):
+        if path.suffix == ".lock":
+            continue
+        with suppress(OSError):
+            if hashlib.sha256(read_own(path)).hexdigest() == path.suffix[1:]:
+                os.utime(path)
+                return path
+    return None
+
+
+class Compilation:
+    """Functions that are interpreted at first and compiled once enough calls show that it pays.
+
+    `count()` is called once a sample. Early on, a library that some earlier run has left is taken
+    up; after `WORTH` samples the compiler is started, and its library taken up when it is there,
+    while the samples go on. The bytes of all results are the same throughout. Without compiler, and
+    where it fails, the interpreter stays. The environment's COSIM_COMPILE may say `never`, or
+    `now` to have it done, and waited for, at once.
+    """
+
+    def __init__(self, functions: Sequence[BufferedFunction]) -> None:
+        self._functions = functions
+        self.mode = INTERPRETED
+        """Whether the functions are `interpreted` or `compiled` now."""
+        self._calls, self._next = 0, LOOK
+        self._build: _Build | None = None
+        self._source = ""
+        chosen = switch()
+        if chosen == "never":
+            self._next = sys.maxsize
+        elif chosen == "now":
+            self.finish()
+
+    def count(self) -> None:
+        """Count a sample."""
+        self._calls += 1
+        if self._calls >= self._next:
+            self._advance()
+
+    def finish(self) -> str:
+        """Do at once, and wait for, what `count` would do in time; returns `mode`."""
+        if self.mode == INTERPRETED and self._prepare() and not self._take(self._stored()):
+            with suppress(filelock.Timeout):
+                if self._build is None:
+                    self._start()
+            if self._build is not None:
+                self._build.done(wait=True)
+                self._finish_build()
+            else:  # another process is at it
+                with filelock.FileLock(self._folder / f"{self._name}.lock"):
+                    self._take(self._stored())
+        self._next = sys.maxsize
+        return self.mode
+
+    def _advance(self) -> None:
+        if self._build is not None:
+            self._next = self._calls + POLL
+            if self._build.done():
+                self._finish_build()
+        elif not self._prepare():
+            self._next = sys.maxsize
+        elif self._take(self._stored()):
+            self._next = sys.maxsize
+        elif self._calls < WORTH:
+            self._next = WORTH
+        else:
+            self._next = self._calls + POLL
+            try:
+                self._start()
+            except filelock.Timeout:  # another process is at it
+                pass
+            except OSError:
+                self._next = sys.maxsize
+
+    def _prepare(self) -> bool:
+        """Write the source and name the library; False where there is no compiler."""
+        compiler = find_compiler(os.environ.get("CC"))
+        if compiler is None:
+            return False
+        if not self._source:
+            self._source = c_source([function.function for function in self._functions])
+            content = "\0".join((self._source, compiler.identity, *FLAGS))
+            self._name = hashlib.sha256(content.encode()).hexdigest()[:32]
+            self._compiler, self._folder = compiler, trusted_folder(KIND)
+        return True
+
+    def _start(self) -> None:
+        self._build = _Build(self._compiler, self._source, self._name, self._folder)
+
+    def _finish_build(self) -> None:
+        assert self._build is not None
+        path, self._build = self._build.publish(), None
+        self._take(path)
+        self._next = sys.maxsize
+        with suppress(OSError):
+            sweep(self._folder)
+
+    def _stored(self) -> Path | None:
+        return find(self._name, self._folder)
+
+    def _take(self, path: Path | None) -> bool:
+        """Put the library's functions in place of the interpreted ones."""
+        if path is None:
+            return False
+        try:
+            loaded = [ca.external(f.function.name(), str(path)) for f in self._functions]
+        except RuntimeError:  # not a library that this system loads
+            return False
+        for function, compiled in zip(self._functions, loaded, strict=True):
+            function.bind(compiled)
+        self.mode = COMPILED
+        return True

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
+Expression = TypeVar("Expression", ca.SX, ca.MX)
 
 
 class BufferedFunction:
@@ -49,11 +51,14 @@ class BufferedFunction:
 
 def stacked(
     name: str,
-    arguments: Mapping[str, ca.SX],
-    results: Mapping[str, ca.SX],
+    arguments: Mapping[str, Expression],
+    results: Mapping[str, Expression],
     shared: Mapping[str, Vector] | None = None,
 ) -> StackedFunction:
-    """Buffered function whose results share one flat array, so that one copy keeps them all."""
+    """Buffered function whose results share one flat array, so that one copy keeps them all.
+
+    Its expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
+    """
     sizes = [result.numel() for result in results.values()]
     ends = np.cumsum(sizes)
     function = ca.Function(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-# CasADi's interpreter returns the first of two zeros of unlike sign, the C library's fmax the other.
+# Of two zeros of unlike sign CasADi's interpreter returns the first, the C library the second.
 _TIES = (
     ("return fmax(x, y);", "return y > x || x != x ? y : x;"),
     ("return fmin(x, y);", "return y < x || x != x ? y : x;"),

@@ -195,9 +195,7 @@ class Compilation:
             self._next = self._calls + POLL
             if self._build.done():
                 self._finish_build()
-        elif not self._prepare():
-            self._next = sys.maxsize
-        elif self._take(self._stored()):
+        elif not self._prepare() or self._take(self._stored()):
             self._next = sys.maxsize
         elif self._calls < WORTH:
             self._next = WORTH

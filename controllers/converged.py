@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controllers.buffered import BufferedFunction
 from controllers.errors import QpError
 from controllers.ocp import merit
 from controllers.parameters import Parameters
@@ -62,6 +63,9 @@ class ConvergedNmpc(RtiNmpc):
         )
         self.iterations_used = 0
         super().__init__(problem, parameters, hessian="exact", backend=backend)
+
+    def _compilable(self) -> list[BufferedFunction]:
+        return [*super()._compilable(), self._merit]
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         solution = super()._solve(s, a)

@@ -1,11 +1,13 @@
-"""The model sampled and linearised along a trajectory, in CasADi: A_k, B_k, r_k and curvature."""
+"""The model sampled, linearised and differentiated at one stage, as CasADi functions to map."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import casadi as ca
 
 from controllers.problem import Problem
-from controllers.theta import SymbolicTheta
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
 def sampled_jacobian(
@@ -40,41 +42,80 @@ def sampled_jacobian(
     return x, drift
 
 
-def linearisation(
-    problem: Problem, symbols: SymbolicTheta, x: ca.SX, u: ca.SX
-) -> tuple[list[ca.SX], list[ca.SX], list[ca.SX]]:
-    """Matrices A_k, B_k and offsets r_k of ξ₊ = A_k ξ + B_k v + r_k along the points x, u.
+def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
+    """One stage's A_k, B_k and r_k of ξ₊ = A_k ξ + B_k v + r_k, as a function of (x, u, theta).
 
-    x has shape (n, N), u (m, N), in absolute units; r_k holds the model offset c_f too.
+    x (n) and u (m) are in absolute units; the results are A_kᵀ (n, n), B_kᵀ (m, n) and r_k (n),
+    which holds the model offset c_f too.
     """
     n = problem.n_states
+    x, u, symbols = _point(problem, blocks)
     x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
-    by_state, by_action, offset = [], [], []
-    for k in range(problem.horizon):
-        x_next, jacobian = sampled_jacobian(problem, x[:, k], u[:, k], symbols.model_parameters)
-        a, b = jacobian[:, :n], jacobian[:, n:]
-        by_state.append(a)
-        by_action.append(b)
-        offset.append(x_next - x_s - a @ (x[:, k] - x_s) - b @ (u[:, k] - u_s) + symbols["c_f"])
-    return by_state, by_action, offset
+    x_next, jacobian = sampled_jacobian(problem, x, u, symbols.model_parameters)
+    a, b = jacobian[:, :n], jacobian[:, n:]
+    offset = x_next - x_s - a @ (x - x_s) - b @ (u - u_s) + symbols["c_f"]
+    return stage_function(
+        "linearise",
+        {"x": x, "u": u, "theta": symbols.theta},
+        {"A": a.T, "B": b.T, "r": offset},
+    )
 
 
-def sampled_curvature(
-    problem: Problem, symbols: SymbolicTheta, x: ca.SX, u: ca.SX, chi: ca.SX
-) -> list[ca.SX]:
-    """Second derivatives D_k of χ_{k+1}ᵀ f(x_k, u_k) with respect to (x, u), stage by stage."""
-    curvature = []
-    for k in range(problem.horizon):
-        point = ca.SX.sym("point", problem.n_states + problem.n_actions)
-        x_k, u_k = point[: problem.n_states], point[problem.n_states :]
-        x_next, _ = sampled_jacobian(problem, x_k, u_k, symbols.model_parameters)
-        costate = ca.SX.sym("costate", problem.n_states)
-        hessian, _ = ca.hessian(ca.dot(costate, x_next), point)
-        curvature.append(
-            ca.substitute(
-                hessian,
-                ca.vertcat(point, costate),
-                ca.vertcat(x[:, k], u[:, k], chi[:, k]),
-            )
-        )
-    return curvature
+def stage_curvature(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
+    """One stage's D_k, the second derivative of χᵀf(x, u) in w = (x, u), by (x, u, chi, theta)."""
+    x, u, symbols = _point(problem, blocks)
+    chi = ca.SX.sym("chi", problem.n_states)
+    return stage_function(
+        "curvature_of_stage",
+        {"x": x, "u": u, "chi": chi, "theta": symbols.theta},
+        {"D": _curvature(problem, symbols, x, u, chi)},
+    )
+
+
+def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> ca.Function:
+    """One stage's ∇_p of the QP's Lagrangian in the model parameters p that θ holds.
+
+    That is ∇_p [χᵀ(f + J Δw) + ⟨M, D⟩] with f and its Jacobian J at (x, u), Δw = w − (x, u) the
+    step to the QP's solution, and with `exact` the curvature D of χ̄ᵀf under the weights M. The
+    multipliers are contracted before anything is differentiated, so that one tangent goes through
+    the model in place of n + m. Arguments x, u, theta, w (n+m) in absolute units, chi (n) and, with
+    `exact`, M (n+m, n+m) and guess (n); result `gradient` (n_p).
+    """
+    n, m = problem.n_states, problem.n_actions
+    x, u, symbols = _point(problem, blocks)
+    w, chi = ca.SX.sym("w", n + m), ca.SX.sym("chi", n)
+    x_next, _ = sampled_jacobian(problem, x, u, symbols.model_parameters)
+    point = ca.vertcat(x, u)
+    part = ca.dot(chi, x_next + ca.jtimes(x_next, point, w - point))
+    arguments = {"x": x, "u": u, "theta": symbols.theta, "w": w, "chi": chi}
+    if exact:
+        M, guess = ca.SX.sym("M", n + m, n + m), ca.SX.sym("guess", n)
+        part += ca.dot(M, _curvature(problem, symbols, x, u, guess))
+        arguments |= {"M": M, "guess": guess}
+    gradient = ca.gradient(part, symbols.theta)[blocks.slices["p"]]
+    return stage_function("parameter_gradient", arguments, {"gradient": gradient})
+
+
+def stage_function(
+    name: str, arguments: Mapping[str, ca.SX], results: Mapping[str, ca.SX]
+) -> ca.Function:
+    """Function of one stage, to be mapped over the horizon: dense, common expressions shared."""
+    return ca.Function(
+        name,
+        [ca.densify(argument) for argument in arguments.values()],
+        [ca.densify(result) for result in results.values()],
+        list(arguments),
+        list(results),
+        {"cse": True},
+    )
+
+
+def _point(problem: Problem, blocks: ThetaBlocks) -> tuple[ca.SX, ca.SX, SymbolicTheta]:
+    x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
+    return x, u, SymbolicTheta.of(problem, blocks)
+
+
+def _curvature(problem: Problem, symbols: SymbolicTheta, x: ca.SX, u: ca.SX, chi: ca.SX) -> ca.SX:
+    x_next, _ = sampled_jacobian(problem, x, u, symbols.model_parameters)
+    hessian, _ = ca.hessian(ca.dot(chi, x_next), ca.vertcat(x, u))
+    return hessian

@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
 from controllers.buffered import StackedFunction, stacked
-from controllers.dynamics import linearisation, sampled_curvature
+from controllers.dynamics import stage_parameter_gradient
 from controllers.problem import Problem
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
@@ -51,19 +52,17 @@ def _theta_part(
     y: PrimalDual,
     x: ca.SX,
     u: ca.SX,
-    exact: tuple[ca.SX, ca.SX] | None,
+    exact: ca.SX | None,
 ) -> ca.SX:
-    """All terms of the QP's Lagrangian in which θ appears.
+    """All terms of the QP's Lagrangian in which θ appears, but for the model's own parameters.
 
-    `exact` is (M, χ̄) where the QP has the exact Hessian: M_k stands for the derivative of the
-    stage's second-order term with respect to L_k, and χ̄ are the costates at which D_k was taken.
+    `exact` is M where the QP has the exact Hessian: M_k stands for the derivative of the stage's
+    second-order term with respect to L_k.
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
     x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
     part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
     part += symbols["c_lambda"]
-    by_state, by_action, offset = linearisation(problem, symbols, x, u)
-    curvature = sampled_curvature(problem, symbols, x, u, exact[1]) if exact else []
     for k in range(horizon):
         w = ca.vertcat(y.xi[:, k], y.v[:, k])
         stage = ca.dot(symbols["b_l"], w)
@@ -72,17 +71,41 @@ def _theta_part(
         else:
             at = ca.vertcat(x[:, k] - x_s, u[:, k] - u_s)
             columns = slice(k * (n + m), (k + 1) * (n + m))
-            M = exact[0][:, columns]
+            M = exact[:, columns]
             stage += ca.bilin(symbols["B_l"], at, 2 * w - at) + 2 * ca.dot(M, symbols["B_l"])
-            part += ca.dot(M, curvature[k])
-        predicted = by_state[k] @ y.xi[:, k] + by_action[k] @ y.v[:, k] + offset[k]
-        part += gamma**k * stage + ca.dot(y.chi[:, k + 1], predicted)
+        part += gamma**k * stage + ca.dot(y.chi[:, k + 1], symbols["c_f"])
         part += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], y.t[:, k])
         part += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], y.t[:, k] ** 2)
         part += ca.dot(ca.fmax(-y.lam[:, k], 0), symbols["x_l"])
         part -= ca.dot(ca.fmax(y.lam[:, k], 0), symbols["x_u"])
     end = y.xi[:, horizon]
     return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
+
+
+def _parameter_gradient(
+    problem: Problem,
+    blocks: ThetaBlocks,
+    theta: ca.SX,
+    y: PrimalDual,
+    x: ca.SX,
+    u: ca.SX,
+    exact: tuple[ca.SX, ca.SX] | None,
+) -> ca.SX:
+    """∇_p of the QP's Lagrangian in the model parameters p, the sum of all stages' parts.
+
+    `exact` is (M, χ̄), where χ̄ are the costates at which the curvature D_k was taken.
+    """
+    size = problem.n_states + problem.n_actions
+    reference = ca.DM(np.concatenate([problem.reference_state, problem.reference_action]))
+    of_stage = stage_parameter_gradient(problem, blocks, exact=exact is not None)
+    total = ca.SX(0)
+    for k in range(problem.horizon):
+        w = ca.vertcat(y.xi[:, k], y.v[:, k]) + reference
+        arguments = [x[:, k], u[:, k], theta, w, y.chi[:, k + 1]]
+        if exact is not None:
+            arguments += [exact[0][:, k * size : (k + 1) * size], exact[1][:, k]]
+        total += of_stage(*arguments)
+    return total
 
 
 def sensitivities(
@@ -93,8 +116,8 @@ def sensitivities(
     The first maps a solution (xi, v, t, lam, chi), the linearisation points x, u and theta to
     `gradient` (n_θ). The second maps that, the QP's A, B, L, L_N and the columns of m adjoint
     directions dv (mN, m), dt and dlam (nN, m) to `policy` (n_θ, m), which is dπ/dθ transposed, and
-    `state` (n, m), dπ/ds transposed. With `exact` both need M and χ̄ (see `_theta_part`), the
-    second also dM, the directional derivative of M.
+    `state` (n, m), dπ/ds transposed. With `exact` both need M and χ̄ (see `_theta_part` and
+    `_parameter_gradient`), the second also dM, the directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
@@ -103,8 +126,12 @@ def sensitivities(
     M = ca.SX.sym("M", n + m, horizon * (n + m))
     guess = ca.SX.sym("guess", n, horizon)
     extra = {"M": M, "guess": guess} if exact else {}
-    part = _theta_part(problem, symbols, y, x, u, (M, guess) if exact else None)
+    part = _theta_part(problem, symbols, y, x, u, M if exact else None)
     gradient = ca.gradient(part, symbols.theta)
+    if "p" in blocks:
+        gradient[blocks.slices["p"]] = _parameter_gradient(
+            problem, blocks, symbols.theta, y, x, u, (M, guess) if exact else None
+        )
     inputs = {**y.named(), "x": x, "u": u, "theta": symbols.theta, **extra}
     value = stacked("value_gradient", inputs, {"gradient": gradient})
 

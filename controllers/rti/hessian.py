@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.buffered import BufferedFunction, stacked
-from controllers.dynamics import sampled_curvature
+from controllers.dynamics import stage_curvature
 from controllers.errors import ControllerError
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.theta import SymbolicTheta, ThetaBlocks
+from controllers.theta import ThetaBlocks
 
 Vector = NDArray[np.float64]
 RULES = ("gauss-newton", "exact", "exact-unlifted")
@@ -53,6 +54,8 @@ class HessianRule(Protocol):
     """Fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation."""
 
     spectrum: Spectrum | None
+    functions: Sequence[BufferedFunction]
+    """The CasADi functions that it calls."""
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over a new θ."""
@@ -65,6 +68,7 @@ class GaussNewton:
     """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is."""
 
     spectrum: Spectrum | None = None
+    functions: Sequence[BufferedFunction] = ()
 
     def __init__(self, problem: Problem, prepared: BufferedFunction) -> None:
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
@@ -108,14 +112,16 @@ class Exact:
         self._cost = GaussNewton(problem, prepared)
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = np.concatenate([problem.reference_state, problem.reference_action])
-        symbols = SymbolicTheta.of(problem, blocks)
-        x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
-        guess = ca.SX.sym("guess", n, horizon)
-        self._curvature = stacked(
-            "curvature",
-            {"x": x, "u": u, "guess": guess, "theta": symbols.theta},
-            {"D": ca.horzcat(*sampled_curvature(problem, symbols, x, u, guess))},
-        )
+        given = {
+            "x": ca.MX.sym("x", n, horizon),
+            "u": ca.MX.sym("u", m, horizon),
+            "guess": ca.MX.sym("guess", n, horizon),
+            "theta": ca.MX.sym("theta", blocks.size),
+        }
+        *point, theta = given.values()
+        D = stage_curvature(problem, blocks).map(horizon)(*point, ca.repmat(theta, 1, horizon))
+        self._curvature = stacked("curvature", given, {"D": D})
+        self.functions: Sequence[BufferedFunction] = (self._curvature,)
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over the costs of θ."""

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.blas import dasum
 
+from controllers.buffered import BufferedFunction
+from controllers.compilation import Compilation
 from controllers.errors import ControllerError, ParameterError, QpError
 from controllers.parameters import Parameters
 from controllers.problem import Problem
@@ -38,8 +40,8 @@ class RtiNmpc:
     `feedback(s, a)` after `feedback(s)` uses the same QP data.
 
     `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
-    or a function that makes a `QpBackend`.
-    Raises ControllerError on another choice.
+    or a function that makes a `QpBackend`; `compilation` says whether the CasADi functions are
+    interpreted or compiled, which changes no bit. Raises ControllerError on another choice.
     """
 
     name = "rti"
@@ -66,6 +68,7 @@ class RtiNmpc:
         self._functions = Functions(
             problem, self._prepare, self._embed, self._readout, gradient, policy
         )
+        self.compilation = Compilation(self._compilable())
         self._qp, self._stages = qp_in_memory(problem, self._prepare, self._embed)
         self._action_lower, self._action_upper = self._qp.lower.copy(), self._qp.upper.copy()
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
@@ -74,6 +77,14 @@ class RtiNmpc:
         self._constant = 0.0
         self.parameters = parameters
         self.reset()
+
+    def _compilable(self) -> list[BufferedFunction]:
+        """All functions that a sample may call."""
+        f = self._functions
+        return [
+            *(f.preparation, f.embedding, f.readout, f.gradient, f.policy),
+            *self._hessian.functions,
+        ]
 
     # θ ------------------------------------------------------------------------------------------
 
@@ -168,6 +179,7 @@ class RtiNmpc:
 
     def _linearise(self) -> None:
         prepare = self._prepare
+        self.compilation.count()
         self._prepared = None
         self._constant = self._hessian.fill(self._x, self._u, self._costates)
         prepare()

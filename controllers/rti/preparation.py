@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from controllers.buffered import StackedFunction, stacked
-from controllers.dynamics import linearisation
+from controllers.dynamics import stage_function, stage_linearisation
 from controllers.problem import Problem
 from controllers.qp import SoftQp, Stages
-from controllers.theta import SymbolicTheta, ThetaBlocks
+from controllers.theta import ThetaBlocks
 
 
 def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
@@ -24,77 +25,126 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
 
     Inputs: x (n, N) and u (m, N), the linearisation points; L (n+m, N(n+m)), q (n+m, N),
     L_N (n, n), q_N (n); theta. Results: A, B, r by stage; H, Γ by rows; Φ, g, f, F.
+
+    Two sweeps of N calls each make it, in O(N²) operations: the forward one carries the responses
+    of ξ_k to every control, to ξ_0 and to the offsets, the backward one turns them into columns of
+    the Hessian. Controls are ordered by age, v_{k−1} first, so that all stages are alike.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    symbols = SymbolicTheta.of(problem, blocks)
-    x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
-    quadratic = ca.SX.sym("L", n + m, horizon * (n + m))
-    linear = ca.SX.sym("q", n + m, horizon)
-    quadratic_end, linear_end = ca.SX.sym("L_N", n, n), ca.SX.sym("q_N", n)
-    by_state, by_action, offset = linearisation(problem, symbols, x, u)
-
-    # Column blocks: each control, then the initial state, then the offset; a column is the
-    # response of ξ_k to it, and the adjoint sweep below turns it into a column of the Hessian.
-    columns = [[ca.SX(n, m)] * (horizon + 1) for _ in range(horizon)]
-    for j, column in enumerate(columns):
-        column[j + 1] = by_action[j]
-        for k in range(j + 1, horizon):
-            column[k + 1] = by_state[k] @ column[k]
-    initial, drift = [ca.SX.eye(n)], [ca.SX(n, 1)]
-    for k in range(horizon):
-        initial.append(by_state[k] @ initial[k])
-        drift.append(by_state[k] @ drift[k] + offset[k])
-
-    def block(k: int, rows: slice, cols: slice) -> ca.SX:
-        return quadratic[:, k * (n + m) : (k + 1) * (n + m)][rows, cols]
-
-    of_x, of_u = slice(0, n), slice(n, n + m)
-
-    def adjoint(response: list[ca.SX], first: int, own: int | None, affine: bool) -> list[ca.SX]:
-        """Gradient blocks of the cost, from stage `first` on, along a state response."""
-        gradient: list[ca.SX] = []
-        costate = quadratic_end @ response[horizon] + (linear_end if affine else 0)
-        for k in reversed(range(first, horizon)):
-            row = block(k, of_u, of_x) @ response[k] + by_action[k].T @ costate
-            row = row + (linear[n:, k] if affine else 0)
-            gradient.insert(0, row + (block(k, of_u, of_u) if own == k else 0))
-            costate = block(k, of_x, of_x) @ response[k] + by_state[k].T @ costate
-            costate = costate + (linear[:n, k] if affine else 0)
-            if own == k:
-                costate = costate + block(k, of_x, of_u)
-        return gradient
-
-    hessian = ca.SX(horizon * m, horizon * m)
-    for j, column in enumerate(columns):
-        rows = ca.vertcat(*adjoint(column, j, j, affine=False))
-        hessian[j * m :, j * m : (j + 1) * m] = rows
-    hessian = ca.tril2symm(ca.tril(hessian))
-    response = ca.vertcat(
-        *(ca.horzcat(*(column[k] for column in columns)) for k in range(1, horizon + 1))
+    width = horizon * m
+    given = {
+        "x": ca.MX.sym("x", n, horizon),
+        "u": ca.MX.sym("u", m, horizon),
+        "L": ca.MX.sym("L", n + m, horizon * (n + m)),
+        "q": ca.MX.sym("q", n + m, horizon),
+        "L_N": ca.MX.sym("L_N", n, n),
+        "q_N": ca.MX.sym("q_N", n),
+        "theta": ca.MX.sym("theta", blocks.size),
+    }
+    A, B, r = stage_linearisation(problem, blocks).map(horizon)(
+        given["x"], given["u"], ca.repmat(given["theta"], 1, horizon)
     )
+    by_state, by_action, offset = ca.horzsplit(A, n), ca.horzsplit(B, n), ca.horzsplit(r, 1)
+    weights, gradients = ca.horzsplit(given["L"], n + m), ca.horzsplit(given["q"], 1)
+    respond, differentiate = _respond(n, m, horizon), _differentiate(n, m, horizon)
+
+    start = np.hstack([np.zeros((n, width)), np.eye(n), np.zeros((n, 1))])
+    responses = [ca.MX(ca.DM(ca.Sparsity.dense(*start.shape), start.reshape(-1, order="F")))]
+    for k in range(horizon):
+        responses.append(respond(by_state[k], by_action[k], offset[k], responses[k]))
+    costate = given["L_N"] @ responses[horizon]
+    costate = ca.horzcat(costate[:, :-1], costate[:, -1] + given["q_N"])
+    rows: list[ca.MX] = []
+    for k in reversed(range(horizon)):
+        stage = (by_state[k], by_action[k], weights[k], gradients[k])
+        row, costate = differentiate(*stage, responses[k], costate)
+        rows.insert(0, row)
+    row, response = ca.horzcat(*rows), ca.horzcat(*responses[1:])
+    free = [following[:, width:] for following in responses[1:]]
     return stacked(
         "preparation",
+        given,
         {
-            "x": x,
-            "u": u,
-            "L": quadratic,
-            "q": linear,
-            "L_N": quadratic_end,
-            "q_N": linear_end,
-            "theta": symbols.theta,
-        },
-        {
-            "A": ca.horzcat(*(matrix.T for matrix in by_state)),
-            "B": ca.horzcat(*(matrix.T for matrix in by_action)),
-            "r": ca.horzcat(*offset),
-            "H": hessian,
-            "Gamma": response.T,
-            "Phi": ca.vertcat(*initial[1:]).T,
-            "g": ca.vertcat(*drift[1:]),
-            "f": ca.vertcat(*adjoint(drift, 0, None, affine=True)),
-            "F": ca.vertcat(*adjoint(initial, 0, None, affine=False)).T,
+            "A": A,
+            "B": B,
+            "r": r,
+            "H": _gathered(row, _hessian_positions(n, m, horizon)),
+            "Gamma": _gathered(response, _response_positions(n, m, horizon)).T,
+            "Phi": ca.vertcat(*(part[:, :n] for part in free)).T,
+            "g": ca.vertcat(*(part[:, n] for part in free)),
+            "f": ca.vertcat(*(part[:, -1] for part in rows)),
+            "F": ca.vertcat(*(part[:, width:-1] for part in rows)).T,
         },
     )
+
+
+def _respond(n: int, m: int, horizon: int) -> ca.Function:
+    """Responses of ξ_{k+1}, (n, Nm + n + 1), from those of ξ_k: to each control, ξ_0 and offsets.
+
+    Every control grows older by one; the oldest place, which no stage before N fills, is dropped.
+    """
+    A, B, r = ca.SX.sym("A", n, n), ca.SX.sym("B", m, n), ca.SX.sym("r", n)
+    response = ca.SX.sym("response", n, horizon * m + n + 1)
+    moved = A.T @ response
+    moved[:, -1] += r
+    kept = ca.horzcat(moved[:, : (horizon - 1) * m], moved[:, horizon * m :])
+    return stage_function(
+        "respond",
+        {"A": A, "B": B, "r": r, "response": response},
+        {"following": ca.horzcat(B.T, kept)},
+    )
+
+
+def _differentiate(n: int, m: int, horizon: int) -> ca.Function:
+    """Rows (m, Nm + n + 1) of the cost's gradient in v_k and costates (n, Nm + n + 1) at stage k.
+
+    One for each response to which the costates at stage k + 1 belong; of the controls, v_k is the
+    first among them and has no response at stage k.
+    """
+    A, B = ca.SX.sym("A", n, n), ca.SX.sym("B", m, n)
+    L, q = ca.SX.sym("L", n + m, n + m), ca.SX.sym("q", n + m)
+    width = horizon * m
+    response, costate = (ca.SX.sym(name, n, width + n + 1) for name in ("response", "costate"))
+    kept = ca.horzcat(response[:, : width - m], response[:, width:])
+    row = L[n:, :n] @ kept + B @ costate[:, m:]
+    row[:, -1] += q[n:]
+    previous = L[:n, :n] @ kept + A @ costate[:, m:]
+    previous[:, -1] += q[:n]
+    return stage_function(
+        "differentiate",
+        {"A": A, "B": B, "L": L, "q": q, "response": response, "costate": costate},
+        {
+            "row": ca.horzcat(B @ costate[:, :m] + L[n:, n:], row),
+            "previous": ca.horzcat(previous[:, : width - m], ca.SX(n, m), previous[:, width - m :]),
+        },
+    )
+
+
+def _gathered(source: ca.MX, positions: NDArray[np.int64]) -> ca.MX:
+    """Matrix of the source's entries at positions in column-major order; −1 stands for zero."""
+    extended = ca.vertcat(ca.vec(source), 0)
+    index = np.where(positions < 0, source.numel(), positions)
+    return ca.reshape(extended[index.reshape(-1, order="F").tolist()], *positions.shape)
+
+
+def _hessian_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
+    """Where H's entries, (Nm, Nm), stand in the rows of all stages; its upper triangle mirrors."""
+    first, second = np.indices((horizon * m, horizon * m))
+    (k, a), (j, b) = (
+        np.divmod(np.maximum(first, second), m),
+        np.divmod(np.minimum(first, second), m),
+    )
+    column: NDArray[np.int64] = k * (horizon * m + n + 1) + (k - j) * m + b
+    return column * m + a
+
+
+def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
+    """Where Γ's entries, (Nn, Nm), stand in the responses of ξ_1 … ξ_N; −1 above its diagonal."""
+    first, second = np.indices((horizon * n, horizon * m))
+    (k, i), (j, b) = np.divmod(first, n), np.divmod(second, m)
+    column = k * (horizon * m + n + 1) + (k - j) * m + b
+    positions: NDArray[np.int64] = np.where(j <= k, column * n + i, -1)
+    return positions
 
 
 def qp_in_memory(

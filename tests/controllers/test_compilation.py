@@ -16,8 +16,8 @@ from controllers import (
 )
 from controllers.buffered import BufferedFunction
 from controllers.compilation import Compilation, description, find, find_compiler
-from cosim.documents import presets
 from cosim.scenario import Scenario
+from cosim.scenario.loading import presets
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 

@@ -3,7 +3,7 @@ import sys
 
 import numpy as np
 import pytest
-from sampling import evaporator_problem
+from tests.controllers.sampling import evaporator_problem
 
 from controllers import (
     ControllerError,

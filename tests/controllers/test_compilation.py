@@ -3,7 +3,6 @@ import sys
 
 import numpy as np
 import pytest
-from tests.controllers.sampling import evaporator_problem
 
 from controllers import (
     ControllerError,
@@ -18,6 +17,7 @@ from controllers.buffered import BufferedFunction
 from controllers.compilation import Compilation, description, find, find_compiler
 from cosim.scenario import Scenario
 from cosim.scenario.loading import presets
+from tests.helpers.sampling import evaporator_problem
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 

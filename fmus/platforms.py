@@ -35,8 +35,8 @@ PLATFORMS = (
     Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
     Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
     Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu"),
-    Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos"),
-    Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos"),
+    Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos.11.0"),
+    Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos.11.0"),
 )
 
 _ARCHITECTURES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}

@@ -1,0 +1,125 @@
+"""What the shipped archives hold for each platform: folders, symbols, load commands."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import struct
+import subprocess
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import fmus
+from fmus.description import MODEL_IDENTIFIER
+from fmus.platforms import PLATFORMS
+from fmus.universal import universal_binary
+from tests.helpers import mach_o
+
+NOT_OURS = {"__dso_handle", "_mh_dylib_header"}
+
+
+@pytest.fixture
+def binaries(version: int) -> dict[str, bytes]:
+    with zipfile.ZipFile(fmus.path(fmus.NAMES[version - 2])) as container:
+        return {
+            name.removeprefix("binaries/"): container.read(name)
+            for name in container.namelist()
+            if name.startswith("binaries/")
+        }
+
+
+@pytest.fixture
+def functions(version: int) -> set[str]:
+    """Every function of the standard, as fmpy's header lists them."""
+    import fmpy
+
+    folder = Path(fmpy.__file__).parent / "c-code"
+    text = (folder / f"fmi{version}Functions.h").read_text()
+    return set(re.findall(rf"^\s*FMI{version}_Export \w+TYPE\s+(fmi{version}\w+);", text, re.M))
+
+
+def test_there_is_a_library_for_each_platform(binaries, version: int) -> None:
+    expected = {f"{p.folder(f'{version}.0')}/{MODEL_IDENTIFIER}{p.suffix}" for p in PLATFORMS}
+    assert set(binaries) == expected
+
+
+def test_fmi2_names_x86_by_its_own_and_arm_by_the_tuples_of_fmi3() -> None:
+    assert [platform.folder("2.0") for platform in PLATFORMS] == [
+        "linux64", "aarch64-linux", "win64", "darwin64", "aarch64-darwin",
+    ]  # fmt: skip
+    assert all(re.fullmatch(r"(x86_64|aarch64)-(linux|windows|darwin)", p.folder("3.0"))
+               for p in PLATFORMS)  # fmt: skip
+
+
+def test_macos_libraries_export_the_functions_of_the_standard_and_need_the_system_alone(
+    binaries, functions, version: int
+) -> None:
+    found = []
+    for name, data in binaries.items():
+        if not name.endswith(".dylib"):
+            continue
+        for part in mach_o.slices(data):
+            library = mach_o.read(part)
+            assert library.exports - NOT_OURS == functions
+            assert library.needs == ("/usr/lib/libSystem.B.dylib",)
+            assert library.name == f"{MODEL_IDENTIFIER}.dylib"
+            assert library.least_version == (11, 0)
+            assert library.signed or library.architecture == "x86_64"
+            found.append((name.split("/")[0], library.architecture))
+    on_x86 = [("x86_64-darwin", "x86_64")]
+    if version == 2:
+        on_x86 = [("darwin64", "x86_64"), ("darwin64", "aarch64")]
+    assert found == [("aarch64-darwin", "aarch64"), *on_x86]
+
+
+def test_universal_binary_starts_each_slice_on_a_page(binaries) -> None:
+    libraries = [data for name, data in binaries.items() if name.endswith(".dylib")]
+    thin = [mach_o.slices(library)[0] for library in libraries]
+    joined = universal_binary(thin)
+    assert mach_o.slices(joined) == thin
+    offsets = [struct.unpack_from(">I", joined, 16 + 20 * i)[0] for i in range(2)]
+    assert all(offset % 16384 == 0 for offset in offsets)
+
+
+def test_windows_library_exports_the_functions_and_needs_what_windows_10_has(
+    binaries, functions, objdump
+) -> None:
+    data = next(data for name, data in binaries.items() if name.endswith(".dll"))
+    listing = objdump("-p", data)
+    exported = set(re.findall(r"\[ *\d+\] (?:\+base\[ *\d+\] +\w+ )?(fmi\d\w+)", listing))
+    assert exported == functions
+    needed = re.findall(r"DLL Name: (\S+)", listing)
+    assert all(name == "KERNEL32.dll" or name.startswith("api-ms-win-crt-") for name in needed)
+
+
+@pytest.mark.parametrize("folder", ["x86", "aarch64"])
+def test_linux_libraries_need_no_newer_glibc_than_2_17_and_only_sqrt_of_libm(
+    binaries, functions, objdump, folder: str
+) -> None:
+    names = {"x86": ("linux64", "x86_64-linux"), "aarch64": ("aarch64-linux",)}[folder]
+    data = next(data for name, data in binaries.items() if name.split("/")[0] in names)
+    listing = objdump("-T", data)
+    versions = {tuple(map(int, v.split("."))) for v in re.findall(r"GLIBC_([\d.]+)", listing)}
+    assert versions
+    assert max(versions) <= (2, 17)
+    assert set(re.findall(r" DF \.text.* (\w+)$", listing, re.M)) == functions
+    undefined = set(re.findall(r"\*UND\*.* (\w+)$", listing, re.M))
+    rounded = {"log", "exp", "sin", "cos", "sincos", "pow", "tan", "log1p", "expm1", "fma"}
+    assert not undefined & rounded
+
+
+@pytest.fixture
+def objdump(tmp_path: Path):
+    """What binutils prints of a library with an option."""
+
+    def run(option: str, data: bytes) -> str:
+        if shutil.which("objdump") is None:
+            pytest.skip("there is no objdump")
+        (tmp_path / "library").write_bytes(data)
+        return subprocess.run(
+            ["objdump", option, tmp_path / "library"], capture_output=True, text=True, check=True
+        ).stdout
+
+    return run

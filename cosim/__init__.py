@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from cosim.registration import register_environments
+
 if TYPE_CHECKING:
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
@@ -41,3 +43,10 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'cosim' has no attribute '{name}'")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+register_environments()

@@ -120,7 +120,7 @@ def limits(axes: Axes, lower: float, upper: float) -> None:
     far = []
     for name, bound, distance in (("≥", lower, low - lower), ("≤", upper, upper - high)):
         if distance < span:
-            limit(axes, bound)
+            limit(axes, bound, f"{name} {bound:g}")
         else:
             far.append(f"{name} {bound:g}")
     if far:

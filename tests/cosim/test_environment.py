@@ -1,11 +1,8 @@
-import warnings
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import cosim.environment  # noqa: F401 (registers the environment)
 from cosim import FmuPlant, simulate
 from cosim.environment import PlantEnv
 from cosim.errors import PlantError
@@ -27,10 +24,40 @@ def test_passes_the_checker(env):
     check_env(env.unwrapped)
 
 
-def test_is_found_by_gymnasium_without_importing_us_first():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        gymnasium.make("cosim.environment:cosim/Evaporator-v0").close()
+@pytest.mark.parametrize("wrong", [150.0, [150.0], [150.0, 200.0, 200.0], [[150.0, 200.0]]])
+def test_an_action_of_another_shape_is_refused(env, wrong):
+    env.reset(seed=0)
+    with pytest.raises(PlantError, match=r"an action has shape \(2,\), not"):
+        env.unwrapped.step(np.array(wrong))
+
+
+def test_the_scenario_is_an_argument():
+    env = gymnasium.make("cosim/Evaporator-v0", scenario="fast-sampling")
+    assert env.unwrapped.scenario.sampling_time == 6.0
+    env.close()
+
+
+def test_an_episode_is_rendered_from_its_first_state_on():
+    env = gymnasium.make("cosim/Evaporator-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    start = env.render()
+    env.step(np.array([200.0, 300.0]))
+    later = env.render()
+    assert start.dtype == np.uint8
+    assert start.shape == later.shape == (*start.shape[:2], 3)
+    assert not np.array_equal(start, later)
+    env.close()
+
+
+def test_without_a_render_mode_nothing_is_drawn():
+    with PlantEnv() as env:
+        env.reset(seed=0)
+        assert env.render() is None
+
+
+def test_an_unknown_render_mode_is_refused():
+    with pytest.raises(PlantError, match="no render mode 'ansi'"):
+        PlantEnv(render_mode="ansi")
 
 
 def test_a_seeded_episode_is_the_simulated_run_of_that_seed(env, paper):

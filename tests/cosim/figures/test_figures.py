@@ -66,10 +66,10 @@ def test_an_overlay_shows_each_run_and_its_cost(trajectory):
     assert [J in text for text in legend] == [True, True, False]
 
 
-def test_a_bound_far_from_the_data_is_named(trajectory, paper):
+def test_a_bound_is_named_whether_it_is_drawn_or_too_far_away(trajectory, paper):
     axes = axes_by_label(trajectory_figure(trajectory, paper))
     said = {name: [text.get_text() for text in axis.texts] for name, axis in axes.items()}
-    assert said["$X_{2}$ [%]"] == ["bound ≤ 100"]
+    assert said["$X_{2}$ [%]"] == ["≥ 25", "bound ≤ 100"]
     assert said["$F_{200}$ [kg/min]"] == ["bound ≥ 100, ≤ 400"]
 
 

@@ -113,6 +113,26 @@ def plan(file: FileArgument, json: JsonOption = False) -> None:
         )
 
 
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of a study.", show_default=False)],
+    json: JsonOption = False,
+) -> None:
+    """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
+
+    A study that is not finished, or a stored one, is reported with what it has.
+    """
+    with output(json) as out_:
+        from cosim.experiments.report import write_report
+        from cosim.experiments.results import StudyResults
+
+        results = StudyResults.load(folder)
+        page = write_report(results)
+        show(results, out_)
+        out_.note(f"the report is {page.resolve()}")
+        out_.json({"report": str(page), "runs": len(results.runs)})
+
+
 def _announce(scenario: Any, out_: Output) -> None:
     from cosim.cli.compose import announce
 

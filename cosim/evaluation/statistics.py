@@ -7,8 +7,9 @@ methods.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from math import floor, isfinite, log10
 from typing import Any
 
@@ -18,6 +19,8 @@ from scipy import stats
 
 Array = NDArray[np.float64]
 
+Interval = tuple[float, float] | None
+
 LEVEL = 0.95
 RESAMPLES = 9999
 TD_WINDOW = 10_000
@@ -26,28 +29,34 @@ TD_WINDOW = 10_000
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % intervals, (low, high): Student's t, and BCa bootstrap over seeds.
+    """A value with its 95 % intervals, (low, high): Student's t, and a bootstrap over seeds.
 
-    The intervals are None where one seed, or none of the two methods, can say anything.
+    The intervals are None where one seed, or none of the two methods, can say anything. The
+    bootstrap, which takes much longer, is drawn when it is first asked for.
     """
 
     value: float
-    t: tuple[float, float] | None
-    bootstrap: tuple[float, float] | None
+    t: Interval = None
+    resample: Callable[[], Interval] = field(default=lambda: None, repr=False, compare=False)
+
+    @cached_property
+    def bootstrap(self) -> Interval:
+        """The bootstrap interval; the same at every call."""
+        return self.resample()
 
     def to_dict(self) -> dict[str, Any]:
         """As a JSON document."""
-        return asdict(self)
+        return {"value": self.value, "t": self.t, "bootstrap": self.bootstrap}
 
 
 def mean(values: Array) -> Estimate:
     """Mean of S independent values, (S,); without intervals where one is not finite."""
     if not np.all(np.isfinite(values)):
-        return Estimate(float(np.mean(values)), None, None)
+        return Estimate(float(np.mean(values)))
     return Estimate(
         float(np.mean(values)),
         _t_interval(values, float(np.mean(values))),
-        _bootstrap((values,), lambda x, axis: np.mean(x, axis=axis)),
+        lambda: _bootstrap((values,), lambda x, axis: np.mean(x, axis=axis)),
     )
 
 
@@ -59,11 +68,11 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     """
     below, value = float(np.mean(denominator)), quotient(numerator, denominator)
     if not np.isfinite(value):
-        return Estimate(value, None, None)
+        return Estimate(value)
     return Estimate(
         value,
         _t_interval((numerator - value * denominator) / below, value),
-        _bootstrap(
+        lambda: _bootstrap(
             (numerator, denominator),
             lambda a, b, axis: np.mean(a, axis=axis) / np.mean(b, axis=axis),
         ),
@@ -111,7 +120,11 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
     """
     value = float(interquartile_mean(np.concatenate(list(strata))))
     if any(len(runs) < 2 for runs in strata) or not all(np.isfinite(r).all() for r in strata):
-        return Estimate(value, None, None)
+        return Estimate(value)
+    return Estimate(value, None, lambda: _resampled_runs(strata))
+
+
+def _resampled_runs(strata: Sequence[Array]) -> Interval:
     interval = stats.bootstrap(
         tuple(strata),
         lambda *resampled, axis: interquartile_mean(np.concatenate(resampled, axis=axis), axis),
@@ -121,7 +134,7 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return Estimate(value, None, (float(interval.low), float(interval.high)))
+    return float(interval.low), float(interval.high)
 
 
 def td_error_mean(

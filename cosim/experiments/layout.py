@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
 from cosim.evaluation.statistics import shown
 from cosim.experiments.results import StudyResults
-from cosim.experiments.summary import aggregate_rows, summary_rows
+from cosim.experiments.summary import aggregate_rows, run_rows, summary_rows
 
 Lines = list[list[str]]
 
@@ -20,7 +21,7 @@ AGGREGATE_HEADER = ("case", "runs", "regret %, IQM [95 %]", "median", "worst")
 
 def lines(results: StudyResults, scenario: str) -> Lines:
     """Rows of a scenario's table."""
-    return [_line(row) for row in summary_rows(results) if row["scenario"] == scenario]
+    return [_line(row) for row in summary_rows(results, scenario)]
 
 
 def _line(row: dict[str, Any]) -> list[str]:
@@ -74,3 +75,38 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; the first column is text, the others numbers."""
     rule = ["---", *["---:"] * (len(header) - 1)]
     return "\n".join(f"| {' | '.join(line)} |" for line in (header, rule, *rows)) + "\n"
+
+
+def setting_lines(results: StudyResults) -> tuple[list[str], Lines]:
+    """Header and rows of what each case is."""
+    header = ["case", "algorithm or controller", "samples", "start", "NMPC", "settings"]
+    rows = [
+        [
+            case.name,
+            case.target,
+            str(case.samples or ""),
+            case.start,
+            case.nmpc,
+            ", ".join(f"{key} = {json.dumps(value)}" for key, value in case.settings.items()),
+        ]
+        for case in results.cases.values()
+    ]
+    return header, rows
+
+
+def run_lines(results: StudyResults) -> tuple[list[str], Lines]:
+    """Header and rows of every run."""
+    header = ["case", "scenario", "seed", "status", "plant samples", "regret % [95 %]", "J"]
+    rows = [
+        [
+            row["case"],
+            row["scenario"],
+            "" if row["training_seed"] is None else str(row["training_seed"]),
+            row["status"],
+            str(row["plant_samples"] or ""),
+            percent(row, "regret"),
+            number(row["J"], 6),
+        ]
+        for row in run_rows(results)
+    ]
+    return header, rows

@@ -56,6 +56,11 @@ class RunResult:
     greedy_J: float = float("nan")
 
     @property
+    def key(self) -> tuple[str, str, int | None]:
+        """Scenario, case and training seed."""
+        return self.scenario, self.case, self.seed
+
+    @property
     def J(self) -> float:
         """Mean cost per sample; infinite where it is no number."""
         cost = float(np.mean(self.indicators["J"]))

@@ -95,15 +95,27 @@ class StudyResults:
         """
         optimum = self.optimum(runs[0].scenario)
         if optimum is None:
-            return Estimate(float("nan"), None, None)
+            return Estimate(float("nan"))
         cost = np.mean([_paired(run, optimum) for run in runs], axis=0)
         return regret(cost, optimum.indicators["J"])
+
+    @cached_property
+    def regrets(self) -> dict[tuple[str, str, int | None], float]:
+        """Regret of every run by scenario, case and training seed; infinite where J is no number.
+
+        Scenarios whose J* is not known are not there.
+        """
+        return {
+            run.key: self.regret(run).value if np.isfinite(run.J) else float("inf")
+            for run in self.runs
+            if self.optimum(run.scenario) is not None
+        }
 
     def gap_closed(self, *runs: RunResult) -> Estimate:
         """(J_naive − J)/(J_naive − J*), likewise."""
         optimum, naive = self.optimum(runs[0].scenario), self.naive(runs[0].scenario)
         if optimum is None or naive is None:
-            return Estimate(float("nan"), None, None)
+            return Estimate(float("nan"))
         cost = np.mean([_paired(run, optimum) for run in runs], axis=0)
         return gap_closed(cost, _paired(naive, optimum), optimum.indicators["J"])
 

@@ -52,14 +52,14 @@ def run_rows(results: StudyResults) -> list[dict[str, Any]]:
     return rows
 
 
-def summary_rows(results: StudyResults) -> list[dict[str, Any]]:
-    """A row for each scenario and case, the least regret first (J where J* is not known).
+def summary_rows(results: StudyResults, *scenarios: str) -> list[dict[str, Any]]:
+    """A row for each scenario (all, if none is named) and case, the least J first.
 
     Medians are those of the middle runs (of both, where their number is even), so that the paired
     interval of the median regret is that of real runs.
     """
     rows = []
-    for scenario in results.scenarios:
+    for scenario in scenarios or results.scenarios:
         known = [
             _summary(results, runs)
             for case in results.cases
@@ -73,9 +73,8 @@ def _summary(results: StudyResults, runs: Sequence[RunResult]) -> dict[str, Any]
     ranked = sorted(runs, key=lambda run: run.J)
     middle = ranked[(len(ranked) - 1) // 2 : len(ranked) // 2 + 1]
     median = results.regret(*middle)
-    regrets = np.array([results.regret(run).value for run in ranked])
-    regrets[~np.isfinite([run.J for run in ranked])] = np.inf
-    spread = over_runs([regrets]) if len(runs) > 1 else Estimate(float(regrets[0]), None, None)
+    regrets = np.array([results.regrets.get(run.key, NAN) for run in ranked])
+    spread = over_runs([regrets]) if len(runs) > 1 else Estimate(float(regrets[0]))
     return {
         "scenario": runs[0].scenario,
         "case": runs[0].case,
@@ -109,7 +108,7 @@ def aggregate_rows(results: StudyResults) -> list[dict[str, Any]]:
     rows = []
     for case in results.cases if len(scenarios) > 1 else ():
         strata = [
-            np.array([results.regret(run).value for run in results.of(case, scenario)])
+            np.array([results.regrets[run.key] for run in results.of(case, scenario)])
             for scenario in scenarios
         ]
         if any(len(stratum) == 0 for stratum in strata):

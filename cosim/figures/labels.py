@@ -1,0 +1,73 @@
+"""Names at the ends of lines, in place of a legend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+
+from cosim.figures.style import plain
+
+Array = NDArray[np.float64]
+
+
+class EndLabel(NamedTuple):
+    """A line's name, the ordinate at which it ends (data coordinates), and its colour."""
+
+    text: str
+    y: float
+    color: str
+
+
+def label_ends(axes: Axes, labels: Sequence[EndLabel], size: float = 6.5) -> None:
+    """Write names right of the axes, each at its line's end, pushed apart where they overlap.
+
+    The limits and the scale of the ordinate must be set before.
+    """
+    if not labels:
+        return
+    height = axes.get_window_extent().height * 72 / axes.figure.dpi
+    low, high = (axes.transData.transform((0, y))[1] for y in axes.get_ylim())
+    wanted = np.array(
+        [(axes.transData.transform((0, item.y))[1] - low) / (high - low) for item in labels]
+    )
+    order = np.argsort(-np.clip(wanted, 0.0, 1.0), kind="stable")
+    placed = spread(np.clip(wanted, 0.0, 1.0)[order], 1.25 * size / height)
+    for position, index in zip(placed, order, strict=True):
+        item = labels[index]
+        end = float(np.clip(wanted[index], 0.0, 1.0))
+        axes.annotate(
+            plain(item.text),
+            xy=(1.0, end),
+            xytext=(1.035, position),
+            xycoords="axes fraction",
+            textcoords="axes fraction",
+            fontsize=size,
+            color=item.color,
+            va="center",
+            ha="left",
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": item.color, "linewidth": 0.5, "shrinkB": 0.0,
+                        "shrinkA": 0.5},
+        )  # fmt: skip
+
+
+def spread(positions: Array, gap: float) -> Array:
+    """Descending positions in [0, 1], moved as little as need be to be `gap` apart."""
+    placed: Array = positions.astype(np.float64)
+    for _ in range(200):
+        moved = False
+        for i in range(len(placed) - 1):
+            overlap = gap - (placed[i] - placed[i + 1])
+            if overlap > 1e-9:
+                placed[i] += overlap / 2
+                placed[i + 1] -= overlap / 2
+                moved = True
+        if not moved:
+            break
+    # Those that were pushed out come back in as one, if they fit.
+    placed += max(-placed[-1], 0.0) or -max(placed[0] - 1.0, 0.0)
+    return placed

@@ -47,8 +47,13 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
 
 def import_from_here() -> None:
     """Let `module:factory` name a module of the working directory too, after all others."""
-    if (folder := str(Path.cwd())) not in sys.path:
-        sys.path.append(folder)
+    import_from(Path.cwd())
+
+
+def import_from(folder: Path) -> None:
+    """Let `module:factory` name a module of a folder too, after all others."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
 
 
 def _made(name: str, target: str, scenario: Scenario) -> Controller:

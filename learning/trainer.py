@@ -85,7 +85,7 @@ class Trainer:
                 result.status,
                 log=to_csv(result.rows),
                 parameters=(folder / "parameters.toml").read_text("utf-8"),
-                plant_samples=samples,
+                plant_samples=result.plant_samples,
                 wall_seconds=time.perf_counter() - begin,
             )
 
@@ -120,8 +120,6 @@ class Trainer:
 def _run(training: Training) -> TrainingRun:
     import_from_here()
     algorithm = load_algorithm(training.algorithm)
-    if training.start != "naive":
-        raise ConfigurationError(f"start '{training.start}' is not known; there is naive")
     try:
         return TrainingRun(
             algorithm=training.algorithm,
@@ -130,6 +128,7 @@ def _run(training: Training) -> TrainingRun:
             seed=training.seed,
             configuration=algorithm.Configuration.from_dict(dict(training.settings)),
             controller=training.nmpc,
+            start=training.start,
             log_every=training.log_every,
             evaluate_every=training.evaluate_every,
             checkpoint_every=training.checkpoint_every,

@@ -12,6 +12,7 @@ from cosim.errors import StudyError
 from cosim.experiments.cases import BASELINES, Case, expand
 from cosim.experiments.document import DEFAULT, PerScenario, StudyTable, read, validate
 from cosim.experiments.protocols import Trainer, Training, registered_trainer
+from cosim.lookup import import_from
 from cosim.scenario import Scenario
 from cosim.scenario.loading import resolved
 from cosim.validation import suggestion
@@ -47,6 +48,7 @@ class Definition:
     def __init__(self, table: StudyTable, folder: Path, trainer: Trainer | None = None) -> None:
         self.table = table
         self.folder = folder.resolve()
+        import_from(self.folder)
         self.trainer = registered_trainer() if trainer is None else trainer
 
     @classmethod

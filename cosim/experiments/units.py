@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 import traceback
 from collections import OrderedDict
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 
 from cosim.errors import StudyError
@@ -13,6 +13,7 @@ from cosim.evaluation.provenance import code_hash
 from cosim.experiments.protocols import Progress, Trainer, Training
 from cosim.experiments.store import INDICATORS, Indicators
 from cosim.kpis import indicators
+from cosim.lookup import import_from
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
@@ -34,8 +35,7 @@ class Place:
     def enter(self) -> None:
         """Let foreign modules be imported; raises StudyError where the code is another."""
         for folder in self.folders:
-            if folder not in sys.path:
-                sys.path.append(folder)
+            import_from(Path(folder))
         if (here := code_hash(PACKAGES)) != self.code:
             raise StudyError(
                 f"a worker runs other code ({here}) than the study ({self.code}); install the same "

@@ -2,6 +2,7 @@
 
 import json
 
+from cosim import Study
 from cosim.errors import StudyError
 from cosim.experiments.protocols import Progress
 from tests.helpers.loop import Hold, Proportional
@@ -70,3 +71,27 @@ class ToyTrainer:
 
     def sources(self, target):
         return {}
+
+
+def document(**changes):
+    return {
+        "schema": 1,
+        "name": "toy",
+        "scenarios": ["paper"],
+        "training_seeds": {"first": 0, "count": 2},
+        "evaluation": {"seeds": 3, "steps": 30},
+        "curves": {"points": 4, "seeds": 2, "steps": 20},
+        "case": [
+            {
+                "name": "grow",
+                "algorithm": "grow",
+                "samples": 1200,
+                "settings": {"rate": [1.0, 2.0]},
+            },
+            {"controller": ["naive", "best"]},
+        ],
+    } | changes
+
+
+def study(folder=".", **changes):
+    return Study.from_dict(document(**changes), folder, trainer=ToyTrainer())

@@ -8,7 +8,7 @@ from cosim.experiments.layout import HEADER, lines
 from cosim.experiments.report import write_report
 from cosim.experiments.results import StudyResults
 from cosim.experiments.summary import aggregate_rows, summary_rows
-from tests.cosim.experiments.test_study import study
+from tests.helpers.toy_trainer import study
 
 CASES = [
     {"name": "grow", "algorithm": "grow", "samples": 2000, "settings": {"rate": [1.0, 9.0]}},

@@ -3,37 +3,13 @@
 import numpy as np
 import pytest
 
-from cosim import FmuPlant, Study, simulate
+from cosim import FmuPlant, simulate
 from cosim.errors import FailedRunsError, StudyError
 from cosim.experiments.results import StudyResults
 from tests.helpers.loop import Proportional
-from tests.helpers.toy_trainer import ToyTrainer
+from tests.helpers.toy_trainer import study
 
 TABLES = ("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "study.json")
-
-
-def document(**changes):
-    return {
-        "schema": 1,
-        "name": "toy",
-        "scenarios": ["paper"],
-        "training_seeds": {"first": 0, "count": 2},
-        "evaluation": {"seeds": 3, "steps": 30},
-        "curves": {"points": 4, "seeds": 2, "steps": 20},
-        "case": [
-            {
-                "name": "grow",
-                "algorithm": "grow",
-                "samples": 1200,
-                "settings": {"rate": [1.0, 2.0]},
-            },
-            {"controller": ["naive", "best"]},
-        ],
-    } | changes
-
-
-def study(folder=".", **changes):
-    return Study.from_dict(document(**changes), folder, trainer=ToyTrainer())
 
 
 def contents(folder):

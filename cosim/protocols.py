@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -101,32 +101,28 @@ The loop saturates the result.
 
 
 @dataclass(frozen=True)
-class Block:
+class SampleBlock:
     """K consecutive samples of a run, as columns; arrays are views that the loop overwrites later.
 
-    `first` is the number of the first sample. `states` (K, n), `actions` (K, m), `disturbances`
-    (K, p), `time` (K,) in s; `stage_cost`, `penalty`, `value` and `residual` (K,); `explored` and
-    `failed` (K,) bool; `prepare_time` and `feedback_time` (K,) in s; `status` K strings;
-    `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m), NaN where the controller
+    `first` is the number of the first sample. `columns` maps each name in `cosim.signals.SIGNALS`
+    to its values, (K,) or for a vector (K, n), which `block[name]` gives; `status` are K words;
+    `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m) are NaN where the controller
     gave none, or None if it never did in this block.
     """
 
     first: int
-    time: Array
-    states: Array
-    actions: Array
-    disturbances: Array
-    stage_cost: Array
-    penalty: Array
-    value: Array
-    residual: Array
-    explored: NDArray[np.bool_]
-    failed: NDArray[np.bool_]
-    status: list[str]
-    prepare_time: Array
-    feedback_time: Array
-    predicted_states: Array | None
-    predicted_actions: Array | None
+    columns: Mapping[str, Array]
+    status: Sequence[str]
+    predicted_states: Array | None = None
+    predicted_actions: Array | None = None
+
+    def __len__(self) -> int:
+        """Return the number of samples K."""
+        return len(self.status)
+
+    def __getitem__(self, name: str) -> Array:
+        """Values of a declared signal."""
+        return self.columns[name]
 
 
 class Recorder(Protocol):
@@ -142,7 +138,7 @@ class Recorder(Protocol):
     ) -> None:
         """Open the record; `units` maps each FMU variable's name to its unit."""
 
-    def record(self, block: Block) -> None:
+    def record(self, block: SampleBlock) -> None:
         """Append a block; copy what must outlive the call."""
 
     def close(self) -> None:
@@ -152,6 +148,13 @@ class Recorder(Protocol):
 def is_solver_failure(error: BaseException) -> bool:
     """Whether an exception is a controller's declared failure to solve its problem."""
     return bool(getattr(type(error), "is_solver_failure", False))
+
+
+def recover(controller: Controller, error: Exception) -> None:
+    """Reset a controller that declared this failure; raise every other error."""
+    if not is_solver_failure(error):
+        raise error
+    controller.reset()
 
 
 def controller_name(controller: Any) -> str:

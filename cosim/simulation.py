@@ -8,19 +8,20 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim import signals
 from cosim.errors import CosimError
 from cosim.protocols import (
-    Block,
     Controller,
     Exploration,
     Plant,
     Recorder,
+    SampleBlock,
     Solution,
     controller_name,
-    is_solver_failure,
+    recover,
 )
 from cosim.scenario import Scenario
-from cosim.trajectory import FALLBACK, Signal, Trajectory, signal_names
+from cosim.trajectory import FALLBACK, Signal, Trajectory
 
 Array = NDArray[np.float64]
 BLOCK = 500
@@ -73,7 +74,7 @@ def simulate(
     return run.trajectory()
 
 
-def _no_record(_: Block) -> None:
+def _no_record(_: SampleBlock) -> None:
     return None
 
 
@@ -92,81 +93,76 @@ class _Run:
         self._scenario: Scenario = plant.scenario
         self._exploration = exploration
         self._seed, self._steps = seed, steps
-        table = self._scenario.plant
-        self._states = np.empty((steps, len(table.states)))
-        self._actions = np.empty((steps, len(table.actions)))
-        self._disturbances = np.empty((steps, len(table.disturbances)))
-        self._stage_cost, self._penalty = np.empty(steps), np.empty(steps)
-        self._value, self._residual = np.full(steps, np.nan), np.full(steps, np.nan)
-        self._explored, self._failed = np.zeros(steps, bool), np.zeros(steps, bool)
-        self._prepare_time, self._feedback_time = np.empty(steps), np.empty(steps)
-        self._plant_time = np.empty(steps)
+        self._columns = {
+            kind.name: np.empty((steps, len(kind.names(self._scenario))) if kind.vector else steps)
+            for kind in signals.SIGNALS
+        }
         self._status: list[str] = []
-        self._time: Array = np.arange(steps, dtype=np.float64) * self._scenario.sampling_time
         self._predicted_states: Array | None = None
         self._predicted_actions: Array | None = None
         self._final_state: Array | None = None
 
-    def go(self, record: Callable[[Block], None], progress: Callable[[int], None] | None) -> None:
+    def go(
+        self, record: Callable[[SampleBlock], None], progress: Callable[[int], None] | None
+    ) -> None:
         keeps_predictions = record is not _no_record
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
         plant_seed, rng = spawn_seeds(self._seed)
         s = self._plant.reset(plant_seed)
         self._controller.reset()
         applied = self._scenario.reference_action
-        exploration = self._exploration
+        exploration, scenario = self._exploration, self._scenario
+        read, rows = [kind.of for kind in signals.SIGNALS], []
         for k in range(self._steps):
-            solution = self._solve(k, s)
-            action = applied if solution is None else solution.action
+            solution, *times = self._solve(s)
+            action, explores = applied if solution is None else solution.action, False
             if exploration is not None:
                 explored = exploration(action, rng)
                 # A failed sample draws its noise too, so that paired runs stay in step.
                 if solution is not None and explored is not None:
-                    self._explored[k] = True
-                    action = explored
+                    action, explores = explored, True
             if action.shape != shape:
                 raise CosimError(
                     f"{controller_name(self._controller)} gave an action of shape {action.shape}, "
                     f"not {shape}, at step {k}"
                 )
             applied = saturate(action)
-            self._states[k] = s
-            self._actions[k] = applied
             begin = perf_counter()
-            s, self._stage_cost[k], self._penalty[k], self._disturbances[k] = self._plant.step(
-                applied
-            )
-            self._plant_time[k] = perf_counter() - begin
+            step = self._plant.step(applied)
+            times.append(perf_counter() - begin)
+            time = k * scenario.sampling_time
+            sample = signals.Sample(scenario, time, s, applied, step, solution, explores, *times)
+            # Read now, since neither plant nor controller need keep what they returned.
+            rows.append([of(sample) for of in read])
+            s = step.s
             if keeps_predictions and solution is not None:
                 self._keep_prediction(k % BLOCK, solution)
             if (k + 1) % BLOCK == 0 or k + 1 == self._steps:
-                record(self._block(k // BLOCK * BLOCK, k + 1))
+                first = k // BLOCK * BLOCK
+                columns = self._columns.values()
+                for column, values in zip(columns, zip(*rows, strict=True), strict=True):
+                    column[first : k + 1] = values
+                rows.clear()
+                record(self._block(first, k + 1))
                 if progress is not None:
                     progress(k + 1)
         self._final_state = s
 
-    def _solve(self, k: int, s: Array) -> Solution | None:
+    def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
         """Prepare and feed back, timed apart; None if the controller declares a failure."""
         controller = self._controller
+        solution: Solution | None = None
         begin = middle = perf_counter()
         try:
             controller.prepare()
             middle = perf_counter()
             solution = controller.feedback(s)
-        except Exception as error:
-            if not is_solver_failure(error):
-                raise
             end = perf_counter()
-            self._status.append(FALLBACK)
-            self._failed[k] = True
-            controller.reset()
-            self._prepare_time[k], self._feedback_time[k] = middle - begin, end - middle
-            return None
-        end = perf_counter()
-        self._prepare_time[k], self._feedback_time[k] = middle - begin, end - middle
-        self._status.append(solution.status)
-        self._value[k], self._residual[k] = solution.value, solution.residual
-        return solution
+        except Exception as error:
+            end = perf_counter()
+            recover(controller, error)
+        self._status.append(FALLBACK if solution is None else solution.status)
+        return solution, middle - begin, end - middle
 
     def _keep_prediction(self, row: int, solution: Solution) -> None:
         states, actions = solution.predicted_states, solution.predicted_actions
@@ -178,67 +174,35 @@ class _Run:
         self._predicted_states[row] = states
         self._predicted_actions[row] = actions
 
-    def _block(self, first: int, end: int) -> Block:
+    def _block(self, first: int, end: int) -> SampleBlock:
         rows, count = slice(first, end), end - first
         states, actions = self._predicted_states, self._predicted_actions
         self._predicted_states = self._predicted_actions = None
-        return Block(
+        return SampleBlock(
             first=first,
-            time=self._time[rows],
-            states=self._states[rows],
-            actions=self._actions[rows],
-            disturbances=self._disturbances[rows],
-            stage_cost=self._stage_cost[rows],
-            penalty=self._penalty[rows],
-            value=self._value[rows],
-            residual=self._residual[rows],
-            explored=self._explored[rows],
-            failed=self._failed[rows],
+            columns={name: values[rows] for name, values in self._columns.items()},
             status=self._status[rows],
-            prepare_time=self._prepare_time[rows],
-            feedback_time=self._feedback_time[rows],
             predicted_states=None if states is None else states[:count],
             predicted_actions=None if actions is None else actions[:count],
         )
 
     def trajectory(self) -> Trajectory:
-        scenario, table = self._scenario, self._scenario.plant
-        cost_unit = self._plant.units[table.stage_cost]
-        violation = scenario.state_penalty.violation(self._states)
-        columns = [
-            self._time,
-            *self._states.T,
-            *self._actions.T,
-            *self._disturbances.T,
-            self._stage_cost,
-            self._penalty,
-            violation.sum(axis=1),
-            self._value,
-            self._residual,
-            self._explored.astype(float),
-            self._failed.astype(float),
-        ]
-        units = {"time": "s", "stage_cost": cost_unit, "penalty": cost_unit, "value": cost_unit}
-        units |= {name: self._plant.units[name] for name in scenario_variables(scenario)}
+        scenario = self._scenario
+        units = signals.signal_units(scenario, self._plant.units)
+        named, timing = {}, {}
+        for kind in signals.SIGNALS:
+            values = self._columns[kind.name].reshape(self._steps, -1)
+            if kind.clock:
+                timing[kind.name.removesuffix("_time")] = values[:, 0]
+                continue
+            for name, column in zip(kind.names(scenario), values.T, strict=True):
+                named[name] = Signal(name, units[name], np.ascontiguousarray(column))
         return Trajectory(
             scenario=scenario,
-            signals={
-                name: Signal(name, units.get(name, ""), np.ascontiguousarray(column))
-                for name, column in zip(signal_names(scenario), columns, strict=True)
-            },
+            signals=named,
             status=self._status,
-            timing={
-                "prepare": self._prepare_time,
-                "feedback": self._feedback_time,
-                "plant": self._plant_time,
-            },
+            timing=timing,
             final_state=self._final_state,
             seed=self._seed,
             controller=controller_name(self._controller),
         )
-
-
-def scenario_variables(scenario: Scenario) -> list[str]:
-    """Names of states, actions and disturbances."""
-    plant = scenario.plant
-    return [*plant.states, *plant.actions, *plant.disturbances]

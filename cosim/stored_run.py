@@ -6,11 +6,10 @@ from pathlib import Path
 
 from cosim.comparison import RunSignals
 from cosim.errors import ComparisonError
+from cosim.signals import clocked
 from cosim.trajectory import Signal, read_signals
 
 TRAJECTORY = "trajectory.csv"
-# Read off the clock: two equal runs differ in them.
-_MEASURED = ("prepare_time", "feedback_time")
 
 
 def load_run(path: str | Path) -> RunSignals:
@@ -33,6 +32,6 @@ def load_run(path: str | Path) -> RunSignals:
     signals = {
         name: Signal(name, recording.units[name], values)
         for name, values in recording.signals.items()
-        if values.ndim == 1 and name not in _MEASURED
+        if values.ndim == 1 and name not in clocked()
     }
     return RunSignals(str(path), signals, recording.status)

@@ -17,6 +17,7 @@ from controllers.storage import write_atomically
 from cosim.errors import TrajectoryError
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
+from cosim.signals import signal_names, whole
 
 Array = NDArray[np.float64]
 STATUS = "status"
@@ -60,7 +61,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         """Check that every signal is there and has one value per sample."""
-        expected = signal_names(self.scenario)
+        expected = signal_names(self.scenario, required=True)
         if missing := [name for name in expected if name not in self.signals]:
             raise TrajectoryError(f"the trajectory lacks the signal {', '.join(missing)}")
         samples = len(self.status)
@@ -141,10 +142,10 @@ class Trajectory:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        signals = list(self.signals.values())
+        signals, counted = list(self.signals.values()), whole()
         writer.writerow([*(signal.header for signal in signals), STATUS])
         columns = [
-            (signal.values.astype(int) if signal.name in ("explored", "failed") else signal.values)
+            (signal.values.astype(int) if signal.name in counted else signal.values)
             for signal in signals
         ]
         writer.writerows(
@@ -164,24 +165,6 @@ class Trajectory:
         lines = (",".join(f"{1e6 * value:.3f}" for value in row) for row in rows)
         write_atomically(path, "\n".join([header, *lines, ""]))
         return Path(path)
-
-
-def signal_names(scenario: Scenario) -> list[str]:
-    """Names of a run's signals, in the order of the CSV's columns."""
-    plant = scenario.plant
-    return [
-        "time",
-        *plant.states,
-        *plant.actions,
-        *plant.disturbances,
-        "stage_cost",
-        "penalty",
-        "violation",
-        "value",
-        "residual",
-        "explored",
-        "failed",
-    ]
 
 
 def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from controllers.errors import QpError
 from controllers.rti.solution import LinearisationPoint
-from cosim.protocols import Step
+from cosim.protocols import Step, recover
 from cosim.scenario import Scenario
 from learning.exploration import Strategy
 from learning.protocols import Algorithm, LearnableController, LearnableSolution, Transition
@@ -162,33 +163,32 @@ class Interaction:
         self.restart()
 
     def _solve(self) -> LearnableSolution | None:
-        try:
+        """V(s) and π(s) at the present state, prepared anew."""
+
+        def solve() -> LearnableSolution:
             self._controller.prepare()
             self._point = self._controller.linearisation_point
-        except QpError:
-            self._fail()
-            return None
-        return self._feedback()
+            return self._controller.feedback(self.s)
+
+        return self._attempt(solve)
 
     def _feedback(self) -> LearnableSolution | None:
-        try:
-            return self._controller.feedback(self.s)
-        except QpError:
-            self._fail()
-            return None
-
-    def _fail(self) -> None:
-        self.failures += 1
-        self._controller.reset()
-        self._point = None
+        """V(s) and π(s) at the present state, as prepared."""
+        return self._attempt(lambda: self._controller.feedback(self.s))
 
     def _action_value(self, s: Vector, a: Vector) -> LearnableSolution | None:
         """Q(s, a) where the algorithm asks for it; moves the guess towards the applied action."""
+        return self._attempt(lambda: self._controller.feedback(s, a))
+
+    def _attempt(self, solve: Callable[[], LearnableSolution]) -> LearnableSolution | None:
+        """What `solve` returns, or None where the controller fails, which is counted."""
         try:
-            return self._controller.feedback(s, a)
-        except QpError:
-            self._fail()
-            return None
+            return solve()
+        except Exception as error:
+            recover(self._controller, error)
+        self.failures += 1
+        self._point = None
+        return None
 
     def _perturbed(self, gradient: Vector) -> Vector:
         """π(s) of the cost with a linear term on the actions added to b_l."""

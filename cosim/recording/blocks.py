@@ -3,37 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import Any
 
 import numpy as np
 
-from cosim.protocols import Array, Block
-
-_PREDICTIONS = ("predicted_states", "predicted_actions")
+from cosim.protocols import Array, SampleBlock
 
 
-def joined(blocks: Sequence[Block]) -> Block:
+def joined(blocks: Sequence[SampleBlock]) -> SampleBlock:
     """Consecutive blocks as one; rows of a block without predictions are NaN."""
-    columns: dict[str, Any] = {
-        field.name: np.concatenate([getattr(block, field.name) for block in blocks])
-        for field in fields(Block)
-        if field.name not in ("first", "status", *_PREDICTIONS)
-    }
-    predictions: dict[str, Any] = {name: _predictions(blocks, name) for name in _PREDICTIONS}
-    status = [word for block in blocks for word in block.status]
-    return Block(first=blocks[0].first, status=status, **columns, **predictions)
+    return SampleBlock(
+        first=blocks[0].first,
+        columns={
+            name: np.concatenate([block[name] for block in blocks]) for name in blocks[0].columns
+        },
+        status=[word for block in blocks for word in block.status],
+        predicted_states=_predictions(blocks, "predicted_states"),
+        predicted_actions=_predictions(blocks, "predicted_actions"),
+    )
 
 
-def _predictions(blocks: Sequence[Block], name: str) -> Array | None:
-    shape = next((getattr(b, name).shape[1:] for b in blocks if getattr(b, name) is not None), None)
+def _predictions(blocks: Sequence[SampleBlock], name: str) -> Array | None:
+    parts = [getattr(block, name) for block in blocks]
+    shape = next((part.shape[1:] for part in parts if part is not None), None)
     if shape is None:
         return None
     return np.concatenate(
         [
-            np.full((len(block.time), *shape), np.nan)
-            if getattr(block, name) is None
-            else getattr(block, name)
-            for block in blocks
+            np.full((len(block), *shape), np.nan) if part is None else part
+            for block, part in zip(blocks, parts, strict=True)
         ]
     )

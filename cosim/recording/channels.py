@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import cycle
 from math import inf, isfinite
@@ -10,13 +10,26 @@ from math import inf, isfinite
 import numpy as np
 import rerun as rr
 
-from cosim.protocols import Array, Block
+from cosim import signals
+from cosim.protocols import Array, SampleBlock
 from cosim.recording.palette import BOUND, SERIES
 from cosim.scenario import Scenario
+from cosim.signals import SignalKind
 
 Range = tuple[float, float]
 BUNDLES = ("disturbances", "step_time", "unseen")
 """Groups whose signals are one entity: each entity costs 40 bytes a sample beside its numbers."""
+HELD = ("actions", "disturbances")
+"""Signals that hold until the next sample."""
+COLORS = {
+    "penalty": SERIES[1],
+    "prepare_time": SERIES[5],
+    "feedback_time": SERIES[1],
+    "violation": BOUND,
+    "value": SERIES[2],
+    "residual": SERIES[3],
+}
+"""Colour of a scalar signal, else the first of the series."""
 
 
 @dataclass(frozen=True)
@@ -95,62 +108,43 @@ def escaped(name: str) -> str:
 
 def run_channels(scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:
     """Every signal of a run in the order of `run_columns`; a unit not known is left empty."""
-    plant, told = scenario.plant, scenario.controller
-    bounds = scenario.bounds
-    cost = units.get(plant.stage_cost, "")
-    state_rows = zip(
-        plant.states, bounds.state_lower, bounds.state_upper, told.reference_state, strict=True
-    )
-    action_rows = zip(
-        plant.actions, bounds.action_lower, bounds.action_upper, told.reference_action, strict=True
-    )
-    colors = cycle(SERIES)
-    states = [
-        Channel("states", name, units.get(name, ""), next(colors), (low, high), reference)
-        for name, low, high, reference in state_rows
-    ]
-    actions = [
-        Channel("actions", name, units.get(name, ""), next(colors), (low, high), reference, True)
-        for name, low, high, reference in action_rows
-    ]
-    disturbances = [
-        Channel("disturbances", name, units.get(name, ""), color, step=True)
-        for name, color in zip(plant.disturbances, cycle(SERIES))
-    ]
-    return [
-        *states,
-        *actions,
-        *disturbances,
-        Channel("costs", "stage_cost", cost, SERIES[0]),
-        Channel("costs", "penalty", cost, SERIES[1]),
-        Channel("step_time", "prepare_time", "s", SERIES[5], tail=0.05),
-        Channel("step_time", "feedback_time", "s", SERIES[1], tail=0.05),
-        Channel("unseen", "violation", "", BOUND),
-        Channel("unseen", "value", cost, SERIES[2]),
-        Channel("unseen", "residual", "", SERIES[3]),
-        Channel("unseen", "explored", "", SERIES[3]),
-        Channel("unseen", "failed", "", SERIES[1]),
-        Channel("unseen", "time", "s", SERIES[5]),
-    ]
+    bounds, told = scenario.bounds, scenario.controller
+    known = {
+        "states": (bounds.state_lower, bounds.state_upper, told.reference_state),
+        "actions": (bounds.action_lower, bounds.action_upper, told.reference_action),
+    }
+    measured = cycle(SERIES)
+    channels = []
+    for kind in _recorded():
+        colors = measured if kind.name in known else cycle(SERIES)
+        for i, (name, unit) in enumerate(
+            zip(kind.names(scenario), kind.units(scenario, units), strict=True)
+        ):
+            low, high, reference = (
+                (values[i] for values in known[kind.name])
+                if kind.name in known
+                else (-inf, inf, None)
+            )
+            color = next(colors)
+            channels.append(
+                Channel(
+                    group=str(kind.group),
+                    name=name,
+                    unit=unit,
+                    color=COLORS.get(name, color),
+                    bounds=(low, high),
+                    reference=reference,
+                    step=kind.name in HELD,
+                    tail=0.05 if kind.clock else 0.0,
+                )
+            )
+    return channels
 
 
-def run_columns(block: Block, violation: Callable[[Array], Array]) -> list[Array]:
-    """Values of a block, (K,) for each channel of `run_channels`.
+def run_columns(block: SampleBlock) -> list[Array]:
+    """Values of a block, (K,) for each channel of `run_channels`."""
+    return [column for kind in _recorded() for column in block[kind.name].reshape(len(block), -1).T]
 
-    `violation` maps states (K, n) to the violation of each bound, (K, n).
-    """
-    return [
-        *block.states.T,
-        *block.actions.T,
-        *block.disturbances.T,
-        block.stage_cost,
-        block.penalty,
-        block.prepare_time,
-        block.feedback_time,
-        violation(block.states).sum(axis=1),
-        block.value,
-        block.residual,
-        block.explored.astype(np.float64),
-        block.failed.astype(np.float64),
-        block.time,
-    ]
+
+def _recorded() -> list[SignalKind]:
+    return [kind for kind in signals.SIGNALS if kind.group is not None]

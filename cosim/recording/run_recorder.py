@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from cosim.protocols import Block, Controller, controller_name
+from cosim.protocols import Controller, SampleBlock, controller_name
 from cosim.recording import diagram
 from cosim.recording.blocks import joined
 from cosim.recording.blueprint import run_blueprint
@@ -38,7 +38,7 @@ class RerunRecorder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._stream: Stream | None = None
-        self._pending: list[Block] = []
+        self._pending: list[SampleBlock] = []
 
     def start(
         self,
@@ -53,7 +53,6 @@ class RerunRecorder:
         theta = str(getattr(getattr(controller, "parameters", None), "hash", "none"))
         self._duration = steps * scenario.sampling_time
         self._channels = run_channels(scenario, units)
-        self._violation = scenario.state_penalty.violation
         self._horizon: Horizon | None = None
         self._status: str | None = None
         stream = Stream(self.path, f"{name} on {scenario.name}, seed {seed}")
@@ -75,10 +74,10 @@ class RerunRecorder:
         self._declare(stream)
         self._stream = stream
 
-    def record(self, block: Block) -> None:
+    def record(self, block: SampleBlock) -> None:
         """Append K samples; they reach the file when `ROWS` have come together."""
         self._pending.append(deepcopy(block))
-        if sum(len(pending.time) for pending in self._pending) >= ROWS:
+        if sum(map(len, self._pending)) >= ROWS:
             self._send()
 
     def close(self) -> None:
@@ -96,10 +95,10 @@ class RerunRecorder:
             return
         stream, block = self._stream, joined(self._pending)
         self._pending.clear()
-        samples = np.arange(block.first, block.first + len(block.time))
-        times = sample_times(samples, block.time)
-        ends = sample_times(samples[[0, -1]], block.time[[0, -1]])
-        columns = run_columns(block, self._violation)
+        samples = np.arange(block.first, block.first + len(block))
+        times = sample_times(samples, block["time"])
+        ends = sample_times(samples[[0, -1]], block["time"][[0, -1]])
+        columns = run_columns(block)
         for i, values in enumerate(columns):
             self._channels[i] = self._channels[i].with_values(values)
         for entity, rows in self._entities().items():
@@ -109,7 +108,7 @@ class RerunRecorder:
             # Two rows a block are enough to draw a constant line.
             stream.scalars(entity, ends, np.full(2, bound))
         with np.errstate(divide="ignore", invalid="ignore"):
-            stream.scalars("display/log_residual", times, np.log10(block.residual))
+            stream.scalars("display/log_residual", times, np.log10(block["residual"]))
         self._changes_of_status(stream, samples, block)
         predicted = self._horizon is not None
         self._predictions(stream, times, block)
@@ -152,15 +151,17 @@ class RerunRecorder:
             "solver/status", rr.StateConfiguration(values=["solved"], colors=[packed(GOOD)])
         )
 
-    def _changes_of_status(self, stream: Stream, samples: np.ndarray, block: Block) -> None:
+    def _changes_of_status(self, stream: Stream, samples: np.ndarray, block: SampleBlock) -> None:
         before = [self._status, *block.status[:-1]]
         rows = [i for i, status in enumerate(block.status) if status != before[i]]
         self._status = block.status[-1]
         if rows:
             states = rr.StateChange.columns(state=[drawable(block.status[i]) for i in rows])
-            stream.columns("solver/status", sample_times(samples[rows], block.time[rows]), states)
+            stream.columns(
+                "solver/status", sample_times(samples[rows], block["time"][rows]), states
+            )
 
-    def _predictions(self, stream: Stream, times: list[rr.TimeColumn], block: Block) -> None:
+    def _predictions(self, stream: Stream, times: list[rr.TimeColumn], block: SampleBlock) -> None:
         states, actions = block.predicted_states, block.predicted_actions
         if states is None or actions is None:
             return

@@ -4,7 +4,8 @@ import pytest
 from cosim import FmuPlant, Scenario, simulate
 from cosim.kpis import displaced, indicators, input_effort, settling_time
 from cosim.lookup import build_controller
-from cosim.trajectory import Signal, Trajectory, signal_names
+from cosim.signals import signal_names
+from cosim.trajectory import Signal, Trajectory
 from tests.helpers.loop import Hold, Proportional
 
 

@@ -145,7 +145,7 @@ class Recorder:
     def record(self, block):
         if block.first == self._fail_at:
             raise OSError("disk full")
-        self.blocks.append((block.first, block.states.copy(), list(block.status), block))
+        self.blocks.append((block.first, block["states"].copy(), list(block.status), block))
 
     def close(self):
         self.calls.append(("close",))

@@ -3,7 +3,8 @@ import pytest
 
 from cosim import FmuPlant, simulate
 from cosim.errors import TrajectoryError
-from cosim.trajectory import Signal, Trajectory, read_csv, signal_names
+from cosim.signals import signal_names
+from cosim.trajectory import Signal, Trajectory, read_csv
 from tests.helpers.loop import Proportional
 
 

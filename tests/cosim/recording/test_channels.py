@@ -3,9 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.penalty import Penalty
 from cosim.recording.channels import Channel, run_channels, run_columns
-from cosim.trajectory import signal_names
+from cosim.signals import signal_names
 
 numbers = st.floats(-1e6, 1e6)
 
@@ -51,10 +50,7 @@ def test_channels_and_columns_cover_the_trajectorys_signals(paper, units, rng):
     from tests.helpers.blocks import random_block
 
     channels = run_channels(paper, units)
-    violation = Penalty(
-        paper.state_lower, paper.state_upper, paper.penalty_linear, paper.penalty_quadratic
-    ).violation
-    columns = run_columns(random_block(paper, rng), violation)
+    columns = run_columns(random_block(paper, rng))
     assert len(channels) == len(columns)
     names = [c.name for c in channels]
     assert set(signal_names(paper)) <= set(names)

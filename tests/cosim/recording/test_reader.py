@@ -27,8 +27,8 @@ def test_the_summary_has_units_and_ranges(tmp_path, paper, rng, units):
     assert summary["statuses"] == {"solved": 10}
     assert summary["signals"]["X2"] == {
         "unit": "%",
-        "minimum": block.states[:, 0].min(),
-        "maximum": block.states[:, 0].max(),
+        "minimum": block["states"][:, 0].min(),
+        "maximum": block["states"][:, 0].max(),
     }
     assert summary["signals"]["residual"]["minimum"] is None
 

@@ -47,7 +47,7 @@ def test_times_are_those_of_the_loop_and_predictions_those_of_the_controller(
     blocks = [random_block(paper, rng, first, 700) for first in range(0, 4900, 700)]
     recording = recorded(tmp_path / "run.rrd", paper, blocks, units, 4900)
     for name in ("prepare_time", "feedback_time"):
-        expected = np.concatenate([getattr(block, name) for block in blocks])
+        expected = np.concatenate([block[name] for block in blocks])
         assert recording.signals[name].tobytes() == expected.tobytes()
     states = np.concatenate([block.predicted_states for block in blocks])
     actions = np.concatenate([block.predicted_actions for block in blocks])
@@ -59,11 +59,11 @@ def test_times_are_those_of_the_loop_and_predictions_those_of_the_controller(
 
 def test_a_block_that_the_loop_overwrites_is_recorded_as_it_was(tmp_path, paper, rng):
     block = random_block(paper, rng)
-    before = block.states.copy()
+    before = block["states"].copy()
     recorder = RerunRecorder(tmp_path / "run.rrd")
     recorder.start(paper, CONTROLLER, 0, 10, {})
     recorder.record(block)
-    block.states[:] = 0.0
+    block["states"][:] = 0.0
     recorder.close()
     recording = read_recording(tmp_path / "run.rrd")
     assert np.array_equal(recording.signals["X2"], before[:, 0])
@@ -116,8 +116,8 @@ def test_names_and_units_of_any_spelling_come_back(tmp_path, foreign, rng):
     block = random_block(foreign, rng)
     units = {"tank[1].level": "m³", "der(x)/dt": "∇"}
     recording = recorded(tmp_path / "run.rrd", foreign, [block], units)
-    assert np.array_equal(recording.signals["tank[1].level"], block.states[:, 0])
-    assert np.array_equal(recording.signals["der(x)/dt"], block.actions[:, 0])
+    assert np.array_equal(recording.signals["tank[1].level"], block["states"][:, 0])
+    assert np.array_equal(recording.signals["der(x)/dt"], block["actions"][:, 0])
     assert recording.units["tank[1].level"] == "m³"
     assert recording.units["der(x)/dt"] == "∇"
 
@@ -137,8 +137,9 @@ def test_the_layout_comes_before_the_data(tmp_path, paper, rng):
 
 def test_a_run_that_outgrows_the_layout_gets_another(tmp_path, paper, rng):
     first = random_block(paper, rng, 0, 2000)
-    within = replace(first, first=2000, time=first.time + first.time[-1] + 60.0)
-    beyond = replace(within, states=first.states * 100.0)
+    later = {**first.columns, "time": first["time"] + first["time"][-1] + 60.0}
+    within = replace(first, first=2000, columns=later)
+    beyond = replace(within, columns=later | {"states": first["states"] * 100.0})
     for last, layouts in ((within, 1), (beyond, 2)):
         recorded(tmp_path / "run.rrd", paper, [first, last], steps=4000)
         assert len(RrdReader(tmp_path / "run.rrd").blueprints()) == layouts

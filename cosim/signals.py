@@ -1,0 +1,120 @@
+"""The signals of a sample, declared once: simulation, CSV, recording, readers and units follow.
+
+To add a signal, add a line to `SIGNALS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import nan
+from typing import Literal, NamedTuple
+
+from cosim.protocols import Array, Solution, Step
+from cosim.scenario import Scenario
+
+Group = Literal["states", "actions", "disturbances", "costs", "step_time", "unseen"]
+COST = "unit of the stage cost"
+
+
+class Sample(NamedTuple):
+    """What the loop knows of a sample once the plant has stepped.
+
+    On the `scenario`: `time` in s, the measured state `s` (n,), the applied `action` (m,), the
+    plant's `step`, the controller's `solution`, None where it failed, whether the sample
+    `explored`, and what the clock said: `prepare_time`, `feedback_time`, `plant_time` in s.
+    """
+
+    scenario: Scenario
+    time: float
+    s: Array
+    action: Array
+    step: Step
+    solution: Solution | None
+    explored: bool
+    prepare_time: float
+    feedback_time: float
+    plant_time: float
+
+
+@dataclass(frozen=True)
+class SignalKind:
+    """A declared signal: its `name`, how its value comes `of` a sample, its `unit`.
+
+    A `vector` is a signal per variable that the scenario's plant names under `name`, in the
+    variable's unit; `of` then gives all of them. `group` is where a recording shows it, None if it
+    is not recorded; `whole` marks 0 or 1, `clock` what a clock measured, which stays out of the
+    trajectory's file; `optional` signals may be missing from a file.
+    """
+
+    name: str
+    of: Callable[[Sample], float | list[float]]
+    unit: str = ""
+    group: Group | None = "unseen"
+    vector: bool = False
+    whole: bool = False
+    clock: bool = False
+    optional: bool = False
+
+    def names(self, scenario: Scenario) -> tuple[str, ...]:
+        """Names of the signals, one but for a vector."""
+        return getattr(scenario.plant, self.name) if self.vector else (self.name,)
+
+    def units(self, scenario: Scenario, known: Mapping[str, str]) -> tuple[str, ...]:
+        """Unit of each; `known` maps FMU variables to theirs, and one not known is left empty."""
+        if self.vector:
+            return tuple(known.get(name, "") for name in self.names(scenario))
+        return (known.get(scenario.plant.stage_cost, "") if self.unit == COST else self.unit,)
+
+
+def _violation(sample: Sample) -> float:
+    return sample.scenario.state_penalty.total_violation(sample.s.tolist())
+
+
+SIGNALS: tuple[SignalKind, ...] = (
+    SignalKind("time", lambda x: x.time, "s"),
+    SignalKind("states", lambda x: x.s.tolist(), group="states", vector=True),
+    SignalKind("actions", lambda x: x.action.tolist(), group="actions", vector=True),
+    SignalKind(
+        "disturbances", lambda x: x.step.disturbance.tolist(), group="disturbances", vector=True
+    ),
+    SignalKind("stage_cost", lambda x: x.step.stage_cost, COST, "costs"),
+    SignalKind("penalty", lambda x: x.step.penalty, COST, "costs"),
+    SignalKind("violation", _violation),
+    SignalKind("value", lambda x: nan if x.solution is None else x.solution.value, COST),
+    SignalKind("residual", lambda x: nan if x.solution is None else x.solution.residual),
+    SignalKind("explored", lambda x: x.explored, whole=True),
+    SignalKind("failed", lambda x: x.solution is None, whole=True),
+    SignalKind("prepare_time", lambda x: x.prepare_time, "s", "step_time", clock=True),
+    SignalKind("feedback_time", lambda x: x.feedback_time, "s", "step_time", clock=True),
+    SignalKind("plant_time", lambda x: x.plant_time, "s", None, clock=True),
+)
+
+
+def signal_names(scenario: Scenario, *, required: bool = False) -> list[str]:
+    """Names of a run's signals, in the order of the CSV's columns; with `required` those alone."""
+    return [
+        name
+        for kind in SIGNALS
+        if not kind.clock and not (required and kind.optional)
+        for name in kind.names(scenario)
+    ]
+
+
+def signal_units(scenario: Scenario, known: Mapping[str, str]) -> dict[str, str]:
+    """Unit of each signal by name; `known` maps FMU variables to theirs."""
+    return {
+        name: unit
+        for kind in SIGNALS
+        for name, unit in zip(kind.names(scenario), kind.units(scenario, known), strict=True)
+    }
+
+
+def clocked() -> frozenset[str]:
+    """Names of the signals that a clock measured: two equal runs differ in them."""
+    return frozenset(kind.name for kind in SIGNALS if kind.clock)
+
+
+def whole() -> frozenset[str]:
+    """Names of the signals that are 0 or 1."""
+    return frozenset(kind.name for kind in SIGNALS if kind.whole)

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+import cosim.signals
+from cosim import FmuPlant, simulate
+from cosim.comparison import compare
+from cosim.errors import TrajectoryError
+from cosim.recording import RerunRecorder, read_recording
+from cosim.signals import SIGNALS, SignalKind, signal_names
+from cosim.stored_run import load_run
+from cosim.trajectory import read_csv
+from tests.helpers.loop import Failing, Proportional
+
+TOY = SignalKind("distance", lambda x: x.s[0] - 25.0, "%", "costs", optional=True)
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """A signal more, declared in the one place there is."""
+    monkeypatch.setattr(cosim.signals, "SIGNALS", (*SIGNALS, TOY))
+
+
+def run(folder, scenario):
+    recorder = RerunRecorder(folder / "run.rrd")
+    with FmuPlant(scenario) as plant:
+        trajectory = simulate(plant, Proportional(scenario), 30, 1, recorder=recorder)
+    trajectory.write_csv(folder / "trajectory.csv")
+    return trajectory
+
+
+def test_a_signal_declared_in_one_place_is_simulated_stored_recorded_and_read(toy, tmp_path, paper):
+    trajectory = run(tmp_path, paper)
+    expected = trajectory.states[:, 0] - 25.0
+    np.testing.assert_array_equal(trajectory["distance"], expected)
+    stored = read_csv(tmp_path / "trajectory.csv", paper)
+    np.testing.assert_array_equal(stored["distance"], expected)
+    assert stored.signals["distance"].header == "distance [%]"
+    recording = read_recording(tmp_path / "run.rrd")
+    np.testing.assert_array_equal(recording.signals["distance"], expected)
+    assert recording.units["distance"] == "%"
+    both = load_run(tmp_path), load_run(tmp_path / "run.rrd")
+    assert compare(*both).equal
+
+
+def test_a_file_from_before_a_signal_was_declared_is_still_read(tmp_path, paper, monkeypatch):
+    run(tmp_path, paper)
+    monkeypatch.setattr(cosim.signals, "SIGNALS", (*SIGNALS, TOY))
+    stored = read_csv(tmp_path / "trajectory.csv", paper)
+    assert "distance" in signal_names(paper)
+    with pytest.raises(TrajectoryError, match="no signal 'distance'"):
+        stored["distance"]
+
+
+def test_names_are_unique_and_every_vector_has_a_signal_per_variable(paper):
+    names = signal_names(paper)
+    assert len(set(names)) == len(names) == 16
+    for kind in ("states", "actions", "disturbances"):
+        assert set(getattr(paper.plant, kind)) <= set(names)
+
+
+def test_a_failed_sample_has_no_value_and_no_residual(paper):
+    with FmuPlant(paper) as plant:
+        trajectory = simulate(plant, Failing(paper, [2]), 5, 0)
+    assert np.flatnonzero(trajectory["failed"]).tolist() == [2]
+    assert np.flatnonzero(np.isnan(trajectory["value"])).tolist() == [2]

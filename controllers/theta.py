@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Literal
 
 import casadi as ca
@@ -15,6 +15,13 @@ from controllers.errors import ParameterError
 from controllers.problem import Problem
 
 Vector = NDArray[np.float64]
+
+
+@cache
+def upper_triangle(dimension: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of a matrix's upper triangle, row by row: the order of packed entries."""
+    rows, columns = np.triu_indices(dimension)
+    return rows, columns
 
 
 @dataclass(frozen=True)
@@ -71,14 +78,14 @@ class ThetaBlock:
             return array.reshape(-1)
         if not np.array_equal(array, array.T):
             raise ParameterError(f"θ block {self.name} must be symmetric: {array.tolist()}")
-        return array[np.triu_indices(self.dimension)]
+        return array[upper_triangle(self.dimension)]
 
     def unpack(self, packed: Vector) -> Vector:
         """Value of the block in its own shape from its packed entries."""
         if not self.symmetric:
             return packed.reshape(self.shape).copy()
         matrix = np.empty(self.shape)
-        rows, columns = np.triu_indices(self.dimension)
+        rows, columns = upper_triangle(self.dimension)
         matrix[rows, columns] = matrix[columns, rows] = packed
         return matrix
 
@@ -114,7 +121,7 @@ class ThetaBlocks:
         names: list[str] = []
         for block in self.blocks:
             if block.symmetric:
-                rows, columns = np.triu_indices(block.dimension)
+                rows, columns = upper_triangle(block.dimension)
                 names += [f"{block.name}[{i},{j}]" for i, j in zip(rows, columns, strict=True)]
             elif block.kind == "scalar":
                 names.append(block.name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
 
 from controllers.qp.problem import QpSolution, SoftQp
 
@@ -25,16 +26,23 @@ def kkt_solve(
     the system is singular (LICQ fails) it is solved by least squares.
     """
     held, at_limit, violated = active
-    free = np.flatnonzero(~held)
-    equal, outside = qp.rows[at_limit][:, free], qp.rows[violated][:, free]
-    size, count = free.size, equal.shape[0]
-    kkt = np.zeros((size + count, size + count))
-    kkt[:size, :size] = qp.H[np.ix_(free, free)] + 2 * (outside.T * qp.W[violated]) @ outside
+    free, equal, outside = ~held, qp.rows[at_limit], qp.rows[violated]
+    bound = held.any()
+    H = qp.H
+    if bound:
+        H, equal, outside = H[np.ix_(free, free)], equal[:, free], outside[:, free]
+    size, count = len(H), len(equal)
+    # Column-major, as LAPACK wants it.
+    kkt = np.zeros((size + count, size + count), order="F")
+    right = np.empty((size + count, len(seeds)), order="F")
+    kkt[:size, :size] = H
+    if len(outside):
+        kkt[:size, :size] += 2 * (outside.T * qp.W[violated]) @ outside
     kkt[:size, size:], kkt[size:, :size] = equal.T, equal
-    right = np.concatenate([seeds[:, free], limits[:, at_limit]], axis=1).T
-    try:
-        answer = np.linalg.solve(kkt, right)
-    except np.linalg.LinAlgError:
+    right[:size] = (seeds[:, free] if bound else seeds).T
+    right[size:] = limits[:, at_limit].T
+    _, _, answer, status = dgesv(kkt, right)
+    if status != 0:
         answer = np.linalg.lstsq(kkt, right)[0]
     v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)
     v[:, free], lam[:, at_limit] = answer[:size].T, answer[size:].T

@@ -41,8 +41,9 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
 
     Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta; the QP's
     A, B, r, L, q, L_N, q_N are read from the preparation's memory. Results: xi (n, N+1), t (n, N),
-    chi (n, N+1), value.
-    The costates χ solve the adjoint recursion, so χ_0 is the gradient of the value in s.
+    chi (n, N+1), value. The costates χ solve the adjoint recursion, so χ_0 is the gradient of the
+    value in s. The solution shifted by one stage is the next point of linearisation: next_x (n, N),
+    next_u (m, N) in absolute units, next_chi (n, N), the costates of stages that weigh 1/γ as much.
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
     symbols = SymbolicTheta.of(problem, blocks)
@@ -81,6 +82,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
         else:
             costate += lam[:, k - 1]
         chi.insert(0, costate)
+    u_s = ca.DM(problem.reference_action)
     return stacked(
         "readout",
         {
@@ -102,6 +104,9 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "t": ca.horzcat(*t),
             "chi": ca.horzcat(*chi),
             "value": value,
+            "next_x": ca.horzcat(*(state + x_s for state in xi[1:])),
+            "next_u": ca.horzcat(v[:, 1:], v[:, -1]) + ca.repmat(u_s, 1, horizon),
+            "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
         {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
         | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N")},

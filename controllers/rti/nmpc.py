@@ -74,6 +74,7 @@ class RtiNmpc:
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
         self._u = self._prepare.inputs["u"].reshape(horizon, m)
         self._costates = np.zeros((horizon, n))
+        self._value = self._readout.slices["value"].start
         self._constant = 0.0
         self.parameters = parameters
         self.reset()
@@ -148,12 +149,8 @@ class RtiNmpc:
         linearised, needs no state beyond the predicted x_N.
         """
         if self._pending is not None:
-            last, self._pending = self._pending, None
-            self._x[:] = last.predicted_states[1:]
-            self._u[:-1], self._u[-1] = last.predicted_actions[1:], last.predicted_actions[-1]
-            # Stage k + 1 becomes stage k, whose costs weigh 1/γ as much.
-            self._costates[:-1] = last.costates[2:] / self.problem.discount
-            self._costates[-1] = last.costates[-1]
+            shifted, self._pending = self._pending.shifted, None
+            self._x[:], self._u[:], self._costates[:] = shifted
             self._prepared = None
         if self._prepared is None:
             self._linearise()
@@ -255,7 +252,7 @@ class RtiNmpc:
         stack = self._readout.stack.copy()
         return RtiSolution(
             action=multipliers.v[:m] + self.problem.reference_action,
-            value=float(stack[-1]),
+            value=float(stack[self._value]),
             multipliers=multipliers,
             prepared=prepared,
             stack=stack,

@@ -122,6 +122,13 @@ class RtiSolution:
         return actions
 
     @property
+    def shifted(self) -> LinearisationPoint:
+        """The solution with its first stage dropped and its last control repeated."""
+        return LinearisationPoint(
+            self._part("next_x"), self._part("next_u"), self._part("next_chi")
+        )
+
+    @property
     def slack(self) -> Matrix:
         """Slack of the soft state bounds at stages 1 … N, shape (N, n)."""
         return self._part("t")
@@ -251,9 +258,11 @@ class RtiSolution:
         qp, m = self.qp, self.action.size
         active = self.multipliers.active(qp)
         dv, dlam = kkt_solve(qp, active, np.eye(m, qp.f.size), np.zeros((m, qp.w.size)))
-        violated, moved = active[2], dv @ qp.rows.T
-        dlam[:, violated] = 2 * qp.W[violated] * moved[:, violated]
-        dt = np.where(violated, np.sign(self.multipliers.lam) * moved, 0.0)
+        violated, dt = active[2], np.zeros_like(dlam)
+        if violated.any():
+            moved = (dv @ qp.rows.T)[:, violated]
+            dlam[:, violated] = 2 * qp.W[violated] * moved
+            dt[:, violated] = np.sign(self.multipliers.lam[violated]) * moved
         return dv, dt, dlam
 
     def _curvature_directions(self, dv: Matrix) -> Matrix:

@@ -72,11 +72,14 @@ class ActorCritic:
         self._step = ConstrainedStep(controller, configuration)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
         rows = configuration.batch_size
-        self._batch = {
+        self._batch: dict[str, NDArray[Any]] = {
             "states": np.empty((rows, n)),
             "next_states": np.empty((rows, n)),
             "reward": np.empty(rows),
+            "policy": np.empty((rows, m)),
             "deviation": np.empty((rows, m)),
+            "explored": np.empty(rows, dtype=bool),
+            "number": np.empty(rows, dtype=np.int64),
             "jacobian": np.empty((rows, m, size)),
         }
         self._advantage = AdvantageRegression(size, configuration.forgetting, configuration.ridge)
@@ -89,7 +92,9 @@ class ActorCritic:
         batch, row = self._batch, self._filled
         batch["states"][row], batch["next_states"][row] = transition.s, transition.next_s
         batch["reward"][row] = transition.stage_cost + self._discount * transition.next_penalty
-        batch["deviation"][row] = self._deviation(transition)
+        policy = transition.policy.action
+        batch["policy"][row], batch["deviation"][row] = policy, transition.a - policy
+        batch["explored"][row], batch["number"][row] = transition.explored, transition.number
         batch["jacobian"][row] = transition.policy.policy_jacobian
         self._filled += 1
         if self._filled < self._configuration.batch_size:
@@ -97,18 +102,20 @@ class ActorCritic:
         self._filled = 0
         return self._update(transition.number)
 
-    def _deviation(self, transition: Transition) -> Vector:
-        """a − π(s) less its mean under saturated exploration, zero where the sample was greedy."""
-        if not transition.explored:
-            return np.zeros_like(transition.a)
-        action = transition.policy.action
-        return transition.a - action - np.nan_to_num(self._strategy.bias(action, transition.number))
+    def _deviation(self) -> Vector:
+        """a − π(s) of the batch, (K, m), less its mean under saturation; zero in greedy samples."""
+        batch = self._batch
+        explored = batch["explored"]
+        bias = self._strategy.bias(batch["policy"][explored], batch["number"][explored])
+        deviation = np.zeros_like(batch["deviation"])
+        deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
+        return deviation
 
     def _update(self, number: int) -> Update:
         settings, batch = self._configuration, self._batch
         errors = lstdv(batch["states"], batch["next_states"], batch["reward"], self._discount)
         jacobian = batch["jacobian"] * self._step.scale
-        advantage = np.einsum("kmi,km->ki", jacobian, batch["deviation"])
+        advantage = np.einsum("kmi,km->ki", jacobian, self._deviation())
         self._advantage.add(advantage, errors)
         weights = self._advantage.weights()
         fisher = np.einsum("kmi,kmj->ij", jacobian, jacobian) / len(errors)

@@ -18,6 +18,8 @@ from learning.errors import ConfigurationError
 from learning.schedule import Linear
 
 Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Samples = NDArray[np.int64]
 PerturbedPolicy = Callable[[Vector], Vector]
 """Maps a linear cost term on the actions, (m,), to the policy's action under it, (m,)."""
 
@@ -30,8 +32,11 @@ class Strategy(Protocol):
     ) -> Vector | None:
         """Action that explores at a sample, (m,), or None."""
 
-    def bias(self, action: Vector, sample: int) -> Vector:
-        """E[a − π | explored], (m,): zero but for saturation; NaN where it is not known."""
+    def bias(self, actions: Matrix, samples: Samples) -> Matrix:
+        """E[a − π | explored] of samples with policies π, (K, m): NaN where it is not known.
+
+        It is zero but for saturation.
+        """
 
 
 @dataclass(frozen=True)
@@ -56,12 +61,12 @@ class Exploration:
         scaled: Vector = self.deviation(sample) * e
         return scaled
 
-    def saturated_mean(self, centre: Vector, sample: int) -> Vector:
-        """Mean of sat(c + e) − c, (m,), by the moments of the censored normal distribution."""
-        sigma = np.maximum(self.deviation(sample), np.finfo(float).tiny)
-        low, high = (self.lower - centre) / sigma, (self.upper - centre) / sigma
+    def saturated_mean(self, centres: Matrix, samples: Samples) -> Matrix:
+        """Mean of sat(c + e) − c, (K, m), by the moments of the censored normal distribution."""
+        sigma = np.maximum(self.deviation.at(samples), np.finfo(float).tiny)
+        low, high = (self.lower - centres) / sigma, (self.upper - centres) / sigma
         density = (np.exp(-(low**2) / 2) - np.exp(-(high**2) / 2)) / np.sqrt(2 * np.pi)
-        mean: Vector = sigma * (density + low * ndtr(low) + high * ndtr(-high))
+        mean: Matrix = sigma * (density + low * ndtr(low) + high * ndtr(-high))
         return mean
 
 
@@ -76,9 +81,9 @@ class Additive(Exploration):
         e = self.noise(rng, sample)
         return None if e is None else action + e
 
-    def bias(self, action: Vector, sample: int) -> Vector:
-        """Mean of sat(π + e) − π, (m,)."""
-        return self.saturated_mean(action, sample)
+    def bias(self, actions: Matrix, samples: Samples) -> Matrix:
+        """Mean of sat(π + e) − π, (K, m)."""
+        return self.saturated_mean(actions, samples)
 
 
 @dataclass(frozen=True)
@@ -91,9 +96,9 @@ class Literal(Exploration):
         """Action that explores, (m,), or None."""
         return self.noise(rng, sample)
 
-    def bias(self, action: Vector, sample: int) -> Vector:
-        """Mean of sat(e) − π, (m,)."""
-        return self.saturated_mean(np.zeros_like(action), sample) - action
+    def bias(self, actions: Matrix, samples: Samples) -> Matrix:
+        """Mean of sat(e) − π, (K, m)."""
+        return self.saturated_mean(np.zeros_like(actions), samples) - actions
 
 
 @dataclass(frozen=True)
@@ -111,9 +116,9 @@ class PerturbedCost(Exploration):
         d = self.noise(rng, sample)
         return None if d is None else perturbed(d)
 
-    def bias(self, action: Vector, sample: int) -> Vector:
-        """Not known in closed form: NaN, (m,)."""
-        return np.full_like(action, np.nan)
+    def bias(self, actions: Matrix, samples: Samples) -> Matrix:
+        """Not known in closed form: NaN, (K, m)."""
+        return np.full_like(actions, np.nan)
 
 
 STRATEGIES: dict[str, type[Additive | Literal | PerturbedCost]] = {

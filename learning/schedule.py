@@ -23,6 +23,13 @@ class Linear:
         share = min(sample / self.samples, 1.0) if self.samples > 0 else 1.0
         return self.start + share * (self.end - self.start)
 
+    def at(self, samples: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Values at samples, (K,), in the shape (K, …) with that of `start` behind."""
+        done = samples / self.samples if self.samples > 0 else np.ones(len(samples))
+        shares = np.minimum(done, 1.0).reshape(-1, *(1,) * self.start.ndim)
+        values: NDArray[np.float64] = self.start + shares * (self.end - self.start)
+        return values
+
 
 @dataclass(frozen=True)
 class Geometric:

@@ -7,6 +7,7 @@ from learning.schedule import linear
 
 LOWER, UPPER = np.array([100.0, 100.0]), np.array([400.0, 400.0])
 POLICY = np.array([190.0, 215.0])
+FIRST = np.array([0])
 
 
 def make(kind, probability=1.0, deviation=(10.0,)):
@@ -51,15 +52,15 @@ def test_perturbed_cost_asks_the_policy_of_the_perturbed_cost(rng):
 def test_bias_is_the_mean_that_saturation_leaves(rng, action):
     explore = make("additive")
     measured = (draws(explore, rng, action, 60_000) - action).mean(axis=0)
-    assert explore.bias(action, 0) == pytest.approx(measured, abs=0.15)
+    assert explore.bias(action[None], FIRST)[0] == pytest.approx(measured, abs=0.15)
 
 
 def test_bias_of_the_literal_reading_is_the_way_to_the_corner():
-    assert make("literal").bias(POLICY, 0) == pytest.approx(LOWER - POLICY, abs=1e-6)
+    assert make("literal").bias(POLICY[None], FIRST)[0] == pytest.approx(LOWER - POLICY, abs=1e-6)
 
 
 def test_bias_of_the_perturbed_cost_is_not_known():
-    assert np.isnan(make("perturbed-cost").bias(POLICY, 0)).all()
+    assert np.isnan(make("perturbed-cost").bias(POLICY[None], FIRST)).all()
 
 
 def test_noise_is_drawn_alike_whatever_the_probability():

@@ -41,7 +41,9 @@ def kkt_solve(
     kkt[:size, size:], kkt[size:, :size] = equal.T, equal
     right[:size] = (seeds[:, free] if bound else seeds).T
     right[size:] = limits[:, at_limit].T
-    _, _, answer, status = dgesv(kkt, right)
+    answer, status = right, 0
+    if len(kkt):  # every variable may be held
+        _, _, answer, status = dgesv(kkt, right)
     if status != 0:
         answer = np.linalg.lstsq(kkt, right)[0]
     v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)

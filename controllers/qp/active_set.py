@@ -41,7 +41,8 @@ def kkt_solve(
     kkt[:size, size:], kkt[size:, :size] = equal.T, equal
     right[:size] = (seeds[:, free] if bound else seeds).T
     right[size:] = limits[:, at_limit].T
-    answer, status = right, 0
+    answer: Matrix = right
+    status = 0
     if len(kkt):  # every variable may be held
         _, _, answer, status = dgesv(kkt, right)
     if status != 0:

@@ -41,12 +41,12 @@ def kkt_solve(
     kkt[:size, size:], kkt[size:, :size] = equal.T, equal
     right[:size] = (seeds[:, free] if bound else seeds).T
     right[size:] = limits[:, at_limit].T
-    answer: Matrix = right
-    status = 0
+    answer, singular = right, False
     if len(kkt):  # every variable may be held
         _, _, answer, status = dgesv(kkt, right)
-    if status != 0:
-        answer = np.linalg.lstsq(kkt, right)[0]
+        singular = status != 0
+    if singular:
+        answer = np.asarray(np.linalg.lstsq(kkt, right)[0], dtype=np.float64)
     v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)
     v[:, free], lam[:, at_limit] = answer[:size].T, answer[size:].T
     return v, lam

@@ -39,6 +39,7 @@ class DaqpBackend:
         n, rows = qp.f.size, qp.w.size
         if self._model is None:
             self._lower, self._upper = np.zeros(n + rows), np.zeros(n + rows)
+            self._parts = (self._lower[:n], self._upper[:n], self._lower[n:], self._upper[n:])
             self._free = np.repeat(np.array([0, SOFT], dtype=np.int32), [n, rows])
             self._sense = self._free.copy()
             self._model = daqp.Model()
@@ -64,9 +65,9 @@ class DaqpBackend:
         self._model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
 
     def _write_limits(self, qp: SoftQp) -> None:
-        n = qp.f.size
-        self._lower[:n], self._upper[:n] = qp.lower, qp.upper
-        self._lower[n:], self._upper[n:] = qp.row_lower, qp.row_upper
+        lower, upper, row_lower, row_upper = self._parts
+        lower[:], upper[:] = qp.lower, qp.upper
+        row_lower[:], row_upper[:] = qp.row_lower, qp.row_upper
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the vectors of `qp`; raises QpError where DAQP does not."""

@@ -24,6 +24,7 @@ from controllers.rti.solution import Functions, LinearisationPoint, Prepared, Rt
 from controllers.sensitivities import sensitivities
 
 Vector = NDArray[np.float64]
+# BLAS's Σ|·|, `dasum`, takes a tenth of NumPy's isfinite, and of ∞ − ∞ nobody is warned.
 
 
 class RtiNmpc:
@@ -164,7 +165,7 @@ class RtiNmpc:
         targets = (self._x, self._u, self._costates)
         arrays = [np.asarray(values, dtype=np.float64) for values in point]
         for name, target, array in zip(point._fields, targets, arrays, strict=True):
-            if array.shape != target.shape or not np.isfinite(array).all():
+            if array.shape != target.shape or not isfinite(dasum(array.reshape(-1))):
                 raise ControllerError(
                     f"linearisation point: {name} must be finite with shape {target.shape}, "
                     f"not {array.shape}"
@@ -180,7 +181,6 @@ class RtiNmpc:
         self._prepared = None
         self._constant = self._hessian.fill(self._x, self._u, self._costates)
         prepare()
-        # BLAS's Σ|·| takes a tenth of NumPy's isfinite, and of ∞ − ∞ nobody is warned.
         if not isfinite(dasum(prepare.stack)):
             raise QpError(
                 "the QP is not finite: the model has no finite value or derivative at the point of "

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import re
 import stat
 import threading
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO
+from typing import Any
 
-import fmpy
 from fmpy.model_description import ValidationError, read_model_description
 
 import fmus
@@ -31,6 +32,7 @@ class UnpackedFmu:
     sha256: str
     folder: Path
     description: Any
+    entries: frozenset[str]
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
@@ -75,11 +77,12 @@ def _locate(fmu: str | Path) -> Path:
 def _unpack(path: Path) -> UnpackedFmu:
     try:
         with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-            _check_entries(path, archive.infolist())
-            description = _describe(path, archive, stream)
+            _check_entries(path, archive)
+            description = _describe(path, archive)
             stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
             folder = place(archive, digest)
+            entries = frozenset(archive.namelist())
     except PlantError:
         raise
     except OSError as error:
@@ -89,33 +92,46 @@ def _unpack(path: Path) -> UnpackedFmu:
         raise PlantError(
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
-    return UnpackedFmu(path, digest, folder, description)
+    return UnpackedFmu(path, digest, folder, description, entries)
 
 
-def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse what no honest FMU contains: paths that lead outside, links, absurd size."""
+def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
+    """Refuse what no honest FMU contains: paths that lead outside, links, absurd size.
+
+    Some tools on Windows part folders by backslashes, against the zip format: read as slashes.
+    """
+    entries = archive.infolist()
     if len(entries) > MAX_ENTRIES:
         raise PlantError(f"FMU '{path}' is refused: more than {MAX_ENTRIES} entries")
     if sum(entry.file_size for entry in entries) > MAX_BYTES:
         raise PlantError(f"FMU '{path}' is refused: unpacks to more than {MAX_BYTES >> 20} MiB")
     for entry in entries:
-        name = PurePosixPath(entry.orig_filename)
-        illegal = "\\" in entry.orig_filename or ":" in entry.orig_filename
-        if illegal or name.is_absolute() or ".." in name.parts or "\0" in entry.orig_filename:
+        entry.filename = entry.filename.replace("\\", "/")
+        name = PurePosixPath(entry.orig_filename.replace("\\", "/"))
+        if (
+            ":" in entry.orig_filename
+            or name.is_absolute()
+            or ".." in name.parts
+            or "\0" in entry.orig_filename
+        ):
             raise PlantError(
                 f"FMU '{path}' is refused: entry {entry.orig_filename!r} leads outside its folder"
             )
         if stat.S_ISLNK(entry.external_attr >> 16):
             raise PlantError(f"FMU '{path}' is refused: entry '{name}' is a link")
+    archive.NameToInfo = {entry.filename: entry for entry in entries}
 
 
-def _describe(path: Path, archive: zipfile.ZipFile, stream: BinaryIO) -> Any:
+def _describe(path: Path, archive: zipfile.ZipFile) -> Any:
     if DESCRIPTION not in archive.namelist():
         raise PlantError(f"'{path}' is not an FMU: it has no {DESCRIPTION}")
     # Damage of the archive is told from damage of the text: zipfile checks what it reads.
-    archive.read(DESCRIPTION)
+    text = archive.read(DESCRIPTION)
+    version = _fmi_version(text)
+    if version is not None and version[:2] not in ("2.", "3."):
+        raise PlantError(f"FMU '{path}' is FMI {version}; 2.0 and 3.0 are supported")
     try:
-        return read_model_description(stream)
+        return read_model_description(_alone(archive))
     except ValidationError as error:
         problems = error.problems
         raise PlantError(
@@ -127,6 +143,20 @@ def _describe(path: Path, archive: zipfile.ZipFile, stream: BinaryIO) -> Any:
         raise PlantError(f"FMU '{path}' has an unreadable model description: {error}") from None
 
 
-def binary_folder(version: str) -> str:
-    """Name of this platform's folder under `binaries/` in FMI 2 or FMI 3."""
-    return str(fmpy.platform if version.startswith("2") else fmpy.platform_tuple)
+def _fmi_version(description: bytes) -> str | None:
+    """The version that the root element states, if it can be found without parsing the rest."""
+    found = re.search(
+        rb"<fmiModelDescription[^>]*?\sfmiVersion\s*=\s*[\"']([^\"'<>]*)", description
+    )
+    return found.group(1).decode("utf-8", "replace") if found else None
+
+
+def _alone(archive: zipfile.ZipFile) -> io.BytesIO:
+    """What fmpy reads of the archive, and nothing else: it finds no folder behind backslashes."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as copy:
+        for name in (DESCRIPTION, "sources/buildDescription.xml"):
+            if name in archive.namelist():
+                copy.writestr(name, archive.read(name))
+    stream.seek(0)
+    return stream

@@ -21,7 +21,7 @@ from fmpy.fmi2 import (
 from fmpy.logging import addLoggerProxy
 
 from cosim.plant.archive import UnpackedFmu
-from cosim.plant.instance import WARNING, Instance, Wiring
+from cosim.plant.instance import ACCEPTED, WARNING, Instance, Wiring
 
 _numbers = itertools.count()
 _logs: WeakValueDictionary[bytes, deque[str]] = WeakValueDictionary()
@@ -68,13 +68,14 @@ class Fmi2Instance(Instance):
         self._enter = self._function("EnterInitializationMode")
         self._exit = self._function("ExitInitializationMode")
 
-    def _instantiate(self, identifier: str) -> FMU2Slave:
+    def _instantiate(self, library: str) -> FMU2Slave:
         name = f"cosim-{next(_numbers)}"
         _logs[name.encode()] = self.messages
         slave = FMU2Slave(
             guid=self.fmu.description.guid,
-            modelIdentifier=identifier,
+            modelIdentifier=self.fmu.description.coSimulation.modelIdentifier,
             unzipDirectory=str(self.fmu.folder),
+            libraryPath=library,
             instanceName=name,
         )
         slave.instantiate(callbacks=_callbacks, loggingOn=True)
@@ -88,29 +89,29 @@ class Fmi2Instance(Instance):
     def initialise(self, started: bool) -> None:
         """Reset (if started before), write the start values, initialise and read the states."""
         component = self._component
-        if started and (status := self._reset(component)) > WARNING:
+        if started and (status := self._reset(component)) not in ACCEPTED:
             self.fail("Reset", status)
         self._write_starts()
-        if (status := self._setup(component, _FALSE, _ZERO, _ZERO, _FALSE, _ZERO)) > WARNING:
+        if (status := self._setup(component, _FALSE, _ZERO, _ZERO, _FALSE, _ZERO)) not in ACCEPTED:
             self.fail("SetupExperiment", status)
-        if (status := self._enter(component)) > WARNING:
+        if (status := self._enter(component)) not in ACCEPTED:
             self.fail("EnterInitializationMode", status)
-        if (status := self._exit(component)) > WARNING:
+        if (status := self._exit(component)) not in ACCEPTED:
             self.fail("ExitInitializationMode", status)
-        if (status := self._get_values(*self._get_states)) > WARNING:
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
             self.fail("GetReal", status)
 
     def advance(self, time: float) -> None:
         """Write the inputs, read the outputs at `time`, step, and read the states after it."""
         self._time.value = time
-        if (status := self._set_values(*self._set_inputs)) > WARNING:
+        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
             self.fail("SetReal", status)
-        if (status := self._get_values(*self._get_outputs)) > WARNING:
+        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
             self.fail("GetReal", status)
         # The last argument is false: a snapshot may take the FMU back before this step.
         if (
             status := self._do_step(self._component, self._time, self._step_size, _FALSE)
-        ) > WARNING:
+        ) not in ACCEPTED:
             self.fail("DoStep", status)
-        if (status := self._get_values(*self._get_states)) > WARNING:
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
             self.fail("GetReal", status)

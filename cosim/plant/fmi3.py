@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from fmpy.fmi3 import FMU3Slave
 
 from cosim.plant.archive import UnpackedFmu
-from cosim.plant.instance import DISCARD, WARNING, Instance, Wiring
+from cosim.plant.instance import ACCEPTED, DISCARD, Instance, Wiring
 
 _TRUE, _FALSE = ctypes.c_bool(True), ctypes.c_bool(False)
 _ZERO = ctypes.c_double(0.0)
@@ -58,11 +58,12 @@ class Fmi3Instance(Instance):
             ctypes.byref(self._last_time),
         )
 
-    def _instantiate(self, identifier: str) -> FMU3Slave:
+    def _instantiate(self, library: str) -> FMU3Slave:
         slave = FMU3Slave(
             guid=self.fmu.description.guid,
-            modelIdentifier=identifier,
+            modelIdentifier=self.fmu.description.coSimulation.modelIdentifier,
             unzipDirectory=str(self.fmu.folder),
+            libraryPath=library,
         )
         messages = self.messages
 
@@ -80,27 +81,27 @@ class Fmi3Instance(Instance):
     def initialise(self, started: bool) -> None:
         """Reset (if started before), write the start values, initialise and read the states."""
         component = self._component
-        if started and (status := self._reset(component)) > WARNING:
+        if started and (status := self._reset(component)) not in ACCEPTED:
             self.fail("Reset", status)
         self._write_starts()
-        if (status := self._enter(component, _FALSE, _ZERO, _ZERO, _FALSE, _ZERO)) > WARNING:
+        if (status := self._enter(component, _FALSE, _ZERO, _ZERO, _FALSE, _ZERO)) not in ACCEPTED:
             self.fail("EnterInitializationMode", status)
-        if (status := self._exit(component)) > WARNING:
+        if (status := self._exit(component)) not in ACCEPTED:
             self.fail("ExitInitializationMode", status)
-        if (status := self._get_values(*self._get_states)) > WARNING:
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
             self.fail("GetFloat64", status)
 
     def advance(self, time: float) -> None:
         """Write the inputs, read the outputs at `time`, step, and read the states after it."""
         self._time.value = time
-        if (status := self._set_values(*self._set_inputs)) > WARNING:
+        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
             self.fail("SetFloat64", status)
-        if (status := self._get_values(*self._get_outputs)) > WARNING:
+        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
             self.fail("GetFloat64", status)
-        if (status := self._do_step(*self._step_arguments)) > WARNING:
+        if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
             self.fail("DoStep", status)
         if self._terminate.value or self._early.value:
             self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
             self.fail("DoStep", DISCARD)
-        if (status := self._get_values(*self._get_states)) > WARNING:
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
             self.fail("GetFloat64", status)

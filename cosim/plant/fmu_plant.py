@@ -18,6 +18,7 @@ from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
 from cosim.plant.resource import Resource
 from cosim.plant.snapshot import Memory, Snapshot, packed, unpacked
+from cosim.plant.suitability import check_step, refusals
 from cosim.plant.wiring import Wirer, seed_words
 from cosim.protocols import Step
 from cosim.scenario import Scenario
@@ -49,10 +50,9 @@ class FmuPlant(Resource):
         self._memory = Memory()
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
         version = str(archive.description.fmiVersion)
-        if archive.description.coSimulation is None:
-            raise PlantError(f"FMU '{archive.path}' has no co-simulation interface")
-        if version[0] not in "23":
-            raise PlantError(f"FMU '{archive.path}' is FMI {version}; 2.0 and 3.0 are supported")
+        for refusal in refusals(archive):
+            raise PlantError(refusal)
+        check_step(archive, self.scenario.sampling_time)
         interface = Fmi2Instance if version[0] == "2" else Fmi3Instance
         wirer = Wirer(self.scenario, archive, interface)
         self.unpacked = archive
@@ -103,8 +103,8 @@ class FmuPlant(Resource):
         written anew, so that nothing of an earlier episode remains.
         """
         fmi = self._instance
-        for reference, word in seed_words(seed, self._seeds):
-            fmi.change_start(reference, word)
+        for word in seed_words(seed, self._seeds):
+            fmi.change_start(*word)
         if initial_state is not None or self._elsewhere:
             self._start_from(fmi, initial_state)
         self._k = _NOT_STARTED
@@ -214,7 +214,7 @@ class FmuPlant(Resource):
                 f"initial_state must be {len(table.states)} finite numbers ({names}), not {state}"
             )
         for reference, value in zip(self._initial, values.tolist(), strict=True):
-            fmi.change_start(reference, value)
+            fmi.change_start(fmi.real, reference, value)
         self._elsewhere = state is not None
 
     def _refuse(self, a: object) -> NoReturn:

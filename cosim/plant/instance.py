@@ -11,14 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import fmpy
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import CapabilityError, PlantError
-from cosim.plant.archive import UnpackedFmu, binary_folder
+from cosim.plant.archive import UnpackedFmu
+from cosim.plant.library import library_path
 
-WARNING, DISCARD, FATAL = 1, 2, 4
+OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
+ACCEPTED = frozenset((OK, WARNING))
 _STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 # fmpy changes the working directory while it loads a library.
@@ -69,7 +70,7 @@ class Instance:
             raise CapabilityError(
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
             )
-        self._slave = self._load(interface.modelIdentifier)
+        self._slave = self._load()
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._step_size = ctypes.c_double(step_size)
@@ -78,25 +79,16 @@ class Instance:
         self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs)
         self.states, self.states_view, self._get_states = self._exchange(wiring.states)
         self._starts: list[tuple[str, Any, tuple[Any, ...]]] = []
-        self._slots: dict[int, tuple[Any, int]] = {}
+        self._slots: dict[tuple[str, int], tuple[Any, int]] = {}
         for kind in dict.fromkeys(start.type for start in wiring.starts):
             self._add_starts([start for start in wiring.starts if start.type == kind])
 
-    def _load(self, identifier: str) -> Any:
-        version = self.fmu.description.fmiVersion
-        platforms = self.fmu.folder / "binaries"
-        library = platforms / binary_folder(version) / (identifier + fmpy.sharedLibraryExtension)
-        if not library.is_file():
-            found = sorted(entry.name for entry in platforms.glob("*")) or ["none"]
-            raise PlantError(
-                f"FMU '{self.fmu.path}' has no binary for {binary_folder(version)} (it has: "
-                f"{', '.join(found)}); build one from its sources, the shipped FMU's by `cosim fmu "
-                "build --out DIR` with a C compiler, and name that file"
-            )
+    def _load(self) -> Any:
+        library = str(library_path(self.fmu).resolve())
         with construction_lock:
             folder = Path.cwd()
             try:
-                return self._instantiate(identifier)
+                return self._instantiate(library)
             # fmpy raises bare Exception when the library does not load or instantiate.
             except Exception as error:
                 raise PlantError(
@@ -113,7 +105,7 @@ class Instance:
         """Write the inputs, read the outputs at `time`, step, and read the states after it."""
         raise NotImplementedError
 
-    def _instantiate(self, identifier: str) -> Any:
+    def _instantiate(self, library: str) -> Any:
         raise NotImplementedError
 
     def _function(self, name: str) -> Any:
@@ -139,30 +131,31 @@ class Instance:
         arguments = self._arguments([start.reference for start in starts], buffer)
         name = f"Set{suffix}"
         self._starts.append((name, self._function(name), arguments))
-        self._slots |= {start.reference: (buffer, i) for i, start in enumerate(starts)}
+        # FMI 2 counts value references anew for each type.
+        self._slots |= {(s.type, s.reference): (buffer, i) for i, s in enumerate(starts)}
 
-    def change_start(self, reference: int, value: float) -> None:
-        """Replace a start value that the next reset writes."""
-        buffer, index = self._slots[reference]
+    def change_start(self, type_: str, reference: int, value: float) -> None:
+        """Replace the start value of a variable, by type and reference, for the next reset."""
+        buffer, index = self._slots[type_, reference]
         buffer[index] = value
 
     def _write_starts(self) -> None:
         for name, function, arguments in self._starts:
-            if (status := function(*arguments)) > WARNING:
+            if (status := function(*arguments)) not in ACCEPTED:
                 self.fail(name, status)
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
         if not self._can_save:
             self._lacks("save and restore its state", "canGetAndSetFMUstate")
-        if (status := self._get_state(self._component, ctypes.byref(handle))) > WARNING:
+        if (status := self._get_state(self._component, ctypes.byref(handle))) not in ACCEPTED:
             self.fail(f"Get{self.state_suffix}", status)
 
     def load(self, handle: ctypes.c_void_p) -> None:
         """Set the FMU's state from a handle and read the plant's states."""
-        if (status := self._set_state(self._component, handle)) > WARNING:
+        if (status := self._set_state(self._component, handle)) not in ACCEPTED:
             self.fail(f"Set{self.state_suffix}", status)
-        if (status := self._get_values(*self._get_states)) > WARNING:
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
             self.fail("Get", status)
 
     def free(self, handle: ctypes.c_void_p) -> None:
@@ -176,11 +169,13 @@ class Instance:
             self._lacks("serialise its state", "canSerializeFMUstate")
         size = ctypes.c_size_t()
         name = f"Serialized{self.state_suffix}Size"
-        if (status := self._function(name)(self._component, handle, ctypes.byref(size))) > WARNING:
+        if (
+            status := self._function(name)(self._component, handle, ctypes.byref(size))
+        ) not in ACCEPTED:
             self.fail(name, status)
         buffer = ctypes.create_string_buffer(size.value)
         name = f"Serialize{self.state_suffix}"
-        if (status := self._function(name)(self._component, handle, buffer, size)) > WARNING:
+        if (status := self._function(name)(self._component, handle, buffer, size)) not in ACCEPTED:
             self.fail(name, status)
         return buffer.raw
 
@@ -192,7 +187,7 @@ class Instance:
         size = ctypes.c_size_t(len(data))
         name = self._deserialise_name
         pointer = ctypes.byref(handle)
-        if (status := self._function(name)(self._component, buffer, size, pointer)) > WARNING:
+        if (status := self._function(name)(self._component, buffer, size, pointer)) not in ACCEPTED:
             self.fail(name, status)
 
     _deserialise_name: ClassVar[str]
@@ -214,7 +209,7 @@ class Instance:
     def fail(self, function: str, status: int) -> None:
         """Raise PlantError for a failed call, with what the FMU logged about it."""
         self.fatal |= status == FATAL
-        label = _STATUS.get(status, f"status {status}")
+        label = _STATUS.get(status, f"status {status}, which FMI does not have")
         raise PlantError(
             f"FMU '{self.fmu.path.name}': {self.prefix}{function} returned {label}{self._log()}"
         )

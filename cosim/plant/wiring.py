@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from cosim.errors import PlantError
 from cosim.plant.archive import UnpackedFmu
@@ -13,6 +13,14 @@ from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
 _WIDE = ("Int64", "UInt64")
+
+
+class SeedWord(NamedTuple):
+    """A variable that takes part of the seed: FMI type, value reference, width in bits."""
+
+    type: str
+    reference: int
+    bits: int
 
 
 class Wirer:
@@ -35,13 +43,15 @@ class Wirer:
             starts=self._starts(),
         )
 
-    def seeds(self) -> list[tuple[int, int]]:
-        """Value reference and width in bits of the variables that take the seed, low word first."""
+    def seeds(self) -> list[SeedWord]:
+        """The variables that take the seed, low word first."""
         words = []
         for name in self._scenario.plant.mapping.seed:
             variable = self._find(name, "plant.mapping.seed")
             wide = variable.type in _WIDE
-            words.append((int(variable.valueReference), 64 if wide else 32))
+            words.append(
+                SeedWord(self._seed_type(name), int(variable.valueReference), 64 if wide else 32)
+            )
             if wide:
                 break
         return words
@@ -79,8 +89,7 @@ class Wirer:
             starts += self._start("ranges", mapping.ranges, law.ranges)
         for name, value in scenario.plant.parameters.items():
             starts.append(self._start_value(name, float(value), "plant.parameters"))
-        for (reference, width), name in zip(self.seeds(), mapping.seed, strict=False):
-            starts.append(StartValue(reference, self._seed_type(width, name), 0.0))
+        starts += [StartValue(word.reference, word.type, 0.0) for word in self.seeds()]
         return starts
 
     def _start(
@@ -94,34 +103,37 @@ class Wirer:
     def _start_value(self, name: str, value: float, table: str) -> StartValue:
         variable = self._find(name, table)
         if variable.type not in self._interface.setters:
-            raise self._misfit(name, table, f"is a {variable.type}, which cannot be set here")
+            raise self._misfit(name, table, f"is {_a(variable.type)}, which cannot be set here")
         if variable.type not in ("Real", "Float64", "Float32") and value != int(value):
-            raise self._misfit(name, table, f"is a {variable.type} and cannot take {value}")
+            raise self._misfit(name, table, f"is {_a(variable.type)} and cannot take {value}")
         if variable.causality in ("output", "calculatedParameter", "independent"):
-            raise self._misfit(name, table, f"is a {variable.causality}: it has no start to set")
+            raise self._misfit(name, table, f"is {_a(variable.causality)}: it has no start to set")
         if variable.variability == "constant":
             raise self._misfit(name, table, "is a constant")
         return StartValue(int(variable.valueReference), variable.type, value)
 
-    def _seed_type(self, width: int, name: str) -> str:
-        # By name: FMI 2 counts value references anew for each type.
+    def _seed_type(self, name: str) -> str:
         variable = self._variables[name]
-        if width == 32 and variable.type not in ("Integer", "Int32", "UInt32"):
-            raise self._misfit(name, "plant.mapping.seed", f"is a {variable.type}")
+        if variable.type not in (*_WIDE, "Integer", "Int32", "UInt32"):
+            raise self._misfit(
+                name,
+                "plant.mapping.seed",
+                f"is {_a(variable.type)}, not an integer of 32 or 64 bits",
+            )
         return str(variable.type)
 
     def _input(self, name: str) -> int:
         reference = self._real(name, "plant.actions")
         variable = self._variables[name]
         if variable.causality != "input" and variable.variability != "tunable":
-            raise self._misfit(name, "plant.actions", f"is a {variable.causality}, not an input")
+            raise self._misfit(name, "plant.actions", f"is {_a(variable.causality)}, not an input")
         return reference
 
     def _real(self, name: str, table: str) -> int:
         variable = self._find(name, table)
         if variable.type != self._interface.real or variable.shape:
             kind = f"{variable.type} array" if variable.shape else variable.type
-            raise self._misfit(name, table, f"is a {kind}, not a scalar {self._interface.real}")
+            raise self._misfit(name, table, f"is {_a(kind)}, not a scalar {self._interface.real}")
         return int(variable.valueReference)
 
     def _find(self, name: str, table: str) -> Any:
@@ -140,13 +152,17 @@ class Wirer:
         )
 
 
+def _a(noun: str) -> str:
+    return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
+
+
 def _unit(variable: Any) -> str:
     declared = variable.declaredType.unit if variable.declaredType is not None else None
     return str(variable.unit or declared or "")
 
 
-def seed_words(seed: int, variables: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """A seed's words by value reference, for variables as `Wirer.seeds` gives them.
+def seed_words(seed: int, variables: Sequence[SeedWord]) -> list[tuple[str, int, int]]:
+    """A seed's words, each with type and value reference, for variables of `Wirer.seeds`.
 
     Raises PlantError for anything but an integer in [0, 2⁶⁴).
     """
@@ -157,7 +173,7 @@ def seed_words(seed: int, variables: Sequence[tuple[int, int]]) -> list[tuple[in
     if not 0 <= number < 1 << 64:
         raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
     words, shift = [], 0
-    for reference, width in variables:
-        words.append((reference, number >> shift & (1 << width) - 1))
-        shift += width
+    for word in variables:
+        words.append((word.type, word.reference, number >> shift & (1 << word.bits) - 1))
+        shift += word.bits
     return words

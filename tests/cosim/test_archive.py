@@ -131,5 +131,5 @@ def test_an_fmu_without_a_binary_for_this_platform_says_what_it_has(tmp_path, pa
     with zipfile.ZipFile(fmus.path()) as old, zipfile.ZipFile(path, "w") as new:
         for entry in old.infolist():
             new.writestr(entry.filename.replace("linux64", "amiga68k"), old.read(entry))
-    with pytest.raises(PlantError, match=r"no binary for linux64 \(it has: amiga68k\)"):
+    with pytest.raises(PlantError, match=r"no binary for x86_64-linux \(it has: .*amiga68k, "):
         FmuPlant(paper, path)

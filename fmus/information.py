@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,22 +11,18 @@ from xml.etree import ElementTree
 from fmpy import read_model_description
 from fmpy.model_description import ModelDescription, ScalarVariable
 
+from fmus.binary import platforms_of
 from fmus.errors import FmuError
+from fmus.flags import default_flags
 
 _INTERFACES = {
     "CoSimulation": "co-simulation",
     "ModelExchange": "model exchange",
     "ScheduledExecution": "scheduled execution",
 }
-# Spelt differently by FMI 2.0 and 3.0: compared in lower case, without a plural's s.
-_CAPABILITIES = {
-    "cangetandsetfmustate": "get and set the state",
-    "canserializefmustate": "serialise the state",
-    "providesdirectionalderivative": "directional derivatives",
-    "providesadjointderivative": "adjoint derivatives",
-    "canhandlevariablecommunicationstepsize": "variable communication step",
-    "canbeinstantiatedonlyonceperproces": "one instance per process only",
-}
+# Attributes of an interface that are no flag.
+_NAMES = ("modelIdentifier",)
+_LIBRARIES = (".so", ".dll", ".dylib")
 
 
 @dataclass(frozen=True)
@@ -54,8 +49,11 @@ class VariableSummary:
 class Information:
     """Contents of a model description, and the file's path and SHA-256 (`sha256`).
 
-    `fmi_version`, name and description of the model; `interfaces` and `capabilities` in words;
-    the default experiment's `start_time`, `stop_time` and `step_size` in s; all `variables`.
+    `fmi_version`, name and description of the model; `interfaces` in words; `platforms`, folders
+    under ``binaries/`` with what their libraries are made for by their own first bytes, as FMI
+    3.0's tuples, and ``c-code`` for sources; `flags`, for each interface all capability flags that
+    the standard has, with the default where the file says nothing; the default experiment's
+    `start_time`, `stop_time` and `step_size` in s; all `variables`.
     """
 
     path: str
@@ -64,7 +62,8 @@ class Information:
     name: str
     description: str
     interfaces: tuple[str, ...]
-    capabilities: tuple[str, ...]
+    platforms: dict[str, tuple[str, ...]]
+    flags: dict[str, dict[str, str]]
     start_time: float | None
     stop_time: float | None
     step_size: float | None
@@ -84,7 +83,8 @@ def description_of(fmu: Path) -> ModelDescription:
 def information(fmu: Path) -> Information:
     """Read the FMU file `fmu`; raises FmuError when it is missing or is no FMU."""
     description = description_of(fmu)
-    interfaces = _interfaces(fmu)
+    members = _members(fmu)
+    interfaces = _interfaces(members)
     experiment = description.defaultExperiment
     times = [getattr(experiment, n, None) for n in ("startTime", "stopTime", "stepSize")]
     start, stop, step = (None if t is None else float(t) for t in times)
@@ -95,7 +95,10 @@ def information(fmu: Path) -> Information:
         name=description.modelName,
         description=description.description or "",
         interfaces=tuple(interfaces),
-        capabilities=_capabilities(interfaces.values()),
+        platforms=_platforms(members),
+        flags={
+            name: _flags(description.fmiVersion, name, given) for name, given in interfaces.items()
+        },
         start_time=start,
         stop_time=stop,
         step_size=step,
@@ -103,22 +106,44 @@ def information(fmu: Path) -> Information:
     )
 
 
-def _interfaces(fmu: Path) -> dict[str, dict[str, str]]:
-    """Interface → its attributes, from the XML: fmpy misses FMI 3.0's directional derivatives."""
+def _members(fmu: Path) -> dict[str, bytes]:
+    """Model description, libraries and names of sources, by path with slashes."""
+    found = {}
     with zipfile.ZipFile(fmu) as container:
-        root = ElementTree.fromstring(container.read("modelDescription.xml"))
+        for entry in container.infolist():
+            name = entry.filename.replace("\\", "/")
+            wanted = name == "modelDescription.xml" or name.endswith(_LIBRARIES)
+            if wanted or name.startswith("sources/"):
+                found[name] = container.read(entry) if wanted else b""
+    return found
+
+
+def _interfaces(members: dict[str, bytes]) -> dict[str, dict[str, str]]:
+    """Interface → its attributes, from the XML: fmpy misses FMI 3.0's directional derivatives."""
+    root = ElementTree.fromstring(members["modelDescription.xml"])
     found = {name: root.find(tag) for tag, name in _INTERFACES.items()}
-    return {name: element.attrib for name, element in found.items() if element is not None}
+    if root.get("fmiVersion") == "1.0":
+        tool = root.find("Implementation")  # only co-simulation FMUs have one
+        found = {"model exchange": root} if tool is None else {"co-simulation": tool}
+        return {name: {} for name in found}
+    return {name: dict(element.attrib) for name, element in found.items() if element is not None}
 
 
-def _capabilities(interfaces: Iterable[dict[str, str]]) -> tuple[str, ...]:
-    given = {
-        key.lower().rstrip("s")
-        for attributes in interfaces
-        for key, value in attributes.items()
-        if value in ("true", "1")
-    }
-    return tuple(text for key, text in _CAPABILITIES.items() if key in given)
+def _platforms(members: dict[str, bytes]) -> dict[str, tuple[str, ...]]:
+    found: dict[str, tuple[str, ...]] = {}
+    for name, data in sorted(members.items()):
+        parts = name.split("/")
+        if parts[0] == "binaries" and len(parts) == 3 and data:
+            found[parts[1]] = platforms_of(data) or ("not a library",)
+    if any(name.startswith("sources/") and name.endswith(".c") for name in members):
+        found["c-code"] = ()
+    return found
+
+
+def _flags(version: str, interface: str, given: dict[str, str]) -> dict[str, str]:
+    """The standard's flags with their values, then what else the file gives."""
+    flags = dict(default_flags(version, interface))
+    return flags | {key: value for key, value in given.items() if key not in _NAMES}
 
 
 def _summary(variable: ScalarVariable) -> VariableSummary:

@@ -32,9 +32,25 @@ def _short(number: str | None) -> str:
         return str(number)
 
 
+def _binary(folder: str, made_for: tuple[str, ...]) -> str:
+    return f"{folder} ({', '.join(made_for)})" if made_for else folder
+
+
+def _refusals(fmu: Path) -> list[str]:
+    """Why no scenario can use the FMU as its plant."""
+    from cosim.errors import PlantError
+    from cosim.plant.archive import unpack
+    from cosim.plant.suitability import refusals
+
+    try:
+        return list(refusals(unpack(fmu)))
+    except PlantError as error:
+        return [str(error)]
+
+
 @app.command()
 def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
-    """Show an FMU's interfaces, capabilities and variables."""
+    """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
     with output(json) as out_:
         from dataclasses import asdict
 
@@ -43,21 +59,30 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
         found = information(_path(file))
         out_.note(f"{found.path}\nsha256 {found.sha256}\n{found.name}: {found.description}")
         out_.note(f"FMI {found.fmi_version}: {', '.join(found.interfaces)}")
-        out_.note(f"offers: {', '.join(found.capabilities) or 'no optional capability'}")
+        out_.note(f"binaries: {', '.join(_binary(*item) for item in found.platforms.items())}")
+        refused = _refusals(_path(file))
+        for reason in refused:
+            out_.note(f"no plant: {reason}")
+        if not refused:
+            out_.note("the plant accepts it")
+        names = list(dict.fromkeys(name for flags in found.flags.values() for name in flags))
+        flags = [(name, *(f.get(name, "–") for f in found.flags.values())) for name in names]
+        out_.table("capability flags", ("flag", *found.flags), flags)
         header = ("variable", "causality", "unit", "start", "min", "max")
         rows = [
             (v.name, v.causality, v.unit or "", *(_short(x) for x in (v.start, v.min, v.max)))
             for v in found.variables
         ]
         out_.table(f"{len(rows)} variables", header, rows)
-        out_.json(asdict(found))
+        out_.json(asdict(found) | {"refusals": refused})
 
 
 @app.command()
 def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Run an FMU through every independent importer that is installed.
 
-    Exit code 1 if one of them fails. The optional ones: pip install 'rti-cosim\\[fmi-check]'.
+    Exit code 1 if the FMU is wrong, not if an importer is unable. The optional importers:
+    pip install 'rti-cosim\\[fmi-check]'.
     """
     with output(json) as out_:
         from dataclasses import asdict

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fmus.checks.outcome import NotOfferedError, require
 from fmus.errors import CheckError
+from fmus.information import information
 
 AGREEMENT = 1e-6
 
@@ -23,6 +24,9 @@ def jacobian(fmu: Path) -> str:
     description = fmpy.read_model_description(str(fmu))
     if description.modelExchange is None:
         raise NotOfferedError("the FMU has no model-exchange interface")
+    flags = information(fmu).flags["model exchange"]
+    if "true" not in {v for k, v in flags.items() if k.startswith("providesDirectional")}:
+        raise NotOfferedError("the FMU provides no directional derivatives")
     folder = fmpy.extract(str(fmu))
     try:
         dae = casadi.DaeBuilder("check", str(folder))

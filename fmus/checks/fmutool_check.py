@@ -13,10 +13,9 @@ from fmus.errors import CheckError
 def conformity(fmu: Path) -> str:
     """`fmutool -check` must log neither an error nor a warning."""
     require("fmu_manipulation_toolbox", "fmu-manipulation-toolbox")
-    program = Path(sys.executable).parent / "fmutool"
-    result = subprocess.run(
-        [str(program), "-input", str(fmu), "-check"], capture_output=True, text=True, check=False
-    )
+    program = "from fmu_manipulation_toolbox.cli.fmutool import fmutool; fmutool()"
+    command = [sys.executable, "-c", program, "-input", str(fmu), "-check"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     output = result.stdout + result.stderr
     bad = [
         line for line in output.splitlines() if line.startswith(("ERROR", "WARNING", "CRITICAL"))

@@ -16,6 +16,10 @@ class NotOfferedError(FmuError):
     """The FMU or the importer lacks the interface that the check needs."""
 
 
+class NotedError(FmuError):
+    """A finding that is worth a line but no fault of the FMU."""
+
+
 def require(module: str, package: str) -> ModuleType:
     """Import `module`, or raise NotInstalledError that says how to install `package`."""
     try:

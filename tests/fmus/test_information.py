@@ -8,6 +8,7 @@ import pytest
 import fmus
 from fmus.errors import FmuError
 from fmus.information import information
+from fmus.platforms import PLATFORMS
 
 
 def test_tells_what_is_in_the_file(version: int) -> None:
@@ -15,8 +16,16 @@ def test_tells_what_is_in_the_file(version: int) -> None:
     found = information(path)
     assert found.fmi_version == f"{version}.0"
     assert found.interfaces == ("co-simulation", "model exchange")
-    assert "directional derivatives" in found.capabilities
-    assert ("adjoint derivatives" in found.capabilities) == (version == 3)
+    for flags in found.flags.values():
+        assert flags["needsExecutionTool"] == "false"
+        assert flags["canBeInstantiatedOnlyOncePerProcess"] == "false"
+        plural = "" if version == 2 else "s"
+        assert flags[f"providesDirectionalDerivative{plural}"] == "true"
+        assert flags.get("providesAdjointDerivatives") == (None if version == 2 else "true")
+    folders = {p.folder(f"{version}.0"): (p.tuple,) for p in PLATFORMS} | {"c-code": ()}
+    if version == 2:
+        folders["darwin64"] = ("x86_64-darwin", "aarch64-darwin")
+    assert found.platforms == folders
     assert (found.start_time, found.stop_time, found.step_size) == (0.0, 6000.0, 60.0)
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     (pressure,) = [v for v in found.variables if v.name == "P100"]

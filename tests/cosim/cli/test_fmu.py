@@ -3,10 +3,12 @@
 import json
 import os
 import shutil
+import zipfile
 
 import pytest
 
 import fmus
+from tests.helpers.kinds import build_kind
 
 needs_compiler = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
@@ -110,3 +112,40 @@ def test_missing_compiler_is_told(cosim, monkeypatch):
     code, _, err = cosim("fmu", "build", "--out", "x")
     assert code == 2
     assert "install gcc or set CC" in err
+
+
+def test_info_says_what_bars_an_fmu_as_a_plant(cosim, tmp_path):
+    face = 'ModelExchange modelIdentifier="kinds"'
+    path = build_kind(tmp_path, 3, face=face)
+    code, out, _ = cosim("fmu", "info", path, "--json")
+    assert code == 0
+    (reason,) = json.loads(out)["refusals"]
+    assert "no co-simulation interface (it has: model exchange)" in reason
+
+
+def test_info_knows_fmi1_by_name(cosim, tmp_path):
+    path = tmp_path / "one.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", FMI1)
+    code, out, _ = cosim("fmu", "info", path, "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert (document["fmi_version"], document["interfaces"]) == ("1.0", ["model exchange"])
+    assert "is FMI 1.0; 2.0 and 3.0 are supported" in document["refusals"][0]
+
+
+FMI1 = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="1.0" modelName="one" modelIdentifier="one" guid="{one}"
+  numberOfContinuousStates="0" numberOfEventIndicators="0">
+  <ModelVariables>
+    <ScalarVariable name="x" valueReference="0" causality="output"><Real/></ScalarVariable>
+  </ModelVariables>
+</fmiModelDescription>
+"""
+
+
+def test_info_lists_platforms_and_flags(cosim):
+    _, out, err = cosim("fmu", "info")
+    assert "darwin64 (x86_64-darwin, aarch64-darwin)" in " ".join(err.split())
+    assert "canBeInstantiatedOnlyOncePerProcess" in out
+    assert "the plant accepts it" in err

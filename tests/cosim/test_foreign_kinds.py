@@ -1,0 +1,271 @@
+"""Foreign FMUs of many kinds and both FMI versions: they run, or are refused with a reason."""
+
+import zipfile
+
+import numpy as np
+import pytest
+
+import fmus
+from cosim import FmuPlant, Scenario
+from cosim.errors import CapabilityError, PlantError, ScenarioError
+from cosim.plant.archive import unpack
+from cosim.plant.suitability import refusals
+from tests.helpers.kinds import REALS, build_kind, scenario_for
+
+CS = 'CoSimulation modelIdentifier="kinds" '
+VARIABLE_STEP = 'canHandleVariableCommunicationStepSize="true"'
+
+
+@pytest.fixture(params=[2, 3], ids=["fmi2", "fmi3"])
+def version(request):
+    return request.param
+
+
+def trajectory(scenario, seed=0, steps=3):
+    with FmuPlant(scenario) as plant:
+        rows = [plant.reset(seed)[0]]
+        return rows + [plant.step([2.0]).s[0] for _ in range(steps)]
+
+
+def expected(steps=3, start=1.0, push=0.0):
+    rows = [start]
+    for _ in range(steps):
+        rows.append(rows[-1] + 0.5 * (2.0 - rows[-1]) + push)
+    return rows
+
+
+def test_the_plain_kind_runs(tmp_path, version):
+    fmu = build_kind(tmp_path, version)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    assert list(refusals(unpack(fmu))) == []
+
+
+def test_references_that_collide_between_types_are_kept_apart(tmp_path):
+    """FMI 2.0: u is Real 0 and seed Integer 0, x is Real 1 and fault Integer 1."""
+    reals = REALS.replace("range 4  parameter  fixed    0", "range 4  parameter  fixed    0")
+    fmu = build_kind(tmp_path, 2, reals=reals)
+    scenario = scenario_for(tmp_path, fmu, parameters=", range = 0.125")
+    assert trajectory(scenario, seed=4) == expected(push=0.5)
+    assert trajectory(scenario, seed=0) == expected()
+
+
+def test_a_start_parameter_with_the_number_of_the_seed_is_its_own(tmp_path):
+    """The range is Real 0, the seed Integer 0; before, the seed was written into the range."""
+    reals = "u 4 input - 0\nx 1 output - -\ncost 2 output - -\nx_start 3 parameter fixed 1\n"
+    fmu = build_kind(tmp_path, 2, reals=reals + "range 0 parameter fixed 0")
+    scenario = Scenario.load(scenario_for(tmp_path, fmu, parameters=", range = 0.5"))
+    with FmuPlant(scenario) as plant:
+        plant.reset(3, [2.0])
+        # the C code takes Real 0 for u: the range's value must have arrived there
+        assert plant.step([0.0]).stage_cost == 0.25
+
+
+def test_references_that_collide_in_fmi3_are_refused(tmp_path):
+    more = '<Int32 name="twin" valueReference="0" causality="parameter" start="0"/>'
+    fmu = build_kind(tmp_path, 3, more=more)
+    with pytest.raises(PlantError, match="invalid model description"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_an_array_beside_the_scalars_is_no_obstacle(tmp_path):
+    dimension = '<Dimension start="3"/>'
+    more = f'<Float64 name="profile" valueReference="5" causality="output">{dimension}</Float64>'
+    fmu = build_kind(tmp_path, 3, more=more)
+    scenario = scenario_for(tmp_path, fmu)
+    assert trajectory(scenario) == expected()
+    named = Scenario.load(scenario).replace({"plant": {"states": ["profile"]}})
+    with pytest.raises(PlantError, match=r"'profile'.* is a Float64 array, not a scalar Float64"):
+        FmuPlant(named)
+
+
+def test_names_of_array_elements_are_scalars_in_fmi2(tmp_path):
+    reals = REALS.replace("x     1", "x[1] 1")
+    fmu = build_kind(tmp_path, 2, reals=reals)
+    scenario = Scenario.load(scenario_for(tmp_path, fmu)).replace({"plant": {"states": ["x[1]"]}})
+    assert trajectory(scenario) == expected()
+
+
+def test_a_string_is_no_obstacle_unless_it_is_named(tmp_path, version):
+    common = 'name="label" valueReference="30" causality="parameter" variability="fixed"'
+    more = (
+        f'<ScalarVariable {common}><String start="a"/></ScalarVariable>'
+        if version == 2
+        else f'<String {common}><Start value="a"/></String>'
+    )
+    fmu = build_kind(tmp_path, version, more=more)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    named = scenario_for(tmp_path, fmu, parameters=", label = 1.0")
+    with pytest.raises(PlantError, match=r"'label'.* is a String, which cannot be set here"):
+        FmuPlant(named)
+
+
+def test_events_that_need_no_event_mode_are_no_obstacle(tmp_path):
+    fmu = build_kind(tmp_path, 3, face=f'{CS} {VARIABLE_STEP} hasEventMode="true"')
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+
+
+def test_a_step_that_ends_the_simulation_is_an_error(tmp_path):
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, 3), fault=13)
+    with FmuPlant(scenario) as plant:
+        plant.reset(0)
+        with pytest.raises(PlantError, match="ended the step early"):
+            plant.step([1.0])
+
+
+def test_without_an_input_there_is_nothing_to_control(tmp_path, version):
+    reals = REALS.replace("u     0  input      -        0", "u 0 parameter fixed 0")
+    fmu = build_kind(tmp_path, version, reals=reals)
+    with pytest.raises(PlantError, match="no scalar real input and no tunable parameter"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_a_tunable_parameter_serves_as_action(tmp_path, version):
+    reals = REALS.replace("u     0  input      -        0", "u 0 parameter tunable 0")
+    fmu = build_kind(tmp_path, version, reals=reals)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+
+
+def test_a_fixed_step_runs_at_its_own_and_is_refused_at_another(tmp_path, version):
+    experiment = '<DefaultExperiment stepSize="0.5"/>'
+    fmu = build_kind(tmp_path, version, face=CS, experiment=experiment)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    words = r"steps by 0\.5 s alone .*but the sampling time is 0\.25 s"
+    with pytest.raises(PlantError, match=words):
+        FmuPlant(scenario_for(tmp_path, fmu, sampling_time=0.25))
+
+
+def test_a_fixed_internal_step_takes_its_multiples(tmp_path):
+    fmu = build_kind(tmp_path, 3, face=f'{CS} fixedInternalStepSize="0.25"')
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    with pytest.raises(PlantError, match=r"multiples of 0\.25 s .*sampling time of 0\.6 s is none"):
+        FmuPlant(scenario_for(tmp_path, fmu, sampling_time=0.6))
+
+
+def test_model_exchange_alone_is_refused(tmp_path, version):
+    fmu = build_kind(tmp_path, version, face='ModelExchange modelIdentifier="kinds"')
+    with pytest.raises(PlantError, match=r"no co-simulation interface \(it has: model exchange\)"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_one_instance_per_process_is_kept_to(tmp_path, version):
+    face = f'{CS} {VARIABLE_STEP} canBeInstantiatedOnlyOncePerProcess="true"'
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, version, face=face))
+    with (
+        FmuPlant(scenario),
+        pytest.raises(CapabilityError, match="only once per process; close the other"),
+    ):
+        FmuPlant(scenario)
+    assert trajectory(scenario) == expected()
+
+
+def test_one_that_needs_its_tool_is_refused(tmp_path, version):
+    fmu = build_kind(tmp_path, version, face=f'{CS} {VARIABLE_STEP} needsExecutionTool="true"')
+    with pytest.raises(PlantError, match=r"needs the tool that made it to run"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+@pytest.mark.parametrize(("fault", "status"), [(1, -7), (2, 9)])
+def test_a_status_that_fmi_does_not_have_is_an_error(tmp_path, version, fault, status):
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, version), fault=fault)
+    with FmuPlant(scenario) as plant:
+        plant.reset(0)
+        with pytest.raises(PlantError, match=f"DoStep returned status {status}, which FMI does"):
+            plant.step([1.0])
+
+
+def test_a_warning_is_none(tmp_path, version):
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, version), fault=11)
+    with FmuPlant(scenario) as plant:
+        plant.reset(0)
+        plant.step([1.0])
+
+
+@pytest.mark.parametrize("identifier", ["../../kinds", "/tmp/kinds", "a b", "kinds.so", "1kinds"])
+def test_a_model_identifier_is_no_path(tmp_path, version, identifier):
+    fmu = build_kind(
+        tmp_path, version, face=f'CoSimulation modelIdentifier="{identifier}" {VARIABLE_STEP}'
+    )
+    with pytest.raises(
+        PlantError, match=r"modelIdentifier .*C identifier|invalid model description"
+    ):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_a_library_that_is_no_entry_of_the_archive_is_not_loaded(tmp_path, version):
+    fmu = build_kind(
+        tmp_path, version, face=f'CoSimulation modelIdentifier="other" {VARIABLE_STEP}'
+    )
+    folder = (
+        unpack(fmu).folder / "binaries" / next((unpack(fmu).folder / "binaries").iterdir()).name
+    )
+    (folder / "other.so").write_bytes((folder / "kinds.so").read_bytes())
+    try:
+        with pytest.raises(PlantError, match="has no binary for"):
+            FmuPlant(scenario_for(tmp_path, fmu))
+    finally:
+        (folder / "other.so").unlink()
+
+
+@pytest.mark.parametrize(
+    ("name", "platform"), [("aarch64-linux", "aarch64-linux"), ("win64", "x86_64-windows")]
+)
+def test_a_library_for_another_platform_is_named(tmp_path, name, platform):
+    with zipfile.ZipFile(fmus.path()) as shipped:
+        suffix = "dll" if name == "win64" else "so"
+        data = shipped.read(f"binaries/{name}/evaporator.{suffix}")
+    fmu = build_kind(tmp_path, 2, data=data)
+    with pytest.raises(PlantError, match=f"its 'binaries/.*' is made for {platform}"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_what_is_no_library_is_named(tmp_path, version):
+    fmu = build_kind(tmp_path, version, data=b"text")
+    with pytest.raises(PlantError, match="is not a shared library"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_an_archive_with_backslashes_runs(tmp_path, version):
+    fmu = build_kind(tmp_path, version, separator="\\")
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    assert (unpack(fmu).folder / "resources" / "readme.txt").read_bytes() == b"nothing"
+
+
+@pytest.mark.parametrize("entry", ["..\\evil.txt", "a\\..\\..\\evil.txt", "C:\\evil.txt", "\\evil"])
+def test_a_backslash_leads_nowhere_else(tmp_path, version, entry):
+    fmu = build_kind(tmp_path, version)
+    with zipfile.ZipFile(fmu, "a") as archive:
+        archive.writestr(entry, b"evil")
+    with pytest.raises(PlantError, match="leads outside its folder"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_fmi1_is_named(tmp_path):
+    fmu = tmp_path / "one.fmu"
+    with zipfile.ZipFile(fmu, "w") as archive:
+        archive.writestr("modelDescription.xml", FMI1)
+    with pytest.raises(PlantError, match=r"is FMI 1\.0; 2\.0 and 3\.0 are supported"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+FMI1 = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="1.0" modelName="one" modelIdentifier="one" guid="{one}"
+  numberOfContinuousStates="0" numberOfEventIndicators="0">
+  <ModelVariables>
+    <ScalarVariable name="x" valueReference="0" causality="output"><Real/></ScalarVariable>
+  </ModelVariables>
+</fmiModelDescription>
+"""
+
+
+def test_a_plant_without_actions_is_no_scenario(tmp_path, version):
+    path = scenario_for(tmp_path, build_kind(tmp_path, version))
+    with pytest.raises(ScenarioError):
+        Scenario.load(path).replace({"plant": {"actions": []}})
+
+
+def test_snapshots_are_refused_where_they_are_not_offered(tmp_path, version):
+    with FmuPlant(scenario_for(tmp_path, build_kind(tmp_path, version))) as plant:
+        plant.reset(0)
+        np.testing.assert_array_equal(plant.step([2.0]).s, [1.5])
+        with pytest.raises(CapabilityError, match="canGetAndSetFMUstate"):
+            plant.snapshot()

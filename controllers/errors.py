@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
-
-if TYPE_CHECKING:
-    from controllers.qp.problem import SoftQp
+from typing import Any, ClassVar
 
 
 class ControllerError(Exception):
@@ -38,7 +35,7 @@ class QpError(ControllerError):
 
     is_solver_failure: ClassVar[bool] = True
 
-    def __init__(self, message: str, *, status: str, qp: SoftQp | None = None) -> None:
+    def __init__(self, message: str, *, status: str, qp: Any = None) -> None:
         super().__init__(message)
         self.status = status
         self.qp = qp

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.storage import write_atomically
+from cosim import files
 from cosim.errors import TrajectoryError
+from cosim.files import csv_text, write_atomically
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
 from cosim.signals import signal_names, whole
@@ -140,18 +139,15 @@ class Trajectory:
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
         signals, counted = list(self.signals.values()), whole()
-        writer.writerow([*(signal.header for signal in signals), STATUS])
         columns = [
             (signal.values.astype(int) if signal.name in counted else signal.values)
             for signal in signals
         ]
-        writer.writerows(
-            zip(*(map(repr, column.tolist()) for column in columns), self.status, strict=True)
+        return csv_text(
+            [*(signal.header for signal in signals), STATUS],
+            zip(*(map(repr, column.tolist()) for column in columns), self.status, strict=True),
         )
-        return text.getvalue()
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `to_csv` to a file, whole or not at all."""
@@ -160,10 +156,9 @@ class Trajectory:
 
     def write_timing_csv(self, path: str | Path) -> Path:
         """Write the wall-clock times in µs to a file of their own, one row per sample."""
-        header = ",".join(f"{name} [us]" for name in self.timing)
         rows = zip(*(values.tolist() for values in self.timing.values()), strict=True)
-        lines = (",".join(f"{1e6 * value:.3f}" for value in row) for row in rows)
-        write_atomically(path, "\n".join([header, *lines, ""]))
+        header = [f"{name} [us]" for name in self.timing]
+        write_atomically(path, csv_text(header, ([f"{1e6 * v:.3f}" for v in row] for row in rows)))
         return Path(path)
 
 
@@ -177,11 +172,7 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
 
     Raises TrajectoryError with file and line.
     """
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise TrajectoryError(f"trajectory '{path}' cannot be read: {error}") from None
+    rows = files.read_csv(path, TrajectoryError)
     if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
     header, body = rows[0], rows[1:]

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.storage import read_arrays, write_atomically
+from controllers.storage import read_arrays
+from cosim.files import write_atomically
 from learning.errors import CheckpointError
 
 SCHEMA = 3

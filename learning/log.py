@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from math import inf, isnan
 
+from cosim.files import csv_text
 from learning.protocols import Update
 
 LogRow = dict[str, float]
@@ -78,13 +77,15 @@ class Totals:
 
 def to_csv(rows: list[LogRow]) -> str:
     """The log as CSV with exact decimals; what was not measured is left empty."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    if rows:
-        writer.writerow(rows[0])
-    for row in rows:
-        writer.writerow(
-            "" if isnan(value) else repr(int(value) if value == int(value) else value)
-            for value in row.values()
-        )
-    return stream.getvalue()
+    if not rows:
+        return ""
+    return csv_text(
+        list(rows[0]),
+        (
+            [
+                "" if isnan(value) else repr(int(value) if value == int(value) else value)
+                for value in row.values()
+            ]
+            for row in rows
+        ),
+    )

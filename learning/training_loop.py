@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
-from controllers.storage import write_atomically
 from cosim.errors import CapabilityError
 from cosim.evaluation.statistics import shown
+from cosim.files import write_atomically
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from learning import checkpoint

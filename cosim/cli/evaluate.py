@@ -46,14 +46,14 @@ def evaluate(
 ) -> None:
     """Compare controllers on the same disturbances, seed by seed.
 
-    Writes evaluation.csv and evaluation.parquet (a row per controller and seed), summary.json,
-    timing.csv and scenario.toml. Run again with the same --out to go on after an interruption.
+    Writes evaluation.csv (a row per controller and seed), summary.json, timing.csv and
+    scenario.toml. Run again with the same --out to go on after an interruption.
     """
     with output(json) as out_:
-        from controllers.storage import write_atomically
         from cosim.cli.compose import announce
         from cosim.evaluation import evaluate as run
         from cosim.evaluation.parallel import cores
+        from cosim.files import write_atomically
         from cosim.lookup import build_controller
         from cosim.scenario import Scenario
         from learning.optimum import has_stored_optimum

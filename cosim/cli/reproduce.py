@@ -164,8 +164,8 @@ def _write(
     evaluation: Evaluation,
     readings: Sequence[tuple[Reading, Evaluation]],
 ) -> dict[str, Any]:
-    from controllers.storage import write_atomically
     from cosim.cli.training import figure, trained
+    from cosim.files import write_atomically
     from cosim.reproduction.comparison import Table, against_converged, rows
     from cosim.reproduction.report import report
 

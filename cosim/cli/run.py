@@ -31,8 +31,8 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     Returns the trajectory and the summary. Everything that a clock measured is in timing.csv and
     the summary's `timing`; all other bytes are the same for the same command and seed.
     """
-    from controllers.storage import write_atomically
     from cosim.cli.compose import announce
+    from cosim.files import write_atomically
     from cosim.lookup import build_controller
     from cosim.plant import FmuPlant, IsolatedPlant
     from cosim.scenario import Scenario

@@ -144,8 +144,8 @@ def _thousands(samples: int) -> int:
 
 
 def _write_summary(results: StudyResults) -> dict[str, Any]:
-    from controllers.storage import write_atomically
     from cosim.experiments.summary import aggregate_rows, summary_rows
+    from cosim.files import write_atomically
 
     document = {
         **results.about,

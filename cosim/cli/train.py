@@ -264,7 +264,7 @@ def _validation(run: TrainingRun, result: TrainingResult) -> dict[str, int] | No
 
 
 def _write(folder: Path, run: TrainingRun, result: TrainingResult, summary: dict[str, Any]) -> None:
-    from controllers.storage import write_atomically
+    from cosim.files import write_atomically
     from learning.log import to_csv
 
     write_atomically(folder / "learning.csv", to_csv(result.rows))

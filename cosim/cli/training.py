@@ -51,9 +51,9 @@ def train(task: Training) -> str:
     command and the hash of all code are the same. Raises what `cosim train` raises, but takes
     divergence for a result: the last good θ is stored then.
     """
-    from controllers.storage import write_atomically
     from cosim.cli.inner import run_command
     from cosim.evaluation.provenance import PACKAGES, code_hash
+    from cosim.files import write_atomically
 
     task.folder.mkdir(parents=True, exist_ok=True)
     facts = {"command": task.command(), "code": code_hash((*PACKAGES, "learning"))}
@@ -75,7 +75,7 @@ def trainings(sizes: Budget, folder: Path) -> dict[str, Training]:
 
     Writes the scenarios of the map into `folder`.
     """
-    from controllers.storage import write_atomically
+    from cosim.files import write_atomically
     from cosim.reproduction.readings import Reading, readings
     from cosim.scenario import Scenario
 

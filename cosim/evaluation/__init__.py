@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from cosim.evaluation.paired import evaluate as evaluate
     from cosim.evaluation.table import Evaluation as Evaluation
 
-# Imported on first use: a worker needs a unit's code, not tables, Parquet and statistics.
+# Imported on first use: a worker needs a unit's code, not tables and statistics.
 _HOMES = {"Evaluation": "cosim.evaluation.table", "evaluate": "cosim.evaluation.paired"}
 
 __all__ = ["Evaluation", "evaluate"]

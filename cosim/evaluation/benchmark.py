@@ -31,7 +31,7 @@ def measure(
             begin = perf_counter()
             evaluation = evaluate(scenario, controllers, seeds, steps, jobs=workers)
             spent.append(perf_counter() - begin)
-            tables.add((evaluation.to_csv(), evaluation.to_parquet()))
+            tables.add(evaluation.to_csv())
     return {
         "scenario": scenario.name,
         "controllers": list(controllers),

@@ -7,9 +7,9 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from controllers.storage import write_atomically
 from cosim.errors import EvaluationError
 from cosim.evaluation.unit import Result, as_document, from_document
+from cosim.files import write_atomically
 
 FOLDER = ".units"
 FORMAT = 1

@@ -1,9 +1,7 @@
-"""The tidy table: one row per controller and seed, as CSV and Parquet with repeatable bytes."""
+"""The tidy table of an evaluation, one row per controller and seed, and its summary."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,14 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from controllers.storage import write_atomically
-from cosim.evaluation.statistics import gain, gap_closed, regret
-from cosim.evaluation.summary import summarise
+from cosim.evaluation.statistics import gain, gap_closed, mean, regret
 from cosim.evaluation.unit import Result
+from cosim.files import cell, csv_text, write_atomically
 
 Array = NDArray[np.float64]
 
@@ -44,6 +39,8 @@ PROVENANCE = (
     "parameters_hash",
     "command",
 )
+MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
+COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
 COLUMNS = (*TEXT, "seed", "steps", *NUMBERS, "failures", *PROVENANCE)
 
 
@@ -115,50 +112,93 @@ class Evaluation:
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows([_cell(name, row[name]) for name in COLUMNS] for row in self.rows)
-        return text.getvalue()
-
-    def to_parquet(self) -> bytes:
-        """The table as Parquet, with the columns' types; the same rows give the same bytes."""
-        table = pa.table(
-            {name: pa.array([row[name] for row in self.rows], _type(name)) for name in COLUMNS}
+        return csv_text(
+            COLUMNS, ([_cell(name, row[name]) for name in COLUMNS] for row in self.rows)
         )
-        sink = pa.BufferOutputStream()
-        pq.write_table(table, sink, compression="zstd")
-        return bytes(sink.getvalue())
 
     def timing_csv(self) -> str:
         """What the clock said, one row per controller and seed."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
         names = list(next(iter(self.results.values())).timing)
-        writer.writerow(["controller", "seed", *names])
-        for (controller, seed), result in self.results.items():
-            if controller not in self.controllers:
-                continue
-            cells = (f"{result.timing[name]:.6g}" for name in names)
-            writer.writerow([controller, seed, *cells])
-        return text.getvalue()
+        rows = (
+            [controller, str(seed), *(f"{result.timing[name]:.6g}" for name in names)]
+            for (controller, seed), result in self.results.items()
+            if controller in self.controllers
+        )
+        return csv_text(["controller", "seed", *names], rows)
 
     def write(self, folder: Path) -> None:
-        """Write evaluation.csv, evaluation.parquet and timing.csv, each whole or not at all."""
+        """Write evaluation.csv and timing.csv, each whole or not at all."""
         write_atomically(folder / "evaluation.csv", self.to_csv())
-        write_atomically(folder / "evaluation.parquet", self.to_parquet())
         write_atomically(folder / "timing.csv", self.timing_csv())
 
 
 def _cell(name: str, value: Any) -> str:
-    if name in WHOLE:
-        return str(int(value))
-    if isinstance(value, float):
-        return "" if np.isnan(value) else repr(value)
-    return str(value)
+    return str(int(value)) if name in WHOLE else cell(value)
 
 
-def _type(name: str) -> pa.DataType:
-    if name in WHOLE:
-        return pa.int64()
-    return pa.float64() if name in NUMBERS else pa.string()
+def summarise(evaluation: Evaluation) -> dict[str, Any]:
+    """An evaluation as a JSON document: controllers, comparisons, provenance, timing.
+
+    `controllers`: per controller the means over all seeds and samples, `failures` in total,
+    `settling_time` [s], `intervals` of each mean, where J* is known the `regret` (J − J*)/|J*|,
+    and where the naive controller is there too `gap_closed` = (J_naive − J)/(J_naive − J*).
+    `comparisons`: for each pair, the paired difference controller − reference of each mean, and
+    `gain_in_J`, (J_ref − J)/|J_ref|. Every interval is of 95 %, paired over seeds, once by
+    Student's t and once by BCa bootstrap. `optimal_J` is J* on the same seeds.
+    """
+    names = list(evaluation.controllers)
+    return {
+        **evaluation.facts,
+        "seeds": list(evaluation.seeds),
+        "reference": evaluation.reference,
+        "optimum": evaluation.optimum,
+        "optimal_J": None if evaluation.optimum is None else float(np.mean(evaluation.optimal)),
+        "controllers": {name: _controller(evaluation, name) for name in names},
+        "comparisons": [
+            _comparison(evaluation, name, reference)
+            for i, name in enumerate(names)
+            for reference in names[:i]
+        ],
+        "timing": {name: _timing(evaluation, name) for name in names},
+    }
+
+
+def _controller(evaluation: Evaluation, name: str) -> dict[str, Any]:
+    estimates = {key: mean(evaluation.column(name, key)) for key in MEANS}
+    document: dict[str, Any] = {key: estimate.value for key, estimate in estimates.items()}
+    document |= {
+        "failures": int(np.sum(evaluation.column(name, "failures"))),
+        "settling_time": evaluation.settling[name],
+        "parameters_hash": evaluation.parameters[name],
+        "intervals": {
+            key: {"t": estimate.t, "bootstrap": estimate.bootstrap}
+            for key, estimate in estimates.items()
+        },
+    }
+    if evaluation.optimum is None:
+        return document
+    cost = evaluation.column(name, "J")
+    document["regret"] = regret(cost, evaluation.optimal).to_dict()
+    if evaluation.naive is not None:
+        naive = evaluation.column(evaluation.naive, "J")
+        document["gap_closed"] = gap_closed(cost, naive, evaluation.optimal).to_dict()
+    return document
+
+
+def _comparison(evaluation: Evaluation, name: str, reference: str) -> dict[str, Any]:
+    cost, base = evaluation.column(name, "J"), evaluation.column(reference, "J")
+    return {
+        "controller": name,
+        "reference": reference,
+        "differences": {
+            key: mean(evaluation.column(name, key) - evaluation.column(reference, key)).to_dict()
+            for key in COMPARED
+        },
+        "gain_in_J": gain(cost, base).to_dict(),
+    }
+
+
+def _timing(evaluation: Evaluation, name: str) -> dict[str, float]:
+    """Median over seeds of each of the clock's figures."""
+    timings = [evaluation.results[name, seed].timing for seed in evaluation.seeds]
+    return {key: float(np.median([timing[key] for timing in timings])) for key in timings[0]}

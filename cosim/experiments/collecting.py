@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.storage import write_atomically
 from cosim.experiments.plan import Plan, Run
 from cosim.experiments.records import CURVE, EVALUATED, RunResult
 from cosim.experiments.results import ABOUT, SCHEMA, StudyResults
@@ -26,6 +25,7 @@ from cosim.experiments.summary import (
     summary_rows,
 )
 from cosim.experiments.tables import CURVES, RUNS, TIMING, curves_csv, evaluation_csv, to_csv
+from cosim.files import write_atomically
 
 Array = NDArray[np.float64]
 SUMMARY, AGGREGATE = "summary.csv", "aggregate.csv"

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from controllers.storage import write_atomically
 from cosim.experiments.charts import FOLDER, draw
 from cosim.experiments.layout import (
     AGGREGATE_HEADER,
@@ -20,6 +19,7 @@ from cosim.experiments.layout import (
     setting_lines,
 )
 from cosim.experiments.results import StudyResults
+from cosim.files import write_atomically
 
 PAGE, TABLES = "report.html", "report.md"
 CAPTIONS = {

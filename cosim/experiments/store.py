@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from controllers.storage import write_atomically
 from cosim.errors import StudyError
 from cosim.experiments.protocols import Progress
+from cosim.files import write_atomically
 
 RUNS = "runs"
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"

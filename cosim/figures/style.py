@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from controllers.storage import write_atomically
 from cosim.errors import FigureError
+from cosim.files import write_atomically
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""

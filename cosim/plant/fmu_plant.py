@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import CapabilityError, PlantError
-from cosim.plant.archive import SHIPPED, unpack
+from cosim.plant.archive import unpack
 from cosim.plant.fmi2 import Fmi2Instance
 from cosim.plant.fmi3 import Fmi3Instance
 from cosim.plant.instance import Instance
@@ -72,7 +72,6 @@ class FmuPlant(Resource):
         self._k = _NOT_STARTED
         self._started = False
         self._penalty_now = 0.0
-        self.is_shipped = str(self.scenario.plant.fmu if fmu is None else fmu) in SHIPPED
         self._fmi = interface(archive, wiring, self._h)
         self._advance = self._fmi.advance
         self._inputs = self._fmi.inputs

@@ -74,7 +74,6 @@ class IsolatedPlant(Resource):
         self.fmi_version: str = about["fmi_version"]
         self.fmu_path = Path(about["fmu_path"])
         self.fmu_sha256: str = about["fmu_sha256"]
-        self.is_shipped: bool = about["is_shipped"]
 
     @property
     def k(self) -> int:
@@ -187,7 +186,6 @@ def _serve(pipe: Connection, scenario: str, fmu: str | None) -> None:
         "fmi_version": plant.fmi_version,
         "fmu_path": str(plant.fmu_path),
         "fmu_sha256": plant.fmu_sha256,
-        "is_shipped": plant.is_shipped,
     }
     pipe.send_bytes(b"+" + json.dumps(about).encode())
     server = _Server(plant)

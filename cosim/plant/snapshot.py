@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import ctypes
 import struct
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from cosim.errors import PlantError
-
-if TYPE_CHECKING:
-    from cosim.plant.fmu_plant import FmuPlant
-    from cosim.plant.instance import Instance
+from cosim.plant.instance import Instance
 
 _HEADER = struct.Struct("<8sq32s")
 _MAGIC = b"cosimfs1"
+
+
+class Owner(Protocol):
+    """The plant that a snapshot is of."""
+
+    def recycle(self, handle: ctypes.c_void_p) -> None:
+        """Take back a dropped snapshot's memory."""
 
 
 class Snapshot:
@@ -24,12 +28,12 @@ class Snapshot:
 
     __slots__ = ("_plant", "handle", "k")
 
-    def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
+    def __init__(self, plant: Owner, handle: ctypes.c_void_p, k: int) -> None:
         self._plant = plant
         self.handle = handle
         self.k = k
 
-    def belongs_to(self, plant: FmuPlant) -> bool:
+    def belongs_to(self, plant: Owner) -> bool:
         """Whether the plant made this snapshot."""
         return self._plant is plant
 

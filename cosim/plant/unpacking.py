@@ -14,7 +14,7 @@ import zipfile
 from contextlib import suppress
 from pathlib import Path
 
-from controllers.storage import user_cache
+from cosim.files import user_cache
 
 UNUSED_DAYS = 30
 _CHUNK = 1 << 20

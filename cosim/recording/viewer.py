@@ -14,8 +14,8 @@ from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
-from controllers.storage import write_atomically
 from cosim.errors import RecordingError
+from cosim.files import write_atomically
 from cosim.lifetime import end_guarded, start_guarded
 from cosim.recording.stream import SAMPLE, TIME
 

@@ -8,9 +8,9 @@ from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
-from controllers.storage import write_atomically
 from cosim.errors import ResultsError
 from cosim.evaluation.provenance import code_hash, versions
+from cosim.files import write_atomically
 from cosim.results.check import table_path
 from cosim.results.experiments import Experiment
 from cosim.results.figures import Policy, draw

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from controllers.storage import write_atomically
 from cosim.evaluation.statistics import shown
+from cosim.files import write_atomically
 from cosim.results.experiments import Experiment
 from cosim.results.making import MADE, SUMMARY
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.storage import write_atomically
 from cosim import FmuPlant, Scenario
+from cosim.files import write_atomically
 from learning import BatchQLearning
 from learning.average_cost import AverageCost
 from learning.batch_q_learning import BatchQLearningConfiguration

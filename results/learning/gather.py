@@ -19,8 +19,8 @@ import numpy as np
 from cases import CASES
 from stored import BASELINES, FIGURES, SCENARIOS, Array, rows
 
-from controllers.storage import write_atomically
 from cosim.evaluation.statistics import quotient
+from cosim.files import write_atomically
 
 Key = tuple[str, str, str]
 """Scenario, case or baseline, training seed (empty for a baseline)."""

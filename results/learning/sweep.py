@@ -23,10 +23,10 @@ from cases import CASES, NOISE_SEEDS, STEPS
 from stored import BASELINES, FIGURES, SCENARIOS
 
 from controllers.problem import Problem
-from controllers.storage import write_atomically
 from cosim import FmuPlant, Scenario
 from cosim.cli.train import summarise
 from cosim.evaluation.parallel import run_all
+from cosim.files import write_atomically
 from cosim.lookup import build_controller
 from learning.evaluation import HeldOutRuns, held_out
 from learning.log import to_csv

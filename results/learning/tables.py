@@ -13,8 +13,8 @@ import numpy as np
 from cases import CASES, NOISE_SEEDS, STEPS, TUNING_NOISE_SEEDS, TUNING_SEEDS
 from stored import SCENARIOS, Run, Stored, load
 
-from controllers.storage import write_atomically
 from cosim.evaluation.statistics import Estimate, ratio, shown
+from cosim.files import write_atomically
 
 HERE = Path(__file__).parent
 TARGETS = {  # median and worst share of the gap closed that the benchmark asks for

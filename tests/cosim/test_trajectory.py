@@ -71,7 +71,7 @@ def test_signals_of_unequal_length_are_refused(paper):
 
 BAD = {
     "missing": (None, "cannot be read"),
-    "empty": ("", "not a trajectory"),
+    "empty": ("", "is empty"),
     "other table": ("a,b\n1,2\n", "not a trajectory"),
     "short row": ("time [s],status\n0.0\n", "line 2: 1 fields, not 2"),
     "text in a number": ("time [s],status\n0.0,ok\nx,ok\n", "line 3"),

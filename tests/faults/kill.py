@@ -150,7 +150,7 @@ JOBS = (
     Job(
         "evaluation",
         lambda _: [*EVALUATE.split(), "--out", "out"],
-        ("out/evaluation.csv", "out/evaluation.parquet"),
+        ("out/evaluation.csv",),
         _inspect_units,
     ),
     Job(

@@ -1,4 +1,3 @@
-import io
 import json
 import os
 import signal
@@ -8,7 +7,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from cosim import FmuPlant, evaluate, simulate
@@ -23,7 +21,6 @@ BOTH = {"proportional": proportional, "hold": hold}
 def contents(evaluation):
     return (
         evaluation.to_csv(),
-        evaluation.to_parquet(),
         json.dumps(evaluation.summary()["controllers"]),
     )
 
@@ -84,17 +81,6 @@ def test_each_row_has_the_regret_of_its_seed(paper):
     for row in evaluation.rows:
         optimum = evaluation.results["hold", row["seed"]].indicators["J"]
         assert row["regret"] == pytest.approx((row["J"] - optimum) / optimum, abs=1e-15)
-
-
-def test_parquet_holds_the_table_of_the_csv(paper):
-    evaluation = evaluate(paper, BOTH, 2, 20)
-    table = pq.read_table(io.BytesIO(evaluation.to_parquet())).to_pylist()
-    lines = evaluation.to_csv().splitlines()
-    header = lines[0].split(",")
-    assert [row["J"] for row in table] == [
-        float(line.split(",")[header.index("J")]) for line in lines[1:]
-    ]
-    assert list(table[0]) == header
 
 
 def test_two_workers_give_the_bytes_of_one(paper):
@@ -190,8 +176,8 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     subprocess.run(command(out), env=environment, check=True, capture_output=True)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     subprocess.run(command(tmp_path / "whole"), env=environment, check=True, capture_output=True)
-    for name in ("evaluation.csv", "evaluation.parquet"):
-        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    whole = tmp_path / "whole" / "evaluation.csv"
+    assert (out / "evaluation.csv").read_bytes() == whole.read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ TINY = Budget(
     map_seeds=1,
     factorial=False,
 )
-TABLES = ("comparison.csv", "converged.csv", "map.csv", "evaluation.csv", "evaluation.parquet")
+TABLES = ("comparison.csv", "converged.csv", "map.csv", "evaluation.csv")
 
 
 pytestmark = pytest.mark.slow

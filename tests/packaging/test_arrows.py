@@ -1,0 +1,81 @@
+"""Imports run one way: between the packages as designed, between files in no circle."""
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("fmus", "cosim", "controllers", "learning")
+MAY = {
+    "fmus": set(),
+    "cosim": {"fmus"},
+    "controllers": set(),
+    "learning": {"controllers", "cosim"},
+}
+"""What a package may import of the others; the command line composes all of them."""
+ONLY = {"rerun": ("cosim.recording",), "fmpy": ("cosim.plant", "fmus", "cosim.cli.fmu")}
+"""Third-party packages that only these modules import."""
+
+
+def modules():
+    """Every file's module name with its path."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            found[".".join(path.relative_to(ROOT).with_suffix("").parts)] = path
+    return found
+
+
+def imported(path, known):
+    """Modules that a file imports anywhere in it, for types only too, as full names."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            full = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= {name if name in known else node.module for name in full}
+    return names
+
+
+def test_a_package_imports_only_those_it_may():
+    known = modules()
+    for name, path in known.items():
+        package = name.partition(".")[0]
+        if name.startswith("cosim.cli"):
+            continue
+        others = {other.partition(".")[0] for other in imported(path, known)} & set(PACKAGES)
+        assert others - {package} <= MAY[package], name
+
+
+@pytest.mark.parametrize("library", ONLY)
+def test_a_library_of_one_room_is_imported_nowhere_else(library):
+    known = modules()
+    users = [
+        name
+        for name, path in known.items()
+        if any(other.partition(".")[0] == library for other in imported(path, known))
+    ]
+    assert users
+    assert [name for name in users if not name.startswith(ONLY[library])] == []
+
+
+def graph(known):
+    """Imports between files; a package's face only hands names on and is left out."""
+    # The command line that runs itself goes with `cosim reproduce`.
+    files = {n for n in known if not n.endswith("__init__") and n != "cosim.cli.inner"}
+    return {name: imported(known[name], known) & files - {name} for name in files}
+
+
+def test_no_file_imports_itself_in_a_circle():
+    TopologicalSorter(graph(modules())).prepare()
+
+
+def test_a_circle_is_seen(tmp_path):
+    for name, other in (("one", "two"), ("two", "one")):
+        (tmp_path / f"{name}.py").write_text(f"def f():\n    from {other} import g\n")
+    known = {name: tmp_path / f"{name}.py" for name in ("one", "two")}
+    with pytest.raises(CycleError):
+        TopologicalSorter(graph(known)).prepare()

@@ -1,0 +1,165 @@
+"""The RTI-NMPC as C: CasADi's code for its functions, a QP solver, a problem's constants."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from controllers.buffered import BufferedFunction, StackedFunction
+from controllers.code_generation import c_source
+from controllers.errors import ControllerError
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.rti.feedback import embedding, readout
+from controllers.rti.hessian import Exact, make_hessian
+from controllers.rti.preparation import preparation
+
+SOURCES = Path(__file__).parent / "sources"
+RULES = {"gauss-newton": "gauss_newton.h", "exact": "exact.h"}
+# A sample's arrays live on the stack, of which a thread has 1 MB on some platforms.
+STACK_LIMIT = 400_000
+STATUSES = ("solved", "not convex", "iteration limit", "not finite", "θ not well posed")
+
+
+@dataclass(frozen=True)
+class Core:
+    """A controller in C: its `sources` by file name, and the `parameters` that it starts from.
+
+    `core.h` is what to include: it defines CoreState, core_reset, core_evaluate, core_commit and
+    core_outputs, all static. `problem` is the one it was made for.
+    """
+
+    problem: Problem
+    parameters: Parameters
+    sources: Mapping[str, bytes]
+
+
+def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton") -> Core:
+    """Write the C of an RTI-NMPC: deterministic, without allocation, C99.
+
+    It does what `RtiNmpc` does with the backend `daqp`, whose part a solver of its own takes; the
+    parameters θ stay an input. Raises ControllerError where `hessian` is not `gauss-newton` or
+    `exact`, or the horizon is too long for a thread's stack.
+    """
+    if hessian not in RULES:
+        raise ControllerError(
+            f"the Hessian '{hessian}' cannot be exported; choose {' or '.join(RULES)}"
+        )
+    if (size := _stack(problem)) > STACK_LIMIT:
+        raise ControllerError(
+            f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "
+            f"than the {STACK_LIMIT / 1e3:.0f} kB that an exported controller may take; shorten it"
+        )
+    parameters.require_well_posed()
+    blocks = parameters.blocks
+    prepared = preparation(problem, blocks)
+    functions = {
+        "PREPARED": prepared,
+        "EMBEDDED": embedding(problem, blocks, prepared),
+        "READ": readout(problem, blocks, prepared),
+    }
+    rule = make_hessian(hessian, problem, blocks, prepared)
+    called: dict[str, BufferedFunction] = {**functions}
+    if hessian == "exact":
+        (called["CURVATURE"],) = rule.functions
+    wanted = ("core.h", "rti.h", "qp.h", "costs.h", RULES[hessian])
+    sources = {name: (SOURCES / name).read_bytes() for name in wanted}
+    sources["functions.h"] = _functions(list(called.values())).encode()
+    sources["problem.h"] = _constants(problem, parameters, hessian, functions, called).encode()
+    return Core(problem, parameters, sources)
+
+
+def _stack(problem: Problem) -> int:
+    """Bytes of the largest arrays of a sample: those of the QP solver, and the QP itself."""
+    variables = problem.horizon * problem.n_actions
+    rows = problem.horizon * problem.n_states
+    limits = variables + rows
+    return 8 * (limits * (variables + limits + 8) + variables * (2 * variables + rows))
+
+
+def _functions(functions: Sequence[BufferedFunction]) -> str:
+    """CasADi's C with every function static and without the compiler's remarks on it."""
+    own = re.compile(r"^casadi_real casadi_|^void casadi_|^casadi_int casadi_", re.MULTILINE)
+    code = c_source([function.function for function in functions])
+    code = own.sub(lambda found: f"static {found.group()}", code)
+    return (
+        "#define CASADI_SYMBOL_EXPORT static\n"
+        "#ifdef __GNUC__\n"
+        "#pragma GCC diagnostic push\n"
+        '#pragma GCC diagnostic ignored "-Wunused-function"\n'
+        '#pragma GCC diagnostic ignored "-Wunused-parameter"\n'
+        "#endif\n"
+        f"{code}"
+        "#ifdef __GNUC__\n"
+        "#pragma GCC diagnostic pop\n"
+        "#endif\n"
+    )
+
+
+def _constants(
+    problem: Problem,
+    parameters: Parameters,
+    hessian: str,
+    functions: Mapping[str, StackedFunction],
+    called: Mapping[str, BufferedFunction],
+) -> str:
+    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+    blocks, gamma = parameters.blocks, problem.discount
+    sizes = {"N_X": n, "N_U": m, "N_W": n + m, "HORIZON": horizon, "N_THETA": blocks.size}
+    for prefix, function in functions.items():
+        sizes |= {f"{prefix}_{name}": part.start for name, part in function.slices.items()}
+        sizes[f"{prefix}_SIZE"] = function.stack.size
+    for prefix, call in called.items():
+        of = call.function
+        work = {"ARG": of.sz_arg(), "RES": of.sz_res(), "IW": of.sz_iw(), "W": of.sz_w()}
+        sizes |= {f"{prefix}_{name}": size for name, size in work.items()}
+    sizes |= {f"THETA_{name}": part.start for name, part in blocks.slices.items()}
+    arrays: dict[str, ArrayLike] = {
+        "REFERENCE_STATE": problem.reference_state,
+        "REFERENCE_ACTION": problem.reference_action,
+        "ACTION_LOWER": problem.action_lower,
+        "ACTION_UPPER": problem.action_upper,
+        "PENALTY_LINEAR": problem.penalty_linear,
+        "PENALTY_QUADRATIC": problem.penalty_quadratic,
+        "DISCOUNTS": gamma ** np.arange(horizon),
+        "SLACK_DISCOUNTS": gamma ** np.arange(1, horizon + 1),
+    }
+    learned = "w_sigma" in blocks
+    linear = "((theta) + THETA_w_sigma)" if learned else "((void)(theta), PENALTY_LINEAR)"
+    quadratic = "((theta) + THETA_W_sigma)" if learned else "((void)(theta), PENALTY_QUADRATIC)"
+    if learned:
+        del arrays["PENALTY_LINEAR"], arrays["PENALTY_QUADRATIC"]
+    lines = [
+        "/* Generated: sizes and constants of the problem. */",
+        "#ifndef PROBLEM_H",
+        "#define PROBLEM_H",
+        "",
+        "enum {",
+        *(f"    {name} = {value}," for name, value in sizes.items()),
+        "};",
+        "",
+        *(_array(name, values) for name, values in arrays.items()),
+        "",
+        f"#define END_DISCOUNT {float(gamma**horizon)!r}",
+        f"#define FLOOR {Exact.FLOOR!r}",
+        f"#define SLACK_LINEAR(theta) {linear}",
+        f"#define SLACK_QUADRATIC(theta) {quadratic}",
+        f'#define HESSIAN_RULE "{RULES[hessian]}"',
+        "",
+        "#endif",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _array(name: str, values: ArrayLike) -> str:
+    numbers = ", ".join(_number(value) for value in np.asarray(values, dtype=np.float64))
+    return f"static const double {name}[] = {{{numbers}}};"
+
+
+def _number(value: float) -> str:
+    return repr(float(value)) if np.isfinite(value) else "INFINITY" if value > 0 else "-INFINITY"

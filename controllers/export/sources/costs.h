@@ -1,0 +1,17 @@
+/* The quadratic costs of θ, packed as upper triangles by rows. */
+#ifndef COSTS_H
+#define COSTS_H
+
+static void symmetric(const double packed[], int size, double scale, double matrix[]) {
+    for (int i = 0; i < size; i++)
+        for (int j = i; j < size; j++)
+            matrix[i * size + j] = matrix[j * size + i] = scale * *packed++;
+}
+
+/* ½ξᵀL_N ξ + q_Nᵀξ */
+static void terminal_cost(const double theta[], double L_N[], double q_N[]) {
+    symmetric(theta + THETA_B_Vf, N_X, 2 * END_DISCOUNT, L_N);
+    for (int i = 0; i < N_X; i++) q_N[i] = END_DISCOUNT * theta[THETA_b_Vf + i];
+}
+
+#endif

@@ -1,0 +1,89 @@
+/* The exact Hessian: the model's curvature added, and each stage's eigenvalues lifted to a floor. */
+#ifndef EXACT_H
+#define EXACT_H
+
+#include <math.h>
+
+#include "costs.h"
+
+/* Eigenvalues on the diagonal of `matrix`, eigenvectors as columns: cyclic Jacobi rotations. */
+static void eigen(double matrix[N_W][N_W], double vectors[N_W][N_W]) {
+    for (int i = 0; i < N_W; i++)
+        for (int j = 0; j < N_W; j++) vectors[i][j] = i == j;
+    for (int sweep = 0; sweep < 50; sweep++) {
+        double outside = 0.0, all = 0.0;
+        for (int i = 0; i < N_W; i++)
+            for (int j = 0; j < N_W; j++) {
+                all += matrix[i][j] * matrix[i][j];
+                if (i != j) outside += matrix[i][j] * matrix[i][j];
+            }
+        if (!(outside > 1e-32 * all)) return;
+        for (int p = 0; p < N_W; p++)
+            for (int r = p + 1; r < N_W; r++) {
+                if (matrix[p][r] == 0.0) continue;
+                const double ratio = (matrix[r][r] - matrix[p][p]) / (2.0 * matrix[p][r]);
+                const double t = copysign(1.0, ratio) / (fabs(ratio) + sqrt(1.0 + ratio * ratio));
+                const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
+                for (int i = 0; i < N_W; i++) {
+                    const double a = matrix[i][p], b = matrix[i][r];
+                    matrix[i][p] = c * a - s * b;
+                    matrix[i][r] = s * a + c * b;
+                }
+                for (int i = 0; i < N_W; i++) {
+                    const double a = matrix[p][i], b = matrix[r][i];
+                    matrix[p][i] = c * a - s * b;
+                    matrix[r][i] = s * a + c * b;
+                }
+                for (int i = 0; i < N_W; i++) {
+                    const double a = vectors[i][p], b = vectors[i][r];
+                    vectors[i][p] = c * a - s * b;
+                    vectors[i][r] = s * a + c * b;
+                }
+            }
+    }
+}
+
+static double lifted_to(double value, double floor) { return value > floor ? value : floor; }
+
+static double stage_costs(const double x[], const double u[], const double costates[],
+                          const double theta[], double L[], double q[]) {
+    double curved[HORIZON * N_W * N_W], constant = 0.0;
+    {
+        const double *arguments[CURVATURE_ARG] = {x, u, costates, theta};
+        double *results[CURVATURE_RES] = {curved}, w[CURVATURE_W + 1];
+        long long int iw[CURVATURE_IW + 1];
+        curvature(arguments, results, iw, w, 0);
+    }
+    for (int k = 0; k < HORIZON; k++) {
+        double B[N_W * N_W], matrix[N_W][N_W], vectors[N_W][N_W], at[N_W];
+        double *const block = L + k * N_W * N_W;
+        symmetric(theta + THETA_B_l, N_W, 1.0, B);
+        for (int i = 0; i < N_W; i++)
+            for (int j = 0; j < N_W; j++)
+                matrix[i][j] = 2 * DISCOUNTS[k] * B[i * N_W + j] +
+                               curved[(k * N_W + i) * N_W + j];
+        eigen(matrix, vectors);
+        for (int i = 0; i < N_W; i++)
+            for (int j = 0; j < N_W; j++) {
+                double sum = 0.0;
+                for (int e = 0; e < N_W; e++)
+                    sum += vectors[i][e] * lifted_to(matrix[e][e], FLOOR * DISCOUNTS[k]) * vectors[j][e];
+                block[i * N_W + j] = isnan(matrix[i][i] + matrix[j][j]) ? NAN : sum;
+            }
+        for (int i = 0; i < N_X; i++) at[i] = x[k * N_X + i] - REFERENCE_STATE[i];
+        for (int i = 0; i < N_U; i++) at[N_X + i] = u[k * N_U + i] - REFERENCE_ACTION[i];
+        for (int i = 0; i < N_W; i++) {
+            double lifted = 0.0, flat = 0.0;
+            for (int j = 0; j < N_W; j++) {
+                lifted += block[i * N_W + j] * at[j];
+                flat += B[i * N_W + j] * at[j];
+            }
+            flat *= 2 * DISCOUNTS[k];
+            q[k * N_W + i] = flat + DISCOUNTS[k] * theta[THETA_b_l + i] - lifted;
+            constant += at[i] * (lifted - flat) / 2;
+        }
+    }
+    return constant;
+}
+
+#endif

@@ -1,0 +1,146 @@
+"""The exported controller against `RtiNmpc` in the loop with the plant."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controllers import Parameters, Problem, RtiNmpc
+from controllers.errors import ControllerError
+from controllers.export import core
+from controllers.factories import naive, tuned
+from controllers.theta import ThetaBlocks
+from cosim import FmuPlant, Scenario
+from tests.helpers.compiled import CompiledController
+from tests.helpers.sampling import evaporator_problem, random_parameters
+
+ACTION = 1e-9
+EXPLORED, DEVIATION = 0.1, 20.0
+SAMPLES = int(os.environ.get("COSIM_EXPORT_SAMPLES", "100000"))
+
+
+def _learnt(scenario: Scenario) -> Parameters:
+    """θ about as far from naive as learning goes, with slack weights and bounds of its own."""
+    problem = Problem.from_scenario(scenario)
+    blocks = ThetaBlocks.of(problem, slack_weights=True)
+    return random_parameters(problem, blocks, np.random.default_rng(7))
+
+
+THETAS = {
+    "naive": lambda scenario: naive(scenario).parameters,
+    "tuned": lambda scenario: tuned(scenario).parameters,
+    "learnt": _learnt,
+}
+
+
+def _worst(scenario: Scenario, theta: Parameters, hessian: str, samples: int, folder: Path):
+    """Largest differences of action, value and predictions over a run with exploration."""
+    problem = Problem.from_scenario(scenario)
+    ours = RtiNmpc(problem, theta, hessian=hessian)
+    exported = CompiledController(folder, core(problem, theta, hessian))
+    lower, upper = scenario.action_lower, scenario.action_upper
+    rng, worst = np.random.default_rng(0), np.zeros(4)
+    with FmuPlant(scenario) as plant:
+        s = plant.reset(1)
+        for k in range(samples):
+            ours.prepare()
+            solution, found = ours.feedback(s), exported.sample(s)
+            action = np.clip(solution.action, lower, upper)
+            assert found["status"] == 0
+            assert found["residual"] < 1e-9
+            differences = [
+                np.abs(found["action"] - action).max(),
+                abs(found["value"][0] / solution.value - 1),
+                np.abs(found["x"] - solution.predicted_states.reshape(-1)).max(),
+                np.abs(found["u"] - solution.predicted_actions.reshape(-1)).max(),
+            ]
+            worst = np.maximum(worst, differences)
+            assert worst[0] < ACTION, k
+            if rng.random() < EXPLORED:
+                action = np.clip(action + DEVIATION * rng.standard_normal(2), lower, upper)
+            s = plant.step(action).s
+    return worst
+
+
+@pytest.mark.parametrize(
+    ("scenario", "theta", "hessian"),
+    [("paper", "tuned", "gauss-newton"), ("fast-sampling", "learnt", "exact")],
+)
+def test_it_gives_the_actions_of_the_python_controller(
+    tmp_path: Path, scenario: str, theta: str, hessian: str
+) -> None:
+    loaded = Scenario.load(scenario)
+    worst = _worst(loaded, THETAS[theta](loaded), hessian, 300, tmp_path)
+    assert worst[1:].max() < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+@pytest.mark.parametrize("theta", THETAS)
+@pytest.mark.parametrize("scenario", ["paper", "fast-sampling", "fouled"])
+def test_a_hundred_thousand_samples_agree(
+    tmp_path: Path, scenario: str, theta: str, hessian: str
+) -> None:
+    """The exact Hessian, ten times slower in Python, for a tenth of the samples."""
+    loaded = Scenario.load(scenario)
+    samples = SAMPLES if hessian == "gauss-newton" else SAMPLES // 10
+    worst = _worst(loaded, THETAS[theta](loaded), hessian, samples, tmp_path)
+    print(f"\n{scenario} {theta} {hessian} {samples}: action {worst[0]:.1e} value {worst[1]:.1e}")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> CompiledController:
+    """A controller with the shortest horizon, which compiles fast; under the sanitizers."""
+    problem = evaporator_problem(horizon=1)
+    flags = ("-fsanitize=undefined,float-cast-overflow", "-fno-sanitize-recover=all")
+    return CompiledController(
+        tmp_path_factory.mktemp("core"), core(problem, Parameters.naive(problem)), *flags
+    )
+
+
+def test_a_sample_without_a_solution_repeats_the_action_and_forgets_the_guess(small) -> None:
+    problem = evaporator_problem(horizon=1)
+    small.reset()
+    before = small.sample(np.array([26.0, 50.0]))
+    assert before["status"] == 0
+    good, slices = small.theta.copy(), Parameters.naive(problem).blocks.slices
+    small.theta[slices["B_l"]] *= -1
+    bad = small.sample(np.array([24.0, 49.0]))
+    assert (bad["status"], bad["failures"]) == (1, 1)
+    assert np.array_equal(bad["action"], before["action"])
+    assert small.sample(np.array([np.nan, 49.0]))["status"] in (1, 3)
+    small.theta[:] = good
+    after = small.sample(np.array([25.5, 50.0]))
+    small.reset()
+    fresh = small.sample(np.array([25.5, 50.0]))
+    assert np.array_equal(after["action"], fresh["action"])
+    assert after["failures"] == 2
+
+
+def test_an_ill_posed_theta_is_a_failure_with_the_reference_action(small) -> None:
+    problem = evaporator_problem(horizon=1)
+    small.reset()
+    good, slices = small.theta.copy(), Parameters.naive(problem).blocks.slices
+    small.theta[slices["x_l"]] = 1000.0
+    found = small.sample(np.array([26.0, 50.0]))
+    small.theta[:] = good
+    assert found["status"] == 4
+    assert np.array_equal(found["action"], problem.reference_action)
+
+
+def test_the_same_problem_gives_the_same_sources() -> None:
+    problem = evaporator_problem(horizon=2)
+    parameters = Parameters.naive(problem)
+    assert core(problem, parameters).sources == core(problem, parameters).sources
+
+
+def test_an_unknown_hessian_and_too_long_a_horizon_are_refused() -> None:
+    problem = evaporator_problem()
+    with pytest.raises(ControllerError, match="cannot be exported; choose gauss-newton or exact"):
+        core(problem, Parameters.naive(problem), "exact-unlifted")
+    problem = evaporator_problem(horizon=60)
+    with pytest.raises(ControllerError, match="of stack a sample"):
+        core(problem, Parameters.naive(problem))

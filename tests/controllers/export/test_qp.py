@@ -1,0 +1,81 @@
+"""The C solver on random and degenerate QPs: by its residual, and against DAQP and ProxQP."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from controllers.errors import QpError
+from controllers.qp import SoftQp
+from controllers.qp.active_set import polish
+from controllers.qp.daqp_backend import DaqpBackend
+from controllers.qp.proxqp_backend import ProxQpBackend
+from tests.helpers.compiled import FAMILIES, CompiledQpSolver, random_qps
+
+RESIDUAL = 1e-9
+AGREEMENT = 1e-6
+NOT_CONVEX, NOT_FINITE = 1, 3
+
+
+@pytest.fixture(scope="module")
+def solver(tmp_path_factory: pytest.TempPathFactory) -> CompiledQpSolver:
+    return CompiledQpSolver(tmp_path_factory.mktemp("qp"), 20, 20)
+
+
+def _check(solver: CompiledQpSolver, count: int, peers: tuple[type, ...], seed: int) -> Counter:
+    """Solve `count` QPs; the residual is that of `QpSolution`, written independently."""
+    solved: Counter = Counter()
+    for k, (family, qp) in enumerate(random_qps(count, seed)):
+        status, solution, own, _ = solver.solve(qp)
+        assert status == 0, (k, family)
+        residual = solution.residuals(qp).largest
+        assert residual < RESIDUAL, (k, family)
+        assert own == pytest.approx(residual, abs=RESIDUAL / 10)
+        for peer in peers:
+            try:
+                backend = peer()
+                backend.load(qp)
+                other = polish(qp, backend.solve(qp))
+            except QpError:
+                continue
+            if not other.residuals(qp).largest < RESIDUAL:
+                continue
+            solved[peer.__name__, family] += 1
+            difference = np.abs(solution.v - other.v) / (1 + np.abs(other.v))
+            assert difference.max() < AGREEMENT, (k, family, peer)
+    return solved
+
+
+def test_the_optimality_conditions_hold_on_every_family(solver: CompiledQpSolver) -> None:
+    _check(solver, 3000, (), seed=1)
+
+
+def test_daqp_and_proxqp_find_the_same_solution(solver: CompiledQpSolver) -> None:
+    solved = _check(solver, 100, (DaqpBackend, ProxQpBackend), seed=2)
+    for family in FAMILIES:
+        assert solved["DaqpBackend", family] + solved["ProxQpBackend", family] > 0
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_qps_against_daqp_and_proxqp(solver: CompiledQpSolver) -> None:
+    solved = _check(solver, 100_000, (DaqpBackend, ProxQpBackend), seed=3)
+    print(f"solved by peers: {dict(solved)}")
+
+
+def test_the_solution_does_not_depend_on_what_was_solved_before(solver) -> None:
+    qps = [qp for _, qp in random_qps(20, seed=4)]
+    first = [solver.solve(qp)[1].v for qp in qps]
+    again = [solver.solve(qp)[1].v for qp in reversed(qps)]
+    for one, other in zip(first, reversed(again), strict=True):
+        assert np.array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("change", "status"),
+    [({"H": -np.eye(20)}, NOT_CONVEX), ({"H": np.full((20, 20), np.nan)}, NOT_FINITE)],
+)
+def test_a_qp_without_a_solution_is_named(solver, change: dict, status: int) -> None:
+    _, qp = next(random_qps(1, seed=5))
+    assert solver.solve(SoftQp(**{**vars(qp), **change}))[0] == status

@@ -21,7 +21,7 @@ from controllers.storage import read_arrays
 from cosim.files import write_atomically
 from learning.errors import CheckpointError
 
-SCHEMA = 3
+SCHEMA = 4
 Array = NDArray[Any]
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isnan
 
+from controllers.parameters import Parameters
 from cosim.files import csv_text
 from learning.protocols import Update
 
-LogRow = dict[str, float]
 COLUMNS = (
     "samples",
     "updates",
@@ -34,6 +35,29 @@ COLUMNS = (
     "regret",
     "gap_closed",
 )
+
+
+@dataclass(frozen=True, eq=False)
+class LogRow(Mapping[str, float]):
+    """A line of the log: `figures` by column, NaN where not measured, and the `parameters` then.
+
+    It reads as the mapping of its figures; the entries of θ get names in the CSV alone.
+    """
+
+    figures: Mapping[str, float]
+    parameters: Parameters
+
+    def __getitem__(self, name: str) -> float:
+        """A figure by its column."""
+        return self.figures[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """The columns."""
+        return iter(self.figures)
+
+    def __len__(self) -> int:
+        """Return the number of figures."""
+        return len(self.figures)
 
 
 @dataclass
@@ -62,7 +86,7 @@ class Totals:
         self.refused += update.refused
         self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
 
-    def means(self) -> LogRow:
+    def means(self) -> dict[str, float]:
         """Means over the samples and their updates, NaN where there was none."""
         count = self.updates or float("nan")
         return {
@@ -75,17 +99,19 @@ class Totals:
         }
 
 
-def to_csv(rows: list[LogRow]) -> str:
-    """The log as CSV with exact decimals; what was not measured is left empty."""
+def to_csv(rows: Sequence[LogRow]) -> str:
+    """The log as CSV with exact decimals: its figures, then a column `theta NAME` for each entry.
+
+    What was not measured is left empty.
+    """
     if not rows:
         return ""
+    labels = [f"theta {label}" for label in rows[0].parameters.blocks.labels]
     return csv_text(
-        list(rows[0]),
-        (
-            [
-                "" if isnan(value) else repr(int(value) if value == int(value) else value)
-                for value in row.values()
-            ]
-            for row in rows
-        ),
+        [*rows[0], *labels],
+        (map(_cell, [*row.values(), *row.parameters.theta.tolist()]) for row in rows),
     )
+
+
+def _cell(value: float) -> str:
+    return "" if isnan(value) else repr(int(value) if value == int(value) else value)

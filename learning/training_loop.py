@@ -160,14 +160,14 @@ class TrainingLoop:
         every = run.validate_every
         validated = bool(every) and (number % every == 0 or number == run.samples)
         cost = self._validate() if validated else float("nan")
-        blocks, theta = self._learner.start.blocks, self._answer.theta
-        row: LogRow = dict.fromkeys(COLUMNS, float("nan"))
-        row |= self._totals.means()
-        row |= {
+        answer = self._answer
+        figures = dict.fromkeys(COLUMNS, float("nan"))
+        figures |= self._totals.means()
+        figures |= {
             "samples": number,
             # The least certificate of the updates since the last row, whichever step gave it.
             "smallest_eigenvalue": min(
-                self._totals.smallest_eigenvalue, certificate(blocks, theta).smallest
+                self._totals.smallest_eigenvalue, certificate(answer.blocks, answer.theta).smallest
             ),
             "failures": interaction.failures,
             "explored": interaction.explored,
@@ -179,10 +179,9 @@ class TrainingLoop:
             "accepted": float("nan") if self._validation is None else self._validation.accepted,
         }
         if judged:
-            row |= self._judge.verdict(theta).row()
-        row |= {f"theta {label}": float(v) for label, v in zip(blocks.labels, theta, strict=True)}
+            figures |= self._judge.verdict(answer.theta).row()
         self._totals = Totals()
-        return row
+        return LogRow(figures, answer)
 
     def _trouble(self, row: LogRow) -> str | None:
         """Why the run must stop, or None."""
@@ -194,9 +193,7 @@ class TrainingLoop:
 
     def _record(self, row: LogRow) -> None:
         assert self._recorder is not None
-        start = self._learner.start
-        theta = np.array([row[f"theta {label}"] for label in start.blocks.labels])
-        self._recorder.record(row, start.with_theta(theta), self._judge.controller(theta))
+        self._recorder.record(row, row.parameters, self._judge.controller(row.parameters.theta))
 
     def _checkpoint(self) -> None:
         """Write the state to disk and start the solver afresh, as a resumed run will."""
@@ -221,7 +218,8 @@ class TrainingLoop:
         stored |= {
             "theta": learner.controller.theta,
             "plant": np.frombuffer(plant, dtype=np.uint8),
-            "rows": np.array([[row[name] for name in columns] for row in self._rows]),
+            "rows": np.array([list(row.values()) for row in self._rows]),
+            "row_thetas": np.array([row.parameters.theta for row in self._rows]),
         }
         state = {
             "interaction": numbers,
@@ -244,8 +242,11 @@ class TrainingLoop:
         checkpoint.restore_generator(learner.rng, state["generator"])
         checkpoint.restore_generator(learner.algorithm_rng, state["algorithm_generator"])
         self._rows = [
-            dict(zip(state["columns"], (float(v) for v in row), strict=True))
-            for row in arrays["rows"]
+            LogRow(
+                dict(zip(state["columns"], figures.tolist(), strict=True)),
+                learner.start.with_theta(theta),
+            )
+            for figures, theta in zip(arrays["rows"], arrays["row_thetas"], strict=True)
         ]
         self._totals = Totals(**state["totals"])
         learner.controller.theta = arrays["theta"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -205,7 +205,7 @@ def _execute(
 
 def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:
     """Show J, TD error, regret and the smallest eigenvalue of the log's rows behind the bar."""
-    last: LogRow = {}
+    last: dict[str, float] = {}
 
     def update(done: int, row: LogRow | None) -> None:
         if row is None:
@@ -225,7 +225,7 @@ def summarise(run: TrainingRun, result: TrainingResult) -> dict[str, Any]:
     """What `summary.json` says of a run, but for its timing."""
     from importlib.metadata import version
 
-    last = result.rows[-1] if result.rows else {}
+    last: Mapping[str, float] = result.rows[-1] if result.rows else {}
     return {
         "version": version("rti-cosim"),
         "algorithm": run.algorithm,

@@ -24,7 +24,6 @@ from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
 ROWS = 64
-_THETA = "theta "
 _TOGETHER = {
     "cost per sample": ("J", "greedy_J"),
     "TD error": ("td_error", "td_error_mean"),
@@ -126,8 +125,7 @@ class TrainingRecorder:
         """Append a row of the log, with θ after it and a controller that has this θ."""
         if self._stream is None:
             raise RuntimeError("TrainingRecorder.start must come first, and close last")
-        scalars = {name: value for name, value in row.items() if not name.startswith(_THETA)}
-        self._rows.append({**scalars, "td_error_mean": self._td_error_mean(row)})
+        self._rows.append({**row, "td_error_mean": self._td_error_mean(row)})
         self._thetas.append(parameters.theta.copy())
         if self._map is not None and isfinite(row.get("greedy_J", nan)):
             self._map.send(int(row["samples"]), controller)

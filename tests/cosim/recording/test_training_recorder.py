@@ -35,7 +35,6 @@ def row(samples, td_error=1.0, greedy=nan):
         "td_error": td_error,
         "updates": 1,
         "greedy_J": greedy,
-        "theta c": 1.0,
     }
 
 
@@ -63,7 +62,6 @@ def test_the_log_comes_back_column_by_column(tmp_path, paper, rng):
     signals = recorded(tmp_path / "t.rrd", paper, rows, np.zeros((70, 6))).signals
     assert np.array_equal(signals["td_error"], errors)
     assert np.isnan(signals["greedy_J"]).all()
-    assert "theta c" not in signals
 
 
 def test_the_td_error_is_averaged_over_the_preceding_ten_thousand_samples(tmp_path, paper, rng):

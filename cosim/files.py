@@ -6,13 +6,15 @@ import csv
 import io
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
 CACHE_VARIABLE = "COSIM_CACHE"
+PIECE = 10_000
 
 
 def user_cache(kind: str) -> Path:
@@ -25,18 +27,20 @@ def user_cache(kind: str) -> Path:
     return root.absolute() / kind
 
 
-def write_atomically(path: str | Path, data: bytes | str) -> Path:
+def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Path:
     """Write a file under a temporary name in its folder, then rename it into place.
 
     A reader never sees half a file, and what stood under the name before survives any failure.
-    Text is encoded as UTF-8. Raises OSError where the folder cannot be written.
+    Text, whole or in pieces that are written as they come, is encoded as UTF-8. Raises OSError
+    where the folder cannot be written.
     """
     path = Path(path)
-    content = data.encode() if isinstance(data, str) else data
+    pieces = (data,) if isinstance(data, bytes | str) else data
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+            for piece in pieces:
+                stream.write(piece.encode() if isinstance(piece, str) else piece)
             stream.flush()
             os.fsync(stream.fileno())
         # mkstemp makes the file private; a result is meant to be read like any other file.
@@ -52,11 +56,22 @@ def write_atomically(path: str | Path, data: bytes | str) -> Path:
 
 def csv_text(header: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
     """A table of texts as CSV, lines ended by one newline."""
+    return "".join(csv_pieces(header, rows))
+
+
+def csv_pieces(header: Sequence[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
+    """`csv_text`, `PIECE` rows at a time: text takes ten times the memory of its numbers."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows(rows)
-    return stream.getvalue()
+    rows = iter(rows)
+    while True:
+        writer.writerows(islice(rows, PIECE))
+        if not (piece := stream.getvalue()):
+            return
+        yield piece
+        stream.seek(0)
+        stream.truncate()
 
 
 def cell(value: Any) -> str:

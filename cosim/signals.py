@@ -37,6 +37,9 @@ class Sample(NamedTuple):
     plant_time: float
 
 
+RESIDUAL = "residual"
+
+
 @dataclass(frozen=True)
 class SignalKind:
     """A declared signal: its `name`, how its value comes `of` a sample, its `unit`.
@@ -82,7 +85,7 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("penalty", lambda x: x.step.penalty, COST, "costs"),
     SignalKind("violation", _violation),
     SignalKind("value", lambda x: nan if x.solution is None else x.solution.value, COST),
-    SignalKind("residual", lambda x: nan if x.solution is None else x.solution.residual),
+    SignalKind(RESIDUAL, lambda x: nan if x.solution is None else x.solution.residual),
     SignalKind("explored", lambda x: x.explored, whole=True),
     SignalKind("failed", lambda x: x.solution is None, whole=True),
     SignalKind("prepare_time", lambda x: x.prepare_time, "s", "step_time", clock=True),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import nan
 from time import perf_counter
 
 import numpy as np
@@ -49,12 +50,15 @@ def simulate(
     exploration: Exploration | None = None,
     recorder: Recorder | None = None,
     progress: Callable[[int], None] | None = None,
+    residuals: bool = True,
 ) -> Trajectory:
     """Run a controller on a plant for `steps` samples from the scenario's initial state.
 
     Each sample: `prepare`, then `feedback(s)`, then the plant steps under the action, which the
     actuators saturate to the scenario's action bounds. `exploration` may change the action;
-    `recorder` gets the run block by block; `progress` the number of samples done.
+    `recorder` gets the run block by block; `progress` the number of samples done. `residuals` says
+    whether the controller's KKT residuals are wanted, which some compute only when asked: NaN
+    without.
 
     If the controller fails to solve (an exception whose class has `is_solver_failure`), the last
     applied action is applied again (at the first sample the scenario's reference action), the
@@ -62,7 +66,7 @@ def simulate(
     """
     if steps < 1:
         raise CosimError(f"steps must be at least 1, not {steps}")
-    run = _Run(plant, controller, steps, seed, exploration)
+    run = _Run(plant, controller, steps, seed, exploration, residuals)
     if recorder is None:
         run.go(_no_record, progress)
         return run.trajectory()
@@ -88,13 +92,17 @@ class _Run:
         steps: int,
         seed: int,
         exploration: Exploration | None,
+        residuals: bool,
     ) -> None:
         self._plant, self._controller = plant, controller
         self._scenario: Scenario = plant.scenario
-        self._exploration = exploration
+        self._exploration, self._residuals = exploration, residuals
         self._seed, self._steps = seed, steps
+        # Column-major, so that a signal is a column and not a copy of one.
         self._columns = {
-            kind.name: np.empty((steps, len(kind.names(self._scenario))) if kind.vector else steps)
+            kind.name: np.empty(
+                (steps, len(kind.names(self._scenario))) if kind.vector else steps, order="F"
+            )
             for kind in signals.SIGNALS
         }
         self._status: list[str] = []
@@ -112,7 +120,7 @@ class _Run:
         self._controller.reset()
         applied = self._scenario.reference_action
         exploration, scenario = self._exploration, self._scenario
-        read, rows = [kind.of for kind in signals.SIGNALS], []
+        read, rows = [self._reader(kind) for kind in signals.SIGNALS], []
         for k in range(self._steps):
             solution, *times = self._solve(s)
             action, explores = applied if solution is None else solution.action, False
@@ -147,6 +155,10 @@ class _Run:
                 if progress is not None:
                     progress(k + 1)
         self._final_state = s
+
+    def _reader(self, kind: signals.SignalKind) -> Callable[[signals.Sample], float | list[float]]:
+        wanted = self._residuals or kind.name != signals.RESIDUAL
+        return kind.of if wanted else lambda _: nan
 
     def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
         """Prepare and feed back, timed apart; None if the controller declares a failure."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cosim import files
 from cosim.errors import TrajectoryError
-from cosim.files import csv_text, write_atomically
+from cosim.files import PIECE, csv_pieces, write_atomically
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
 from cosim.signals import signal_names, whole
@@ -139,27 +139,34 @@ class Trajectory:
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
-        signals, counted = list(self.signals.values()), whole()
-        columns = [
-            (signal.values.astype(int) if signal.name in counted else signal.values)
-            for signal in signals
-        ]
-        return csv_text(
-            [*(signal.header for signal in signals), STATUS],
-            zip(*(map(repr, column.tolist()) for column in columns), self.status, strict=True),
-        )
+        return "".join(self._csv())
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `to_csv` to a file, whole or not at all."""
-        write_atomically(path, self.to_csv())
-        return Path(path)
+        return write_atomically(path, self._csv())
 
     def write_timing_csv(self, path: str | Path) -> Path:
         """Write the wall-clock times in µs to a file of their own, one row per sample."""
-        rows = zip(*(values.tolist() for values in self.timing.values()), strict=True)
         header = [f"{name} [us]" for name in self.timing]
-        write_atomically(path, csv_text(header, ([f"{1e6 * v:.3f}" for v in row] for row in rows)))
-        return Path(path)
+        rows = ([f"{1e6 * v:.3f}" for v in row] for row in _rows(list(self.timing.values())))
+        return write_atomically(path, csv_pieces(header, rows))
+
+    def _csv(self) -> Iterator[str]:
+        signals, counted = list(self.signals.values()), whole()
+        numbers = _rows([signal.values for signal in signals])
+        text = [(lambda v: repr(int(v))) if s.name in counted else repr for s in signals]
+        rows = (
+            [*(write(value) for write, value in zip(text, row, strict=True)), status]
+            for row, status in zip(numbers, self.status, strict=True)
+        )
+        return csv_pieces([*(signal.header for signal in signals), STATUS], rows)
+
+
+def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:
+    """Rows of equally long columns, turned to Python's numbers a part at a time."""
+    for first in range(0, len(columns[0]) if columns else 0, PIECE):
+        parts = (column[first : first + PIECE].tolist() for column in columns)
+        yield from zip(*parts, strict=True)
 
 
 def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:

@@ -64,7 +64,7 @@ def reproduce(
                 status[key] = outcome
                 progress(len(status))
 
-            run_all(train, tasks, done, jobs=workers)
+            run_all(train, tasks.items(), done, jobs=workers)
         learned = {key: task.folder / "parameters.toml" for key, task in tasks.items()}
         evaluation = _evaluate(sizes, learned, folder, workers, out_)
         readings = _map(sizes, learned, folder, workers, out_)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,8 @@ def evaluate(
     _check(controllers, numbers, steps)
     plan = _Plan(scenario, controllers, numbers, steps, optimum)
     store = Store(None if folder is None else Path(folder))
-    results = {key: result for key in plan.units if (result := store.load(key)) is not None}
+    keys = (plan.key(name, seed) for name, seed in plan.runs())
+    results = {key: result for key in keys if (result := store.load(key)) is not None}
     report = progress or (lambda _: None)
     report(len(results))
 
@@ -69,9 +71,10 @@ def evaluate(
         results[key] = result
         report(len(results))
 
-    missing = {key: unit for key, unit in plan.units.items() if key not in results}
+    missing = (plan.unit(name, seed) for name, seed in plan.runs())
+    tasks = ((key, unit) for key, unit in missing if key not in results)
     try:
-        run_all(run, missing, done, jobs=jobs, scheduler=scheduler)
+        run_all(run, tasks, done, jobs=jobs, scheduler=scheduler)
     finally:
         release()
     return plan.assemble(results, command)
@@ -117,22 +120,34 @@ class _Plan:
             "fmu_sha256": fmu,
         }
         self._parameters: dict[str, str] = {}
-        self._keys: dict[tuple[str, int | None], str] = {}
-        self.units: dict[str, Unit] = {}
+        self._units: dict[str, Unit] = {}
+        self._of_controller: dict[str, dict[str, Any]] = {}
         session = secrets.token_hex(8)
         for name, factory in every.items():
             controller = factory(scenario)
             self._parameters[name] = parameters_hash(controller)
-            facts = self._facts | {
+            self._of_controller[name] = self._facts | {
                 "scenario": None,
                 "controller": name,
                 "controller_hash": controller_hash(controller),
                 "parameters_hash": self._parameters[name],
             }
-            for seed in (None, *seeds) if name in controllers else seeds:
-                key = unit_key(facts | {"seed": seed})
-                self._keys[name, seed] = key
-                self.units[key] = Unit(session, name, factory, scenario, seed, steps, code)
+            self._units[name] = Unit(session, name, factory, scenario, None, steps, code)
+
+    def runs(self) -> Iterator[tuple[str, int | None]]:
+        """Controller and seed of every unit; without a seed it is the settling run."""
+        for name in self._units:
+            if name in self._names:
+                yield name, None
+            yield from ((name, seed) for seed in self._seeds)
+
+    def key(self, name: str, seed: int | None) -> str:
+        """Key of a unit, made when it is asked for: a million of them take half a gigabyte."""
+        return unit_key(self._of_controller[name] | {"seed": seed})
+
+    def unit(self, name: str, seed: int | None) -> tuple[str, Unit]:
+        """A unit under its key."""
+        return self.key(name, seed), replace(self._units[name], seed=seed)
 
     def assemble(self, results: Mapping[str, Result], command: str) -> Evaluation:
         names = self._names
@@ -140,12 +155,12 @@ class _Plan:
             controllers=names,
             seeds=self._seeds,
             results={
-                (name, seed): results[key]
-                for (name, seed), key in self._keys.items()
+                (name, seed): results[self.key(name, seed)]
+                for name, seed in self.runs()
                 if seed is not None
             },
             settling={
-                name: results[self._keys[name, None]].indicators["settling_time"] for name in names
+                name: results[self.key(name, None)].indicators["settling_time"] for name in names
             },
             parameters={name: self._parameters[name] for name in names},
             facts=self._facts | {"command": command},

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from importlib import import_module
+from itertools import islice
 from typing import Any, TypeVar
 
 import loky
@@ -31,30 +32,30 @@ def cores() -> int:
 
 def run_all(
     function: Callable[[Task], Outcome],
-    tasks: Mapping[str, Task],
+    tasks: Iterable[tuple[str, Task]],
     done: Callable[[str, Outcome], Mapping[str, Task] | None],
     *,
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> None:
-    """Call `done(key, function(task))` for every task, as they finish, in no certain order.
+    """Call `done(key, function(task))` for every (key, task), as they finish, in no certain order.
 
     What `done` returns are further tasks, which come before those that wait. `done` runs in this
     process, so what it stores survives whatever becomes of the workers. With `scheduler` the tasks
-    go to that Dask cluster; else to `jobs` processes, or none for one job. Only as many are given
-    out as keep the workers busy. A worker that dies takes down only the tasks it had not finished;
-    they are given out again.
+    go to that Dask cluster; else to `jobs` processes, or none for one job. Only as many are taken
+    from `tasks`, and given out, as keep the workers busy. A worker that dies takes down only the
+    tasks it had not finished; they are given out again.
 
     Raises EvaluationError if the cluster cannot be reached, or if the workers die `ROUNDS` times
     without finishing anything; the first exception of a task ends the run and is raised.
     """
     if jobs < 1:
         raise EvaluationError(f"jobs must be at least 1, not {jobs}")
-    waiting = deque(tasks.items())
+    waiting = _Queue(tasks)
     if scheduler is None and jobs == 1:
         while waiting:
-            key, task = waiting.popleft()
-            _put_first(waiting, done(key, function(task)))
+            key, task = waiting.take()
+            waiting.put_first(done(key, function(task)))
         return
     fruitless = 0
     while waiting:
@@ -72,20 +73,36 @@ def run_all(
             fruitless = 0 if finished else fruitless + 1
             if fruitless == ROUNDS:
                 raise EvaluationError(
-                    f"the workers died {ROUNDS} times without finishing one of {len(waiting)} work "
-                    f"units ({error}); run with --jobs 1 to see why"
+                    f"the workers died {ROUNDS} times without finishing one of the work "
+                    f"units left ({error}); run with --jobs 1 to see why"
                 ) from None
 
 
-def _put_first(waiting: deque[tuple[str, Any]], more: Mapping[str, Any] | None) -> None:
-    waiting.extendleft(reversed(list((more or {}).items())))
+class _Queue:
+    """Tasks that wait: those put back or added in front, then what the source still holds."""
+
+    def __init__(self, source: Iterable[tuple[str, Any]]) -> None:
+        self._source = iter(source)
+        self._front: deque[tuple[str, Any]] = deque()
+
+    def __bool__(self) -> bool:
+        if not self._front:
+            self._front.extend(islice(self._source, 1))
+        return bool(self._front)
+
+    def take(self) -> tuple[str, Any]:
+        """The next task, after `bool` has said that there is one."""
+        return self._front.popleft()
+
+    def put_first(self, tasks: Mapping[str, Any] | None) -> None:
+        self._front.extendleft(reversed(list((tasks or {}).items())))
 
 
 def _feed(
     executor: Executor,
     workers: Callable[[], int],
     function: Callable[[Any], Any],
-    waiting: deque[tuple[str, Any]],
+    waiting: _Queue,
     done: Callable[[str, Any], Mapping[str, Any] | None],
 ) -> None:
     """Give out tasks, a few more than there are workers; what was not finished waits again."""
@@ -95,7 +112,7 @@ def _feed(
         while given or (waiting and broken is None):
             limit = 2 * workers() if broken is None else 0
             while waiting and len(given) < limit:
-                key, task = waiting.popleft()
+                key, task = waiting.take()
                 given[executor.submit(function, task)] = (key, task)
             finished, _ = wait(given, return_when=FIRST_COMPLETED)
             for future in finished:
@@ -105,14 +122,14 @@ def _feed(
                 except BrokenProcessPool as error:
                     # Futures that finished before the pool broke still come and still count.
                     broken = error
-                    waiting.appendleft((key, task))
+                    waiting.put_first({key: task})
                     continue
-                _put_first(waiting, done(key, outcome))
+                waiting.put_first(done(key, outcome))
     except BrokenProcessPool as error:  # of submit: the pool broke while nothing was awaited
         broken = error
-        waiting.appendleft((key, task))
+        waiting.put_first({key: task})
         for key, task in given.values():
-            waiting.appendleft((key, task))
+            waiting.put_first({key: task})
     if broken is not None:
         raise broken
 

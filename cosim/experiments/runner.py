@@ -66,7 +66,7 @@ class Runner:
             tasks |= self._next(name, run)
         self._tell("")
         try:
-            run_all(perform, tasks, self._take, jobs=jobs, scheduler=scheduler)
+            run_all(perform, tasks.items(), self._take, jobs=jobs, scheduler=scheduler)
         finally:
             release()
 

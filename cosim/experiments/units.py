@@ -123,7 +123,7 @@ def simulated(
     scenario: Scenario, controller: Controller, steps: int, seed: int
 ) -> dict[str, float]:
     """Indicators of a run of a controller on a scenario's plant, which this process keeps."""
-    figures = indicators(simulate(_plant(scenario), controller, steps, seed))
+    figures = indicators(simulate(_plant(scenario), controller, steps, seed, residuals=False))
     return {name: figures[name] for name in INDICATORS}
 
 

@@ -144,7 +144,7 @@ def main() -> None:
         done.append(folder)
         print(f"{len(done)}/{len(work)} {line}", flush=True)
 
-    run_all(perform, work, report, jobs=arguments.jobs)
+    run_all(perform, work.items(), report, jobs=arguments.jobs)
 
 
 if __name__ == "__main__":

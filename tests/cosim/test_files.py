@@ -62,3 +62,17 @@ def test_a_markdown_table_has_text_left_and_numbers_right():
     assert markdown_table(["case", "J"], [["q", "1.5"]]) == (
         "| case | J |\n| --- | ---: |\n| q | 1.5 |\n"
     )
+
+
+def test_pieces_are_written_as_they_come_and_a_failure_between_them_leaves_nothing(tmp_path):
+    path = write_atomically(tmp_path / "file", (f"{i}\n" for i in range(3)))
+    assert path.read_text() == "0\n1\n2\n"
+
+    def broken():
+        yield "half"
+        raise RuntimeError("no more")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        write_atomically(path, broken())
+    assert path.read_text() == "0\n1\n2\n"
+    assert list(tmp_path.iterdir()) == [path]

@@ -30,7 +30,7 @@ WORKERS = (
     "def work(path):\n"
     "    open(path + str(os.getpid()), 'w').close()\n"
     "    time.sleep(600)\n"
-    "run_all(work, {{str(k): {folder!r} + '/' for k in range(4)}}, print, jobs=2)\n"
+    "run_all(work, {{str(k): {folder!r} + '/' for k in range(4)}}.items(), print, jobs=2)\n"
 )
 
 

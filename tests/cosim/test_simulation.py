@@ -108,6 +108,24 @@ def test_a_failure_leaves_the_exploration_noise_in_step(evaporator, paper):
     np.testing.assert_array_equal(broken.actions[4], broken.actions[3])
 
 
+def test_residuals_that_nobody_wants_are_not_computed(evaporator, paper):
+    class Lacking:
+        status, predicted_states, predicted_actions = "solved", None, None
+
+        def __init__(self, answer):
+            self.action, self.value = answer.action, answer.value
+
+    class Lazy(Proportional):
+        def feedback(self, s):
+            return Lacking(super().feedback(s))
+
+    whole = simulate(evaporator, Proportional(paper), 20, seed=1)
+    spared = simulate(evaporator, Lazy(paper), 20, seed=1, residuals=False)
+    assert np.isnan(spared["residual"]).all()
+    for name in whole.signals.keys() - {"residual"}:
+        assert whole[name].tobytes() == spared[name].tobytes()
+
+
 def test_any_other_exception_of_the_controller_ends_the_run(evaporator, paper):
     class Broken(Proportional):
         def feedback(self, s, a=None):

@@ -31,6 +31,16 @@ def test_csv_reads_back_to_the_same_bits(trajectory, tmp_path):
     assert copy.to_csv() == trajectory.to_csv()
 
 
+def test_a_file_written_in_pieces_is_the_whole_text(trajectory, tmp_path, monkeypatch):
+    text = trajectory.to_csv()
+    timing = trajectory.write_timing_csv(tmp_path / "timing.csv").read_text()
+    monkeypatch.setattr("cosim.trajectory.PIECE", 7)
+    monkeypatch.setattr("cosim.files.PIECE", 5)
+    assert trajectory.write_csv(tmp_path / "run.csv").read_text() == text
+    assert trajectory.write_timing_csv(tmp_path / "timing.csv").read_text() == timing
+    assert len(text.splitlines()) == len(timing.splitlines()) == len(trajectory) + 1
+
+
 def test_summary_is_the_means_of_the_definitions(trajectory, paper):
     v = np.maximum(
         np.maximum(paper.state_lower - trajectory.states, trajectory.states - paper.state_upper), 0

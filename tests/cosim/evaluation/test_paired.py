@@ -113,7 +113,7 @@ def test_a_killed_dask_worker_loses_nothing(paper, cluster, ledger):
 @pytest.mark.slow
 def test_a_cluster_whose_workers_always_die_ends_in_an_error(cluster):
     with pytest.raises(EvaluationError, match="workers of the cluster died again and again"):
-        run_all(die, {"a": 1}, print, scheduler=cluster)
+        run_all(die, {"a": 1}.items(), print, scheduler=cluster)
 
 
 def test_a_finished_evaluation_is_read_not_run_again(paper, tmp_path, ledger):

@@ -7,7 +7,7 @@ from tests.helpers.workers import die, die_once, refuse_three, square
 
 def collect(function, tasks, **options):
     results = {}
-    run_all(function, tasks, results.__setitem__, **options)
+    run_all(function, tasks.items(), results.__setitem__, **options)
     return results
 
 
@@ -18,6 +18,14 @@ SQUARES = {str(i): i * i for i in range(8)}
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_every_task_is_done_once(jobs):
     assert collect(square, NUMBERS, jobs=jobs) == SQUARES
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_tasks_are_taken_from_the_source_as_workers_become_free(jobs):
+    taken, lead = [], []
+    tasks = ((str(i), taken.append(i) or i) for i in range(40))
+    run_all(square, tasks, lambda key, _: lead.append(len(taken) - len(lead)), jobs=jobs)
+    assert len(lead) == 40 and max(lead) <= 2 * jobs + 1
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -34,7 +42,7 @@ def test_what_a_killed_worker_had_not_finished_is_done_by_another(tmp_path):
 
 
 def test_workers_that_always_die_end_in_an_error_that_says_so():
-    with pytest.raises(EvaluationError, match="died 3 times without finishing one of 8"):
+    with pytest.raises(EvaluationError, match="died 3 times without finishing one of the"):
         collect(die, NUMBERS, jobs=2)
 
 

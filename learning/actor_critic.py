@@ -14,6 +14,7 @@ from learning.constrained_step import ConstrainedStep
 from learning.critic import AdvantageRegression, lstdv
 from learning.exploration import Strategy
 from learning.fit import policy_gradient_fit
+from learning.globalised import GlobalisedLearning, Rule
 from learning.protocols import LearnableController, Transition, Update
 from learning.schedule import Geometric
 
@@ -46,7 +47,7 @@ class ActorCriticConfiguration(Configuration):
     )
 
 
-class ActorCritic:
+class PolicyGradient:
     """Descends J along ∇J = E[∇π ∇πᵀ] w (paper.tex, eq. pg_update and pg_solution).
 
     Each batch at one θ: LSTDV fits the smooth part W of V = penalty + W, LSTDQ the weights w of
@@ -54,8 +55,6 @@ class ActorCritic:
     gives to the exploration. The known penalty is moved to the next state, r = ℓ + γ·penalty(s₊),
     so that the critic meets no kink.
     """
-
-    Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
 
     def __init__(
         self,
@@ -65,9 +64,13 @@ class ActorCritic:
         samples: int,
         strategy: Strategy,
         rng: np.random.Generator,
+        *,
+        width: float = 1.0,
     ) -> None:
         self._configuration, self._strategy = configuration, strategy
-        self._radius = Geometric(configuration.radius, configuration.radius_end, samples)
+        self._radius = Geometric(
+            width * configuration.radius, width * configuration.radius_end, samples
+        )
         self._discount = configuration.critic_discount
         self._step = ConstrainedStep(controller, configuration)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
@@ -146,3 +149,21 @@ class ActorCritic:
         self._filled = len(state["reward"])
         for name, values in self._batch.items():
             values[: self._filled] = state[name]
+
+
+class ActorCritic(GlobalisedLearning):
+    """`PolicyGradient`, globalised unless the configuration says otherwise."""
+
+    Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
+
+    def rule(self, samples: int, width: float) -> Rule:
+        """The policy gradient with a trust region `width` times as wide."""
+        return PolicyGradient(
+            self._controller,
+            self._scenario,
+            self._configuration,
+            samples,
+            self._strategy,
+            self._rng,
+            width=width,
+        )

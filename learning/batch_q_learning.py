@@ -16,6 +16,7 @@ from learning.configuration import Configuration, Count, Positive
 from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
 from learning.fit import Fit, damped, least_squares
+from learning.globalised import GlobalisedLearning, Rule
 from learning.protocols import LearnableController, Transition, Update
 from learning.q_configuration import FinalGain, Gain, QConfiguration
 from learning.replay import ReplayBuffer, Replayed
@@ -59,7 +60,7 @@ class BatchQLearningConfiguration(QConfiguration):
     )
 
 
-class BatchQLearning:
+class ReplayedQLearning:
     """Q-learning on the TD errors of a replayed buffer (paper.tex, eq. q_learning_fitting).
 
     One iteration replays the buffer at θ, stands on the target y = ℓ + γV_θ(s₊), and steps
@@ -67,8 +68,6 @@ class BatchQLearning:
     next replay tells whether the errors fell as predicted: else the trust region is halved, and
     where they rose θ goes back, the mean cost g too.
     """
-
-    Configuration: ClassVar[type[Configuration]] = BatchQLearningConfiguration
 
     def __init__(
         self,
@@ -78,6 +77,8 @@ class BatchQLearning:
         samples: int,
         strategy: Strategy,
         rng: np.random.Generator,
+        *,
+        width: float = 1.0,
     ) -> None:
         self._controller, self._configuration = controller, configuration
         self._gain = configuration.gains(samples)
@@ -85,7 +86,8 @@ class BatchQLearning:
         self._step = ConstrainedStep(controller, configuration)
         self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
         self._buffer = ReplayBuffer(configuration.buffer_size)
-        self._radius = configuration.radius
+        self._largest = configuration.radius * width
+        self._radius = self._largest
         self._trial: Trial | None = None
         self.needs_action_value = False
         self.needs_points = True
@@ -145,9 +147,11 @@ class BatchQLearning:
         actual = start - float(((target - replayed.action_value[new]) ** 2).sum())
         promised = start - float(trial.predicted[old].sum())
         if actual < 0.25 * promised:
-            self._radius = max(self._radius / 2, self._configuration.radius_minimum)
+            self._radius = max(
+                self._radius / 2, min(self._configuration.radius_minimum, self._largest)
+            )
         elif actual > 0.75 * promised:
-            self._radius = min(self._radius * 2, self._configuration.radius)
+            self._radius = min(self._radius * 2, self._largest)
         return actual < 0
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -175,6 +179,24 @@ class BatchQLearning:
         self._buffer.restore(part["buffer"])
         trial = part["trial"]
         self._trial = Trial(*(trial[name] for name in Trial._fields)) if trial else None
+
+
+class BatchQLearning(GlobalisedLearning):
+    """`ReplayedQLearning`, globalised unless the configuration says otherwise."""
+
+    Configuration: ClassVar[type[Configuration]] = BatchQLearningConfiguration
+
+    def rule(self, samples: int, width: float) -> Rule:
+        """The replaying rule with a trust region `width` times as wide."""
+        return ReplayedQLearning(
+            self._controller,
+            self._scenario,
+            self._configuration,
+            samples,
+            self._strategy,
+            self._rng,
+            width=width,
+        )
 
 
 def steepest_descent(gradient: Matrix, jacobian: Matrix, td_error: Vector, ridge: float) -> Fit:

@@ -6,6 +6,8 @@ import tomllib
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cosim.scenario import Scenario
@@ -20,9 +22,8 @@ Count = Annotated[int, Field(ge=1)]
 ExplorationProbability = Annotated[
     Share, Field(description="share of samples that explore, at the start")
 ]
-ExplorationDeviation = Annotated[
-    tuple[NonNegative, ...],
-    Field(description="standard deviation of e in the units of u, one or one per action"),
+ExplorationShare = Annotated[
+    Positive, Field(description="standard deviation of e as a share of the input's range")
 ]
 
 
@@ -71,10 +72,28 @@ class Configuration(BaseModel):
     exploration_probability_end: Share | None = Field(
         None, description="share at the end, approached linearly; the same if not given"
     )
-    exploration_deviation: ExplorationDeviation = (5.0,)
+    exploration_share: ExplorationShare = 1 / 60
+    exploration_deviation: tuple[NonNegative, ...] | None = Field(
+        None,
+        description="the same in the units of u, one or one per action, in place of the share",
+    )
     exploration_deviation_end: tuple[NonNegative, ...] | None = Field(
         None, description="the same at the end, approached linearly"
     )
+
+    globalisation: Literal["validated", "none"] | None = Field(
+        None,
+        description="validated: phases of learning and line searches, in which a θ must beat the "
+        "incumbent on the same noise; none: the rule alone; if not given, as the rule recommends",
+    )
+    phase: Count = Field(2500, description="validated: samples of learning between validations")
+    block: Count = Field(100, description="validated: samples of a block of a race")
+    blocks: Count = Field(8, description="validated: blocks of a race that is not decided before")
+
+    @property
+    def globalised(self) -> bool:
+        """Whether validation decides what is kept."""
+        return self.globalisation != "none"
 
     @classmethod
     def from_assignments(cls, assignments: Iterable[str]) -> Self:
@@ -119,6 +138,12 @@ class Configuration(BaseModel):
             stated["value_offset"] = scenario.controller.value_offset
         chosen = self.model_fields_set
         return self.model_copy(update={k: v for k, v in stated.items() if k not in chosen})
+
+    def deviation(self, scenario: Scenario) -> NDArray[np.float64]:
+        """Standard deviation of the exploration at the start in the units of u, (m,) or (1,)."""
+        if self.exploration_deviation is not None:
+            return np.array(self.exploration_deviation)
+        return self.exploration_share * (scenario.action_upper - scenario.action_lower)
 
     def depends_on_samples(self) -> list[str]:
         """Names of what changes over the run, so that a longer run would not begin as this one."""

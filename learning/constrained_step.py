@@ -22,17 +22,25 @@ class ConstrainedStep:
     """Moves a controller's θ by a fit under every constraint on θ.
 
     `scale` (n_θ,) are the coordinates of the fits: the layout's, or ones where the configuration
-    says `scaled = false`. The least eigenvalue that the Hessians may have is the configuration's,
-    or half of the start's where that is less: an economically tuned cost is flat. Raises
-    DivergenceError on a step that is not finite.
+    says `scaled = false`, or `scale` where it is given. The least eigenvalue that the Hessians may
+    have is the configuration's, or half of the start's where that is less: an economically tuned
+    cost is flat. Raises DivergenceError on a step that is not finite.
     """
 
     def __init__(
-        self, controller: LearnableController, configuration: Configuration, *, scaled: bool = True
+        self,
+        controller: LearnableController,
+        configuration: Configuration,
+        *,
+        scaled: bool = True,
+        scale: Vector | None = None,
     ) -> None:
         self._controller = controller
         blocks = controller.parameters.blocks
-        self.blocks = blocks if scaled else unscaled(blocks)
+        if scale is not None:
+            self.blocks = rescaled(blocks, scale)
+        else:
+            self.blocks = blocks if scaled else rescaled(blocks, np.ones(blocks.size))
         self.scale: Vector = self.blocks.scale
         self._enforce = enforcement(
             configuration.definiteness,
@@ -107,8 +115,11 @@ def least_eigenvalue(configuration: Configuration, start: Parameters) -> float:
     )
 
 
-def unscaled(blocks: ThetaBlocks) -> ThetaBlocks:
-    """The blocks with every learning scale 1, for steps in θ itself."""
+def rescaled(blocks: ThetaBlocks, scale: Vector) -> ThetaBlocks:
+    """The blocks with another learning scale, (n_θ,)."""
     return ThetaBlocks(
-        tuple(dataclasses.replace(block, scale=(1.0,) * block.size) for block in blocks)
+        tuple(
+            dataclasses.replace(block, scale=tuple(scale[blocks.slices[block.name]].tolist()))
+            for block in blocks
+        )
     )

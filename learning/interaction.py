@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,18 @@ class ContinuablePlant(Protocol):
     def step(self, a: Vector) -> Step:
         """Hold an action for one sample."""
 
+    def snapshot(self) -> Any:
+        """The plant as it is, its noise to come included."""
+
+    def restore(self, snapshot: Any) -> Any:
+        """Put a snapshot back."""
+
+    def serialise(self, snapshot: Any) -> bytes:
+        """A snapshot as bytes."""
+
+    def deserialise(self, content: bytes) -> Any:
+        """The snapshot of these bytes."""
+
 
 class Interaction:
     """One long episode in which V(s₊) of a sample is V(s) of the next, so a sample costs one QP.
@@ -61,6 +73,7 @@ class Interaction:
         self._policy: LearnableSolution | None = None
         self._point: LinearisationPoint | None = None
         self.s: Vector = scenario.initial_state
+        self._marked: tuple[Any, Vector] | None = None
         self.number = 0
         self.failures = 0
         self.explored = 0
@@ -71,6 +84,18 @@ class Interaction:
     def start(self, seed: int) -> None:
         """Begin the episode: reset plant and controller, solve for the first state."""
         self.s = self._plant.reset(seed)
+        self._controller.reset()
+        self._policy = self._solve()
+
+    def mark(self) -> None:
+        """Remember the plant as it is now; raises CapabilityError where it cannot be."""
+        self._marked = (self._plant.snapshot(), self.s)
+
+    def rewind(self) -> None:
+        """Put the plant back to where it was remembered, and solve there from the reference."""
+        assert self._marked is not None
+        snapshot, self.s = self._marked
+        self._plant.restore(snapshot)
         self._controller.reset()
         self._policy = self._solve()
 
@@ -109,6 +134,8 @@ class Interaction:
 
     def _choose(self, action: Vector) -> tuple[Vector, bool]:
         """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
+        if not getattr(self._algorithm, "explores", True):
+            return self._saturate(action), False
         try:
             explored = self._strategy(action, self._rng, self.number, self._perturbed)
         except QpError:  # of the perturbed cost; the policy itself was solved for
@@ -148,6 +175,9 @@ class Interaction:
         arrays = {"s": self.s, "applied": self._applied}
         if self._point is not None:
             arrays |= {f"point_{key}": value for key, value in self._point._asdict().items()}
+        if self._marked is not None:
+            content = self._plant.serialise(self._marked[0])
+            arrays |= {"marked_s": self._marked[1], "marked": np.frombuffer(content, np.uint8)}
         return {name: getattr(self, name) for name in COUNTS}, arrays
 
     def resume(self, numbers: dict[str, int], arrays: dict[str, Vector]) -> None:
@@ -155,7 +185,10 @@ class Interaction:
         for name, value in numbers.items():
             setattr(self, name, value)
         self.s, self._applied = arrays["s"], arrays["applied"]
-        self._point = None
+        self._point = self._marked = None
+        if "marked" in arrays:
+            snapshot = self._plant.deserialise(arrays["marked"].tobytes())
+            self._marked = (snapshot, arrays["marked_s"])
         if "point_x" in arrays:
             self._point = LinearisationPoint(
                 *(arrays[f"point_{name}"] for name in LinearisationPoint._fields)

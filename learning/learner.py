@@ -64,8 +64,12 @@ class Learner:
             update = failed(cost)
         if update is not None:
             self.interaction.failures += update.failures
-            if update.episode is None:
-                self.interaction.renew()
-            else:
+            if update.mark:
+                self.interaction.mark()
+            if update.rewind:
+                self.interaction.rewind()
+            elif update.episode is not None:
                 self.interaction.start(update.episode)
+            else:
+                self.interaction.renew()
         return cost, update

@@ -90,7 +90,8 @@ class Update(NamedTuple):
     `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
     step, `smallest_eigenvalue` the certificate's; `corrected` and `refused` are its flags;
     `failures` counts QPs of its own that failed. With `episode` the loop goes on with a new
-    episode, from the scenario's initial state and with this seed of the plant's noise.
+    episode, from the scenario's initial state and with this seed of the plant's noise. `mark`
+    remembers the plant as it is now, `rewind` puts it back to there, with the same noise to come.
     """
 
     td_error: float
@@ -100,6 +101,8 @@ class Update(NamedTuple):
     refused: bool = False
     failures: int = 0
     episode: int | None = None
+    mark: bool = False
+    rewind: bool = False
 
 
 class Algorithm(Protocol):
@@ -116,6 +119,7 @@ class Algorithm(Protocol):
     - `theta` (n_θ,), a property: the θ that the run would hand over now, where that is another one
       than it behaves with. Evaluation, log, parameters.toml and summary show it.
     - `first_episode`, int: seed of the plant's noise in the first episode, in place of the run's.
+    - `explores`, bool: whether the samples explore now; they do where it is not there.
     - `failed(cost) -> Update | None`: called in place of `observe` on a sample at which the
       controller failed, with the sample's share of J.
     - `validated(accepted, theta)`: called after each validation run, with whether the θ handed

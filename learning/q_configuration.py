@@ -8,8 +8,8 @@ from pydantic import Field
 
 from learning.configuration import (
     Configuration,
-    ExplorationDeviation,
     ExplorationProbability,
+    ExplorationShare,
     NonNegative,
 )
 from learning.schedule import Geometric
@@ -26,7 +26,7 @@ class QConfiguration(Configuration):
     """Hyperparameters of a fit of Q to its TD errors, online or in batches."""
 
     exploration_probability: ExplorationProbability = 0.3
-    exploration_deviation: ExplorationDeviation = (10.0,)
+    exploration_share: ExplorationShare = 1 / 30
     discount: float | None = Field(
         None, gt=0, le=1, description="of the TD error: the scenario's if not given; 1 is mean cost"
     )

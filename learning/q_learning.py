@@ -16,8 +16,9 @@ from learning.configuration import Configuration, Count, Positive
 from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
 from learning.fit import Fit, least_squares, line_search, td_fit, td_step
+from learning.globalised import GlobalisedLearning, Rule
+from learning.kalman_q_learning import KalmanConfiguration, KalmanQLearning
 from learning.protocols import LearnableController, Transition, Update
-from learning.q_configuration import QConfiguration
 
 Vector = NDArray[np.float64]
 
@@ -31,25 +32,34 @@ AS_PRINTED: dict[str, Any] = {
     "exploration_deviation": [3.1622776601683795],
     "value_offset": "stage-cost",
     "parametrisation": "paper",
+    "globalisation": "none",
 }
 """Hyperparameters of the rule as the paper prints it (paper.tex, Simulations)."""
 ONE_SAMPLE = {"td": td_step, "fit": td_fit}
 """The rules that step on one sample; `gauss-newton` steps on all that it remembers."""
-OPTIONS_OF_ONE_SAMPLE = ("step_size", "line_search")
-OPTIONS_OF_GAUSS_NEWTON = (
-    "update_every", "gain", "gain_end", "memory", "ridge", "largest_step", "warm_up",
-)  # fmt: skip
+OPTIONS = {
+    ("td", "fit"): ("step_size", "line_search"),
+    ("gauss-newton",): (
+        "update_every", "gain", "gain_end", "memory", "ridge", "largest_step", "warm_up",
+    ),
+    ("kalman",): (
+        "prior_width", "prior_samples", "step_every", "innovation_clip", "variance_memory",
+        "prediction_errors", "parameter_drift",
+    ),
+}  # fmt: skip
+"""Which hyperparameters belong to which rules."""
 
 
-class QLearningConfiguration(QConfiguration):
+class QLearningConfiguration(KalmanConfiguration):
     """Hyperparameters of online Q-learning; the defaults are the recommended variant.
 
     `AS_PRINTED` has those of the paper's rule.
     """
 
-    rule: Literal["td", "fit", "gauss-newton"] = Field(
-        "gauss-newton",
-        description="αδ∇Q; the fit's αδ∇Q/(1+α‖∇Q‖²); or recursive Gauss–Newton with forgetting",
+    rule: Literal["kalman", "gauss-newton", "td", "fit"] = Field(
+        "kalman",
+        description="Kalman filter with a prior on θ; recursive Gauss–Newton with forgetting; "
+        "αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
     )
     scaled: bool = Field(True, description="step in coordinates θ/scale, else in θ itself")
     step_size: Positive = Field(1e-3, description="rules td and fit: α")
@@ -65,24 +75,45 @@ class QLearningConfiguration(QConfiguration):
     )
     warm_up: int = Field(200, ge=0, description="gauss-newton: samples before the first step")
 
+    @property
+    def globalised(self) -> bool:
+        """The Kalman form is validated unless it shall not be, the others only if they shall."""
+        if self.globalisation is None:
+            return self.rule == "kalman"
+        return self.globalisation == "validated"
+
     @model_validator(mode="after")
     def _options_belong_to_the_rule(self) -> Self:
-        foreign = OPTIONS_OF_GAUSS_NEWTON if self.rule in ONE_SAMPLE else OPTIONS_OF_ONE_SAMPLE
-        for name in foreign:
-            if getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{name}: has no part in the rule {self.rule}; leave it out")
+        for rules, names in OPTIONS.items():
+            if self.rule in rules:
+                continue
+            for name in names:
+                if getattr(self, name) != type(self).model_fields[name].default:
+                    raise ValueError(f"{name}: has no part in the rule {self.rule}; leave it out")
         return self
 
 
-class QLearning:
+class QLearning(GlobalisedLearning):
+    """Online Q-learning by the rule that the configuration names, globalised if it says so."""
+
+    Configuration: ClassVar[type[Configuration]] = QLearningConfiguration
+
+    def rule(self, samples: int, width: float) -> Rule:
+        """The Kalman form, or the rules that step as transitions come."""
+        settings: QLearningConfiguration = self._configuration
+        arguments = (self._controller, self._scenario, settings, samples, self._strategy, self._rng)
+        if settings.rule == "kalman":
+            return KalmanQLearning(*arguments, width=width)
+        return StepwiseQLearning(*arguments)
+
+
+class StepwiseQLearning:
     """Q-learning on δ = ℓ + γV_θ(s₊) − Q_θ(s, a) (paper.tex, eq. Qlearning and q_solution).
 
     The rules `td` and `fit` step on each transition as it comes; `gauss-newton` keeps the
     information A = Σ λᵏ ∇Q∇Qᵀ and steps now and then by gain·(A+ρ)⁻¹ Σ δ∇Q, the sum since its last
     step.
     """
-
-    Configuration: ClassVar[type[Configuration]] = QLearningConfiguration
 
     def __init__(
         self,

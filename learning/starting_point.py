@@ -112,7 +112,7 @@ def build_strategy(configuration: Configuration, scenario: Scenario, samples: in
     """Exploration of a run of `samples` samples, its schedules spread over them."""
     kind, probability = configuration.exploration, configuration.exploration_probability
     probability_end = configuration.exploration_probability_end
-    deviation: tuple[float, ...] = configuration.exploration_deviation
+    deviation = configuration.deviation(scenario)
     deviation_end = configuration.exploration_deviation_end
     if kind == "none":
         kind, probability, probability_end = "additive", 0.0, None

@@ -15,7 +15,11 @@ class Solution:
 
 def algorithm(problem, scenario, **settings):
     configuration = ActorCritic.Configuration(
-        batch_size=400, forgetting=0.0, parametrisation="paper", **settings
+        batch_size=400,
+        forgetting=0.0,
+        parametrisation="paper",
+        globalisation="none",
+        **settings,
     )
     carrier = Carrier(Parameters.naive(problem))
     strategy = build_strategy(configuration, scenario, 4000)
@@ -82,7 +86,7 @@ def test_saturation_does_not_bias_the_gradient(problem, scenario, rng):
     carrier, actor = algorithm(problem, scenario)
     feed(actor, carrier, rng, np.zeros(2), action, noise=1.0, clip=scenario.action_upper)
     raw_mean = -5.0 * 0.3  # what the noise would average to, roughly
-    assert abs(actor._deviation()[:, 0].mean()) < 0.25 * abs(raw_mean)
+    assert abs(actor._rule._deviation()[:, 0].mean()) < 0.25 * abs(raw_mean)
 
 
 def test_only_a_full_batch_moves_theta(problem, scenario, rng):

@@ -15,7 +15,7 @@ def plant(scenario):
 
 
 def make_run(scenario, seed=3):
-    configuration = QLearning.Configuration.from_dict({"warm_up": 20})
+    configuration = QLearning.Configuration.from_dict({"rule": "gauss-newton", "warm_up": 20})
     return TrainingRun("q-learning", scenario, 100, seed, configuration)
 
 

@@ -68,7 +68,11 @@ def test_wrong_parameters_do_not(linear_quadratic):
     assert np.abs(value_hessian(controller) - linear_quadratic.P).max() > 0.5
 
 
-EXPLORATION = {"exploration_probability": 0.5, "exploration_deviation": (1.0,)}
+EXPLORATION = {
+    "exploration_probability": 0.5,
+    "exploration_deviation": (1.0,),
+    "globalisation": "none",
+}
 
 
 def test_online_q_learning_finds_the_riccati_solution(linear_quadratic):
@@ -77,6 +81,7 @@ def test_online_q_learning_finds_the_riccati_solution(linear_quadratic):
         QLearning,
         8000,
         0.0,
+        rule="gauss-newton",
         gain=1.0,
         gain_end=1.0,
         memory=100.0,
@@ -125,7 +130,7 @@ def test_the_mean_cost_is_found_beside_theta(linear_quadratic, rule):
     exact = noise**2 * np.trace(linear_quadratic.riccati(1.0)[0])
     settings = {"rule": rule, "batch_size": 100, "buffer_size": 300, "gain_end": 0.1, **MEAN_COST}
     _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **settings)
-    assert float(algorithm.state()["mean_cost"]) == pytest.approx(exact, rel=0.2)
+    assert float(algorithm.state()["rule mean_cost"]) == pytest.approx(exact, rel=0.2)
 
 
 def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
@@ -134,6 +139,7 @@ def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
         QLearning,
         20_000,
         0.1,
+        rule="gauss-newton",
         gain=1.0,
         gain_end=0.02,
         memory=1000.0,
@@ -144,7 +150,13 @@ def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=0.03)
 
 
-ACTOR = {"forgetting": 0.0, "step_size": 0.2, "exploration_deviation": (1.0,), "radius": 0.3}
+ACTOR = {
+    "forgetting": 0.0,
+    "step_size": 0.2,
+    "exploration_deviation": (1.0,),
+    "radius": 0.3,
+    "globalisation": "none",
+}
 
 
 def test_actor_critic_nears_the_riccati_gain_of_the_mean_cost(linear_quadratic):

@@ -85,7 +85,7 @@ def test_without_line_search_some_steps_do_raise_it(plant, problem):
 
 
 def test_gauss_newton_moves_every_so_many_samples_after_the_warm_up(plant, problem):
-    bench = Bench(plant, problem, update_every=10, warm_up=25)
+    bench = Bench(plant, problem, rule="gauss-newton", update_every=10, warm_up=25)
     moved = []
     for k in range(60):
         sample, _ = bench.interaction.next()
@@ -96,7 +96,9 @@ def test_gauss_newton_moves_every_so_many_samples_after_the_warm_up(plant, probl
 
 
 def test_state_and_restore_carry_all_memory(plant, problem):
-    bench, other = (Bench(plant, problem, update_every=50, warm_up=0) for _ in range(2))
+    bench, other = (
+        Bench(plant, problem, rule="gauss-newton", update_every=50, warm_up=0) for _ in range(2)
+    )
     samples = [bench.interaction.next()[0] for _ in range(50)]
     for sample in samples[:30]:
         bench.algorithm.observe(sample)

@@ -15,15 +15,22 @@ from learning.errors import CheckpointError, ConfigurationError
 from learning.evaluation import HeldOutRuns, held_out
 from learning.log import to_csv
 from learning.protocols import Update
+from learning.q_learning import StepwiseQLearning
 from learning.registry import load_algorithm
 from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun
 
 SETTINGS = {
-    "q-learning": {"warm_up": 20},
+    "q-learning": {"rule": "gauss-newton", "warm_up": 20},
     "batch-q-learning": {"batch_size": 50, "buffer_size": 100},
     "actor-critic": {"batch_size": 80},
 }
+
+
+def alone(name):
+    """The rule without globalisation."""
+    settings = {**SETTINGS[name], "globalisation": "none"}
+    return load_algorithm(name).Configuration.from_dict(settings)
 
 
 def make_run(scenario, name, **changes):
@@ -115,7 +122,9 @@ def test_the_log_keeps_the_least_certificate_of_all_updates(scenario):
 
 
 def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
-    run, algorithm = make_run(scenario, "actor-critic", divergence=1e-3)
+    run, algorithm = make_run(
+        scenario, "actor-critic", divergence=1e-3, configuration=alone("actor-critic")
+    )
     result = train(run, algorithm, tmp_path)
     assert result.status.startswith("diverged: greedy J")
     assert "at sample 100" in result.status
@@ -128,9 +137,9 @@ def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
 
 
 def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
-    run, algorithm = make_run(scenario, "q-learning")
+    run, _ = make_run(scenario, "q-learning")
 
-    class Broken(algorithm):
+    class Broken(StepwiseQLearning):
         def _recursive(self, number, td_error, gradient):
             return super()._recursive(number, float("nan") if number > 200 else td_error, gradient)
 
@@ -141,7 +150,7 @@ def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
     assert not np.array_equal(result.parameters.theta, train_start(run))
 
 
-class Reporting(load_algorithm("q-learning")):
+class Reporting(StepwiseQLearning):
     """Behaves with one θ and hands over another; draws from the generator of its own."""
 
     def __init__(self, controller, *rest):

@@ -5,7 +5,7 @@ import pytest
 SHORT = (
     "train", "-a", "q-learning", "-n", 200, "--log-every", 50, "--evaluate-every", 100,
     "--checkpoint-every", 100, "--evaluation-seeds", 1, "--evaluation-steps", 30,
-    "--set", "warm_up=20",
+    "--set", "rule=gauss-newton", "--set", "warm_up=20",
 )  # fmt: skip
 
 

@@ -1,0 +1,95 @@
+"""What the plant does beside the controller's model: one-step prediction errors, and their use."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.buffered import BufferedFunction
+from controllers.model import discretise
+from controllers.problem import Problem
+from cosim.scenario import Scenario
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+class OneStepModel:
+    """f(s, a), the next state that the controller's own nominal model predicts, (n,).
+
+    Raises ModelError where the scenario names no model.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        problem = Problem.from_scenario(cast("Any", scenario))
+        model = problem.model
+        step = discretise(model, problem.sampling_time, problem.substeps)
+        x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
+        d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
+        function = ca.Function("f", [x, u], [ca.densify(step(x, u, d, p))], ["x", "u"], ["y"])
+        self._function = BufferedFunction(function)
+
+    def __call__(self, s: Vector, a: Vector) -> Vector:
+        """Prediction for state s (n,) and action a (m,)."""
+        function = self._function
+        function.inputs["x"][:], function.inputs["u"][:] = s, a
+        function()
+        return function.outputs["y"].copy()
+
+
+class KnownPenalty:
+    """p(x) of many states at once: the scenario's penalty of its true bounds."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._lower, self._upper = scenario.state_lower, scenario.state_upper
+        self._linear, self._quadratic = scenario.penalty_linear, scenario.penalty_quadratic
+
+    def __call__(self, states: Matrix) -> Vector:
+        """Penalty of states (…, n), shape (…)."""
+        violation = np.maximum(np.maximum(self._lower - states, states - self._upper), 0.0)
+        penalty: Vector = (violation * (self._linear + self._quadratic * violation)).sum(axis=-1)
+        return penalty
+
+    def expected(self, predictions: Matrix, errors: Matrix) -> float:
+        """Mean of p(f + e) over predictions f (K, n) and errors e (M, n), all pairs."""
+        return float(self(predictions[:, None, :] + errors[None, :, :]).mean())
+
+
+class PredictionErrors:
+    """The last `capacity` errors e = s₊ − f(s, a), and the mean penalty that they make likely.
+
+    The realised penalty p(s₊) is a rare spike; its expectation given (s, a), taken over what the
+    plant did lately, mean_i p(f(s, a) + e_i), is smooth in s and a. It asks for plant data alone
+    and is right under a wrong model too, since the errors carry what the model lacks.
+    """
+
+    def __init__(self, scenario: Scenario, capacity: int) -> None:
+        self._penalty = KnownPenalty(scenario)
+        self._errors = np.zeros((capacity, scenario.state_lower.size))
+        self._count = 0
+
+    @property
+    def values(self) -> Matrix:
+        """The errors kept, (K, n), in no order."""
+        return self._errors[: min(self._count, len(self._errors))]
+
+    def add(self, error: Vector) -> None:
+        """Keep an error (n,) in place of the oldest one."""
+        self._errors[self._count % len(self._errors)] = error
+        self._count += 1
+
+    def expected_penalty(self, prediction: Vector) -> float:
+        """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""
+        values = self.values
+        return float(self._penalty(prediction + values).mean()) if len(values) else float("nan")
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that is kept, as arrays."""
+        return {"errors": self._errors.copy(), "error_count": np.array(self._count)}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._errors, self._count = state["errors"].copy(), int(state["error_count"])

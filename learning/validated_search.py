@@ -1,0 +1,348 @@
+"""Globalisation: what θ to try next, and which of two θ is the better one, as a plan of episodes.
+
+`ValidatedSearch.plan` is a generator. It yields what the plant shall be run for (`Learn`, `Trial`)
+and is sent what came of it (`Learned`, `Block`); it knows no plant, controller or rule. Samples
+are all that it spends, and it counts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.parameters import Parameters
+from controllers.theta import ThetaBlocks
+from cosim.scenario import Scenario
+from learning.definiteness import certificate, clip_eigenvalues
+from learning.prediction_errors import KnownPenalty
+from learning.prior import prior_deviation
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+class Learn(NamedTuple):
+    """Let the rule learn from θ (n_θ,) for some samples.
+
+    A rule that `goes_on` keeps what it has learnt so far; a new one has a prior or trust region
+    `width` times as wide as the configured one.
+    """
+
+    theta: Vector
+    samples: int
+    width: float
+    goes_on: bool
+
+
+class Settle(NamedTuple):
+    """Run θ (n_θ,) greedily for a block, and remember the plant as it is then."""
+
+    theta: Vector
+
+
+class Trial(NamedTuple):
+    """Run θ (n_θ,) greedily for a block, from the remembered plant or on from the last block.
+
+    The remembered plant includes its noise to come. `sensitive` asks for dπ/dθ.
+    """
+
+    theta: Vector
+    begins: bool
+    sensitive: bool = False
+
+
+class Learned(NamedTuple):
+    """What a phase of learning gives.
+
+    `candidates` (K, n_θ), the last is where it ended; `errors` (M, n) one-step prediction errors;
+    `state_deviation` (n,).
+    """
+
+    candidates: Matrix
+    errors: Matrix
+    state_deviation: Vector
+
+
+class Block(NamedTuple):
+    """What a block gives: mean `stage_cost` and `penalty` a sample, `predictions` f(s, a) (K, n).
+
+    `errors` (K, n) beside them are e = s₊ − f(s, a); `metric` is E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ) if it
+    was asked for, with Σ the exploration's variance.
+    """
+
+    stage_cost: float
+    penalty: float
+    predictions: Matrix
+    errors: Matrix
+    metric: Matrix | None
+
+
+Request = Learn | Settle | Trial
+Plan = Generator[Request, "Learned | Block", None]
+Step = Generator[Request, "Learned | Block", bool]
+
+
+class Spent(Exception):
+    """The samples are used up."""
+
+
+@dataclass
+class Candidate:
+    """A θ with the mean costs of its blocks: `realised`, and `expected` with pooled errors."""
+
+    theta: Vector
+    realised: list[float] = field(default_factory=list)
+    expected: list[float] = field(default_factory=list)
+    errors: list[Matrix] = field(default_factory=list)
+
+    @property
+    def costs(self) -> Vector:
+        """The dearer of the two readings, block by block: neither may flatter."""
+        return np.maximum(self.realised, self.expected)
+
+    @property
+    def cost(self) -> float:
+        """Mean over the blocks."""
+        return float(self.costs.mean())
+
+
+class ValidatedSearch:
+    """Phases of learning, each followed by line searches on common noise; the incumbent survives.
+
+    One round: the rule learns from the incumbent; the θ that it passed through are raced against
+    it; then comes a line search along the back-off of all state bounds. A candidate takes the
+    incumbent's place only if it is cheaper on the same noise. If no learnt θ did, the next phase
+    begins anew with half the width, a trust region about the incumbent, and before it come line
+    searches along the directions in θ that move the policy most (leading eigenvectors of
+    E[∇π ∇πᵀ] in the prior's coordinates, turned at random so that no ridge stays in the way), and
+    along the round's whole way. Races of a round all begin at
+    the plant as it was when the round's learning ended, with the same noise to come; so slow states
+    are where operation takes them, and each round has new noise.
+    The last samples go to a longer race between the start and the rounds' incumbents.
+
+    `scenario` gives bounds and penalty, `action_deviation` (m,) the exploration's σ, `samples` the
+    budget, `block` samples make a block, at most `blocks` of them a race, `phase` a phase.
+    """
+
+    DIRECTIONS = 6
+    FINAL = 0.1
+    """Share of the samples for the last race."""
+    CAP = 1.5
+    """Longest first step of a line search, in the prior's standard deviations."""
+    SURE = 3.0
+    """Standard errors at which a race is decided early."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        start: Parameters,
+        action_deviation: Vector,
+        samples: int,
+        seed: int,
+        *,
+        phase: int,
+        block: int,
+        blocks: int,
+    ) -> None:
+        self._penalty = KnownPenalty(scenario)
+        self._start, self._blocks_of = start, start.blocks
+        self._action_deviation, self._samples = action_deviation, samples
+        # A short run has short phases and races.
+        self._phase = min(phase, max(samples // 8, 1))
+        self._block, self._blocks = min(block, max(samples // 100, 1)), blocks
+        self._least = 0.5 * max(certificate(start.blocks, start.theta).smallest, 0.0)
+        self._rng = np.random.default_rng(seed)
+        self._spent, self._limit = 0, samples
+        self._pool: Matrix = np.zeros((0, scenario.state_lower.size))
+        self._scale: Vector = np.ones(start.theta.size)
+        self.incumbent = Candidate(start.theta)
+        self.accepted = 0
+
+    @property
+    def block(self) -> int:
+        """Samples of a block."""
+        return self._block
+
+    def plan(self) -> Plan:
+        """The whole run."""
+        past = [self._start.theta]
+        width, back_off, reach = 1.0, 1.0, np.full(self.DIRECTIONS, 0.5)
+        self._limit = int((1.0 - self.FINAL) * self._samples)
+        try:
+            number, better = 0, True
+            while True:
+                before = self.incumbent.theta
+                # What is left at the end may be too little to learn from, not to search with.
+                if self._limit - self._spent >= self._phase + self._blocks * self._block:
+                    better = yield from self._learn(width, goes_on=better)
+                else:
+                    better = False
+                    yield from self._renew(self._blocks)
+                for _ in range(2):
+                    back_off = yield from self._line(self._tightening(), min(back_off, 1.0))
+                if better:
+                    # While learning pays, searching would only cost samples.
+                    past.append(self.incumbent.theta)
+                    continue
+                width *= 0.5
+                directions = yield from self._directions(turned=number > 0)
+                for j, direction in enumerate(directions.T):
+                    reach[j] = yield from self._line(direction, float(np.clip(reach[j], 0.05, 1)))
+                way = (self.incumbent.theta - before) / self._scale
+                if way.any():
+                    yield from self._line(way, 0.5)
+                past.append(self.incumbent.theta)
+                number += 1
+        except Spent:
+            self._limit = self._samples
+        try:
+            yield from self._final(past)
+        except Spent:
+            return
+
+    def _final(self, past: list[Vector]) -> Plan:
+        """Race the start and the latest incumbents against the present one, for longer."""
+        blocks = max(int(self.FINAL * self._samples / self._block / 2.5), 1)
+        yield from self._renew(blocks)
+        rivals = [past[0], *past[:0:-1][:3]]
+        for theta in rivals:
+            if not np.array_equal(theta, self.incumbent.theta):
+                yield from self._race(theta)
+
+    def _learn(self, width: float, *, goes_on: bool) -> Step:
+        """Learn from the incumbent and race what came of it, the latest θ first."""
+        self._spend(self._phase)
+        learned = yield Learn(self.incumbent.theta, self._phase, width, goes_on)
+        assert isinstance(learned, Learned)
+        self._measure(learned)
+        yield from self._renew(self._blocks)
+        better = False
+        for theta in learned.candidates[::-1]:
+            better |= yield from self._race(theta)
+        return better
+
+    def _measure(self, learned: Learned) -> None:
+        """Take the coordinates of the searches from the latest data about the incumbent."""
+        start = self._start.with_theta(self.incumbent.theta)
+        self._scale = prior_deviation(
+            start,
+            learned.state_deviation,
+            learned.errors.std(axis=0),
+            self._action_deviation,
+            abs(float(start["c_lambda"])),
+            0.3,
+        )
+        self._pool = learned.errors
+
+    def _spend(self, samples: int) -> None:
+        if self._spent + samples > self._limit:
+            raise Spent
+        self._spent += samples
+
+    def _run(self, candidate: Candidate) -> Generator[Request, Learned | Block, None]:
+        """One more block of a candidate's race, always on from its last one."""
+        self._spend(self._block)
+        block = yield Trial(candidate.theta, begins=not candidate.realised)
+        assert isinstance(block, Block)
+        expected = block.penalty
+        if len(block.predictions) and len(self._pool):
+            # Every other error: half the cost, the same mean.
+            expected = self._penalty.expected(block.predictions, self._pool[::2])
+        candidate.realised.append(block.stage_cost + block.penalty)
+        candidate.expected.append(block.stage_cost + expected)
+        candidate.errors.append(block.errors)
+
+    def _renew(self, blocks: int) -> Generator[Request, Learned | Block, None]:
+        """Run the incumbent on from where the plant is, and take its errors for the pool."""
+        self._spend(self._block)
+        yield Settle(self.incumbent.theta)
+        self.incumbent = Candidate(self.incumbent.theta)
+        yield from self._complete(blocks)
+        errors = np.concatenate(self.incumbent.errors)
+        if len(errors):
+            self._pool = errors[-1000:]
+
+    def _complete(self, blocks: int) -> Generator[Request, Learned | Block, None]:
+        """Run the incumbent's episode anew if it has fewer blocks than a race may need."""
+        if len(self.incumbent.realised) < blocks:
+            self.incumbent = Candidate(self.incumbent.theta)
+            while len(self.incumbent.realised) < blocks:
+                yield from self._run(self.incumbent)
+
+    def _race(self, theta: Vector) -> Step:
+        """Whether θ takes the incumbent's place: cheaper on the same noise, block by block."""
+        admissible = self._admissible(theta)
+        if admissible is None:
+            return False
+        candidate, costs = Candidate(admissible), self.incumbent.costs
+        for count in range(1, len(costs) + 1):
+            yield from self._run(candidate)
+            difference = candidate.costs - costs[:count]
+            if difference.mean() >= 0.0:
+                return False
+            realised = np.subtract(candidate.realised, self.incumbent.realised[:count])
+            early = 2 * count >= len(costs) and count > 2
+            error = float(difference.std(ddof=1)) / count**0.5 if early else np.inf
+            if difference.mean() + self.SURE * error < 0.0 and realised.mean() < 0.0:
+                break
+        self.incumbent = candidate
+        self.accepted += 1
+        return True
+
+    def _line(self, direction: Vector, reach: float) -> Generator[Request, Learned | Block, float]:
+        """Search along ±direction (n_θ,), scaled, doubling steps that win; the next first reach."""
+        # A win that was declared early left fewer blocks than the next race should have.
+        yield from self._complete(self._blocks)
+        for sign in (1.0, -1.0):
+            step = sign * reach * direction
+            step *= min(1.0, self.CAP / float(np.abs(step).max()))
+            found = False
+            while (yield from self._race(self.incumbent.theta + self._scale * step)):
+                found = True
+                step *= 2.0
+                reach *= 1.5
+                if np.abs(step).max() > 4.0 * self.CAP:
+                    break
+            if found:
+                return reach
+        return 0.5 * reach
+
+    def _tightening(self) -> Vector:
+        """All state bounds moved inwards by half their prior's deviation, (n_θ,), scaled."""
+        direction = np.zeros_like(self._scale)
+        direction[self._blocks_of.slices["x_l"]] = 0.5
+        direction[self._blocks_of.slices["x_u"]] = -0.5
+        return direction
+
+    def _directions(self, *, turned: bool) -> Generator[Request, Learned | Block, Matrix]:
+        """Directions in scaled θ that change the policy by the exploration's σ, (n_θ, K)."""
+        self._spend(self._block)
+        block = yield Trial(self.incumbent.theta, True, sensitive=True)
+        assert isinstance(block, Block) and block.metric is not None
+        values, vectors = np.linalg.eigh(block.metric * np.outer(self._scale, self._scale))
+        values, vectors = values[::-1][: self.DIRECTIONS], vectors[:, ::-1][:, : self.DIRECTIONS]
+        directions = vectors / np.sqrt(np.maximum(values, 1e-12))
+        if turned:
+            draw = self._rng.standard_normal((directions.shape[1],) * 2)
+            directions = directions @ np.linalg.qr(draw)[0]
+        found: Matrix = directions
+        return found
+
+    def _admissible(self, theta: Vector) -> Vector | None:
+        """θ with definite Hessians; None where bounds cross or a slack weight is not positive."""
+        blocks: ThetaBlocks = self._blocks_of
+        if not np.isfinite(theta).all():
+            return None
+        if certificate(blocks, theta).smallest < self._least:
+            theta = clip_eigenvalues(blocks, theta, self._least)
+        slices = blocks.slices
+        if not (theta[slices["x_l"]] < theta[slices["x_u"]]).all():
+            return None
+        for name in ("w_sigma", "W_sigma"):
+            if name in blocks and not (theta[slices[name]] > 0).all():
+                return None
+        return theta

@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from cosim.penalty import Penalty
+from learning.prediction_errors import KnownPenalty, OneStepModel, PredictionErrors
+
+
+def test_the_penalty_of_many_states_is_that_of_each(scenario, rng):
+    states = np.array([32.0, 60.0]) + rng.normal(size=(50, 2)) * [10.0, 20.0]
+    single = Penalty(
+        scenario.state_lower,
+        scenario.state_upper,
+        scenario.penalty_linear,
+        scenario.penalty_quadratic,
+    )
+    assert KnownPenalty(scenario)(states) == pytest.approx([single(list(s)) for s in states])
+
+
+def test_the_model_rests_at_the_reference_steady_state(scenario):
+    reference = scenario.controller
+    predicted = OneStepModel(scenario)(
+        np.array(reference.reference_state), np.array(reference.reference_action)
+    )
+    assert predicted == pytest.approx(reference.reference_state, abs=1e-6)
+
+
+def test_the_expected_penalty_has_the_mean_of_the_realised_one_and_less_spread(scenario, rng):
+    """Plant s₊ = f + e with uniform e, as the model has it: both estimate E[p(s₊) | s, a]."""
+    penalty, errors = KnownPenalty(scenario), PredictionErrors(scenario, 4000)
+    draws = rng.uniform(-2.0, 2.0, size=(4000, 2))
+    for e in draws:
+        errors.add(e)
+    prediction = np.array([26.0, 60.0])
+    exact = 1e5 * 1.0**2 / 2 / 4 + 1.0**3 / 3 / 4  # E[b v + B v²], v = max(-1 - e, 0)
+    assert errors.expected_penalty(prediction) == pytest.approx(exact, rel=0.1)
+    realised = penalty(prediction + rng.uniform(-2.0, 2.0, size=(4000, 2)))
+    assert realised.mean() == pytest.approx(exact, rel=0.1)
+    assert realised.std() > exact
+
+
+def test_the_oldest_errors_are_forgotten(scenario):
+    errors = PredictionErrors(scenario, 3)
+    assert np.isnan(errors.expected_penalty(np.array([25.0, 50.0])))
+    for k in range(5):
+        errors.add(np.array([float(k), 0.0]))
+    assert sorted(errors.values[:, 0]) == [2.0, 3.0, 4.0]
+    other = PredictionErrors(scenario, 3)
+    other.restore(errors.state())
+    assert np.array_equal(other.values, errors.values)
+
+
+def test_all_pairs_are_averaged(scenario, rng):
+    penalty = KnownPenalty(scenario)
+    predictions, errors = 25.0 + rng.normal(size=(5, 2)), rng.normal(size=(7, 2))
+    one_by_one = [penalty(f + e) for f in predictions for e in errors]
+    assert penalty.expected(predictions, errors) == pytest.approx(np.mean(one_by_one))

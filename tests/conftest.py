@@ -7,6 +7,12 @@ import os
 import shutil
 import tempfile
 
+from hypothesis import settings
+
+# The same examples in every run, so that a failure is the change's.
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")
+
 # pytest's own filter ends with this process; what tests start has to be as strict.
 os.environ.setdefault("PYTHONWARNINGS", "error")
 OWN = "COSIM_CACHE" not in os.environ

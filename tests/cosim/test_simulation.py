@@ -1,11 +1,8 @@
-from time import process_time
-
 import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import CosimError, PlantError
-from cosim.protocols import Step
 from cosim.simulation import BLOCK, spawn_seeds
 from cosim.trajectory import FALLBACK
 from tests.helpers.loop import Answer, Failing, Hold, Proportional
@@ -210,33 +207,6 @@ def test_the_recorder_is_closed_when_the_run_fails(evaporator, paper):
         simulate(evaporator, Proportional(paper), 2 * BLOCK, seed=0, recorder=recorder)
     assert recorder.calls[-1] == ("close",)
     assert len(recorder.blocks) == 1
-
-
-class Stub:
-    """A plant that costs nothing, to time the loop alone."""
-
-    def __init__(self, scenario):
-        self.scenario = scenario
-        self.units = dict.fromkeys(
-            (*scenario.plant.states, *scenario.plant.actions, *scenario.plant.disturbances), ""
-        ) | {scenario.plant.stage_cost: ""}
-        self._step = Step(scenario.initial_state, 1.0, 0.0, np.zeros(4))
-
-    def reset(self, seed):
-        return self._step.s
-
-    def step(self, a):
-        return self._step
-
-
-def test_the_loop_itself_costs_less_than_ten_microseconds_a_step(paper):
-    plant, controller = Stub(paper), Hold(paper.reference_action)
-    times = []
-    for _ in range(10):
-        begin = process_time()
-        simulate(plant, controller, 2000, seed=0)
-        times.append(process_time() - begin)
-    assert min(times) / 2000 < 10e-6
 
 
 def test_any_object_that_keeps_the_protocol_is_a_controller(evaporator, paper):

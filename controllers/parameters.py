@@ -161,10 +161,13 @@ class Parameters:
 
 def _read_document(path: Path) -> dict[str, Any]:
     try:
+        if path.exists() and not path.is_file():
+            raise ParameterError(f"{path}: not a regular file")
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ParameterError(f"{path}: there is no such parameters file") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    # ValueError: not UTF-8, not TOML, a number of thousands of digits, a NUL in the path.
+    except (OSError, ValueError, RecursionError) as error:
         raise ParameterError(f"{path}: not a readable TOML file ({error})") from error
     if document.get("schema") != SCHEMA:
         raise ParameterError(

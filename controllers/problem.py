@@ -181,9 +181,11 @@ def load_model(name: str | None) -> Model:
     try:
         factory = getattr(importlib.import_module(module_name), factory_name)
         model = factory()
-    except (ImportError, AttributeError, ValueError, TypeError) as error:
+    # A user's module may raise anything, and one that is a script may even exit.
+    except (Exception, SystemExit) as error:
         raise ModelError(
-            f"model '{name}' cannot be loaded ({error}); name it as module:factory"
+            f"model '{name}' cannot be loaded ({type(error).__name__}: {error}); name it as "
+            "module:factory"
         ) from error
     if not isinstance(model, Model):
         raise ModelError(f"model '{name}' returned {type(model).__name__}, not a controllers.Model")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
 
 from cosim.errors import ControllerLookupError
+from cosim.plugins import blamed, load_plugin
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -35,7 +34,8 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     suffix = Path(name).suffix.removeprefix(".")
     files = {point.name: point for point in (PARAMETERS, *entry_points(group=FILES))}
     if suffix in files:
-        controller: Controller = files[suffix].load()(scenario, name)
+        read = load_plugin(files[suffix].value, f"the reader of .{suffix}", ControllerLookupError)
+        controller: Controller = read(scenario, name)
         return _named(controller, Path(name).stem)
     if ":" in name:
         return _made(name, name, scenario)
@@ -57,23 +57,33 @@ def import_from(folder: Path) -> None:
 
 
 def _made(name: str, target: str, scenario: Scenario) -> Controller:
-    module, _, attribute = target.partition(":")
-    try:
-        factory: Any = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ControllerLookupError(f"controller '{name}' cannot be imported: {error}") from None
+    factory = load_plugin(target, f"controller '{name}'", ControllerLookupError)
+    if not callable(factory):
+        raise ControllerLookupError(f"controller '{name}' is not a factory of one scenario")
     try:
         controller = factory(scenario)
     except TypeError as error:
         raise ControllerLookupError(
-            f"controller '{name}' is not a factory of one scenario: {error}"
+            f"controller '{name}' is not a factory of one scenario: {blamed(error)}"
         ) from error
+    except Exception as error:
+        if target == name and not _is_ours(error):
+            raise ControllerLookupError(
+                f"the factory of controller '{name}' failed: {blamed(error)}"
+            ) from error
+        raise
     if not isinstance(controller, Controller):
         raise ControllerLookupError(
             f"controller '{name}' made a {type(controller).__name__}, which lacks reset, prepare "
             "or feedback"
         )
     return _named(controller, name)
+
+
+def _is_ours(error: Exception) -> bool:
+    """Whether an error is one of this project, whose words say enough."""
+    packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
+    return bool(packages & {"cosim", "controllers", "learning", "fmus"})
 
 
 def _named(controller: Controller, name: str) -> Controller:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 
+from cosim.plugins import load_plugin
 from cosim.validation import suggestion
 from learning.errors import AlgorithmLookupError
 from learning.protocols import Algorithm
@@ -20,17 +20,13 @@ def algorithms() -> list[str]:
 def load_algorithm(name: str) -> type[Algorithm]:
     """Class of an algorithm by registered name or `module:Class`; raises AlgorithmLookupError."""
     known = {point.name: point for point in entry_points(group=GROUP)}
-    is_target = re.fullmatch(r"[\w.]+:[\w.]+", name)
-    point = EntryPoint(name, name, GROUP) if is_target else known.get(name)
-    if point is None:
+    if name not in known and ":" not in name:
         raise AlgorithmLookupError(
             f"unknown algorithm '{name}'{suggestion(name, known)}; registered are "
             f"{', '.join(sorted(known))}, or give module:Class"
         )
-    try:
-        found = point.load()
-    except (ImportError, AttributeError) as error:
-        raise AlgorithmLookupError(f"algorithm '{name}' cannot be imported: {error}") from error
+    target = known[name].value if name in known else name
+    found = load_plugin(target, f"algorithm '{name}'", AlgorithmLookupError)
     missing = [
         part
         for part in ("Configuration", "observe", "state", "restore")

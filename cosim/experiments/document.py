@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cosim.errors import StudyError
+from cosim.files import read_toml
 from cosim.validation import describe
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
@@ -132,14 +132,7 @@ class StudyTable(Table):
 def read(path: str | Path) -> StudyTable:
     """Read and validate a study file; raises StudyError with file, field and allowed values."""
     origin = f"study file '{path}'"
-    try:
-        document = tomllib.loads(Path(path).read_text("utf-8"))
-    except FileNotFoundError:
-        raise StudyError(f"{origin} does not exist") from None
-    except OSError as error:
-        raise StudyError(f"{origin} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise StudyError(f"{origin} is not valid TOML: {error}") from None
+    document = read_toml(path, origin, StudyError)
     return validate(document, origin)
 
 

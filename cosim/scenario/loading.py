@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import copy
-import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from cosim.errors import ScenarioError
+from cosim.files import parse_toml, read_toml
 from cosim.validation import suggestion
+
+LONGEST = 16
+"""Files that may extend one another in a chain."""
 
 
 def presets() -> list[str]:
@@ -42,22 +45,16 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     path = Path(source)
     if str(source) in presets():
         origin = f"preset '{source}'"
-        text = files("cosim.presets").joinpath(f"{source}.toml").read_text("utf-8")
-        folder = None
-    elif path.suffix == ".toml" or len(path.parts) > 1 or path.is_file():
+        preset = files("cosim.presets").joinpath(f"{source}.toml").read_text("utf-8")
+        document, folder = parse_toml(preset, origin, ScenarioError), None
+    elif path.suffix == ".toml" or len(path.parts) > 1 or _is_file(path):
         origin = f"scenario file '{source}'"
-        text = _text(path, origin)
-        folder = path.resolve().parent
+        document, folder = read_toml(path, origin, ScenarioError), path.resolve().parent
     else:
         raise ScenarioError(
             f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
             f"{', '.join(presets())}, or give the path of a TOML file"
         )
-    try:
-        document = tomllib.loads(text)
-    # A document nested without end exhausts the parser's stack.
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
     return resolved(document, origin, folder, (*seen, str(path.resolve()))), origin
 
 
@@ -76,15 +73,11 @@ def resolved(
     return result
 
 
-def _text(path: Path, origin: str) -> str:
+def _is_file(path: Path) -> bool:
     try:
-        return path.read_text("utf-8")
-    except FileNotFoundError:
-        raise ScenarioError(f"{origin} does not exist") from None
-    except UnicodeDecodeError:
-        raise ScenarioError(f"{origin} is not UTF-8 text") from None
-    except OSError as error:
-        raise ScenarioError(f"{origin} cannot be read: {error.strerror}") from None
+        return path.is_file()
+    except OSError:  # a name that no file can have
+        return False
 
 
 def _extended(
@@ -94,8 +87,12 @@ def _extended(
         raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
     if folder is not None and base not in presets():
         base = str(folder / base)
+    if "\0" in base:
+        raise ScenarioError(f"{origin}: extends must be a path, not {base!r}")
     if str(Path(base).resolve()) in seen:
         raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
+    if len(seen) > LONGEST:
+        raise ScenarioError(f"{origin}: extends another file more than {LONGEST} times over")
     return read(base, seen)[0]
 
 

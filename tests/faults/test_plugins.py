@@ -1,0 +1,116 @@
+"""What users bring along may fail in any way: one line that names it and the line at fault."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from cosim import Scenario
+from cosim.errors import ControllerLookupError
+from cosim.lookup import build_controller
+from cosim.plugins import load_plugin
+from learning.errors import AlgorithmLookupError
+from learning.registry import load_algorithm
+
+PAPER = Scenario.load("paper")
+MODULES = {
+    "raises": "1 / 0",
+    "exits": "raise SystemExit(0)",
+    "is no Python": "def",
+    "imports what is not there": "import no_such_module_at_all",
+    "raises with lines": "raise ValueError('a\\nb\\nc')",
+    "is not UTF-8": "# \udcff",
+}
+TARGETS = [
+    "",
+    ":",
+    "x:",
+    ":x",
+    "..:x",
+    ".x:y",
+    "x y:z",
+    "os:no_such",
+    "json:",
+    "a:b:c",
+    "\0:x",
+    "-:-",
+]
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch, request):
+    name = f"plugin_{abs(hash(request.node.name))}"
+    path = tmp_path / f"{name}.py"
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def write(text):
+        path.write_bytes(text.encode(errors="surrogateescape"))
+        return name
+
+    yield write
+    sys.modules.pop(name, None)
+
+
+LOADERS = {
+    "controller": (lambda name: build_controller(name, PAPER), ControllerLookupError),
+    "algorithm": (load_algorithm, AlgorithmLookupError),
+}
+
+
+@pytest.mark.parametrize("loader", LOADERS)
+@pytest.mark.parametrize("text", MODULES)
+def test_a_module_that_fails_is_named(module, loader, text):
+    load, error = LOADERS[loader]
+    with pytest.raises(error, match="cannot be imported") as caught:
+        load(f"{module(MODULES[text])}:Thing")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("loader", LOADERS)
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_of_no_form_is_refused(loader, target):
+    load, error = LOADERS[loader]
+    with pytest.raises(error):
+        load(target)
+
+
+def test_the_line_at_fault_is_named(module):
+    name = module("x = 1\ny = x / 0\n")
+    with pytest.raises(ValueError, match=rf"ZeroDivisionError: .*{name}\.py, line 2\)"):
+        load_plugin(f"{name}:x", "thing", ValueError)
+
+
+@pytest.mark.parametrize(
+    "body", ["1 / 0", "raise RuntimeError('a\\nb')", "return 3", "return None"]
+)
+def test_a_factory_that_fails_is_named(module, body):
+    name = module(f"def make(scenario):\n    {body}\n")
+    with pytest.raises(ControllerLookupError, match=f"{name}:make"):
+        build_controller(f"{name}:make", PAPER)
+
+
+def test_a_controller_that_fails_in_the_loop_leaves_a_report(tmp_path):
+    (tmp_path / "broken.py").write_text(
+        "class Broken:\n"
+        "    def reset(self): pass\n"
+        "    def prepare(self): pass\n"
+        "    def feedback(self, s, a=None): return 1 / 0\n"
+        "def make(scenario): return Broken()\n"
+    )
+    words = ["simulate", "-c", "broken:make", "-n", "10", "--out", "out"]
+    done = subprocess.run(
+        [sys.executable, "-m", "cosim", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+    )
+    assert done.returncode == 70
+    assert done.stderr.count("\n") == 1
+    assert "ZeroDivisionError" in done.stderr
+    (report,) = tmp_path.glob("cosim-report-*.txt")
+    assert str(report) in done.stderr
+    assert "broken.py" in report.read_text()
+    assert not list((tmp_path / "out").iterdir())

@@ -7,15 +7,21 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from controllers.buffered import StackedFunction, stacked
 from controllers.dynamics import stage_parameter_gradient
 from controllers.problem import Problem
+from controllers.qp.active_set import kkt_solve
+from controllers.qp.problem import QpSolution, SoftQp
 from controllers.theta import SymbolicTheta, ThetaBlocks
+
+Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -173,3 +179,41 @@ def _direction(
         costate = weight[:n, :] @ ca.vertcat(xi[k], dv[:, k]) + A[:, k * n : (k + 1) * n] @ chi[0]
         chi.insert(0, costate + (dlam[:, k - 1] if k else 0))
     return ca.horzcat(*xi), ca.horzcat(*chi)
+
+
+def adjoint_directions(
+    qp: SoftQp, solution: QpSolution, n_actions: int
+) -> tuple[Matrix, Matrix, Matrix]:
+    """Solutions dv, dt, dλ of the KKT system for unit right-hand sides in u_0, a row an action.
+
+    The KKT matrix of the active set is symmetric, so these rows of its inverse are all that dπ/dθ
+    and dπ/ds need.
+    """
+    active = solution.active(qp)
+    dv, dlam = kkt_solve(qp, active, np.eye(n_actions, qp.f.size), np.zeros((n_actions, qp.w.size)))
+    violated, dt = active[2], np.zeros_like(dlam)
+    if violated.any():
+        moved = (dv @ qp.rows.T)[:, violated]
+        dlam[:, violated] = 2 * qp.W[violated] * moved
+        dt[:, violated] = np.sign(solution.lam[violated]) * moved
+    return dv, dt, dlam
+
+
+def curvature_directions(
+    rows: Matrix, dv: Matrix, step: Matrix, contract: Callable[[Matrix], Matrix]
+) -> Matrix:
+    """Directional derivatives of M along the adjoint directions, (m, N(n+m)²).
+
+    `rows` are those of the QP, `step` (N, n+m) is Δw of each stage, `contract` the Hessian's
+    spectrum's.
+    """
+    horizon, width = step.shape
+    n = rows.shape[0] // horizon
+    result = []
+    for row in dv:
+        moved = np.zeros((horizon, width))
+        moved[1:, :n] = (rows @ row).reshape(horizon, n)[:-1]
+        moved[:, n:] = row.reshape(horizon, width - n)
+        seed = (step[:, :, None] * moved[:, None, :] + moved[:, :, None] * step[:, None, :]) / 2
+        result.append(contract(seed).reshape(-1))
+    return np.array(result)

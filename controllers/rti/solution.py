@@ -13,9 +13,9 @@ from controllers.buffered import StackedFunction
 from controllers.errors import ControllerError
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.qp.active_set import kkt_solve
 from controllers.qp.problem import QpSolution, Residuals, SoftQp
 from controllers.rti.hessian import Spectrum
+from controllers.sensitivities import adjoint_directions, curvature_directions
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -210,7 +210,7 @@ class RtiSolution:
                 "the action was enforced, so this solution is Q(s, a) and has no policy; "
                 "call feedback(s) without an action"
             )
-        dv, dt, dlam = self._adjoint_directions()
+        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, self.action.size)
         function = self.prepared.functions.policy
         self._write_solution(function)
         inputs = function.inputs
@@ -219,8 +219,11 @@ class RtiSolution:
         inputs["L"][:], inputs["L_N"][:] = self.prepared.L, self.prepared.L_N
         inputs["dv"][:], inputs["dt"][:] = dv.reshape(-1), dt.reshape(-1)
         inputs["dlam"][:] = dlam.reshape(-1)
-        if self.prepared.spectrum is not None:
-            inputs["dM"][:] = self._curvature_directions(dv).reshape(-1)
+        if (spectrum := self.prepared.spectrum) is not None:
+            moved = curvature_directions(
+                self.qp.rows, dv, self._step_from_point(), spectrum.contract
+            )
+            inputs["dM"][:] = moved.reshape(-1)
         function()
         m = self.action.size
         return (
@@ -248,34 +251,3 @@ class RtiSolution:
         return np.concatenate(
             [self.predicted_states[:-1] - point.x, self.predicted_actions - point.u], axis=1
         )
-
-    def _adjoint_directions(self) -> tuple[Matrix, Matrix, Matrix]:
-        """Solutions of the KKT system for unit right-hand sides in u_0, a row an action.
-
-        The KKT matrix of the active set is symmetric, so these rows of its inverse are all that
-        dπ/dθ and dπ/ds need.
-        """
-        qp, m = self.qp, self.action.size
-        active = self.multipliers.active(qp)
-        dv, dlam = kkt_solve(qp, active, np.eye(m, qp.f.size), np.zeros((m, qp.w.size)))
-        violated, dt = active[2], np.zeros_like(dlam)
-        if violated.any():
-            moved = (dv @ qp.rows.T)[:, violated]
-            dlam[:, violated] = 2 * qp.W[violated] * moved
-            dt[:, violated] = np.sign(self.multipliers.lam[violated]) * moved
-        return dv, dt, dlam
-
-    def _curvature_directions(self, dv: Matrix) -> Matrix:
-        """Directional derivatives of M along the adjoint directions, shape (m, N(n+m)²)."""
-        spectrum, step = self.prepared.spectrum, self._step_from_point()
-        assert spectrum is not None
-        horizon, m = self.predicted_actions.shape
-        n = self.predicted_states.shape[1]
-        result = []
-        for row in dv:
-            moved = np.zeros((horizon, n + m))
-            moved[1:, :n] = (self.qp.rows @ row).reshape(horizon, n)[:-1]
-            moved[:, n:] = row.reshape(horizon, m)
-            seed = (step[:, :, None] * moved[:, None, :] + moved[:, :, None] * step[:, None, :]) / 2
-            result.append(spectrum.contract(seed).reshape(-1))
-        return np.array(result)

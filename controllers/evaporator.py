@@ -75,4 +75,5 @@ def model() -> Model:
         ode=_ode,
         economic_cost=_economic_cost,
         time_unit=60.0,
+        uncertain=("UA2",),  # the condenser fouls
     )

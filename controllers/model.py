@@ -29,7 +29,8 @@ class Model:
 
     The states x, actions u, disturbances d and parameters p are columns in the order of their
     quantities; `economic_cost` is ℓ; `name` is for messages; `time_unit` is the length in seconds
-    of the unit of time in which `ode` counts.
+    of the unit of time in which `ode` counts; `uncertain` names the parameters that a plant may
+    well have otherwise, which identification fits unless told which.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Model:
     ode: Expression = field(repr=False)
     economic_cost: Expression = field(repr=False)
     time_unit: float = 1.0
+    uncertain: tuple[str, ...] = ()
 
     @property
     def nominal_disturbance(self) -> NDArray[np.float64]:

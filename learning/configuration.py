@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from controllers.model import Model
 from cosim.scenario import Scenario
 from cosim.validation import describe, suggestion
 from learning.errors import ConfigurationError
@@ -144,6 +145,10 @@ class Configuration(BaseModel):
         if self.exploration_deviation is not None:
             return np.array(self.exploration_deviation)
         return self.exploration_share * (scenario.action_upper - scenario.action_lower)
+
+    def learned_parameters(self, model: Model) -> tuple[str, ...]:
+        """Names of the model parameters that θ has."""
+        return self.model_parameters
 
     def depends_on_samples(self) -> list[str]:
         """Names of what changes over the run, so that a longer run would not begin as this one."""

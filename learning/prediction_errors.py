@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from controllers.buffered import BufferedFunction
 from controllers.model import discretise
+from controllers.parameters import Parameters
 from controllers.problem import Problem
 from cosim.scenario import Scenario
 
@@ -20,7 +21,8 @@ Matrix = NDArray[np.float64]
 class OneStepModel:
     """f(s, a), the next state that the controller's own nominal model predicts, (n,).
 
-    Raises ModelError where the scenario names no model.
+    `predict` and `errors` are for many samples at once, and for the model parameters and the
+    offset c_f of θ. Raises ModelError where the scenario names no model.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -31,6 +33,9 @@ class OneStepModel:
         d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
         function = ca.Function("f", [x, u], [ca.densify(step(x, u, d, p))], ["x", "u"], ["y"])
         self._function = BufferedFunction(function)
+        self._model = model
+        free = ca.SX.sym("p", len(model.parameters))
+        self._parametric = ca.Function("f", [x, u, free], [step(x, u, d, free)])
 
     def __call__(self, s: Vector, a: Vector) -> Vector:
         """Prediction for state s (n,) and action a (m,)."""
@@ -38,6 +43,26 @@ class OneStepModel:
         function.inputs["x"][:], function.inputs["u"][:] = s, a
         function()
         return function.outputs["y"].copy()
+
+    def parameters(self, theta: Parameters) -> Vector:
+        """All parameters of the model at θ, (n_p,): the nominal ones but for its block p."""
+        values = self._model.nominal_parameters
+        if "p" in theta.blocks:
+            values[self._model.parameter_indices(theta.blocks.block("p").labels)] = theta["p"]
+        return values
+
+    def predict(self, states: Matrix, actions: Matrix, parameters: Vector) -> Matrix:
+        """f(s, a), (K, n), without offset, for K states and actions and one (n_p,) for all."""
+        inputs = (np.atleast_2d(states).T, np.atleast_2d(actions).T, parameters)
+        predicted: Matrix = self._parametric(*inputs).full().T
+        return predicted
+
+    def errors(
+        self, states: Matrix, actions: Matrix, next_states: Matrix, theta: Parameters
+    ) -> Matrix:
+        """s₊ − f_θ(s, a), (K, n), offset included."""
+        predicted = self.predict(states, actions, self.parameters(theta)) + theta["c_f"]
+        return np.atleast_2d(next_states) - predicted
 
 
 class KnownPenalty:

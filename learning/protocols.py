@@ -118,6 +118,7 @@ class Algorithm(Protocol):
 
     - `theta` (n_θ,), a property: the θ that the run would hand over now, where that is another one
       than it behaves with. Evaluation, log, parameters.toml and summary show it.
+    - `budget`, int, of the class: samples of a run where the user says nothing, else 50 000.
     - `first_episode`, int: seed of the plant's noise in the first episode, in place of the run's.
     - `explores`, bool: whether the samples explore now; they do where it is not there.
     - `failed(cost) -> Update | None`: called in place of `observe` on a sample at which the

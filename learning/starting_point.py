@@ -36,7 +36,7 @@ def starting_parameters(
     blocks = ThetaBlocks.of(
         problem,
         slack_weights=configuration.parametrisation == "extended",
-        model_parameters=configuration.model_parameters,
+        model_parameters=configuration.learned_parameters(problem.model),
     )
     offset = _value_offset(problem, configuration)
     naive = Parameters.naive(problem, blocks, value_offset=offset)
@@ -78,7 +78,9 @@ def _extended(problem: Problem, configuration: Configuration, path: str) -> Para
             "parametrisation=extended"
         )
     names = found.blocks.block("p").labels if "p" in found.blocks else ()
-    more = tuple(name for name in configuration.model_parameters if name not in names)
+    more = tuple(
+        name for name in configuration.learned_parameters(problem.model) if name not in names
+    )
     blocks = ThetaBlocks.of(
         problem,
         slack_weights=configuration.parametrisation == "extended",

@@ -31,7 +31,8 @@ AlgorithmOption = Annotated[
     typer.Option(
         "--algorithm",
         "-a",
-        help="actor-critic, batch-q-learning, q-learning, another registered one or module:Class.",
+        help="actor-critic, batch-q-learning, q-learning; backoff, offset-free, identified, "
+        "policy-search; another registered one or module:Class.",
     ),
 ]
 
@@ -40,8 +41,15 @@ def train(
     algorithm: AlgorithmOption,
     scenario: ScenarioOption = "paper",
     samples: Annotated[
-        int, typer.Option("--samples", "-n", min=1, max=100_000_000, help="Plant samples.")
-    ] = 50_000,
+        int | None,
+        typer.Option(
+            "--samples",
+            "-n",
+            min=1,
+            max=100_000_000,
+            help="Plant samples; default: 50 000, or what the algorithm says.",
+        ),
+    ] = None,
     seed: Annotated[
         int, typer.Option("--seed", min=0, max=999_999, help="Seed of noise and exploration.")
     ] = 0,
@@ -136,7 +144,7 @@ def train(
         run = TrainingRun(
             algorithm=algorithm,
             scenario=Scenario.load(scenario),
-            samples=samples,
+            samples=getattr(found, "budget", 50_000) if samples is None else samples,
             seed=seed,
             configuration=found.Configuration.from_assignments(assignments or []),
             controller=controller,

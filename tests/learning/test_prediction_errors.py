@@ -1,6 +1,9 @@
 import numpy as np
 import pytest
 
+from controllers.model import discretise
+from controllers.parameters import Parameters
+from controllers.theta import ThetaBlocks
 from cosim.penalty import Penalty
 from learning.prediction_errors import KnownPenalty, OneStepModel, PredictionErrors
 
@@ -54,3 +57,21 @@ def test_all_pairs_are_averaged(scenario, rng):
     predictions, errors = 25.0 + rng.normal(size=(5, 2)), rng.normal(size=(7, 2))
     one_by_one = [penalty(f + e) for f in predictions for e in errors]
     assert penalty.expected(predictions, errors) == pytest.approx(np.mean(one_by_one))
+
+
+def test_errors_are_those_of_the_model_with_thetas_parameters_and_offset(scenario, problem, rng):
+    blocks = ThetaBlocks.of(problem, model_parameters=("UA2",))
+    theta = Parameters.naive(problem, blocks).replace({"p": [5.2], "c_f": [0.1, -0.2]})
+    model = problem.model
+    f = discretise(model, problem.sampling_time, problem.substeps)
+    p = model.nominal_parameters
+    p[model.parameter_indices(("UA2",))] = 5.2
+    states = problem.reference_state + rng.normal(size=(4, 2))
+    actions = problem.reference_action + rng.normal(size=(4, 2))
+    following = rng.normal(size=(4, 2))
+    expected = [
+        y - f(s, a, model.nominal_disturbance, p).full().reshape(-1) - [0.1, -0.2]
+        for s, a, y in zip(states, actions, following, strict=True)
+    ]
+    found = OneStepModel(scenario).errors(states, actions, following, theta)
+    assert found == pytest.approx(np.array(expected), abs=1e-12)

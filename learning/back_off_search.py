@@ -1,0 +1,229 @@
+"""A line search over the back-off of the active bounds, on samples of the plant."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from cosim.scenario import Scenario
+from learning.errors import ConfigurationError
+from learning.prediction_errors import KnownPenalty, OneStepModel
+from learning.protocols import Transition
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+PHASES = ((3, (0.0, 2.0, 4.0)), (5, (-0.5, 0.0, 0.5)), (8, (-0.25, 0.25)))
+"""Sixteenths of a bound's samples, and back-offs κ about the best so far, of each round."""
+REACH = 1.0
+"""How far, in κ, a sample speaks for another back-off; twice that in the coarse first round."""
+RESOLUTION = 0.01
+SEGMENTS = 16
+"""The budget has that many of the first round's stretches."""
+BINDING = 0.05
+"""Share of the samples in which a bound must bind to count as active."""
+
+
+class Segment(NamedTuple):
+    """A stretch of `steps` samples of a `round` with back-offs `kappa` (2n,)."""
+
+    round: int
+    steps: int
+    kappa: Vector
+
+
+class BackOffSearch:
+    """Finds κ such that the bounds x_l + κσ and x_u − κσ, where they are active, cost least.
+
+    σ is the standard deviation of the model's one-step prediction error in each state, so that κ
+    has no unit; a bound is active where it binds in the QP (dV/dx_l or dV/dx_u ≠ 0) now and then.
+    Each has a line search of three rounds. That of the bound which binds most often at κ = 0 has
+    the first round, which shows what others there are, and, with those in place, the last two.
+
+    A round runs a few κ on the same noise. What is fitted to the samples near a κ is how the loop
+    moves with it: mean stage cost and the mean of the other states linearly, the bounded state
+    with its bound. The known penalty is then that of the very states that were seen, moved so.
+    Every sample near it thus serves each κ; to compare costs alone would take many times the
+    samples, since one violation in a thousand decides.
+
+    Raises ConfigurationError on a budget that is too small to see anything.
+    """
+
+    def __init__(
+        self,
+        start: Parameters,
+        problem: Problem,
+        scenario: Scenario,
+        budget: int,
+        rng: np.random.Generator,
+    ) -> None:
+        least = 2 * SEGMENTS * problem.horizon
+        if budget < least:
+            raise ConfigurationError(
+                f"a search of the back-off needs at least {least} samples, it has {budget}"
+            )
+        self.start, self._budget = start, budget
+        self._penalty, self._model = KnownPenalty(scenario), OneStepModel(scenario)
+        self._settling = problem.horizon
+        n, self._actions = problem.n_states, problem.n_actions
+        self._n = n
+        self._seeds = rng.integers(2**63, size=2 * n * len(PHASES)).tolist()
+        self.kappa = np.zeros(2 * n)
+        """Best back-offs found, of lower then upper bounds, (2n,)."""
+        self._unit = np.zeros(n)
+        self._schedule: list[tuple[int, int]] = []
+        self._plan = [Segment(0, budget // SEGMENTS, self.kappa.copy())]
+        self._segment = self._step = 0
+        self._binding, self._share = np.zeros(2 * n), np.zeros(2 * n)
+        self._first: list[Vector] = []
+        self._rows: list[Vector] = []
+
+    @property
+    def seed(self) -> int:
+        """Seed of the noise of the present episode."""
+        return int(self._seeds[self._plan[self._segment].round])
+
+    @property
+    def theta(self) -> Parameters:
+        """θ with the best back-offs found."""
+        return self.at(self.kappa)
+
+    @property
+    def candidate(self) -> Parameters:
+        """θ that is tried now."""
+        return self.theta if self.done else self.at(self._plan[self._segment].kappa)
+
+    @property
+    def done(self) -> bool:
+        """Whether the budget is spent, or no bound is active."""
+        return self._segment >= len(self._plan)
+
+    def at(self, kappa: Vector) -> Parameters:
+        """θ with its bounds κ (2n,) backed off, x_l kept below x_u."""
+        lower = self.start["x_l"] + kappa[: self._n] * self._unit
+        upper = self.start["x_u"] - kappa[self._n :] * self._unit
+        crossed = lower >= upper
+        middle = (lower + upper) / 2
+        lower[crossed], upper[crossed] = middle[crossed] - 1e-6, middle[crossed] + 1e-6
+        return self.start.replace({"x_l": lower, "x_u": upper})
+
+    def observe(self, transition: Transition | None) -> bool:
+        """Take a sample, None where the controller failed; whether a new episode begins now."""
+        if self.done:
+            return False
+        segment = self._plan[self._segment]
+        if transition is not None and self._step >= self._settling:
+            cost = [float(segment.round), transition.stage_cost]
+            self._rows.append(np.concatenate([cost, segment.kappa, transition.s]))
+        if transition is not None and segment.round == 0:
+            self._watch(transition)
+        self._step += 1
+        if self._step < segment.steps:
+            return False
+        self._share = np.maximum(self._share, self._binding / segment.steps)
+        self._binding[:] = 0.0
+        self._step = 0
+        self._segment += 1
+        if self._segment == 1:
+            self._begin()
+        elif self.done:
+            self._end_round(segment.round)
+        return not self.done
+
+    def _watch(self, transition: Transition) -> None:
+        gradient, slices = transition.policy.value_gradient, self.start.blocks.slices
+        self._binding += np.concatenate([gradient[slices[name]] for name in ("x_l", "x_u")]) != 0
+        if self._segment == 0:
+            self._first.append(np.concatenate([transition.s, transition.a, transition.next_s]))
+
+    def _begin(self) -> None:
+        """σ and the bound to begin with, from the first segment, at κ = 0."""
+        if not self._first or self._share.max() < BINDING:
+            return
+        rows, n = np.array(self._first), self._n
+        errors = self._model.errors(rows[:, :n], rows[:, n:-n], rows[:, -n:], self.start)
+        self._unit = errors.std(axis=0)
+        self._schedule = [(int(np.argmax(self._share)), 0)]
+        self._plan += self._segments(0)[1:]
+
+    def _end_round(self, number: int) -> None:
+        """Move κ to the estimated optimum and plan the next round about it."""
+        first = self._schedule[0][0]
+        self.kappa[self._schedule[number][0]] = self._best(number)
+        if number == 0:
+            others = [int(i) for i in np.flatnonzero(self._share >= BINDING) if i != first]
+            self._schedule += [(bound, phase) for bound in others for phase in range(3)]
+            self._schedule += [(first, 1), (first, 2)]
+        if number + 1 < len(self._schedule):
+            self._plan += self._segments(number + 1)
+
+    def _segments(self, number: int) -> list[Segment]:
+        bound, phase = self._schedule[number]
+        share, offsets = PHASES[phase]
+        # The first round knows of one bound; the others share what it leaves.
+        left = 13 / sum(PHASES[later][0] for _, later in self._schedule[1:]) if number else 1.0
+        steps = int(self._budget * left * share / (SEGMENTS * len(offsets)))
+        steps = max(steps, self._settling + 1)
+        direction = np.eye(self.kappa.size)[bound]
+        return [Segment(number, steps, self.kappa + offset * direction) for offset in offsets]
+
+    def _best(self, number: int) -> float:
+        """κ of least estimated cost of a round's bound, from this round and the second one."""
+        n, (bound, phase) = self._n, self._schedule[number]
+        rows = np.array(self._rows).reshape(len(self._rows), 2 + 3 * n)
+        rows = rows[rows[:, 0] >= number - (phase == 2)]
+        if not len(rows):  # the controller failed in all of them
+            return float(self.kappa[bound])
+        kappa, states = rows[:, 2 + bound], rows[:, 2 + 2 * n :]
+        slope = self._slopes(rows[:, 0], kappa, np.column_stack([rows[:, 1], states]))
+        slope[1 + bound % n] = self._unit[bound % n] * (1 if bound < n else -1)
+        reach = REACH * (2 if phase == 0 else 1)
+        low, high = kappa.min() - reach, kappa.max() + reach
+        grid = np.linspace(low, high, round((high - low) / RESOLUTION) + 1)
+        estimates = np.full(grid.size, np.inf)
+        for i, value in enumerate(grid):
+            near = np.abs(kappa - value) < reach + RESOLUTION / 2
+            moved = states[near] + np.outer(value - kappa[near], slope[1:])
+            estimates[i] = slope[0] * value + self._penalty(moved).mean()
+        return float(grid[int(np.argmin(estimates))])
+
+    @staticmethod
+    def _slopes(rounds: Vector, kappa: Vector, values: Matrix) -> Vector:
+        """d/dκ of each column's mean, (1+n,), within the rounds, whose noise is common."""
+        above, below = np.zeros(values.shape[1]), 0.0
+        for number in np.unique(rounds):
+            mine = rounds == number
+            centred = kappa[mine] - kappa[mine].mean()
+            above += centred @ values[mine]
+            below += float(centred @ centred)
+        slopes: Vector = above / below if below > 0 else above
+        return slopes
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that the search remembers, as arrays."""
+        n = self._n
+        return {
+            "progress": np.array([self._segment, self._step]),
+            "kappa": self.kappa,
+            "unit": self._unit,
+            "schedule": np.array(self._schedule, dtype=np.int64).reshape(-1, 2),
+            "binding": np.array([self._binding, self._share]),
+            "plan": np.array([np.append(s.kappa, [s.round, s.steps]) for s in self._plan]),
+            "seeds": np.array(self._seeds, dtype=np.int64),
+            "first": np.array(self._first).reshape(len(self._first), 2 * n + self._actions),
+            "rows": np.array(self._rows).reshape(len(self._rows), 2 + 3 * n),
+        }
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._segment, self._step = (int(value) for value in state["progress"])
+        self.kappa, self._unit = state["kappa"], state["unit"]
+        self._binding, self._share = state["binding"]
+        self._schedule = [(int(bound), int(phase)) for bound, phase in state["schedule"]]
+        self._seeds = state["seeds"].tolist()
+        self._plan = [Segment(int(row[-2]), int(row[-1]), row[:-2]) for row in state["plan"]]
+        self._first, self._rows = list(state["first"]), list(state["rows"])

@@ -1,0 +1,199 @@
+"""Policy search: CMA-ES over the part of θ that the policy depends on, no gradient, no model."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from cmaes import CMA
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.linalg import expm
+
+from controllers.parameters import Parameters
+from cosim.scenario import Scenario
+from learning.configuration import Configuration, Count, Positive
+from learning.definiteness import HESSIANS, certificate
+from learning.exploration import Strategy
+from learning.protocols import LearnableController, Transition, Update
+
+Vector = NDArray[np.float64]
+
+
+class PolicySearchConfiguration(Configuration):
+    """Settings of the policy search; it explores θ, not actions."""
+
+    exploration: Literal["none"] = Field(
+        "none", description="none: it is θ that is tried, not actions"
+    )
+    population: Count = Field(13, description="candidates of a generation")
+    episode: Count = Field(500, description="plant samples that judge a candidate")
+    spread: Positive = Field(0.5, description="σ at the start, in the coordinates of the search")
+    width: Positive = Field(
+        0.02, description="unit of states and actions, as a share of the width of their bounds"
+    )
+
+    def for_scenario(self, scenario: Scenario) -> Self:
+        """Copy with what the scenario states of c_lambda's start; its exploration has no part."""
+        own = {name: getattr(self, name) for name in type(self).model_fields if "explor" in name}
+        return super().for_scenario(scenario).model_copy(update=own)
+
+
+class Coordinates:
+    """θ about a start by coordinates z that have no unit: θ(0) is the start.
+
+    A Hessian B = LLᵀ becomes L exp(Z) Lᵀ, which is positive definite for every symmetric Z; its
+    linear term b − 2B·δ, which moves the minimum by δ to first order; c_f, x_l and x_u move by δ.
+    δ is in units of the bounds' width, a tenth of that for c_f, which acts in each sample. The
+    initial cost λ_θ and the slack weights stay: the policy knows nothing of the first.
+    """
+
+    def __init__(self, start: Parameters, scenario: Scenario, width: float) -> None:
+        self._start = start
+        states = _unit(scenario.state_lower, scenario.state_upper, scenario.reference_state, width)
+        both = np.concatenate([states, scenario.action_upper - scenario.action_lower])
+        both[states.size :] *= width
+        self._factors = {name: np.linalg.cholesky(start[name]) for name in HESSIANS}
+        self._units = {
+            "B_Vf": np.ones(start.blocks.block("B_Vf").size),
+            "b_Vf": states,
+            "B_l": np.ones(start.blocks.block("B_l").size),
+            "b_l": both,
+            "c_f": 0.1 * states,
+            "x_l": states,
+            "x_u": states,
+        }
+        self.size = sum(unit.size for unit in self._units.values())
+
+    def theta(self, z: Vector) -> Parameters:
+        """θ at z, (size,); x_l is kept below x_u."""
+        start, values, place = self._start, {}, 0
+        for name, unit in self._units.items():
+            moved, place = unit * z[place : place + unit.size], place + unit.size
+            if name in HESSIANS:
+                symmetric = start.blocks.block(name).unpack(moved)
+                matrix = self._factors[name] @ expm(symmetric) @ self._factors[name].T
+                values[name] = (matrix + matrix.T) / 2
+            elif name.startswith("b_"):
+                values[name] = start[name] - 2 * start["B_" + name[2:]] @ moved
+            else:
+                values[name] = start[name] + moved
+        crossed = values["x_l"] >= values["x_u"]
+        for name in ("x_l", "x_u"):
+            values[name] = np.where(crossed, start[name], values[name])
+        return start.replace(values)
+
+
+class PolicySearch:
+    """CMA-ES (Hansen) on the mean cost of episodes; the candidates of a generation meet one noise.
+
+    An episode begins at the scenario's initial state. The mean of the search distribution is what
+    the run hands over; the part of a generation that the budget leaves over changes nothing.
+    """
+
+    Configuration: ClassVar[type[Configuration]] = PolicySearchConfiguration
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: PolicySearchConfiguration,
+        samples: int,
+        strategy: Strategy,
+        rng: np.random.Generator,
+    ) -> None:
+        self._controller, self._configuration, self._rng = controller, configuration, rng
+        self._coordinates = Coordinates(controller.parameters, scenario, configuration.width)
+        self._seed = int(rng.integers(2**31))
+        self._search = self._new_search()
+        self._told: list[Vector] = []
+        self._population: list[Vector] = []
+        self._costs: list[float] = []
+        self._sum, self._step = 0.0, 0
+        self.needs_action_value = False
+        self.needs_points = False
+        self.first_episode = self._begin_generation()
+        controller.theta = self._coordinates.theta(self._population[0]).theta
+
+    def _new_search(self) -> CMA:
+        return CMA(
+            mean=np.zeros(self._coordinates.size),
+            sigma=self._configuration.spread,
+            population_size=self._configuration.population,
+            seed=self._seed,
+        )
+
+    def _begin_generation(self) -> int:
+        """Ask for a population; the seed of its noise."""
+        self._population = self._ask()
+        self._costs = []
+        self._noise = int(self._rng.integers(2**63))
+        return self._noise
+
+    def _ask(self) -> list[Vector]:
+        return [self._search.ask() for _ in range(self._configuration.population)]
+
+    @property
+    def theta(self) -> Vector:
+        """θ at the mean of the search distribution, (n_θ,)."""
+        return self._coordinates.theta(self._search.mean).theta
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Count a sample's cost; the last of an episode brings the next candidate."""
+        return self._take(transition.cost)
+
+    def failed(self, cost: float) -> Update | None:
+        """Count the cost of a sample at which the controller failed."""
+        return self._take(cost)
+
+    def _take(self, cost: float) -> Update | None:
+        self._sum += cost
+        self._step += 1
+        if self._step < self._configuration.episode:
+            return None
+        self._costs.append(self._sum / self._step)
+        self._sum, self._step = 0.0, 0
+        before = self.theta
+        if len(self._costs) == len(self._population):
+            self._tell(np.array(self._population), self._costs)
+            self._begin_generation()
+        candidate = self._coordinates.theta(self._population[len(self._costs)])
+        self._controller.theta = candidate.theta
+        blocks = candidate.blocks
+        return Update(
+            td_error=float("nan"),
+            step=float(np.linalg.norm((self.theta - before) / blocks.scale)),
+            smallest_eigenvalue=certificate(blocks, candidate.theta).smallest,
+            episode=self._noise,
+        )
+
+    def _tell(self, population: NDArray[np.float64], costs: list[float]) -> None:
+        self._search.tell(list(zip(population, costs, strict=True)))
+        self._told.append(np.column_stack([population, costs]))
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What was told, from which the search is made again, and the present generation."""
+        size, population = self._coordinates.size, self._configuration.population
+        return {
+            "told": np.array(self._told).reshape(len(self._told), population, size + 1),
+            "costs": np.array(self._costs),
+            "noise": np.array([self._noise], dtype=np.uint64),
+            "episode": np.array([self._sum, self._step]),
+        }
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave, by asking and telling all of it again."""
+        self._search, self._told = self._new_search(), []
+        for generation in state["told"]:
+            self._ask()
+            self._tell(generation[:, :-1], generation[:, -1].tolist())
+        self._population = self._ask()
+        self._costs = state["costs"].tolist()
+        self._noise = int(state["noise"][0])
+        self._sum, self._step = float(state["episode"][0]), int(state["episode"][1])
+
+
+def _unit(lower: Vector, upper: Vector, reference: Vector, width: float) -> Vector:
+    """A share of the bounds' width, (n,), of the reference where a bound is infinite."""
+    span = np.where(np.isfinite(upper - lower), upper - lower, np.abs(reference))
+    return width * np.where(span > 0, span, 1.0)

@@ -1,0 +1,98 @@
+"""The search on a loop that can be computed: x_k = x_l + κσ + noise, stage cost rising with it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from controllers.parameters import Parameters
+from learning.back_off_search import BackOffSearch
+from learning.prediction_errors import OneStepModel
+
+
+class Loop:
+    """States ride their learned lower bound, or the upper one in the second, with known noise."""
+
+    def __init__(self, problem, scenario, both=False):
+        self.problem, self.scenario, self.both = problem, scenario, both
+        self.model = OneStepModel(scenario)
+        self.noises = {}
+
+    def run(self, search, seed_of):
+        while not search.done:
+            rng = np.random.default_rng(search.seed)
+            begins = False
+            while not begins and not search.done:
+                begins = search.observe(self.transition(search, rng))
+        return search
+
+    def transition(self, search, rng):
+        candidate, reference = search.candidate, self.problem.reference_state
+        noise = rng.uniform(-1.0, 1.0, 2) * [1.0, 0.2]
+        low, high = candidate["x_l"], candidate["x_u"]
+        s = np.array([low[0] + noise[0], high[1] + noise[1] if self.both else reference[1]])
+        gradient = np.zeros(candidate.blocks.size)
+        gradient[candidate.blocks.slices["x_l"].start] = 1.0
+        if self.both and search._segment > 0:
+            gradient[candidate.blocks.slices["x_u"].start + 1] = -1.0
+        a = self.problem.reference_action
+        predicted = self.model.predict(s, a, self.model.parameters(candidate))[0]
+        return SimpleNamespace(
+            s=s,
+            a=a,
+            next_s=predicted + rng.uniform(-1.0, 1.0, 2) * [1.0, 0.2],
+            stage_cost=6000.0 + 50.0 * (s[0] - 25.0) - 10.0 * (s[1] - 80.0),
+            policy=SimpleNamespace(value_gradient=gradient),
+        )
+
+
+@pytest.fixture
+def start(problem):
+    return Parameters.naive(problem)
+
+
+def search_of(problem, scenario, start, budget=8000):
+    return BackOffSearch(start, problem, scenario, budget, np.random.default_rng(1))
+
+
+def test_the_least_cost_of_a_known_loop_is_found(problem, scenario, start):
+    search = Loop(problem, scenario).run(search_of(problem, scenario, start), None)
+    # 50 = 1e5·P(noise < −δ) at the optimum, so δ = 1 − 1e-3.
+    assert search.theta["x_l"] == pytest.approx([25.999, 40.0], abs=0.01)
+    assert np.array_equal(search.theta["x_u"], start["x_u"])
+    assert sum(segment.steps for segment in search._plan) <= 8000
+
+
+def test_a_bound_that_binds_only_once_another_is_backed_off_is_searched_too(
+    problem, scenario, start
+):
+    loop = Loop(problem, scenario, both=True)
+    search = loop.run(search_of(problem, scenario, start, 16000), None)
+    assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.02)
+    assert search.theta["x_u"][1] == pytest.approx(79.8, abs=0.01)
+
+
+def test_a_start_that_is_backed_off_too_far_is_taken_back(problem, scenario, start):
+    cautious = start.replace({"x_l": [28.0, 40.0]})
+    search = Loop(problem, scenario).run(search_of(problem, scenario, cautious), None)
+    assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.03)
+
+
+def test_without_an_active_bound_the_start_stands(problem, scenario, start):
+    loop, search = Loop(problem, scenario), search_of(problem, scenario, start)
+    rng = np.random.default_rng(0)
+    while not search.done:
+        free = loop.transition(search, rng)
+        free.policy.value_gradient[:] = 0.0
+        search.observe(free)
+    assert np.array_equal(search.theta.theta, start.theta)
+
+
+def test_the_candidates_of_a_round_meet_the_same_noise(problem, scenario, start):
+    search, seeds = search_of(problem, scenario, start, 800), {}
+    loop, rng = Loop(problem, scenario), np.random.default_rng(0)
+    while not search.done:
+        seeds.setdefault(search._plan[search._segment].round, set()).add(search.seed)
+        search.observe(loop.transition(search, rng))
+    assert len(seeds) == 3 and all(len(each) == 1 for each in seeds.values())
+    assert len(set.union(*seeds.values())) == 3

@@ -1,0 +1,167 @@
+"""What a practitioner would do, as algorithms: they run, count, resume, and find what is there."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from controllers.economic import tune
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.rti import RtiNmpc
+from cosim import FmuPlant, Scenario, simulate
+from learning.errors import ConfigurationError
+from learning.log import to_csv
+from learning.policy_search import Coordinates
+from learning.prediction_errors import OneStepModel
+from learning.registry import load_algorithm
+from learning.training_loop import TrainingLoop
+from learning.training_run import TrainingRun
+
+SETTINGS = {
+    "backoff": {},
+    "offset-free": {"memory": 100},
+    "identified": {},
+    "policy-search": {"population": 4, "episode": 20},
+}
+
+
+def make_run(name, scenario="paper", **changes):
+    values = {
+        "algorithm": name,
+        "scenario": Scenario.load(scenario),
+        "samples": 450,
+        "seed": 3,
+        "configuration": load_algorithm(name).Configuration.from_dict(SETTINGS[name]),
+        "start": "tuned",
+        "log_every": 50,
+        "evaluate_every": 450,
+        "checkpoint_every": 50,
+        "evaluation_seeds": 1,
+        "evaluation_steps": 20,
+    }
+    return TrainingRun(**{**values, **changes})
+
+
+def train(run, out=None, *, resume=False, progress=None):
+    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
+        loop = TrainingLoop(run, load_algorithm(run.algorithm), plant, other, out=out)
+        return loop.go(resume=resume, progress=progress)
+
+
+class Killed(BaseException):
+    """Stands for a kill."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "offset-free",
+        "policy-search",
+        pytest.param("backoff", marks=pytest.mark.slow),
+        pytest.param("identified", marks=pytest.mark.slow),
+    ],
+)
+def test_a_baseline_resumed_after_a_kill_ends_in_the_same_digits(name, tmp_path):
+    run = make_run(name)
+    whole = train(run)
+
+    def die(done, row):
+        if done == 250:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(run, tmp_path, progress=die)
+    resumed = train(run, tmp_path, resume=True)
+    assert to_csv(resumed.rows) == to_csv(whole.rows)
+    assert whole.plant_samples == 450
+    assert whole.status == "finished"
+
+
+def test_the_seed_gives_the_noise_of_a_search():
+    J = [train(make_run("backoff", samples=320, seed=k)).rows[0]["J"] for k in (3, 3, 4)]
+    assert J[0] == J[1] != J[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["paper", "fast-sampling"])
+@pytest.mark.parametrize("seed", range(5))
+def test_tuned_with_back_off_is_within_a_thousandth_of_the_optimum(scenario, seed):
+    from controllers.factories import optimal
+
+    run = make_run("backoff", scenario, samples=8000, seed=seed, log_every=500)
+    run = dataclasses.replace(run, evaluate_every=8000, checkpoint_every=8000)
+    theta = train(run).parameters
+    problem = Problem.from_scenario(run.scenario)
+    with FmuPlant(run.scenario) as plant:
+        J = [
+            simulate(plant, controller, 10_000, 3_000_000 + seed).summary()["J"]
+            for controller in (RtiNmpc(problem, theta), optimal(run.scenario))
+        ]
+    assert J[0] / J[1] - 1 < 1e-3
+
+
+def test_offset_free_predicts_without_bias_under_a_wrong_model():
+    run = make_run("offset-free", "fouled", samples=600)
+    run = dataclasses.replace(
+        run,
+        configuration=load_algorithm("offset-free").Configuration.from_dict({"back_off": False}),
+    )
+    theta = train(run).parameters
+    problem = Problem.from_scenario(run.scenario)
+    assert np.array_equal(theta["x_l"], problem.state_lower), "no back-off was asked for"
+    with FmuPlant(run.scenario) as plant:
+        seen = simulate(plant, RtiNmpc(problem, theta), 300, 11)
+    model, naive = OneStepModel(run.scenario), Parameters.naive(problem)
+    parts = seen.states[:-1], seen.actions[:-1], seen.states[1:]
+    before, after = (model.errors(*parts, each).mean(axis=0) for each in (naive, theta))
+    assert abs(after[1]) < 0.1 * abs(before[1])
+
+
+def test_identification_finds_the_fouled_condenser_and_tunes_with_it():
+    run = make_run("identified", "fouled", samples=1200)
+    theta = train(run).parameters
+    assert theta["p"] == pytest.approx([5.2], rel=0.01)
+    problem = Problem.from_scenario(run.scenario)
+    model = problem.model
+    fouled = dataclasses.replace(
+        model,
+        parameters=tuple(
+            dataclasses.replace(q, nominal=float(theta["p"][0])) if q.name == "UA2" else q
+            for q in model.parameters
+        ),
+    )
+    expected = tune(dataclasses.replace(problem, model=fouled)).parameters
+    for name in ("B_l", "b_l", "B_Vf", "b_Vf"):
+        assert theta[name] == pytest.approx(expected[name], rel=1e-9)
+
+
+def test_the_policy_search_hands_over_the_mean_and_improves(scenario, problem):
+    run = make_run("policy-search", samples=13 * 60 * 3, start="naive")
+    configuration = load_algorithm("policy-search").Configuration.from_dict({"episode": 60})
+    run = dataclasses.replace(
+        run, configuration=configuration, log_every=780, evaluate_every=2340, checkpoint_every=2340
+    )
+    result = train(run)
+    assert result.rows[0]["updates"] == 13
+    costs = [row["J"] for row in result.rows]
+    assert costs[2] < costs[0]
+    assert result.evaluation["J"] == result.rows[-1]["greedy_J"]
+
+
+def test_coordinates_begin_at_the_start_and_stay_definite(scenario, problem, rng):
+    start = tune(problem).parameters
+    coordinates = Coordinates(start, scenario, 0.02)
+    assert coordinates.size == 25
+    same = coordinates.theta(np.zeros(25))
+    assert same.theta == pytest.approx(start.theta, rel=1e-12)
+    for _ in range(20):
+        theta = coordinates.theta(3.0 * rng.normal(size=25))
+        theta.require_well_posed()
+        assert np.linalg.eigvalsh(theta["B_l"])[0] > 0
+        assert np.array_equal(theta["B_lambda"], start["B_lambda"])
+
+
+def test_too_few_samples_for_a_search_are_refused():
+    with pytest.raises(ConfigurationError, match="needs at least 320 samples, it has 100"):
+        train(make_run("backoff", samples=100))

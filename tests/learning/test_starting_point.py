@@ -68,7 +68,7 @@ def test_a_scenario_that_leaves_them_open_changes_nothing(scenario):
 def test_no_exploration_is_greedy(scenario, rng):
     strategy = build_strategy(Configuration(exploration="none"), scenario, 100)
     action = scenario.reference_action
-    assert all(strategy(action, rng, k, None) is action for k in range(20))
+    assert all(strategy(action, rng, k, None) is None for k in range(20))
 
 
 def test_the_level_of_the_value_follows_the_discount_of_the_td_error(problem):

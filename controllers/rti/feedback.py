@@ -12,8 +12,8 @@ from controllers.theta import SymbolicTheta, ThetaBlocks
 def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
     """Initial value embedding: the vectors of the QP that depend on the state s.
 
-    Inputs: s; theta; the rest is read from the preparation's memory. Results: the gradient f, and
-    the lower and upper limits that the soft rows Γ V must respect.
+    Inputs: s; theta and the rest are read from the preparation's memory. Results: the gradient f,
+    and the lower and upper limits that the soft rows Γ V must respect.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
@@ -32,18 +32,20 @@ def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) 
         "embedding",
         {"s": s, "theta": symbols.theta, **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
-        {name: prepared.stack[prepared.slices[name]] for name in prior},
+        {name: prepared.stack[prepared.slices[name]] for name in prior}
+        | {"theta": prepared.inputs["theta"]},
     )
 
 
 def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
     """States, slack, costates and value that belong to a solution (v, λ) of the condensed QP.
 
-    Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta; the QP's
-    A, B, r, L, q, L_N, q_N are read from the preparation's memory. Results: xi (n, N+1), t (n, N),
-    chi (n, N+1), value. The costates χ solve the adjoint recursion, so χ_0 is the gradient of the
-    value in s. The solution shifted by one stage is the next point of linearisation: next_x (n, N),
-    next_u (m, N) in absolute units, next_chi (n, N), the costates of stages that weigh 1/γ as much.
+    Inputs: s (n), v (m, N), lam (n, N); the constant of the QP's stage costs; theta and the QP's
+    A, B, r, L, q, L_N, q_N are read from the preparation's memory. Results: xi (n, N+1),
+    t (n, N), chi (n, N+1), value. The costates χ solve the adjoint recursion, so χ_0 is the
+    gradient of the value in s. The solution shifted by one stage is the next point of
+    linearisation: next_x (n, N), next_u (m, N) in absolute units, next_chi (n, N), the costates of
+    stages that weigh 1/γ as much.
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
     symbols = SymbolicTheta.of(problem, blocks)
@@ -109,5 +111,5 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
         {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
-        | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N")},
+        | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N", "theta")},
     )

@@ -111,8 +111,7 @@ class RtiNmpc:
         problem, horizon = self.problem, self.problem.horizon
         self._parameters = parameters
         self._hessian.set_parameters(parameters)
-        for function in (self._prepare, self._embed, self._readout):
-            function.inputs["theta"][:] = parameters.theta
+        self._prepare.inputs["theta"][:] = parameters.theta
         discounts = np.repeat(problem.discount ** np.arange(1, horizon + 1), problem.n_states)
         learned = "w_sigma" in parameters.blocks
         w = parameters["w_sigma"] if learned else problem.penalty_linear

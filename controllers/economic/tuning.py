@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.economic.convexification import Convexification, convexify
 from controllers.economic.local_feedback import LocalFeedback, local_feedback
 from controllers.economic.steady_state import SteadyState, optimal_steady_state
+from controllers.errors import TuningError
+from controllers.model import discretise
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.theta import ThetaBlocks
@@ -62,19 +66,27 @@ def tune(
     blocks: ThetaBlocks | None = None,
     *,
     value_offset: float | None = None,
-    weight: float = 1e-2,
+    weight: float = 1e-3,
+    accuracy: float = 1e-8,
 ) -> EconomicTuning:
     """Tune the NMPC so that its local feedback is that of the economic optimum.
 
     The economic cost is rotated by the costate λ of the optimal steady state, which leaves its
-    gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = `weight`).
+    gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = `weight`,
+    published as 1e-3). For this the model is integrated in as many steps as bring the relative
+    error of a sample's A and B below `accuracy`, published as 1e-8; the controller's own model
+    keeps its `substeps`.
     Then ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B], V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx with P
-    the value of H̃ under γ = 1: the term in 1−γ makes P and its feedback those of the
-    discounted problem as well, for any γ and horizon. λ_θ undoes both rotations, so that V_θ is
-    to second order the economic value. `value_offset` is c_λ where it shall not be ℓ_s. Raises
-    TuningError where steady state, local optimum or convexification do not exist.
+    the value of H̃ under γ = 1: the term in 1−γ, which the published procedure for γ = 1 does not
+    need, makes P and its feedback those of the discounted problem as well, for any γ and horizon.
+    Without it a discounted NMPC would act as if what it postpones were cheaper. λ_θ undoes both
+    rotations, so that V_θ is to second order the economic value. `value_offset` is c_λ where it
+    shall not be ℓ_s. Raises TuningError where steady state, local optimum or convexification do
+    not exist.
     """
-    steady = optimal_steady_state(problem)
+    steady = optimal_steady_state(
+        dataclasses.replace(problem, substeps=accurate_substeps(problem, accuracy))
+    )
     n, A, B = problem.n_states, steady.A, steady.B
     economic = local_feedback(A, B, steady.hessian, steady.C)
     convex = convexify(A, B, steady.hessian, steady.C, weight)
@@ -103,6 +115,40 @@ def tune(
         convexification=convex,
         economic=economic,
         tuned=tuned,
+    )
+
+
+def accurate_substeps(problem: Problem, accuracy: float) -> int:
+    """Runge–Kutta steps a sample with a relative error below `accuracy`, at the reference.
+
+    The error is that of A and B: a steady state itself is integrated exactly by any number of
+    steps. The problem's own number is doubled until doubling it once more changes less. Raises
+    TuningError where that does not come about in 1024 steps.
+    """
+    model, substeps = problem.model, problem.substeps
+    point = (
+        problem.reference_state,
+        problem.reference_action,
+        model.nominal_disturbance,
+        model.nominal_parameters,
+    )
+
+    def end(steps: int) -> Array:
+        x, u, d, p = model.symbols()
+        following = discretise(model, problem.sampling_time, steps)(x, u, d, p)
+        jacobian = ca.jacobian(following, ca.vertcat(x, u))
+        found: Array = ca.Function("AB", [x, u, d, p], [jacobian])(*point).full()
+        return found
+
+    present = end(substeps)
+    while substeps <= 1024:
+        finer = end(2 * substeps)
+        if (np.abs(finer - present) <= accuracy * (1.0 + np.abs(present))).all():
+            return substeps
+        substeps, present = 2 * substeps, finer
+    raise TuningError(
+        f"model '{model.name}' cannot be integrated to {accuracy:g} over a sample of "
+        f"{problem.sampling_time:g} s"
     )
 
 

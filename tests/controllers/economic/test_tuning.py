@@ -100,6 +100,27 @@ def test_certificate_holds(tuning):
     assert "X2 ≥ 25 %" in str(result)
 
 
+def test_the_published_procedure_gives_the_published_hessian():
+    # ρ = 1e-3 and 20 Runge–Kutta steps a sample.
+    found = tune(PROBLEMS["paper"]).convexification.hessian
+    assert np.diag(found) == pytest.approx([1.5310e-2, 1.0848e-2, 9.2506e-5, 4.5407e-3], rel=5e-5)
+
+
+@pytest.mark.parametrize("name", ["paper", "fast-sampling"])
+def test_the_tunings_model_is_integrated_to_a_hundred_millionth(name):
+    problem = PROBLEMS[name]
+    exact = optimal_steady_state(replace(problem, substeps=200))
+    found = tune(problem).steady_state
+    for one, other in ((found.A, exact.A), (found.B, exact.B)):
+        assert one == pytest.approx(other, rel=1e-8, abs=1e-8)
+
+
+def test_a_model_that_no_step_resolves_is_refused():
+    stiff = economic_problem(lambda x, u, d, p: x**2 + u**2, lambda x, u, d, p: u - 1e5 * x)
+    with pytest.raises(TuningError, match="cannot be integrated to 1e-08"):
+        tune(stiff)
+
+
 def test_without_the_active_constraint_there_is_no_solution():
     steady = optimal_steady_state(PROBLEMS["paper"])
     none = np.zeros((0, 4))
@@ -108,7 +129,8 @@ def test_without_the_active_constraint_there_is_no_solution():
 
 
 def test_economic_gain_is_that_of_the_nonlinear_economic_problem():
-    problem = PROBLEMS["paper"]
+    # The oracle is to have the tuning's integrator, not the controller's coarser one.
+    problem = replace(PROBLEMS["paper"], substeps=8)
     gain, solve = tune(problem).economic.gain, long_economic_problem(problem)
     s = problem.reference_state
     np.testing.assert_allclose(solve(s)[0], problem.reference_action, atol=1e-5)
@@ -223,7 +245,7 @@ def economic_problem(cost, ode=None, **changes):
 
 def test_unconstrained_indefinite_cost_has_the_riccati_gain():
     # −0.3 x² + u²: indefinite, yet dissipative since the plant is stable.
-    problem = economic_problem(lambda x, u, d, p: -0.3 * x**2 + u**2 + u)
+    problem = economic_problem(lambda x, u, d, p: -0.3 * x**2 + u**2 + u, substeps=16)
     result = tune(problem)
     steady = result.steady_state
     assert steady.active == ()

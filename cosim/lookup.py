@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 
 from cosim.errors import ControllerLookupError
 from cosim.plugins import blamed, load_plugin
@@ -52,8 +57,25 @@ def import_from_here() -> None:
 
 def import_from(folder: Path) -> None:
     """Let `module:factory` name a module of a folder too, after all others."""
-    if str(folder) not in sys.path:
-        sys.path.append(str(folder))
+    finder = _Folder(str(folder))
+    if finder not in sys.meta_path:
+        sys.meta_path.append(finder)
+
+
+@dataclass(frozen=True)
+class _Folder(MetaPathFinder):
+    """Finds modules in a folder that nobody else finds.
+
+    Not so an entry at the end of `sys.path`: a plain folder named as a package hides that package
+    where it is installed as editable, since such a package is searched for last of all.
+    """
+
+    folder: str
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return None if path is not None else PathFinder.find_spec(fullname, [self.folder])
 
 
 def _made(name: str, target: str, scenario: Scenario) -> Controller:

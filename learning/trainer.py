@@ -24,7 +24,7 @@ from learning.log import LogRow, to_csv
 from learning.optimum import has_stored_optimum
 from learning.registry import GROUP as ALGORITHMS
 from learning.registry import load_algorithm
-from learning.starting_point import build_controller
+from learning.starting_point import build_controller, starting_parameters
 from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun
 
@@ -83,7 +83,7 @@ class Trainer:
             return Progress(
                 samples,
                 result.status,
-                log=to_csv(result.rows),
+                log=to_csv(_with_start(run, result.rows)),
                 parameters=(folder / "parameters.toml").read_text("utf-8"),
                 plant_samples=result.plant_samples,
                 wall_seconds=time.perf_counter() - begin,
@@ -115,6 +115,16 @@ class Trainer:
                 if point.name == target:
                     return source_hashes(point.value)
         return source_hashes(target)
+
+
+def _with_start(run: TrainingRun, rows: list[LogRow]) -> list[LogRow]:
+    """The log with a first row of θ at the start, from which its increments are counted."""
+    problem = Problem.from_scenario(run.scenario)
+    start = starting_parameters(problem, run.configuration, run.start)
+    first: LogRow = dict.fromkeys(rows[0], float("nan")) if rows else {}
+    first |= {"samples": 0}
+    labels = zip(start.blocks.labels, start.theta.tolist(), strict=True)
+    return [first | {f"theta {label}": value for label, value in labels}, *rows]
 
 
 def _run(training: Training) -> TrainingRun:

@@ -39,44 +39,55 @@ def run(
     file: what is finished is not done again. Exit code 1: some runs failed, all others are done.
     """
     with output(json) as out_:
-        from cosim.errors import FailedRunsError
-        from cosim.evaluation.parallel import cores
-        from cosim.experiments.study import Study
-
-        study = Study.load(file)
-        folder = open_folder(out)
-        for scenario in study.scenarios.values():
-            _announce(scenario, out_)
-        planned = study.plan()
-        failure: str | None = None
-        with out_.progress(
-            f"{study.name}, thousands of samples", _thousands(planned.samples)
-        ) as bar:
-
-            def report(state: State, line: str) -> None:
-                failed = f", {state.failed} failed" if state.failed else ""
-                runs = f"{state.runs}/{state.all_runs} runs{failed}"
-                bar(_thousands(state.samples), runs)
-                if line:
-                    out_.note(f"{runs}  {line}")
-
-            try:
-                results = study.run(
-                    folder,
-                    jobs=jobs or cores(),
-                    scheduler=scheduler,
-                    report=report,
-                    planned=planned,
-                )
-            except FailedRunsError as error:
-                failure = str(error)
-        if failure is not None:
-            out_.note(f"failed: {failure}")
-            raise typer.Exit(1)
-        summary = _write_summary(results)
+        results = execute(file, out, out_, jobs=jobs, scheduler=scheduler)
+        summary = write_summary(results)
         show(results, out_)
-        out_.note(f"tables are in {folder.resolve()}; cosim study report {out} draws them")
+        out_.note(f"tables are in {out.resolve()}; cosim study report {out} draws them")
         out_.json(summary)
+
+
+def execute(
+    file: Path,
+    out: Path,
+    out_: Output,
+    *,
+    jobs: int | None,
+    scheduler: str | None = None,
+    figures: bool = True,
+) -> StudyResults:
+    """Run a study with a progress bar; exits with code 1 where runs failed."""
+    from cosim.errors import FailedRunsError
+    from cosim.evaluation.parallel import cores
+    from cosim.experiments.study import Study
+
+    study = Study.load(file)
+    folder = open_folder(out)
+    for scenario in study.scenarios.values():
+        _announce(scenario, out_)
+    planned = study.plan()
+    label, total = f"{study.name}, thousands of samples", _thousands(planned.samples)
+    with out_.progress(label, total) as bar:
+
+        def report(state: State, line: str) -> None:
+            failed = f", {state.failed} failed" if state.failed else ""
+            runs = f"{state.runs}/{state.all_runs} runs{failed}"
+            bar(_thousands(state.samples), runs)
+            if line:
+                out_.note(f"{runs}  {line}")
+
+        try:
+            return study.run(
+                folder,
+                jobs=jobs or cores(),
+                scheduler=scheduler,
+                report=report,
+                planned=planned,
+                figures=figures,
+            )
+        except FailedRunsError as error:
+            failure = error
+    out_.note(f"failed: {failure}")
+    raise typer.Exit(1)
 
 
 @app.command()
@@ -143,7 +154,8 @@ def _thousands(samples: int) -> int:
     return round(samples / 1000)
 
 
-def _write_summary(results: StudyResults) -> dict[str, Any]:
+def write_summary(results: StudyResults) -> dict[str, Any]:
+    """Write summary.json and return what it says."""
     from cosim.experiments.summary import aggregate_rows, summary_rows
     from cosim.files import write_atomically
 

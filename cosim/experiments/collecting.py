@@ -25,6 +25,7 @@ from cosim.experiments.summary import (
     summary_rows,
 )
 from cosim.experiments.tables import CURVES, RUNS, TIMING, curves_csv, evaluation_csv, to_csv
+from cosim.experiments.traces import draw, keep
 from cosim.files import write_atomically
 
 Array = NDArray[np.float64]
@@ -69,6 +70,8 @@ def collect(plan: Plan, out: Path, stores: Mapping[str, RunStore]) -> StudyResul
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.naive),
         "runs": len(plan.runs),
+        "tables": list(definition.table.tables),
+        "pictures": [],
         "made_with": plan.provenance,
     }
     return StudyResults(out, json.loads(json.dumps(about)), found)
@@ -116,9 +119,11 @@ def _curve(log: str) -> dict[str, Array]:
     }
 
 
-def write(results: StudyResults, stores: Mapping[str, RunStore]) -> None:
-    """Write the tables, each whole or not at all; study.json last, so that all of it is there."""
+def write(results: StudyResults, plan: Plan, stores: Mapping[str, RunStore], figures: bool) -> None:
+    """Write all that a study keeps; study.json last, so that what it says is there."""
     out = results.folder
+    keep(plan, out, stores)
+    pictures = draw(plan, out, stores) if figures else []
     write_atomically(out / EVALUATION, evaluation_csv(results.runs))
     write_atomically(out / CURVES, curves_csv(results.runs))
     write_atomically(out / RUNS, to_csv(RUN_COLUMNS, run_rows(results)))
@@ -127,7 +132,10 @@ def write(results: StudyResults, stores: Mapping[str, RunStore]) -> None:
     if aggregate:
         write_atomically(out / AGGREGATE, to_csv(AGGREGATE_COLUMNS, aggregate))
     write_atomically(out / TIMING, _timing(stores))
-    write_atomically(out / ABOUT, json.dumps(results.about, indent=1, sort_keys=True) + "\n")
+    write_atomically(
+        out / ABOUT,
+        json.dumps(dict(results.about) | {"pictures": pictures}, indent=1, sort_keys=True) + "\n",
+    )
 
 
 def _timing(stores: Mapping[str, RunStore]) -> str:

@@ -166,6 +166,14 @@ class Definition:
         between = max(1, case.samples // self.table.curves.points)
         rows = -(-between // ROW)
         log_every = max(1, between // rows)
+        options = {
+            "log_every": log_every,
+            "evaluate_every": rows * log_every,
+            "checkpoint_every": log_every * max(1, round(CHECKPOINT / log_every)),
+            "evaluation_seeds": sizes.curve_seeds,
+            "evaluation_steps": sizes.curve_steps,
+            **case.training,
+        }
         return Training(
             algorithm=case.algorithm,
             scenario=self.scenarios[scenario],
@@ -174,12 +182,12 @@ class Definition:
             settings=case.settings,
             start=case.start,
             nmpc=case.nmpc,
-            log_every=log_every,
-            evaluate_every=rows * log_every,
-            checkpoint_every=log_every * max(1, round(CHECKPOINT / log_every)),
-            evaluation_seeds=sizes.curve_seeds,
-            evaluation_steps=sizes.curve_steps,
-            options=case.training,
+            log_every=options.pop("log_every"),
+            evaluate_every=options.pop("evaluate_every"),
+            checkpoint_every=options.pop("checkpoint_every"),
+            evaluation_seeds=options.pop("evaluation_seeds"),
+            evaluation_steps=options.pop("evaluation_steps"),
+            options=options,
         )
 
     def _check_seeds(self, cases: list[Case]) -> None:

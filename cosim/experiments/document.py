@@ -112,6 +112,21 @@ class CaseTable(Table):
         return f"case '{self.name or self.algorithm or self.controller or ''}'"
 
 
+class TrajectoryTable(Table):
+    """A table `[[trajectory]]`: one run of each case on the same noise, kept sample by sample."""
+
+    name: Name
+    seed: Seed = 1
+    """Noise seed."""
+    steps: Count = 240
+    cases: list[Source] | None = None
+    """Names of cases; a trained one runs with its first training seed. All, if left out."""
+    scenarios: list[Source] | None = None
+    """Those of the study's scenarios that it is of; all, if left out."""
+    figures: list[Literal["trajectory", "overlay", "density", "phase"]] = []
+    """What is drawn of the runs."""
+
+
 class StudyTable(Table):
     """A study file."""
 
@@ -127,6 +142,13 @@ class StudyTable(Table):
     evaluation: EvaluationTable = EvaluationTable()
     curves: CurvesTable = CurvesTable()
     case: Annotated[list[CaseTable], Field(min_length=1)]
+    trajectory: list[TrajectoryTable] = []
+    logs: list[Source] = []
+    """Trained cases whose log and θ are kept beside the tables, and drawn: first training seed."""
+    tables: list[Literal["paper"]] = []
+    """Further tables of the report: `paper` holds the paper's figures beside ours."""
+    check: bool = False
+    """Whether `cosim results check` runs it, where it is one of a folder of stored studies."""
 
 
 def read(path: str | Path) -> StudyTable:

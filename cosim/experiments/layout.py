@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from typing import Any
 
 from cosim.evaluation.statistics import shown
@@ -69,12 +68,6 @@ def percent(row: dict[str, Any], name: str) -> str:
 def number(value: float, digits: int) -> str:
     """A number with significant digits."""
     return shown(value, None, 1.0, digits)
-
-
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; the first column is text, the others numbers."""
-    rule = ["---", *["---:"] * (len(header) - 1)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (header, rule, *rows)) + "\n"
 
 
 def setting_lines(results: StudyResults) -> tuple[list[str], Lines]:

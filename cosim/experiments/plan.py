@@ -10,10 +10,12 @@ from cosim.errors import StudyError
 from cosim.evaluation.provenance import code_hash, versions
 from cosim.experiments.cases import Case
 from cosim.experiments.definition import HELD_OUT, Definition, Sizes
+from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Training
 from cosim.experiments.store import EVALUATION, GREEDY, RunKey
 from cosim.experiments.units import PACKAGES
 from cosim.plant import FmuPlant
+from cosim.validation import suggestion
 
 BLOCK = 20_000
 """Samples of an evaluation unit, about: a few seconds of work."""
@@ -30,6 +32,8 @@ class Run:
     sizes: Sizes
     greedy: bool
     """Whether a controller is run on the noise of the learning curves, too."""
+    traces: tuple[TrajectoryTable, ...] = ()
+    """Runs that are kept sample by sample."""
 
     @property
     def noise(self) -> dict[str, tuple[tuple[int, ...], int]]:
@@ -45,7 +49,8 @@ class Run:
     def samples(self) -> int:
         """Plant samples of the run, validation apart."""
         trained = 0 if self.training is None else self.training.samples
-        return trained + sum(len(seeds) * steps for seeds, steps in self.noise.values())
+        evaluated = sum(len(seeds) * steps for seeds, steps in self.noise.values())
+        return trained + evaluated + sum(trace.steps for trace in self.traces)
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,8 @@ def plan(definition: Definition) -> Plan:
                 facts["start"] = dict(definition.trainer.sources(case.start))
         key = RunKey(scenario, case.name, seed)
         curves = training is None and _learns(definition, scenario)
-        runs.append(Run(key, case, training, facts, definition.sizes(scenario), curves))
+        sizes, traces = definition.sizes(scenario), _traces(definition, case, scenario, seed)
+        runs.append(Run(key, case, training, facts, sizes, curves, traces))
     _check(definition, runs)
     provenance = {
         "versions": versions(),
@@ -98,6 +104,19 @@ def plan(definition: Definition) -> Plan:
         "study": definition.name,
     }
     return Plan(definition, runs, provenance)
+
+
+def _traces(
+    definition: Definition, case: Case, scenario: str, seed: int | None
+) -> tuple[TrajectoryTable, ...]:
+    """The trajectories that a run takes part in: of a training, that of the first seed."""
+    if case.training_seeds and seed != case.training_seeds[0]:
+        return ()
+    return tuple(
+        table
+        for table in definition.table.trajectory
+        if case.name in (table.cases or [case.name]) and scenario in (table.scenarios or [scenario])
+    )
 
 
 def _learns(definition: Definition, scenario: str) -> bool:
@@ -120,7 +139,21 @@ def _order(definition: Definition) -> Iterator[tuple[Case, str, int | None]]:
 
 
 def _check(definition: Definition, runs: list[Run]) -> None:
-    """Find every mistake before the work: names of algorithms, settings, folders."""
+    """Find every mistake before the work: names of cases, algorithms, settings, folders."""
+    names = [case.name for case in [*definition.references, *definition.cases]]
+    trained = [case.name for case in definition.cases if case.algorithm is not None]
+    asked = [
+        (f"trajectory '{t.name}'", c, names)
+        for t in definition.table.trajectory
+        for c in t.cases or []
+    ]
+    asked += [("logs", case, trained) for case in definition.table.logs]
+    for where, name, known in asked:
+        if name not in known:
+            raise StudyError(
+                f"{where}: there is no case '{name}'{suggestion(name, known)}; there are "
+                f"{', '.join(known)}"
+            )
     folders: dict[str, RunKey] = {}
     checked = set()
     for run in runs:

@@ -14,15 +14,20 @@ from cosim.experiments.layout import (
     HEADER,
     aggregate_lines,
     lines,
-    markdown,
     run_lines,
     setting_lines,
 )
+from cosim.experiments.paper import further
 from cosim.experiments.results import StudyResults
-from cosim.files import write_atomically
+from cosim.files import markdown_table, write_atomically
 
 PAGE, TABLES = "report.html", "report.md"
 CAPTIONS = {
+    "parameters": "Increments of θ by block, and the TD error: root mean square over the updates "
+    "of the preceding 10 000 samples (the paper's figure). First training seed.",
+    "overlay": "All on the same disturbances; the area beyond a bound is shaded.",
+    "phase": "Where the state lives (density) and what the policy does there (arrows).",
+    "density": "Density of the first state against its lower bound.",
     "regret": "Regret of every run. Dots are training runs, crosses runs that diverged; the bar is "
     "the interquartile mean with its 95 % interval (bootstrap over runs; for a controller without "
     "training over the noise seeds).",
@@ -58,13 +63,16 @@ def report_markdown(results: StudyResults, figures: dict[str, list[str]]) -> str
     parts += [_progress(results), f"{NOTES}\n"]
     for scenario in results.scenarios:
         parts += [f"## Scenario `{scenario}`\n", _noise(results, scenario)]
-        parts.append(markdown(HEADER, lines(results, scenario)))
+        parts.append(markdown_table(HEADER, lines(results, scenario)))
         parts += [f"![{name}]({FOLDER}/{name}.svg)\n" for name in figures[scenario]]
     if overall := aggregate_lines(results):
-        parts += ["## All scenarios\n", markdown(AGGREGATE_HEADER, overall)]
+        parts += ["## All scenarios\n", markdown_table(AGGREGATE_HEADER, overall)]
         parts += [f"![{name}]({FOLDER}/{name}.svg)\n" for name in figures[""]]
+    for title, head, body in further(results):
+        parts += [f"## {title}\n", markdown_table(head, body)]
+    parts += [f"![{name}]({FOLDER}/{name}.svg)\n" for name in results.about["pictures"]]
     header, rows = setting_lines(results)
-    parts += ["## Cases\n", markdown(header, rows), f"{_made(results)}\n"]
+    parts += ["## Cases\n", markdown_table(header, rows), f"{_made(results)}\n"]
     return "\n".join(parts)
 
 
@@ -107,6 +115,11 @@ def report_html(results: StudyResults, figures: dict[str, list[str]], folder: Pa
     if overall := aggregate_lines(results):
         sections += ["<section id='all'><h2>All scenarios</h2>", table(AGGREGATE_HEADER, overall)]
         sections += [*(_figure(folder, name) for name in figures[""]), "</section>"]
+    for title, head, body in further(results):
+        sections += [f"<section><h2>{escape(title)}</h2>", table(head, body), "</section>"]
+    if pictures := results.about["pictures"]:
+        sections += ["<section id='samples'><h2>Sample by sample</h2>"]
+        sections += [*(_figure(folder, name) for name in pictures), "</section>"]
     header, rows = setting_lines(results)
     sections += ["<section id='cases'><h2>Cases</h2>", table(header, rows), "</section>"]
     header, rows = run_lines(results)
@@ -140,7 +153,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _figure(folder: Path, name: str) -> str:
     data = base64.b64encode((folder / FOLDER / f"{name}.svg").read_bytes()).decode()
-    caption = escape(CAPTIONS[name.partition("-")[0]])
+    caption = escape(CAPTIONS.get(name.partition("-")[0], name))
     image = f"<img alt='{escape(name)}' src='data:image/svg+xml;base64,{data}'>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 

@@ -18,6 +18,8 @@ from cosim.experiments.units import (
     Learnt,
     Outcome,
     Place,
+    Trace,
+    Traced,
     Unit,
     perform,
     release,
@@ -87,6 +89,7 @@ class Runner:
         if run.training is not None:
             controller = Learnt(run.training, progress.parameters)
         units: dict[str, Unit] = {}
+        place, scenario = self._place, self._plan.definition.scenarios[run.key.scenario]
         for file, (seeds, steps) in run.noise.items():
             known = self.stores[name].indicators(file, steps)
             missing = [seed for seed in seeds if seed not in known]
@@ -94,10 +97,16 @@ class Runner:
             size = max(1, BLOCK // steps)
             for first in range(0, len(missing), size):
                 block = tuple(missing[first : first + size])
-                scenario = self._plan.definition.scenarios[run.key.scenario]
                 units[f"{name}: {file} {block[0]}"] = Evaluate(
-                    self._place, name, scenario, controller, block, steps
+                    place, name, scenario, controller, block, steps
                 )
+        for trace in run.traces:
+            if self.stores[name].trajectory(trace) is not None:
+                self._done[name] += trace.steps
+                continue
+            units[f"{name}: {trace.name}"] = Trace(
+                place, name, scenario, controller, trace.seed, trace.steps
+            )
         if not units:
             self._finished.add(name)
         return units
@@ -118,6 +127,12 @@ class Runner:
             ended = outcome.status if outcome.status not in ("", "finished") else ""
             self._tell(f"{name}: {ended}" if ended else "")
             return more
+        if isinstance(outcome, Traced):
+            trace = next(trace for trace in run.traces if trace.name == what)
+            store.trace(trace, outcome.trajectory)
+            self._done[name] += trace.steps
+            self._tell(self._finish(name, run))
+            return None
         assert isinstance(outcome, Evaluated)
         file = what.split()[0]
         _, steps = run.noise[file]
@@ -129,6 +144,8 @@ class Runner:
     def _finish(self, name: str, run: Run) -> str:
         """A line for a run whose last evaluation just came, else nothing."""
         store, costs = self.stores[name], []
+        if any(store.trajectory(trace) is None for trace in run.traces):
+            return ""
         for file, (seeds, steps) in run.noise.items():
             found = store.indicators(file, steps)
             if any(seed not in found for seed in seeds):
@@ -136,7 +153,7 @@ class Runner:
             if file == EVALUATION:
                 costs = [found[seed]["J"] for seed in seeds]
         self._finished.add(name)
-        status = store.progress().status
+        status = store.progress().status.partition(":")[0]
         cost = sum(costs) / len(costs)
         return f"{name}: J {cost:.6g}{f', {status}' if status else ''}"
 

@@ -9,7 +9,6 @@ Only the process that runs the study writes, so workers need no shared disk.
 from __future__ import annotations
 
 import csv
-import io
 import json
 import re
 import shutil
@@ -19,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import StudyError
+from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Progress
-from cosim.files import write_atomically
+from cosim.files import cell, csv_text, write_atomically
 
 RUNS = "runs"
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
@@ -49,7 +49,7 @@ class RunKey:
     @property
     def folder(self) -> Path:
         """Where its files are, relative to the study's folder."""
-        parts = [_safe(self.scenario), _safe(self.case)]
+        parts = [safe(self.scenario), safe(self.case)]
         return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ class RunKey:
         return f"{self.case} on {self.scenario}{seed}"
 
 
-def _safe(name: str) -> str:
+def safe(name: str) -> str:
     """A folder's name on any system."""
     return re.sub(r"[^\w.+=()\[\]-]", "_", name)
 
@@ -143,7 +143,7 @@ class RunStore:
         try:
             with path.open(newline="", encoding="utf-8") as stream:
                 return {
-                    int(row["seed"]): {name: float(row[name]) for name in INDICATORS}
+                    int(row["seed"]): {name: float(row[name] or "nan") for name in INDICATORS}
                     for row in csv.DictReader(stream)
                     if int(row["steps"]) == steps
                 }
@@ -153,12 +153,23 @@ class RunStore:
     def evaluate(self, file: str, steps: int, fresh: Indicators) -> None:
         """Add indicators to a file."""
         known = self.indicators(file, steps) | fresh
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(("seed", "steps", *INDICATORS))
-        for seed, values in sorted(known.items()):
-            writer.writerow((seed, steps, *(repr(values[name]) for name in INDICATORS)))
-        self._write(file, stream.getvalue())
+        rows = (
+            [str(seed), str(steps), *(cell(values[name]) for name in INDICATORS)]
+            for seed, values in sorted(known.items())
+        )
+        self._write(file, csv_text(("seed", "steps", *INDICATORS), rows))
+
+    def _trace(self, trace: TrajectoryTable) -> Path:
+        return self.folder / f"trajectory-{trace.name}-{trace.seed}-{trace.steps}.csv"
+
+    def trajectory(self, trace: TrajectoryTable) -> Path | None:
+        """File of a trajectory, None if there is none yet."""
+        path = self._trace(trace)
+        return path if path.is_file() else None
+
+    def trace(self, trace: TrajectoryTable, trajectory: str) -> None:
+        """Store a trajectory."""
+        write_atomically(self._trace(trace), trajectory)
 
     def fail(self, trace: str) -> None:
         """Keep the traceback of what failed."""

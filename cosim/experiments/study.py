@@ -36,12 +36,14 @@ class Study(Definition):
         scheduler: str | None = None,
         report: Report = silent,
         planned: Plan | None = None,
+        figures: bool = True,
     ) -> StudyResults:
         """Train and evaluate all that `out` does not hold yet, and write the tables there.
 
         `jobs` worker processes, or the Dask cluster at `scheduler`; the tables' bytes depend on
         neither. `report` gets the state after every unit of work and a line for each run that ends
-        or fails; `planned` is what `plan` returned, if it is known. Raises FailedRunsError after
+        or fails; `planned` is what `plan` returned, if it is known; `figures` draws the
+        study's trajectories and logs. Raises FailedRunsError after
         all others are done and written.
         """
         folder = Path(out)
@@ -50,7 +52,7 @@ class Study(Definition):
         runner = Runner(planned, folder, report)
         runner.go(jobs, scheduler)
         results = collecting.collect(planned, folder, runner.stores)
-        collecting.write(results, runner.stores)
+        collecting.write(results, planned, runner.stores, figures)
         if runner.failures:
             name, failure = next(iter(runner.failures.items()))
             more = len(runner.failures) - 1

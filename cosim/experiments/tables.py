@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.experiments.records import CURVE, RunResult
 from cosim.experiments.store import INDICATORS
+from cosim.files import cell, csv_text, read_records
 
+Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 EVALUATION, CURVES, RUNS, TIMING = "evaluation.csv", "curves.csv", "runs.csv", "timing.csv"
@@ -23,29 +24,7 @@ RUN = (*KEYS, "status", "samples", "plant_samples")
 
 def to_csv(columns: Sequence[str], rows: Iterable[Row]) -> str:
     """Rows as CSV; floats read back to the same bits, what is undefined is empty."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([cell(row.get(name)) for name in columns] for row in rows)
-    return stream.getvalue()
-
-
-def cell(value: Any) -> str:
-    """Text of a cell."""
-    if value is None or (isinstance(value, float) and np.isnan(value)):
-        return ""
-    if isinstance(value, float):
-        return repr(float(value))
-    return str(value)
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    """Rows of a table; raises StudyError."""
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            return list(csv.DictReader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise StudyError(f"'{path}' cannot be read: {error}") from None
+    return csv_text(columns, ([cell(row.get(name)) for name in columns] for row in rows))
 
 
 def evaluation_csv(runs: Sequence[RunResult]) -> str:
@@ -85,10 +64,10 @@ def read_runs(folder: Path) -> list[RunResult]:
 
 
 def _read_runs(folder: Path) -> list[RunResult]:
-    evaluations = _grouped(read_csv(folder / EVALUATION))
-    curves = _grouped(read_csv(folder / CURVES))
+    evaluations = _grouped(read_records(folder / EVALUATION, StudyError))
+    curves = _grouped(read_records(folder / CURVES, StudyError))
     found = []
-    for row in read_csv(folder / RUNS):
+    for row in read_records(folder / RUNS, StudyError):
         key = tuple(row[name] for name in KEYS)
         noise, log = evaluations[key], curves.get(key, [])
         trained = bool(row["training_seed"])
@@ -123,3 +102,17 @@ def _grouped(rows: list[dict[str, str]]) -> dict[tuple[str, ...], list[dict[str,
 
 def _number(text: str) -> float:
     return float(text) if text else float("nan")
+
+
+def read_numbers(path: Path) -> dict[str, Array]:
+    """Columns by name of a table of numbers, a training's log say; an empty cell is NaN.
+
+    Raises StudyError.
+    """
+    rows = read_records(path, StudyError)
+    if not rows:
+        raise StudyError(f"'{path}' has no rows")
+    try:
+        return {name: np.array([_number(row[name]) for row in rows]) for name in rows[0]}
+    except (TypeError, ValueError) as error:
+        raise StudyError(f"'{path}' is damaged: {error}") from None

@@ -77,6 +77,25 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Trace:
+    """A controller on one seed, sample by sample."""
+
+    place: Place
+    key: str
+    scenario: Scenario
+    controller: str | Learnt
+    seed: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class Traced:
+    """A run's trajectory as CSV."""
+
+    trajectory: str
+
+
+@dataclass(frozen=True)
 class Evaluated:
     """Indicators by seed, and the wall time that they took."""
 
@@ -92,8 +111,8 @@ class Failure:
     trace: str
 
 
-Unit = Advance | Evaluate
-Outcome = Progress | Evaluated | Failure
+Unit = Advance | Evaluate | Trace
+Outcome = Progress | Evaluated | Traced | Failure
 
 
 def perform(unit: Unit) -> Outcome:
@@ -102,7 +121,11 @@ def perform(unit: Unit) -> Outcome:
         unit.place.enter()
         if isinstance(unit, Advance):
             return unit.place.trainer.advance(unit.training, unit.checkpoint, unit.seconds)
-        return _evaluate(unit)
+        controller = _controller(unit)
+        if isinstance(unit, Trace):
+            plant = _plant(unit.scenario)
+            return Traced(simulate(plant, controller, unit.steps, unit.seed).to_csv())
+        return _evaluate(unit, controller)
     except Exception as error:
         text = " ".join(f"{error}".split()) or type(error).__name__
         return Failure(f"{type(error).__name__}: {text}", traceback.format_exc())
@@ -127,9 +150,8 @@ def simulated(
     return {name: figures[name] for name in INDICATORS}
 
 
-def _evaluate(unit: Evaluate) -> Evaluated:
+def _evaluate(unit: Evaluate, controller: Controller) -> Evaluated:
     begin = perf_counter()
-    controller = _controller(unit)
     found = {s: simulated(unit.scenario, controller, unit.steps, s) for s in unit.seeds}
     return Evaluated(found, perf_counter() - begin)
 
@@ -144,7 +166,7 @@ def _plant(scenario: Scenario) -> FmuPlant:
     return _plants[key]
 
 
-def _controller(unit: Evaluate) -> Controller:
+def _controller(unit: Evaluate | Trace) -> Controller:
     if unit.key not in _controllers:
         if len(_controllers) == KEPT:
             _controllers.popitem(last=False)

@@ -1,1 +1,0 @@
-"""Stored results: what was measured, by which command, and whether it still holds."""

@@ -1,0 +1,177 @@
+"""A study as users run it: their own algorithm beside ours, killed twice, on one core, two, Dask.
+
+The study's folder lies outside the checkout, and the command runs as a process of its own.
+"""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+TABLES = ("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "aggregate.csv", "study.json")
+HOW_TO = Path(__file__).parents[2] / "docs" / "how-to" / "algorithm.md"
+STUDY = """\
+schema = 1
+name = "mine"
+scenarios = ["paper", "other.toml"]
+training_seeds = { first = 0, count = 3 }
+evaluation = { seeds = 3, steps = { default = 60, other = 50 } }
+curves = { points = 4, seeds = 2, steps = 50 }
+
+[[case]]
+name = "mine"
+algorithm = "my_algorithm:CappedTd"
+samples = 1200
+settings = { cap = [0.02, 0.05] }
+training = { checkpoint_every = 300 }
+
+[[case]]
+name = "q"
+algorithm = "q-learning"
+samples = 1200
+settings = { exploration_probability = [0.5, 1.0] }
+training = { checkpoint_every = 300 }
+
+[[case]]
+controller = ["naive", "my_controller:hold"]
+"""
+CONTROLLER = """\
+from types import SimpleNamespace
+
+
+class Hold:
+    def __init__(self, action):
+        self.solution = SimpleNamespace(
+            action=action, value=float("nan"), status="solved", residual=float("nan"),
+            predicted_states=None, predicted_actions=None,
+        )
+
+    def reset(self): ...
+
+    def prepare(self): ...
+
+    def feedback(self, s, a=None):
+        return self.solution
+
+
+def hold(scenario):
+    return Hold(scenario.reference_action)
+"""
+# Checkpoints are handed over after every piece, not only after some seconds.
+COMMAND = """\
+import sys
+import cosim.experiments.runner
+cosim.experiments.runner.SLICE = 0.0
+from cosim.cli import main
+sys.argv = ["cosim", *sys.argv[1:]]
+main()
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("user")
+    algorithm = re.search(r'```python title="my_algorithm.py"\n(.*?)```', HOW_TO.read_text(), re.S)
+    (folder / "my_algorithm.py").write_text(algorithm[1])
+    (folder / "my_controller.py").write_text(CONTROLLER)
+    (folder / "other.toml").write_text('extends = "paper"\nname = "other"\ndiscount = 0.95\n')
+    (folder / "study.toml").write_text(STUDY)
+    (folder / "elsewhere").mkdir()
+    return folder
+
+
+def start(folder, out, *options):
+    arguments = ["study", "run", "../study.toml", "--out", str(out), "--json", *options]
+    # A session of its own, so that its workers can be killed with it.
+    return subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *arguments],
+        cwd=folder / "elsewhere",
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def finish(process):
+    out, err = process.communicate(timeout=500)
+    assert process.returncode == 0, err
+    return json.loads(out)
+
+
+def contents(out):
+    return {name: (out / name).read_bytes() for name in TABLES}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("undisturbed")
+    summary = finish(start(folder, out, "--jobs", "1"))
+    assert summary["runs"] == 2 * (2 * 2 * 3 + 2) + 1, "two algorithms, settings, scenarios; J*"
+    return contents(out)
+
+
+def trained(out):
+    """Samples that are safe, of trainings begun and ended."""
+    return sum(
+        json.loads(path.read_text()).get("samples", 0) for path in out.glob("runs/*/*/*/run.json")
+    )
+
+
+def kill_after(process, out, samples):
+    """Kill a run and its workers once so many samples are stored; returns how many there are."""
+    deadline = time.monotonic() + 300
+    while trained(out) < samples:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    return trained(out)
+
+
+def test_a_run_that_was_killed_twice_ends_in_the_same_bytes(folder, undisturbed, tmp_path):
+    first = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, 1500)
+    second = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, first + 6000)
+    assert second < 2 * 12 * 1200, "it was killed before its end"
+    assert list(tmp_path.glob("runs/*/*/*/checkpoint.npz")), "a training was under way"
+    finish(start(folder, tmp_path, "--jobs", "2"))
+    assert contents(tmp_path) == undisturbed
+
+
+def test_a_cluster_of_two_ends_in_the_same_bytes(folder, undisturbed, tmp_path):
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        finish(start(folder, tmp_path, "--scheduler", cluster.scheduler_address))
+    assert contents(tmp_path) == undisturbed
+
+
+def test_a_worker_that_is_killed_loses_only_its_piece(folder, undisturbed, tmp_path):
+    process = start(folder, tmp_path, "--jobs", "2")
+    while trained(tmp_path) < 1500:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    os.kill(worker_of(process.pid), signal.SIGKILL)
+    finish(process)
+    assert contents(tmp_path) == undisturbed
+
+
+def worker_of(parent):
+    """The process id of one of the workers, children that are not the resource tracker."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        fields = stat.read_text().rpartition(")")[2].split()
+        command = (stat.parent / "cmdline").read_text()
+        if int(fields[1]) == parent and "popen_loky" in command and "tracker" not in command:
+            return int(stat.parent.name)
+    raise AssertionError("no worker was found")

@@ -7,7 +7,7 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 
 # Recordings are large and are made anew by one command; `.work` is what unfinished runs left.
-LEFT_OUT = shutil.ignore_patterns(".work", "*.rrd", "*.py", "__pycache__")
+LEFT_OUT = shutil.ignore_patterns(".work", "*.rrd", "report.html")
 
 
 class BuildWithResults(build_py):

@@ -1,4 +1,4 @@
-"""Learning over samples: curves with bands over seeds, and the paper's figure."""
+"""The paper's figure of a training: increments of θ, and the TD error."""
 
 from __future__ import annotations
 
@@ -12,70 +12,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.style import SERIES, WIDTH, colors, figure, legend_above, plain, save
+from cosim.figures.style import SERIES, figure, plain, save
 
 Array = NDArray[np.float64]
-
-LINES = ("-", "--", ":")
-Curves = Mapping[str, tuple[Array, Array]]
-"""Learning curves by name: samples (K,) and the values of S seeds, (S, K) or (K,) for one."""
-
-
-def plot_learning_curves(
-    panels: Mapping[str, Curves],
-    path: str | Path,
-    *,
-    ylabel: str = "J per sample",
-    references: Mapping[str, float] | None = None,
-    logarithmic: bool = False,
-) -> Path:
-    """Draw a panel for each set of curves: median over seeds, their quartiles and full range.
-
-    `panels` are named in their legends. `references` are levels drawn as dashed lines in all of
-    them, e.g. the baselines and the optimum.
-    """
-    with figure(3.0, 4.9 if len(panels) == 1 else WIDTH) as drawn:
-        row = drawn.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for axes, (title, curves) in zip(row, panels.items(), strict=True):
-            color = colors(list(curves))
-            drawn_before: list[str] = []
-            for name, (samples, values) in curves.items():
-                # More curves than colours: a colour comes again with another line.
-                style = LINES[drawn_before.count(color[name]) % len(LINES)]
-                drawn_before.append(color[name])
-                _band(axes, samples, np.atleast_2d(values), color[name], plain(name), style)
-            for name, level in (references or {}).items():
-                axes.axhline(
-                    level,
-                    color=colors([name])[name],
-                    linewidth=0.9,
-                    linestyle=(0, (4, 2)),
-                    label=f"{plain(name)} {level:.0f}",
-                )
-            axes.set_xlim(left=0.0)
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.set_xlabel("samples")
-            legend_above(axes, columns=1, title=plain(title))
-        row[0].set_ylabel(ylabel)
-        if logarithmic:
-            row[0].set_yscale("log")
-    return save(drawn, path)
-
-
-def _band(axes: Axes, samples: Array, values: Array, color: str, name: str, style: str) -> None:
-    seeds = len(values)
-    axes.plot(
-        samples,
-        np.median(values, axis=0),
-        color=color,
-        linewidth=1.3,
-        linestyle=style,
-        label=f"{name} ({seeds} seeds)" if seeds > 1 else name,
-    )
-    if seeds > 1:
-        for low, high, alpha in ((0.0, 1.0, 0.12), (0.25, 0.75, 0.25)):
-            edges = np.quantile(values, (low, high), axis=0)
-            axes.fill_between(samples, *edges, color=color, alpha=alpha, linewidth=0)
 
 
 def plot_parameters_and_td_error(

@@ -38,25 +38,25 @@ from learning.checkpoint import load as load_checkpoint
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("fmus", "cosim", "controllers", "learning")
 COSIM = (sys.executable, "-m", "cosim")
-EXPERIMENTS = """
-[experiment.run]
-title = "A run"
-table = "trajectory.csv"
-keys = ["time"]
-drop = ["status", "residual"]
-files = ["scenario.toml"]
-[experiment.run.runs]
-naive = "cosim simulate --steps 200"
-
-[experiment.table]
-title = "A table"
-table = "evaluation.csv"
-keys = ["controller", "scenario", "seed"]
-drop = [
-  "version", "versions", "code_hash", "scenario_hash", "fmu_sha256", "parameters_hash", "command",
-]
-[experiment.table.runs]
-naive = "cosim evaluate --controllers naive --seeds 3 --steps 200 --jobs 1"
+STUDY = """\
+schema = 1
+name = "runs"
+scenarios = ["paper"]
+training_seeds = { first = 0, count = 2 }
+evaluation = { seeds = 4, steps = 500 }
+curves = { points = 4, seeds = 2, steps = 100 }
+logs = ["q"]
+[[case]]
+controller = "tuned"
+[[case]]
+name = "q"
+algorithm = "q-learning"
+samples = 3000
+training = { checkpoint_every = 750 }
+[[trajectory]]
+name = "run"
+steps = 100
+figures = ["overlay"]
 """
 # So long that a small part of each command's time is its start, before it writes anything.
 TRAIN = "train --algorithm batch-q-learning --samples 6000 --log-every 100 --evaluate-every 1000"
@@ -131,8 +131,8 @@ def _inspect_recording(folder: Path, reference: Path) -> Counter[str]:
 
 def _stored(folder: Path) -> None:
     (folder / "results").mkdir(exist_ok=True)
-    (folder / "results" / "experiments.toml").write_text(EXPERIMENTS)
-    (folder / "results" / "tolerances.toml").write_text("")
+    (folder / "results" / "runs.toml").write_text(STUDY)
+    (folder / "results" / "tolerances.toml").write_text("[tolerance]\n")
 
 
 def _inspect_results(folder: Path, reference: Path) -> Counter[str]:
@@ -162,7 +162,7 @@ JOBS = (
     Job(
         "results update",
         lambda _: ["results", "update", "--results", "results"],
-        ("results/README.md", "results/run/trajectory.csv", "results/table/evaluation.csv"),
+        ("results/README.md", "results/runs/summary.csv", "results/runs/evaluation.csv"),
         _inspect_results,
         _stored,
     ),

@@ -64,8 +64,7 @@ def test_a_library_of_one_room_is_imported_nowhere_else(library):
 
 def graph(known):
     """Imports between files; a package's face only hands names on and is left out."""
-    # The command line that runs itself goes with `cosim reproduce`.
-    files = {n for n in known if not n.endswith("__init__") and n != "cosim.cli.inner"}
+    files = {n for n in known if not n.endswith("__init__")}
     return {name: imported(known[name], known) & files - {name} for name in files}
 
 

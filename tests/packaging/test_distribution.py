@@ -89,7 +89,7 @@ def bare_environment(python):
 def test_the_sdist_holds_what_a_fork_needs(sdist):
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    expected = {"constraints.txt", "Makefile", "results/experiments.toml", "tests/faults"}
+    expected = {"constraints.txt", "Makefile", "results/learning.toml", "tests/faults"}
     assert expected <= names
     assert not {name for name in names if name.endswith((".rrd", ".pyc"))}
 

@@ -6,18 +6,24 @@ from scipy.stats import t as student
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures import (
+    Dots,
+    LearningCurve,
     Portrait,
+    Profile,
     overlay_figure,
+    plot_curves,
     plot_density,
-    plot_learning_curves,
     plot_overlay,
     plot_parameters_and_td_error,
     plot_pareto,
     plot_phase_portraits,
+    plot_profiles,
+    plot_regret,
     plot_trajectory,
     policy_on_grid,
     trajectory_figure,
 )
+from cosim.figures.labels import spread
 from cosim.figures.pareto import half_width, nondominated
 from tests.helpers.loop import Failing, Proportional
 
@@ -97,7 +103,14 @@ def figures(rng, paper):
     x, y = np.linspace(24.0, 28.0, 7), np.linspace(47.0, 53.0, 6)
     actions = policy_on_grid(lambda s: np.array([200.0 - s[0], 215.0 + s[1]]), x, y)
     portraits = [Portrait(name, cloud, actions) for name in ("naive", "$mine", "optimal", "d")]
-    curves = {"q": (samples, rng.random((5, len(samples)))), "one": (samples, rng.random(51))}
+    greedy = np.where(np.arange(51) % 5 == 0, rng.random((5, 51)), np.nan)
+    curves = {"$q": LearningCurve(samples, rng.random((5, 51)), greedy)}
+    curves["one"] = LearningCurve(samples, rng.random((1, 51)), greedy[:1] - 0.5)
+    finished = np.array([True, False, True])
+    dots = {"$a": Dots("a", rng.random(3) - 0.2, finished, 0.3, (0.1, 0.9))}
+    dots["b"] = Dots("b", np.array([2.0, 30.0, np.inf]), finished, 16.0, None)
+    shares = np.linspace(0.0, 1.0, 20)
+    profile = Profile(np.geomspace(0.01, 10.0, 20), shares, 0.9 * shares, shares)
     cost = {name: (rng.random(9), rng.random(9)) for name in ("naive", "$mine", "tuned")}
     increments = {"B_l": rng.random((51, 10)), "c_lambda": rng.random(51), "x_u": np.zeros((51, 2))}
     return {
@@ -105,10 +118,12 @@ def figures(rng, paper):
         "density": lambda path: plot_density(
             {"naive": cloud[:, 0], "$mine": cloud[:, 0] + 1}, 25.0, "X2", "%", path
         ),
-        "learning": lambda path: plot_learning_curves(
-            {"$one": curves, "two": curves}, path, references={"optimal": 0.1}
+        "curves": lambda path: plot_curves(
+            {"$one": curves, "two": curves}, {"naive": 3.0}, path, ylabel="regret %", floor=0.1
         ),
-        "learning alone": lambda path: plot_learning_curves({"": curves}, path, logarithmic=True),
+        "curves of J": lambda path: plot_curves({"one": curves}, {}, path, ylabel="J", floor=None),
+        "regret": lambda path: plot_regret(dots, path),
+        "profiles": lambda path: plot_profiles({"a": {"$x": profile}, "b": {"y": profile}}, path),
         "parameters": lambda path: plot_parameters_and_td_error(
             samples, increments, samples[10:], rng.random(41), path
         ),
@@ -118,7 +133,7 @@ def figures(rng, paper):
 
 @pytest.mark.parametrize(
     "name",
-    ["phase", "density", "learning", "learning alone", "parameters", "pareto"],
+    ["phase", "density", "curves", "curves of J", "regret", "profiles", "parameters", "pareto"],
 )
 def test_every_figure_repeats_its_bytes(name, tmp_path, paper):
     files = []
@@ -175,3 +190,11 @@ def test_a_plant_at_rest_draws(tmp_path, paper):
     plot_phase_portraits([Portrait("rest", rest, actions)], x, y, paper, tmp_path / "a.png")
     plot_density({"rest": rest[:, 0]}, 25.0, "X2", "%", tmp_path / "b.png")
     plot_pareto({"rest": (np.zeros(5), np.full(5, 6210.0))}, tmp_path / "c.png")
+
+
+def test_labels_at_line_ends_do_not_overlap_and_stay_within_the_axes(rng):
+    wanted = np.sort(rng.random(8) ** 3)[::-1]
+    placed = spread(wanted, 0.1)
+    assert np.diff(placed).max() <= -0.1 + 1e-6
+    assert placed[0] <= 1.0 + 1e-9
+    assert spread(np.array([0.9, 0.1]), 0.1).tolist() == [0.9, 0.1], "what is apart stays"

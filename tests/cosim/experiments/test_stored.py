@@ -1,0 +1,194 @@
+"""The stored studies themselves: they hold, and small changes do not go unnoticed."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cosim.cli.main import app
+from cosim.errors import ResultsError
+from cosim.experiments.check import compared_tables
+from cosim.experiments.document import read
+from cosim.experiments.keyed import rounded_csv
+from cosim.experiments.results import StudyResults
+from cosim.experiments.stored import stored_studies
+from cosim.experiments.tables import read_numbers
+from cosim.stored_run import load_run
+
+STORED = Path(__file__).parents[3] / "results"
+MINIMAL = """\
+schema = 1
+name = "mini"
+scenarios = ["paper"]
+evaluation = { seeds = 2, steps = 30 }
+check = true
+[[case]]
+controller = ["naive", "tuned"]
+[[trajectory]]
+name = "loop"
+steps = 40
+figures = ["overlay"]
+"""
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["results", *map(str, arguments)])
+
+
+def check(folder, *names):
+    result = run("check", *names, "--results", folder, "--jobs", 1)
+    return result.exit_code, " ".join(result.output.split())
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mini") / "results"
+    folder.mkdir()
+    (folder / "mini.toml").write_text(MINIMAL)
+    shutil.copy(STORED / "tolerances.toml", folder)
+    result = run("update", "--results", folder, "--jobs", 1)
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    return folder
+
+
+@pytest.fixture
+def changed(mini, tmp_path):
+    """A copy of stored results whose study uses another reading of the scenario `paper`."""
+
+    def change(text):
+        folder = tmp_path / "results"
+        shutil.copytree(mini, folder, ignore=shutil.ignore_patterns(".work"))
+        own = f'[[scenario]]\nextends = "paper"\nname = "paper"\n{text}\n'
+        document = (folder / "mini.toml").read_text()
+        (folder / "mini.toml").write_text(document.replace("[[case]]", f"{own}[[case]]", 1))
+        return folder
+
+    return change
+
+
+def test_results_hold_no_python():
+    assert not list(STORED.rglob("*.py"))
+
+
+def test_every_stored_study_is_a_valid_study_that_can_be_planned():
+    studies = stored_studies(STORED)
+    assert {"closed-loop", "learning", "quick", "reproduce", "reproduce-full"} <= set(studies)
+    assert all(table.name == name for name, table in studies.items())
+    assert [name for name, table in studies.items() if table.check] == ["closed-loop", "quick"]
+
+
+def test_the_benchmark_evaluates_on_ten_thousand_samples_where_the_state_mixes_slowly():
+    steps = read(STORED / "learning.toml").evaluation.steps
+    assert steps["fast-sampling"] == 10_000
+
+
+def test_stored_tables_are_read_by_the_project_s_own_readers():
+    for name in ("closed-loop", "quick"):
+        folder = STORED / name
+        assert StudyResults.load(folder).runs
+        tables = compared_tables(folder)
+        trajectories = [table for table in tables if table.startswith("trajectories/")]
+        assert trajectories
+        for table in trajectories:
+            assert len(load_run(folder / table)) > 100
+        for table in tables:
+            if table.startswith("logs/"):
+                assert read_numbers(folder / table)["samples"][-1] > 1000
+
+
+@pytest.mark.slow
+def test_stored_results_hold():
+    code, output = check(STORED)
+    assert code == 0, output
+
+
+def test_what_was_stored_checks(mini):
+    code, output = check(mini)
+    assert code == 0, output
+
+
+def test_update_stores_tables_figures_report_and_readme(mini):
+    names = {path.relative_to(mini / "mini").as_posix() for path in (mini / "mini").rglob("*.*")}
+    assert {
+        *("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "study.json", "report.md"),
+        *("trajectories/loop/paper/naive.csv", "trajectories/loop/paper/optimal.csv"),
+        *("figures/overlay-paper-loop.svg", "figures/overlay-paper-loop.png"),
+    } <= names
+    assert not {name for name in names if name.startswith("runs/") or "timing" in name}
+    assert "| tuned |" in (mini / "README.md").read_text()
+
+
+def test_stored_tables_have_eight_digits(mini):
+    for path in (mini / "mini").rglob("*.csv"):
+        assert rounded_csv(path.read_text()) == path.read_text(), path.name
+
+
+@pytest.mark.parametrize(
+    ("change", "signal"),
+    [
+        ("plant.parameters = { UA2 = 6.9084 }", "stage_cost"),
+        ("penalty = { linear = [1.01e5, 1.01e5] }", "penalty"),
+    ],
+    ids=["UA2", "penalty weight"],
+)
+def test_one_per_cent_in_plant_or_cost_fails_and_names_the_signal(changed, change, signal):
+    code, output = check(changed(change))
+    assert code == 1
+    assert f"signal {signal} " in output
+
+
+def test_a_loose_qp_tolerance_fails_and_names_the_signal(changed, monkeypatch):
+    monkeypatch.setattr("controllers.qp.daqp_backend.SETTINGS", {"primal_tol": 1e-2})
+    code, output = check(changed(""))
+    assert code == 1
+    assert "signal X2" in output
+
+
+@pytest.mark.slow
+def test_another_qp_solver_passes(changed):
+    code, output = check(changed('controller = { backend = "proxqp" }'))
+    assert code == 0, output
+
+
+def test_a_changed_number_is_named_with_its_row(mini, tmp_path):
+    folder = tmp_path / "results"
+    shutil.copytree(mini, folder, ignore=shutil.ignore_patterns(".work"))
+    table = folder / "mini" / "trajectories" / "loop" / "paper" / "tuned.csv"
+    lines = table.read_text().splitlines()
+    row = lines[2].split(",")
+    table.write_text("\n".join([*lines[:2], ",".join([row[0], "26.5", *row[2:]]), *lines[3:], ""]))
+    code, output = check(folder)
+    assert code == 1
+    assert "mini/trajectories/loop/paper/tuned.csv: row time=60: signal X2 is" in output
+    assert "26.5 stored" in output
+
+
+def test_a_row_or_table_that_is_gone_is_named(mini, tmp_path):
+    folder = tmp_path / "results"
+    shutil.copytree(mini, folder, ignore=shutil.ignore_patterns(".work"))
+    table = folder / "mini" / "evaluation.csv"
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join([*lines[:-1], ""]))
+    code, output = check(folder)
+    assert code == 1
+    assert "is computed but not stored" in output
+    table.unlink()
+    assert isinstance(run("check", "--results", folder, "--jobs", 1).exception, Exception)
+
+
+def test_an_unknown_study_is_refused():
+    result = run("check", "closed-lop", "--results", STORED)
+    assert isinstance(result.exception, ResultsError)
+    assert "did you mean 'closed-loop'" in str(result.exception)
+
+
+@pytest.mark.slow
+def test_update_repeats_its_bytes(mini, tmp_path):
+    again = tmp_path / "results"
+    again.mkdir()
+    for name in ("mini.toml", "tolerances.toml"):
+        shutil.copy(mini / name, again)
+    assert run("update", "--results", again, "--jobs", 2).exit_code == 0
+    for path in (mini / "mini").rglob("*.*"):
+        assert path.read_bytes() == (again / path.relative_to(mini)).read_bytes(), path.name

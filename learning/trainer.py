@@ -20,7 +20,7 @@ from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from learning.errors import ConfigurationError
-from learning.log import LogRow, to_csv
+from learning.log import COLUMNS, LogRow, to_csv
 from learning.optimum import has_stored_optimum
 from learning.registry import GROUP as ALGORITHMS
 from learning.registry import load_algorithm
@@ -121,10 +121,8 @@ def _with_start(run: TrainingRun, rows: list[LogRow]) -> list[LogRow]:
     """The log with a first row of θ at the start, from which its increments are counted."""
     problem = Problem.from_scenario(run.scenario)
     start = starting_parameters(problem, run.configuration, run.start)
-    first: LogRow = dict.fromkeys(rows[0], float("nan")) if rows else {}
-    first |= {"samples": 0}
-    labels = zip(start.blocks.labels, start.theta.tolist(), strict=True)
-    return [first | {f"theta {label}": value for label, value in labels}, *rows]
+    figures = dict.fromkeys(COLUMNS, float("nan")) | {"samples": 0.0}
+    return [LogRow(figures, start), *rows]
 
 
 def _run(training: Training) -> TrainingRun:

@@ -1,14 +1,18 @@
 """NMPC as function approximator: parametric OCP, one QP per sample, its sensitivities."""
 
+from typing import TYPE_CHECKING, Any
+
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
 from controllers.model import Model, Quantity
-from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.rti.solution import LinearisationPoint, RtiSolution
 from controllers.theta import ThetaBlocks
+
+if TYPE_CHECKING:
+    from controllers.optimum import OptimalPolicy
 
 __all__ = [
     "ControllerError",
@@ -24,3 +28,12 @@ __all__ = [
     "RtiSolution",
     "ThetaBlocks",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "OptimalPolicy":
+        raise AttributeError(f"module 'controllers' has no attribute '{name}'")
+    # On first use: a controller must not pay for the import of SciPy.
+    from controllers.optimum import OptimalPolicy  # noqa: PLC0415
+
+    return OptimalPolicy

@@ -14,15 +14,17 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
-import filelock
 
 from controllers.buffered import BufferedFunction
 from controllers.cache import read_own, sweep, trusted_folder
 from controllers.code_generation import c_source
 from controllers.errors import ControllerError
+
+if TYPE_CHECKING:
+    import filelock
 
 FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
 KIND = "compiled"
@@ -81,13 +83,25 @@ def description() -> str:
     return f"{COMPILED} by {compiler.path} {' '.join(FLAGS)}, kept in {trusted_folder(KIND)}"
 
 
+def _lock(name: str, folder: Path, *, wait: bool = False) -> filelock.BaseFileLock | None:
+    """The lock of a library that is being built, held; None where another process holds it."""
+    import filelock  # noqa: PLC0415 (short runs, which compile nothing, shall not pay for it)
+
+    lock = filelock.FileLock(folder / f"{name}.lock", blocking=wait)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        return None
+    return lock
+
+
 class _Build:
     """A compiler at work on a source, in a folder of its own; the lock keeps others from it."""
 
-    def __init__(self, compiler: Compiler, source: str, name: str, folder: Path) -> None:
-        self._name, self._folder = name, folder
-        self._lock = filelock.FileLock(folder / f"{name}.lock", blocking=False)
-        self._lock.acquire()
+    def __init__(
+        self, compiler: Compiler, source: str, name: str, folder: Path, lock: filelock.BaseFileLock
+    ) -> None:
+        self._name, self._folder, self._lock = name, folder, lock
         try:
             self._own = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
             (self._own / "functions.c").write_text(source, encoding="utf-8")
@@ -178,15 +192,11 @@ class Compilation:
     def finish(self) -> str:
         """Do at once, and wait for, what `count` would do in time; returns `mode`."""
         if self.mode == INTERPRETED and self._prepare() and not self._take(self._stored()):
-            with suppress(filelock.Timeout):
-                if self._build is None:
-                    self._start()
+            if self._build is None:
+                self._start(wait=True)
             if self._build is not None:
                 self._build.done(wait=True)
                 self._finish_build()
-            else:  # another process is at it
-                with filelock.FileLock(self._folder / f"{self._name}.lock"):
-                    self._take(self._stored())
         self._next = sys.maxsize
         return self.mode
 
@@ -203,8 +213,6 @@ class Compilation:
             self._next = self._calls + POLL
             try:
                 self._start()
-            except filelock.Timeout:  # another process is at it
-                pass
             except OSError:
                 self._next = sys.maxsize
 
@@ -220,8 +228,16 @@ class Compilation:
             self._compiler, self._folder = compiler, trusted_folder(KIND)
         return True
 
-    def _start(self) -> None:
-        self._build = _Build(self._compiler, self._source, self._name, self._folder)
+    def _start(self, *, wait: bool = False) -> None:
+        """Start the compiler unless another process is at it, or, after a wait, has been."""
+        lock = _lock(self._name, self._folder, wait=wait)
+        if lock is None:
+            return
+        if self._take(self._stored()):
+            lock.release()
+            self._next = sys.maxsize
+            return
+        self._build = _Build(self._compiler, self._source, self._name, self._folder, lock)
 
     def _finish_build(self) -> None:
         assert self._build is not None

@@ -6,15 +6,18 @@ These are the package's entry points of the group `cosim.controllers`.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from controllers.converged import ConvergedNmpc
-from controllers.dynamic_programming.plant import StochasticScenario
-from controllers.economic import tune
-from controllers.optimum import OptimalPolicy
 from controllers.parameters import Parameters
 from controllers.problem import Problem, ScenarioLike
 from controllers.rti import RtiNmpc
+
+if TYPE_CHECKING:
+    from controllers.dynamic_programming.plant import StochasticScenario
+    from controllers.optimum import OptimalPolicy
+
+# Imported where it is needed: who simulates an RTI-NMPC shall not pay for SciPy and Clarabel.
 
 
 def rti(scenario: ScenarioLike, parameters: Parameters) -> RtiNmpc:
@@ -52,6 +55,8 @@ def from_file(scenario: ScenarioLike, path: str | Path) -> RtiNmpc:
 
 def tuned(scenario: ScenarioLike) -> RtiNmpc:
     """RTI-NMPC with the cost tuned by economics: baseline (b)."""
+    from controllers.economic import tune  # noqa: PLC0415
+
     problem = Problem.from_scenario(scenario)
     return rti(scenario, tune(problem, value_offset=value_offset(scenario, problem)).parameters)
 
@@ -66,4 +71,6 @@ def converged(scenario: ScenarioLike) -> ConvergedNmpc:
 
 def optimal(scenario: ScenarioLike) -> OptimalPolicy:
     """Policy of least mean cost on the scenario's stochastic plant, solved once and then stored."""
-    return OptimalPolicy.from_scenario(cast(StochasticScenario, scenario))
+    from controllers.optimum import OptimalPolicy  # noqa: PLC0415
+
+    return OptimalPolicy.from_scenario(cast("StochasticScenario", scenario))

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from multiprocessing import parent_process
-from multiprocessing.connection import wait
 from pathlib import Path
 from types import FrameType
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
-from cosim import guardian
+if TYPE_CHECKING:
+    import subprocess
+
+# Every command imports this file; processes are imported where one is started.
 
 POLL = 0.5
 """Seconds between two looks at the parent where nothing announces its end."""
@@ -57,6 +57,9 @@ def follow_parent() -> None:
 
     To be called once in a worker, whose work is lost with its parent anyway.
     """
+    from multiprocessing import parent_process  # noqa: PLC0415
+    from multiprocessing.connection import wait  # noqa: PLC0415
+
     parent = parent_process()
     sentinel = None if parent is None else parent.sentinel
     number = os.getppid()
@@ -83,6 +86,10 @@ def start_guarded(
     `env` is its environment, `log` takes what it prints (default: where this process prints).
     The process returned is the guard: its exit code is the command's, and `end_guarded` ends it.
     """
+    import subprocess  # noqa: PLC0415
+
+    from cosim import guardian  # noqa: PLC0415
+
     return subprocess.Popen(
         [sys.executable, "-I", str(Path(guardian.__file__)), *command],
         stdin=subprocess.PIPE,

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.util import find_spec
 from types import ModuleType
+from typing import Any, cast
 
 EPISODE_STEPS = 500
 ENVIRONMENTS = {
@@ -35,7 +34,7 @@ def _register(registry: ModuleType) -> None:
             registry.register(name, entry_point, max_episode_steps=EPISODE_STEPS)
 
 
-class _WhenImported(MetaPathFinder):
+class _WhenImported:
     """Steps in front of the import of Gymnasium's registry, once."""
 
     def find_spec(
@@ -44,20 +43,24 @@ class _WhenImported(MetaPathFinder):
         if name != _REGISTRY:
             return None
         sys.meta_path.remove(self)
+        # Not imported above, since every command would pay for it.
+        from importlib.util import find_spec  # noqa: PLC0415
+
         spec = find_spec(name)
         if spec is not None and spec.loader is not None:
-            spec.loader = _Registering(spec.loader)
+            spec.loader = cast("Any", _Registering(spec.loader))
         return spec
 
 
-class _Registering(Loader):
+class _Registering:
     """Executes a module as its own loader does, then adds our environments."""
 
-    def __init__(self, loader: Loader) -> None:
+    def __init__(self, loader: Any) -> None:
         self._loader = loader
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        return self._loader.create_module(spec)
+        module: ModuleType | None = self._loader.create_module(spec)
+        return module
 
     def exec_module(self, module: ModuleType) -> None:
         self._loader.exec_module(module)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgesv
 
 from controllers.qp.problem import QpSolution, SoftQp
 
@@ -43,13 +45,22 @@ def kkt_solve(
     right[size:] = limits[:, at_limit].T
     answer, singular = right, False
     if len(kkt):  # every variable may be held
-        _, _, answer, status = dgesv(kkt, right)
+        _, _, answer, status = _dgesv()(kkt, right)
         singular = status != 0
     if singular:
         answer = np.asarray(np.linalg.lstsq(kkt, right)[0], dtype=np.float64)
     v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)
     v[:, free], lam[:, at_limit] = answer[:size].T, answer[size:].T
     return v, lam
+
+
+@cache
+def _dgesv() -> Callable[..., tuple[Matrix, Matrix, Matrix, int]]:
+    """LAPACK's solver, imported when it is first needed: SciPy is a quarter of a short run."""
+    from scipy.linalg.lapack import dgesv  # noqa: PLC0415
+
+    solver: Callable[..., tuple[Matrix, Matrix, Matrix, int]] = dgesv
+    return solver
 
 
 def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-10) -> QpSolution:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 from typing import Protocol
 
 from controllers.errors import ControllerError
-from controllers.qp.daqp_backend import DaqpBackend
 from controllers.qp.problem import QpSolution, SoftQp
-from controllers.qp.proxqp_backend import ProxQpBackend
-from controllers.qp.qpsolvers_backend import QpsolversBackend
 
 
 class QpBackend(Protocol):
@@ -25,7 +22,12 @@ class QpBackend(Protocol):
         """
 
 
-BACKENDS: dict[str, Callable[[], QpBackend]] = {"daqp": DaqpBackend, "proxqp": ProxQpBackend}
+BACKENDS = {
+    "daqp": "controllers.qp.daqp_backend:DaqpBackend",
+    "proxqp": "controllers.qp.proxqp_backend:ProxQpBackend",
+    "qpsolvers": "controllers.qp.qpsolvers_backend:QpsolversBackend",
+}
+"""Class of each backend by name, imported when it is chosen: a solver is slow to import."""
 
 
 def make_backend(name: str) -> QpBackend:
@@ -33,10 +35,11 @@ def make_backend(name: str) -> QpBackend:
 
     Raises ControllerError on an unknown name.
     """
-    if name.startswith("qpsolvers:"):
-        return QpsolversBackend(name.removeprefix("qpsolvers:"))
-    if name not in BACKENDS:
+    kind, _, solver = name.partition(":")
+    if kind not in BACKENDS or (kind == "qpsolvers") != bool(solver):
         raise ControllerError(
-            f"there is no QP backend '{name}'; choose {', '.join(BACKENDS)} or qpsolvers:SOLVER"
+            f"there is no QP backend '{name}'; choose daqp, proxqp or qpsolvers:SOLVER"
         )
-    return BACKENDS[name]()
+    module, _, attribute = BACKENDS[kind].partition(":")
+    backend: QpBackend = getattr(import_module(module), attribute)(*([solver] if solver else []))
+    return backend

@@ -86,6 +86,9 @@ class Output:
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator[Progressing]:
         """Progress bar on standard error; yields a function of the number done and a remark."""
+        if self.as_json or not sys.stderr.isatty():
+            yield lambda done, remark="": None
+            return
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -97,8 +100,7 @@ class Output:
         console = self.console()
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
         ends = (TimeRemainingColumn(), TextColumn("{task.fields[remark]}"))
-        hidden = self.as_json or not console.is_terminal
-        with Progress(*columns, *ends, console=console, disable=hidden) as bar:
+        with Progress(*columns, *ends, console=console) as bar:
             task = bar.add_task(label, total=total, remark="")
 
             def update(done: int, remark: str = "") -> None:

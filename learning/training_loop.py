@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.compilation import mode_of
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError
 from cosim.evaluation.statistics import shown
@@ -99,6 +100,7 @@ class TrainingLoop:
             status,
             self._plant_samples,
             0 if self._validation is None else self._validation.samples,
+            mode_of(self._learner.controller),
         )
 
     @property

@@ -107,7 +107,8 @@ class TrainingResult:
     `parameters` are what the run would hand over: the algorithm's last ones, or the best validated
     ones where there was validation. `evaluation` is a `Verdict.summary`; `status` is `finished` or
     `diverged: …`, which changes nothing of what θ is; `plant_samples` counts those of training
-    and validation, `validated` those of the latter.
+    and validation, `validated` those of the latter; `functions` says whether the controller's were
+    `interpreted` or `compiled` at the end.
     """
 
     parameters: Parameters
@@ -116,3 +117,4 @@ class TrainingResult:
     status: str
     plant_samples: int
     validated: int
+    functions: str | None = None

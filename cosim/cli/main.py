@@ -70,11 +70,13 @@ def _version(wanted: bool) -> None:
     from importlib.metadata import version
 
     import fmus
+    from controllers.compilation import description
 
     print(f"cosim {version('rti-cosim')}")
     for name in ("evaporator", "evaporator_fmi3"):
         digest = hashlib.sha256(fmus.path(name).read_bytes()).hexdigest()
         print(f"{name}.fmu sha256 {digest}")
+    print(f"functions of long runs: {description()}")
     raise typer.Exit
 
 
@@ -86,7 +88,7 @@ def options(
             "--version",
             callback=_version,
             is_eager=True,
-            help="Print the version and the shipped FMUs' hashes.",
+            help="Print the version, the shipped FMUs' hashes and how functions are computed.",
         ),
     ] = False,
 ) -> None:

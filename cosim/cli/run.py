@@ -64,6 +64,8 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
 def _summary(run: Run, trajectory: Trajectory, controller: Any, plant: Any) -> dict[str, Any]:
     from importlib.metadata import version
 
+    from controllers.compilation import mode_of
+
     parameters = getattr(controller, "parameters", None)
     return {
         "version": version("rti-cosim"),
@@ -75,7 +77,7 @@ def _summary(run: Run, trajectory: Trajectory, controller: Any, plant: Any) -> d
         "parameters_hash": getattr(parameters, "hash", None),
         "seed": run.seed,
         **trajectory.summary(),
-        "timing": trajectory.timing_summary(),
+        "timing": {**trajectory.timing_summary(), "functions": mode_of(controller)},
     }
 
 
@@ -92,5 +94,6 @@ def show(summary: dict[str, Any], output: Output) -> None:
     rows += [
         (f"{name} time, median / 99 %", f"{t['median_us']:.1f} / {t['p99_us']:.1f} µs")
         for name, t in summary["timing"].items()
+        if name != "functions"
     ]
     output.table(title, ("per sample", "value"), rows)

@@ -161,7 +161,10 @@ def train(
         begin = time.perf_counter()
         result = _execute(run, found, folder, optimum, resume, record, out_)
         summary = summarise(run, result)
-        summary["timing"] = {"wall_seconds": time.perf_counter() - begin}
+        summary["timing"] = {
+            "wall_seconds": time.perf_counter() - begin,
+            "functions": result.functions,
+        }
         _write(folder, run, result, summary)
         _show(summary, out_)
         out_.json(summary)

@@ -155,6 +155,15 @@ def test_version_gives_the_fmus_hashes(cosim):
     assert hashlib.sha256(fmus.path("evaporator_fmi3").read_bytes()).hexdigest() in out
 
 
+@pytest.mark.parametrize(
+    ("switch", "said"),
+    [("never", "interpreted (COSIM_COMPILE=never)"), ("auto", "functions of long runs: ")],
+)
+def test_version_says_how_functions_are_computed(cosim, monkeypatch, switch, said):
+    monkeypatch.setenv("COSIM_COMPILE", switch)
+    assert said in cosim("--version")[1]
+
+
 def time_of_children():
     """The processors' time [s], which others on the machine hardly change."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)

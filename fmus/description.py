@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from xml.etree import ElementTree
 
 from fmus.structure import add_structure, index
@@ -11,6 +12,7 @@ from fmus.variables import (
     FmiVersion,
     Kind,
     Type,
+    Unit,
     Variable,
     exported,
     value_reference,
@@ -45,11 +47,9 @@ def model_description(version: FmiVersion, token: str) -> str:
     """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
     root = _root(version, token)
     _interfaces(root, version)
-    _units(root, version)
+    add_units(root, UNITS)
     _types(root, version)
-    categories = ElementTree.SubElement(root, "LogCategories")
-    for name, text in _LOG_CATEGORIES.items():
-        ElementTree.SubElement(categories, "Category", name=name, description=text)
+    add_categories(root)
     ElementTree.SubElement(
         root, "DefaultExperiment", startTime="0", stopTime="6000", tolerance="1e-8", stepSize="60"
     )
@@ -57,7 +57,7 @@ def model_description(version: FmiVersion, token: str) -> str:
     for variable in exported(version):
         (_variable2 if version == 2 else _variable3)(variables, variable)
     add_structure(root, version)
-    return _text(root)
+    return to_text(root)
 
 
 def build_description(version: FmiVersion) -> str:
@@ -74,10 +74,11 @@ def build_description(version: FmiVersion) -> str:
     )
     ElementTree.SubElement(sources, "SourceFile", name=f"fmi{version}.c")
     ElementTree.SubElement(build, "Library", name="m")
-    return _text(root)
+    return to_text(root)
 
 
-def _text(root: ElementTree.Element) -> str:
+def to_text(root: ElementTree.Element) -> str:
+    """The XML document of `root`, indented."""
     ElementTree.indent(root, "  ")
     body = ElementTree.tostring(root, encoding="unicode")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{body}\n'
@@ -124,9 +125,17 @@ def _interfaces(root: ElementTree.Element, version: FmiVersion) -> None:
             ElementTree.SubElement(sources, "File", name="fmi2.c")
 
 
-def _units(root: ElementTree.Element, version: FmiVersion) -> None:
+def add_categories(root: ElementTree.Element) -> None:
+    """Append the categories of log messages that the C sources know."""
+    categories = ElementTree.SubElement(root, "LogCategories")
+    for name, text in _LOG_CATEGORIES.items():
+        ElementTree.SubElement(categories, "Category", name=name, description=text)
+
+
+def add_units(root: ElementTree.Element, defined: Iterable[Unit]) -> None:
+    """Append UnitDefinitions, the same in FMI 2.0 and 3.0."""
     units = ElementTree.SubElement(root, "UnitDefinitions")
-    for unit in UNITS:
+    for unit in defined:
         element = ElementTree.SubElement(units, "Unit", name=unit.name)
         base = {name: str(exponent) for name, exponent in unit.exponents}
         if unit.factor != 1.0:
@@ -147,11 +156,12 @@ def _types(root: ElementTree.Element, version: FmiVersion) -> None:
         ElementTree.SubElement(enumeration, "Item", name=name, value=str(value), description=text)
 
 
-def _common(variable: Variable) -> dict[str, str]:
+def common_attributes(variable: Variable, reference: int) -> dict[str, str]:
+    """The attributes that every variable has in FMI 2.0 and 3.0."""
     causality, variability, initial = _CAUSALITY[variable.kind]
     attributes = {
         "name": variable.name,
-        "valueReference": str(value_reference(variable.name)),
+        "valueReference": str(reference),
         "description": variable.description,
         "causality": causality,
         "variability": variability,
@@ -161,7 +171,8 @@ def _common(variable: Variable) -> dict[str, str]:
     return attributes
 
 
-def _real(variable: Variable) -> dict[str, str]:
+def real_attributes(variable: Variable) -> dict[str, str]:
+    """Unit, range, nominal and start value of a real variable."""
     attributes = {"unit": variable.unit}
     for key in ("min", "max", "nominal", "start"):
         value = getattr(variable, key)
@@ -179,7 +190,9 @@ def _state_of(variable: Variable) -> str:
 
 
 def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
-    scalar = ElementTree.SubElement(parent, "ScalarVariable", _common(variable))
+    scalar = ElementTree.SubElement(
+        parent, "ScalarVariable", common_attributes(variable, value_reference(variable.name))
+    )
     if variable.type is Type.BOOLEAN:
         ElementTree.SubElement(scalar, "Boolean", _boolean(variable))
     elif variable.type is Type.LAW:
@@ -189,14 +202,14 @@ def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
     elif variable.type in (Type.SEED, Type.SEED_HIGH):
         ElementTree.SubElement(scalar, "Integer", min=_INT32[0], max=_INT32[1], start="0")
     else:
-        attributes = _real(variable)
+        attributes = real_attributes(variable)
         if variable.kind is Kind.DERIVATIVE:
             attributes["derivative"] = str(index(_state_of(variable)))
         ElementTree.SubElement(scalar, "Real", attributes)
 
 
 def _variable3(parent: ElementTree.Element, variable: Variable) -> None:
-    attributes = _common(variable)
+    attributes = common_attributes(variable, value_reference(variable.name))
     if variable.type is Type.BOOLEAN:
         ElementTree.SubElement(parent, "Boolean", attributes | _boolean(variable))
     elif variable.type is Type.LAW:
@@ -206,7 +219,7 @@ def _variable3(parent: ElementTree.Element, variable: Variable) -> None:
         seed = {"min": "0", "max": str(2**64 - 1), "start": "0"}
         ElementTree.SubElement(parent, "UInt64", attributes | seed)
     else:
-        attributes |= _real(variable)
+        attributes |= real_attributes(variable)
         if variable.kind is Kind.DERIVATIVE:
             attributes["derivative"] = str(value_reference(_state_of(variable)))
         ElementTree.SubElement(parent, "Float64", attributes)

@@ -6,6 +6,7 @@ A variable's value reference is its position in the table, the same in FMI 2.0 a
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
@@ -55,8 +56,8 @@ class Variable:
 
     @property
     def identifier(self) -> str:
-        """The name as a C identifier: ``der(X2)`` becomes ``der_X2``."""
-        return self.name.replace("(", "_").replace(")", "")
+        """The name as a C identifier: ``der(X2)`` becomes ``der_X2``, ``p.x[0]`` ``p_x_0_``."""
+        return re.sub(r"\W", "_", self.name.replace(")", ""))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from cosim.cli import (
     compare,
     demo,
     evaluate,
+    export,
     fmu,
     optimum,
     reproduce,
@@ -43,6 +44,7 @@ app.command("view")(view.view)
 app.command("compare")(compare.compare)
 app.command("optimum")(optimum.optimum)
 app.command("tuning")(tuning.tuning)
+app.command("export")(export.export)
 app.command("scenario")(scenario.scenario)
 app.add_typer(benchmark.app, name="benchmark")
 app.add_typer(study.app, name="study")

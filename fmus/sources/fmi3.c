@@ -424,9 +424,10 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
     *terminateSimulation = false;
     *earlyReturn = false;
     *lastSuccessfulTime = self->state.v[VR_time];
-    TRY(do_step(self, __func__, currentCommunicationPoint, communicationStepSize));
+    const Status status =
+        do_step(self, __func__, currentCommunicationPoint, communicationStepSize);
     *lastSuccessfulTime = self->state.v[VR_time];
-    return fmi3OK;
+    return (fmi3Status)status;
 }
 
 /* Not offered: each is refused with a message */

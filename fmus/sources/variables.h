@@ -2,7 +2,7 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{87fccf04-bb7f-5c03-bfe7-11c6a482d6aa}"
+#define MODEL_TOKEN "{e8350973-0974-5d25-895e-cf69be22819b}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
 #define LAYOUT_DIGEST UINT64_C(0xe41af7b351f96337)

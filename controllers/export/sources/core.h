@@ -61,6 +61,15 @@ static void core_commit(CoreState *state) {
     rti_reset(&state->guess);
 }
 
+/* Whether a state could be one that the functions above leave behind. */
+static int core_plausible(const CoreState *state) {
+    return all_finite(&state->guess.x[0][0], sizeof state->guess / sizeof(double)) &&
+           all_finite(&state->solution.x[0][0], sizeof state->solution / sizeof(double)) &&
+           all_finite(state->action, N_U) && all_finite(state->applied, N_U) &&
+           state->failures >= 0.0 && state->failures < 9e15 && state->status >= 0 &&
+           state->status <= RTI_ILL_POSED;
+}
+
 /* Outputs in the order of the table of variables: action, value, status, residual, iterations,
  * failures, predicted states by stage, predicted actions by stage. */
 static void core_outputs(const CoreState *state, double y[]) {

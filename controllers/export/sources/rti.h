@@ -98,6 +98,7 @@ static int rti_sample(const RtiGuess *guess, const double theta[], const double 
         long long int iw[READ_IW + 1];
         readout(arguments, results, iw, w, 0);
     }
+    if (!all_finite(read, READ_SIZE)) return QP_NOT_FINITE;
     for (int k = 0; k <= HORIZON; k++)
         for (int i = 0; i < N_X; i++)
             solution->x[k][i] = read[READ_xi + k * N_X + i] + REFERENCE_STATE[i];

@@ -1,0 +1,83 @@
+"""The controller's C and its table of variables, put into an FMU; the loop put into an SSP."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from controllers import RtiNmpc
+from controllers.export import Entry, core, table
+from cosim.errors import ControllerLookupError
+from cosim.lookup import build_controller
+from cosim.scenario import Scenario
+from fmus.sampled import SampledSystem, Signal, build_sampled
+from fmus.variables import FmiVersion
+
+IDENTIFIER = "rti_nmpc"
+RECORD = "extra/org.rti-cosim/controller.json"
+
+
+def rti_controller(name: str, scenario: Scenario) -> RtiNmpc:
+    """The controller `name`; raises ControllerLookupError where it is no RTI-NMPC."""
+    found: Any = build_controller(name, scenario)
+    if type(found) is not RtiNmpc:
+        raise ControllerLookupError(
+            f"controller '{name}' is no RTI-NMPC and cannot be exported; give naive, tuned or a "
+            "parameters file (.toml) of a training"
+        )
+    return found
+
+
+def sampled_controller(
+    controller: RtiNmpc, scenario: Scenario, units: dict[str, str]
+) -> SampledSystem:
+    """The controller as a sampled system; raises ControllerError where it cannot be exported."""
+    hessian = scenario.controller.hessian
+    exported = core(controller.problem, controller.parameters, hessian)
+    plant = scenario.plant
+    variables = table(
+        exported,
+        [(name, units.get(name, "")) for name in plant.states],
+        [(name, units.get(name, "")) for name in plant.actions],
+    )
+    return SampledSystem(
+        name=f"RTI-NMPC {scenario.name}",
+        identifier=IDENTIFIER,
+        description=(
+            f"Real-time-iteration NMPC for {scenario.name}: horizon {exported.problem.horizon}, "
+            f"{hessian} Hessian, θ {controller.parameters.hash}"
+        ),
+        sampling_time=scenario.sampling_time,
+        inputs=tuple(map(_signal, variables.inputs)),
+        outputs=tuple(map(_signal, variables.outputs)),
+        parameters=tuple(map(_signal, variables.parameters)),
+        sources=exported.sources,
+    )
+
+
+def _signal(entry: Entry) -> Signal:
+    return Signal(entry.name, entry.unit, entry.meaning, entry.start, entry.lower, entry.upper)
+
+
+def write_fmu(
+    system: SampledSystem,
+    controller: RtiNmpc,
+    scenario: Scenario,
+    target: Path,
+    version: FmiVersion,
+    every_platform: bool,
+) -> Path:
+    """Write the FMU with a record of what it was made from."""
+    record = {
+        "scenario": scenario.to_dict(),
+        "scenario_hash": scenario.hash,
+        "theta": dict(
+            zip(controller.parameters.blocks.labels, controller.theta.tolist(), strict=True)
+        ),
+        "theta_hash": controller.parameters.hash,
+    }
+    document = (json.dumps(record, indent=2, default=repr) + "\n").encode()
+    return build_sampled(
+        system, target, version, every_platform=every_platform, files={RECORD: document}
+    )

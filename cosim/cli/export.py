@@ -1,0 +1,71 @@
+"""`cosim export`: the learnt controller as an FMU, and the closed loop as an SSP."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosim.cli.output import JsonOption, output
+from cosim.cli.simulate import ScenarioOption
+
+
+def export(
+    controller: Annotated[
+        str, typer.Argument(help="naive, tuned or a parameters file (.toml) of a training.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Write the controller's FMU here.")],
+    scenario: ScenarioOption = "paper",
+    fmi: Annotated[int, typer.Option("--fmi", help="FMI version: 2 or 3.", min=2, max=3)] = 2,
+    local: Annotated[
+        bool,
+        typer.Option("--local", help="Build for this machine alone, by $CC or cc."),
+    ] = False,
+    ssp: Annotated[
+        Path | None,
+        typer.Option("--ssp", help="Write the loop with the plant here.", show_default=False),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Seed of the plant in the SSP, as in cosim simulate.")
+    ] = 0,
+    json: JsonOption = False,
+) -> None:
+    """Write an RTI-NMPC as a self-contained co-simulation FMU that needs no Python.
+
+    For Linux, Windows and macOS, x86_64 and ARM64 (pip install 'rti-cosim\\[cross]'); without that
+    package, or with --local, for this machine by its C compiler. θ are tunable parameters.
+    """
+    with output(json) as out_:
+        from importlib.util import find_spec
+
+        from cosim.cli.compose import build_plant
+        from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
+        from cosim.scenario import Scenario
+        from fmus.platforms import PLATFORMS, present
+
+        loaded = Scenario.load(scenario)
+        rti = rti_controller(controller, loaded)
+        with build_plant(loaded, out_) as plant:
+            units = plant.units
+        system = sampled_controller(rti, loaded, units)
+        every_platform = not local and find_spec("ziglang") is not None
+        version = 3 if fmi == 3 else 2
+        path = write_fmu(system, rti, loaded, out, version, every_platform)
+        platforms = [p.tuple for p in (PLATFORMS if every_platform else [present()])]
+        out_.note(f"wrote {path}: FMI {version}.0 for {', '.join(platforms)}")
+        document = {
+            "fmu": str(path),
+            "fmi_version": f"{version}.0",
+            "platforms": platforms,
+            "scenario": loaded.name,
+            "scenario_hash": loaded.hash,
+            "theta_hash": rti.parameters.hash,
+            "sampling_time": loaded.sampling_time,
+        }
+        if ssp is not None:
+            from cosim.cli.loop_ssp import write_ssp
+
+            document["ssp"] = str(write_ssp(path, loaded, seed, ssp))
+            out_.note(f"wrote {ssp}")
+        out_.json(document)

@@ -1,0 +1,113 @@
+"""What a sampled system is: signals in, signals out once a sample, and C that computes them."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+from fmus.errors import BuildError
+from fmus.variables import UNITS, Kind, Type, Unit, Variable
+
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_INFINITE = float("inf")
+_LARGEST = sys.float_info.max
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A real input, output or parameter; `start` is what an input or a parameter begins with."""
+
+    name: str
+    unit: str
+    description: str
+    start: float | None = None
+    min: float | None = None
+    max: float | None = None
+
+    def variable(self, kind: Kind) -> Variable:
+        """The signal as a row of a table of variables."""
+        low, high = [
+            None if v in (None, -_INFINITE, _INFINITE) else v for v in (self.min, self.max)
+        ]
+        return Variable(
+            self.name, kind, Type.REAL, self.unit, self.start, low, high, None, self.description
+        )
+
+
+@dataclass(frozen=True)
+class SampledSystem:
+    """A function of `inputs` and `parameters` that is evaluated once a `sampling_time` [s].
+
+    `identifier` is the model's C identifier. `sources` are C headers by name, of which ``core.h``
+    defines what ``sampled/sources/model_state.h`` lists; the arrays it is given and fills are
+    ordered like `inputs`, `outputs` and `parameters`. Raises BuildError on an identifier that is
+    none in C, on names that are taken twice and on a sampling time that is not positive.
+    """
+
+    name: str
+    identifier: str
+    description: str
+    sampling_time: float
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    parameters: tuple[Signal, ...]
+    sources: Mapping[str, bytes]
+
+    def __post_init__(self) -> None:
+        """Check what the model description and the C header rely on."""
+        if not _IDENTIFIER.fullmatch(self.identifier):
+            raise BuildError(f"'{self.identifier}' is not a C identifier")
+        if not 0 < self.sampling_time < float("inf"):
+            raise BuildError(f"the sampling time must be positive, not {self.sampling_time}")
+        for names in ([v.name for v in self.variables], [v.identifier for v in self.variables]):
+            if twice := next((name for name in names if names.count(name) > 1), None):
+                raise BuildError(f"two variables of {self.name} are called '{twice}'")
+
+    @cached_property
+    def variables(self) -> tuple[Variable, ...]:
+        """The table of variables; a value reference is a position in it."""
+        time = Variable(
+            "time", Kind.INDEPENDENT, Type.REAL, "s", None, None, None, None, "simulation time"
+        )
+        groups = (
+            (Kind.INPUT, self.inputs), (Kind.OUTPUT, self.outputs), (Kind.TUNABLE, self.parameters),
+        )  # fmt: skip
+        return (time, *(signal.variable(kind) for kind, signals in groups for signal in signals))
+
+    @property
+    def units(self) -> tuple[Unit, ...]:
+        """The units in use; one that `fmus.variables` does not know has no SI form."""
+        known = {unit.name: unit for unit in UNITS}
+        names = dict.fromkeys(variable.unit for variable in self.variables)
+        return tuple(known.get(name, Unit(name)) for name in names if name)
+
+    @property
+    def header(self) -> str:
+        """The C header ``system.h``: where the groups of variables begin, and the sampling time."""
+        first_output = 1 + len(self.inputs)
+        first_parameter = first_output + len(self.outputs)
+        return f"""\
+/* Generated: the sampled system's groups of variables and its sampling time. */
+#ifndef SYSTEM_H
+#define SYSTEM_H
+
+enum {{ FIRST_INPUT = 1, FIRST_OUTPUT = {first_output}, FIRST_PARAMETER = {first_parameter} }};
+
+#define SAMPLING_TIME {float(self.sampling_time)!r}
+
+#endif
+"""
+
+    def bounded(self) -> tuple[Variable, ...]:
+        """The variables with a range for those that have none, which the C checks against."""
+        return tuple(
+            Variable(
+                v.name, v.kind, v.type, v.unit, v.start,
+                -_LARGEST if v.min is None else v.min, _LARGEST if v.max is None else v.max,
+                v.nominal, v.description,
+            )
+            for v in self.variables
+        )  # fmt: skip

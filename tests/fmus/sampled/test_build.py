@@ -1,0 +1,67 @@
+"""The FMU of a sampled system: valid, reproducible, refused where its table is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import fmpy
+import pytest
+from fmpy.validation import validate_fmu
+
+from fmus.compiler import COMPILER_FLAGS
+from fmus.errors import BuildError
+from fmus.sampled import SampledSystem, build_sampled
+
+
+def test_the_model_description_is_valid(built: tuple[int, Path]) -> None:
+    assert validate_fmu(str(built[1])) == []
+
+
+def test_it_is_for_co_simulation_alone_with_tunable_parameters(built: tuple[int, Path]) -> None:
+    found = fmpy.read_model_description(str(built[1]))
+    assert found.modelExchange is None
+    assert found.defaultExperiment.stepSize == "2.0"
+    variables = {v.name: v for v in found.modelVariables}
+    assert (variables["u"].causality, variables["u"].unit) == ("input", "kPa")
+    assert (variables["y"].causality, variables["y"].variability) == ("output", "discrete")
+    gain = variables["theta.gain[0]"]
+    assert (gain.causality, gain.variability, gain.start) == ("parameter", "tunable", "1.0")
+
+
+def test_a_rebuild_repeats_its_bytes(
+    built: tuple[int, Path], adder: SampledSystem, tmp_path: Path
+) -> None:
+    again = build_sampled(adder, tmp_path / "adder.fmu", built[0])
+    assert again.read_bytes() == built[1].read_bytes()
+
+
+def test_another_core_has_another_token(adder: SampledSystem, tmp_path: Path) -> None:
+    core = adder.sources["core.h"].replace(b"gain[0] * u[0]", b"gain[0] + u[0]")
+    paths = [
+        build_sampled(system, tmp_path / f"{k}.fmu")
+        for k, system in enumerate([adder, replace(adder, sources={"core.h": core})])
+    ]
+    tokens = {fmpy.read_model_description(str(path)).guid for path in paths}
+    assert len(tokens) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"identifier": "no identifier"}, "not a C identifier"),
+        ({"sampling_time": 0.0}, "must be positive"),
+    ],
+)
+def test_a_wrong_table_is_refused(adder: SampledSystem, change: dict, message: str) -> None:
+    with pytest.raises(BuildError, match=message):
+        replace(adder, **change)
+
+
+def test_one_name_for_two_variables_is_refused(adder: SampledSystem) -> None:
+    with pytest.raises(BuildError, match="two variables of adder are called 'u'"):
+        replace(adder, outputs=adder.inputs)
+
+
+def test_no_products_are_contracted() -> None:
+    assert "-ffp-contract=off" in COMPILER_FLAGS

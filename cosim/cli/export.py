@@ -41,8 +41,10 @@ def export(
 
         from cosim.cli.compose import build_plant
         from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
+        from cosim.errors import CosimError
         from cosim.scenario import Scenario
         from fmus.platforms import PLATFORMS, present
+        from fmus.variables import FmiVersion
 
         loaded = Scenario.load(scenario)
         rti = rti_controller(controller, loaded)
@@ -50,7 +52,9 @@ def export(
             units = plant.units
         system = sampled_controller(rti, loaded, units)
         every_platform = not local and find_spec("ziglang") is not None
-        version = 3 if fmi == 3 else 2
+        version: FmiVersion = 3 if fmi == 3 else 2
+        if ssp is not None and version != 2:
+            raise CosimError("--ssp needs --fmi 2: SSP 1.0 connects FMUs of FMI 2.0")
         path = write_fmu(system, rti, loaded, out, version, every_platform)
         platforms = [p.tuple for p in (PLATFORMS if every_platform else [present()])]
         out_.note(f"wrote {path}: FMI {version}.0 for {', '.join(platforms)}")
@@ -64,8 +68,8 @@ def export(
             "sampling_time": loaded.sampling_time,
         }
         if ssp is not None:
-            from cosim.cli.loop_ssp import write_ssp
+            from cosim.cli.loop_ssp import write_loop
 
-            document["ssp"] = str(write_ssp(path, loaded, seed, ssp))
+            document["ssp"] = str(write_loop(path, loaded, seed, ssp))
             out_.note(f"wrote {ssp}")
         out_.json(document)

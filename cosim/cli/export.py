@@ -46,6 +46,9 @@ def export(
         from fmus.platforms import PLATFORMS, present
         from fmus.variables import FmiVersion
 
+        for target in [out] if ssp is None else [out, ssp]:
+            if not target.parent.is_dir():
+                raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
         loaded = Scenario.load(scenario)
         rti = rti_controller(controller, loaded)
         with build_plant(loaded, out_) as plant:

@@ -1,0 +1,145 @@
+"""`cosim export`: the FMU and the SSP that it writes, and what it refuses."""
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+
+from controllers.factories import naive, tuned
+from cosim import FmuPlant, Scenario, simulate
+from fmus.checks import Status, check
+
+pytestmark = pytest.mark.skipif(
+    shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
+)
+EXAMPLE = Path(__file__).parents[3] / "examples" / "ssp_loop.py"
+SAMPLES = 60
+ACTION = 1e-9
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A tuned controller's FMU for FMI 2.0, its loop with seed 5, and the command's JSON."""
+    folder = tmp_path_factory.mktemp("export")
+    fmu, ssp = folder / "controller.fmu", folder / "loop.ssp"
+    command = ["export", "tuned", "--out", fmu, "--ssp", ssp, "--seed", "5", "--local", "--json"]
+    result = subprocess.run(
+        [sys.executable, "-m", "cosim", *map(str, command)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return fmu, ssp, json.loads(result.stdout)
+
+
+def test_the_summary_says_what_was_written(exported):
+    fmu, ssp, summary = exported
+    assert (summary["fmu"], summary["ssp"]) == (str(fmu), str(ssp))
+    assert (summary["fmi_version"], summary["sampling_time"]) == ("2.0", 60.0)
+    assert len(summary["platforms"]) == 1
+
+
+def test_every_installed_importer_takes_the_fmu(exported):
+    findings = check(exported[0])
+    assert not [f for f in findings if f.status is Status.FAILED], findings
+    assert [f for f in findings if f.status is Status.PASSED]
+
+
+def test_its_variables_have_the_plants_names_and_units_and_theta_is_tunable(exported):
+    description = fmpy.read_model_description(str(exported[0]))
+    found = {v.name: v for v in description.modelVariables}
+    assert [found[name].causality for name in ("X2", "P2", "P100", "F200")] == [
+        "input", "input", "output", "output",
+    ]  # fmt: skip
+    assert (found["P100"].unit, found["P100"].min, found["P100"].max) == ("kPa", "100.0", "400.0")
+    assert found["theta.B_l[0,2]"].variability == "tunable"
+    assert {"value", "qp_status", "kkt_residual", "predicted.X2[10]"} <= set(found)
+    with zipfile.ZipFile(exported[0]) as container:
+        record = json.loads(container.read("extra/org.rti-cosim/controller.json"))
+    assert record["theta_hash"] == exported[2]["theta_hash"]
+
+
+def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
+    """The twenty lines of the example; the two QP solvers differ by rounding."""
+    result = subprocess.run(
+        [sys.executable, "-W", "error", EXAMPLE, exported[1], str(SAMPLES)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    rows = np.array([list(map(float, row)) for row in list(csv.reader(result.stdout.split()))[1:]])
+    scenario = Scenario.load("paper")
+
+    with FmuPlant(scenario) as plant:
+        expected = simulate(plant, tuned(scenario), SAMPLES, 5)
+    for column, name in enumerate(("X2", "P2", "P100", "F200"), start=1):
+        np.testing.assert_allclose(rows[:, column], expected[name], rtol=0, atol=ACTION)
+
+
+def test_theta_set_in_the_fmu_is_the_controller_with_that_theta(exported):
+    """The tuned FMU with naive θ acts as the naive controller."""
+    scenario = Scenario.load("paper")
+    controller = naive(scenario)
+    names = [f"theta.{label}" for label in controller.parameters.blocks.labels]
+    states = np.array([[25.0, 49.7], [26.0, 50.0], [24.0, 49.0], [25.5, 51.0]])
+    inputs = np.array(
+        [(60.0 * k, *s) for k, s in enumerate(states)],
+        dtype=[("time", float), ("X2", float), ("P2", float)],
+    )
+    result = fmpy.simulate_fmu(
+        str(exported[0]),
+        stop_time=60.0 * len(states),
+        step_size=60.0,
+        output_interval=60.0,
+        start_values=dict(zip(names, controller.theta.tolist(), strict=True)),
+        input=inputs,
+        output=["P100", "F200"],
+    )
+    for k, s in enumerate(states):
+        controller.prepare()
+        action = controller.feedback(s).action
+        found = [result[name][k + 1] for name in ("P100", "F200")]
+        np.testing.assert_allclose(found, action, rtol=0, atol=ACTION)
+
+
+def test_libcosim_runs_the_ssp_with_an_error_of_first_order_in_its_step(exported):
+    """Its components step side by side: an action arrives one communication step late."""
+    pytest.importorskip("libcosimpy")
+    code = Path(__file__).parents[2] / "helpers" / "ssp_by_libcosim.py"
+    errors = []
+    for step in ("6.0", "3.0"):
+        result = subprocess.run(
+            [sys.executable, code, exported[1], step, "20"], capture_output=True, text=True,
+            check=True,
+        )  # fmt: skip
+        lines = [line.split()[1] for line in result.stdout.splitlines() if line[:4] == "row "]
+        rows = np.array([list(map(float, line.split(","))) for line in lines])
+        with FmuPlant("paper") as plant:
+            expected = simulate(plant, tuned(Scenario.load("paper")), 20, 5)
+        errors.append(np.abs(rows[1:, 0] - expected["X2"][1:]).max())
+    assert errors[0] < 0.5
+    assert errors[1] < 0.6 * errors[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["converged", "--out", "c.fmu"], "is no RTI-NMPC and cannot be exported"),
+        (["naive", "--out", "c.fmu", "--fmi", "3", "--ssp", "l.ssp"], "--ssp needs --fmi 2"),
+        (["nothing.toml", "--out", "c.fmu"], "no such parameters file"),
+        (["naive", "--out", "no/such/folder/c.fmu", "--local"], "no/such/folder"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(
+    cosim, monkeypatch, tmp_path, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = cosim("export", *arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+    assert not list(tmp_path.iterdir())

@@ -5,13 +5,14 @@ These are the package's entry points of the group `cosim.controllers`.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from controllers.converged import ConvergedNmpc
 from controllers.parameters import Parameters
 from controllers.problem import Problem, ScenarioLike
-from controllers.rti import RtiNmpc
+from controllers.rti import IteratedNmpc, RtiNmpc
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming.plant import StochasticScenario
@@ -21,9 +22,10 @@ if TYPE_CHECKING:
 
 
 def rti(scenario: ScenarioLike, parameters: Parameters) -> RtiNmpc:
-    """RTI-NMPC for a scenario with given θ."""
+    """RTI-NMPC for a scenario with given θ, of as many QPs a sample as the scenario says."""
     settings = scenario.controller
-    return RtiNmpc(
+    make = partial(IteratedNmpc, iterations=settings.iterations)
+    return (RtiNmpc if settings.iterations == 1 else make)(
         Problem.from_scenario(scenario),
         parameters,
         hessian=settings.hessian,

@@ -7,9 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.converged import ConvergedNmpc
 from controllers.economic.tuning import tune
+from controllers.factories import rti
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.rti import RtiNmpc
 from controllers.theta import ThetaBlocks
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
@@ -102,7 +102,7 @@ def build_controller(
     """`rti` or `converged`; raises ConfigurationError on another kind."""
     settings = scenario.controller
     if kind == "rti":
-        return RtiNmpc(problem, parameters, hessian=settings.hessian, backend=settings.backend)
+        return rti(scenario, parameters)
     if kind == "converged":
         return ConvergedNmpc(problem, parameters, backend=settings.backend)
     raise ConfigurationError(

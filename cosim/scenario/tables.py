@@ -127,6 +127,8 @@ class ControllerTable(Table):
     """Hessian of the QP: the cost's, or the Lagrangian's, convexified."""
     backend: Annotated[str, Field(pattern=r"^(daqp|proxqp|qpsolvers:\w+)$")] = "daqp"
     """QP solver: `daqp`, `proxqp`, or any of qpsolvers as `qpsolvers:NAME`."""
+    iterations: Annotated[int, Field(ge=1, le=100)] = 1
+    """QPs a sample: 1 is the real-time iteration, more of them come near to convergence."""
     value_offset: Literal["stage-cost", "discounted"] | None = None
     """c_λ at the start: ℓ_s (paper) or ℓ_s/(1−γ); without it left to the algorithm, ℓ_s else."""
     reference_state: Numbers

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from controllers import ConvergedNmpc, Parameters, Problem
+from controllers import ConvergedNmpc, Parameters, Problem, RtiNmpc
 from controllers.errors import ParameterError
 from controllers.factories import converged, from_file, naive
+from controllers.rti import IteratedNmpc
 from cosim import Scenario
 
 
@@ -54,3 +55,8 @@ def test_a_file_gives_the_same_controller(paper, tmp_path):
 def test_a_missing_file_is_named(paper):
     with pytest.raises(ParameterError, match=r"nowhere\.toml: there is no such parameters file"):
         from_file(paper, "nowhere.toml")
+
+
+def test_the_scenario_says_how_many_qps_a_sample_has(paper):
+    assert type(naive(paper)) is RtiNmpc
+    assert type(naive(changed(paper, iterations=3))) is IteratedNmpc

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.output import JsonOption, open_folder, output
+from cosim.cli.output import JsonOption, output, writable_folder
 
 DIFFERENT = 1
 
@@ -169,10 +169,10 @@ def build(
         if out is None:
             built = build_in_place()
         elif folder is not None:
-            open_folder(out.parent)
+            writable_folder(out.parent)
             built = [build_folder(folder, out, every_platform=every)]
         else:
-            built = build_fmus(open_folder(out), every_platform=every)
+            built = build_fmus(writable_folder(out), every_platform=every)
         for path in built:
             out_.note(f"built {path}")
         out_.json({"built": [str(path) for path in built]})

@@ -131,7 +131,10 @@ def output(as_json: bool) -> Iterator[Output]:
     """
     result = Output(as_json)
     if not as_json or not _has_descriptor():
-        yield result
+        try:
+            yield result
+        finally:
+            _release()
         return
     sys.stdout.flush()
     result._stdout = os.dup(1)
@@ -139,10 +142,18 @@ def output(as_json: bool) -> Iterator[Output]:
     try:
         yield result
     finally:
+        _release()
         sys.stdout.flush()
         os.dup2(result._stdout, 1)
         os.close(result._stdout)
         result._stdout = -1
+
+
+def _release() -> None:
+    """Give back the folders that the command held, if it held any."""
+    locking = sys.modules.get("cosim.cli.locking")
+    if locking is not None:
+        locking.release()
 
 
 def _has_descriptor() -> bool:
@@ -167,11 +178,24 @@ def _finite(value: Any) -> Any:
 
 
 def open_folder(folder: Path) -> Path:
-    """Create an output folder and make sure, before the work, that it can be written."""
+    """Create an output folder, make sure that it can be written, and hold it to the command's end.
+
+    Raises CosimError before the work where it cannot be written or another process holds it.
+    """
+    from cosim.cli.locking import hold
+
+    writable_folder(folder)
+    hold(folder)
+    return folder
+
+
+def writable_folder(folder: Path) -> Path:
+    """Create a folder and make sure, before the work, that it can be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".cosim-"):
             pass
-    except OSError as error:
-        raise CosimError(f"cannot write to folder '{folder}': {error.strerror}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise CosimError(f"cannot write to folder '{folder}': {reason}") from None
     return folder

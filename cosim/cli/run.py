@@ -54,6 +54,9 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
                 plant, controller, run.steps, run.seed, recorder=recorder, progress=progress
             )
         summary = _summary(run, trajectory, controller, plant)
+    if not run.record:
+        # A recording that another run left would stand beside this one's signals.
+        (folder / "run.rrd").unlink(missing_ok=True)
     trajectory.write_csv(folder / "trajectory.csv")
     trajectory.write_timing_csv(folder / "timing.csv")
     write_atomically(folder / "scenario.toml", scenario.to_toml())

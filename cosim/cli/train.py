@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from learning.log import LogRow
     from learning.training_run import TrainingResult, TrainingRun
 
+FILES = ("checkpoint.npz", "learning.csv", "parameters.toml", "summary.json", "training.rrd")
+"""What a training leaves in its folder; each belongs to the same run."""
 # Columns of the log behind the progress bar: name, text, scale, format.
 FIGURES = (
     ("J", "J", 1, ".0f"),
@@ -61,6 +63,9 @@ def train(
         typer.Option(
             "--resume", help="Go on from the folder's checkpoint, to more --samples if you like."
         ),
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Begin anew where the folder holds another run.")
     ] = False,
     assignments: Annotated[
         list[str] | None,
@@ -158,6 +163,11 @@ def train(
             validation_samples=validation_samples,
         )
         folder = open_folder(out)
+        if overwrite:
+            for name in FILES:
+                (folder / name).unlink(missing_ok=True)
+        elif not resume:
+            _require_no_run(folder)
         begin = time.perf_counter()
         result = _execute(run, found, folder, optimum, resume, record, out_)
         summary = summarise(run, result)
@@ -170,6 +180,16 @@ def train(
         out_.json(summary)
     if result.status != "finished":
         raise typer.Exit(1)
+
+
+def _require_no_run(folder: Path) -> None:
+    from cosim.errors import CosimError
+
+    if found := [name for name in FILES if (folder / name).exists()]:
+        raise CosimError(
+            f"folder '{folder}' holds another training ({found[0]}); go on with it by --resume, "
+            "begin anew by --overwrite, or choose another --out"
+        )
 
 
 def _execute(

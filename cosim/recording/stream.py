@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -49,13 +50,16 @@ class Stream:
 
     def __init__(self, path: str | Path, name: str) -> None:
         self.path = Path(path)
-        self._partial = self.path.with_name(f".{self.path.stem}.partial.rrd")
         try:
-            self._partial.open("wb").close()
+            handle, name_of_partial = tempfile.mkstemp(
+                dir=self.path.parent, prefix=f".{self.path.stem}.", suffix=".partial.rrd"
+            )
+            os.close(handle)
         except OSError as error:
             raise RecordingError(
                 f"cannot write the recording {self.path}: {error.strerror}"
             ) from None
+        self._partial = Path(name_of_partial)
         # Without it a column of the wrong shape is dropped with no more than a warning.
         rr.set_strict_mode(True)
         self._stream = rr.RecordingStream(APPLICATION)
@@ -114,6 +118,10 @@ class Stream:
             written.seek(-min(len(FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
             if FOOTER not in written.read():
                 self._give_up("its end is missing")
+        # mkstemp makes the file private; a recording is meant to be read like any other file.
+        umask = os.umask(0)
+        os.umask(umask)
+        self._partial.chmod(0o666 & ~umask)
         self._partial.replace(self.path)
 
     def _bounded(self, call: Callable[[], None]) -> None:

@@ -109,8 +109,8 @@ def _inspect_recording(folder: Path, reference: Path) -> Counter[str]:
     if (out / "run.rrd").exists():
         assert np.array_equal(read_recording(out / "run.rrd").samples, whole.samples)
         return Counter({"whole recordings found": 1})
-    partial = out / ".run.partial.rrd"
-    if not partial.exists() or partial.stat().st_size == 0:
+    partial = next(out.glob(".run.*.partial.rrd"), None)
+    if partial is None or partial.stat().st_size == 0:
         return Counter()
     repaired = folder / "repaired.rrd"
     rerun = str(Path(sys.executable).with_name("rerun"))

@@ -273,8 +273,9 @@ class RtiNmpc:
         return self._solve(s, None).action
 
 
+@np.errstate(invalid="ignore")  # 0·∞ is what is looked for
 def _is_finite(values: Vector) -> bool:
-    """Whether all entries are finite: 0ᵀx takes a tenth of NumPy's isfinite, and never warns."""
+    """Whether all entries are finite: 0ᵀx takes a third of the time of NumPy's isfinite."""
     return isfinite(values.dot(_zeros(values.size)))
 
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from controllers.converged import ConvergedNmpc
+from controllers.errors import ControllerError
 from controllers.parameters import Parameters
 from controllers.problem import Problem, ScenarioLike
 from controllers.rti import IteratedNmpc, RtiNmpc
@@ -21,23 +22,26 @@ if TYPE_CHECKING:
 # Imported where it is needed: who simulates an RTI-NMPC shall not pay for SciPy and Clarabel.
 
 
-def rti(scenario: ScenarioLike, parameters: Parameters) -> RtiNmpc:
-    """RTI-NMPC for a scenario with given θ, of as many QPs a sample as the scenario says."""
-    settings = scenario.controller
+def nmpc(scenario: ScenarioLike, parameters: Parameters, kind: str = "rti") -> RtiNmpc:
+    """NMPC for a scenario with given θ, `rti` or `converged`; ControllerError on another `kind`.
+
+    The RTI-NMPC solves as many QPs a sample as the scenario says.
+    """
+    problem, settings = Problem.from_scenario(scenario), scenario.controller
+    if kind == "converged":
+        return ConvergedNmpc(problem, parameters, backend=settings.backend)
+    if kind != "rti":
+        raise ControllerError(f"there is no NMPC '{kind}'; there are rti and converged")
     make = partial(IteratedNmpc, iterations=settings.iterations)
     return (RtiNmpc if settings.iterations == 1 else make)(
-        Problem.from_scenario(scenario),
-        parameters,
-        hessian=settings.hessian,
-        backend=settings.backend,
+        problem, parameters, hessian=settings.hessian, backend=settings.backend
     )
 
 
 def value_offset(scenario: ScenarioLike, problem: Problem) -> float:
     """c_λ at the start, as the scenario says: ℓ_s or ℓ_s/(1−γ)."""
-    if scenario.controller.value_offset == "discounted" and problem.discount < 1:
-        return problem.reference_cost / (1 - problem.discount)
-    return problem.reference_cost
+    discounted = scenario.controller.value_offset == "discounted"
+    return problem.value_level() if discounted else problem.reference_cost
 
 
 def naive_parameters(scenario: ScenarioLike, problem: Problem) -> Parameters:
@@ -47,12 +51,12 @@ def naive_parameters(scenario: ScenarioLike, problem: Problem) -> Parameters:
 
 def naive(scenario: ScenarioLike) -> RtiNmpc:
     """RTI-NMPC with the paper's naive guess: baseline (a)."""
-    return rti(scenario, naive_parameters(scenario, Problem.from_scenario(scenario)))
+    return nmpc(scenario, naive_parameters(scenario, Problem.from_scenario(scenario)))
 
 
 def from_file(scenario: ScenarioLike, path: str | Path) -> RtiNmpc:
     """RTI-NMPC with θ from a parameters file."""
-    return rti(scenario, Parameters.load(path, Problem.from_scenario(scenario)))
+    return nmpc(scenario, Parameters.load(path, Problem.from_scenario(scenario)))
 
 
 def tuned(scenario: ScenarioLike) -> RtiNmpc:
@@ -60,19 +64,17 @@ def tuned(scenario: ScenarioLike) -> RtiNmpc:
     from controllers.economic import tune  # noqa: PLC0415
 
     problem = Problem.from_scenario(scenario)
-    return rti(scenario, tune(problem, value_offset=value_offset(scenario, problem)).parameters)
+    return nmpc(scenario, tune(problem, value_offset=value_offset(scenario, problem)).parameters)
 
 
-def converged(scenario: ScenarioLike) -> ConvergedNmpc:
+def converged(scenario: ScenarioLike) -> RtiNmpc:
     """NMPC solved to convergence with the paper's naive guess."""
-    problem = Problem.from_scenario(scenario)
-    return ConvergedNmpc(
-        problem, naive_parameters(scenario, problem), backend=scenario.controller.backend
-    )
+    parameters = naive_parameters(scenario, Problem.from_scenario(scenario))
+    return nmpc(scenario, parameters, "converged")
 
 
-def optimal(scenario: ScenarioLike) -> OptimalPolicy:
+def optimal(scenario: StochasticScenario) -> OptimalPolicy:
     """Policy of least mean cost on the scenario's stochastic plant, solved once and then stored."""
     from controllers.optimum import OptimalPolicy  # noqa: PLC0415
 
-    return OptimalPolicy.from_scenario(cast("StochasticScenario", scenario))
+    return OptimalPolicy.from_scenario(scenario)

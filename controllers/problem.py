@@ -148,6 +148,14 @@ class Problem:
             self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
         )
 
+    def value_level(self, discount: float | None = None) -> float:
+        """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.
+
+        `discount` γ is the problem's own where None.
+        """
+        gamma = self.discount if discount is None else discount
+        return self.reference_cost / (1 - gamma) if gamma < 1 else self.reference_cost
+
     @classmethod
     def from_scenario(cls, scenario: ScenarioLike) -> Problem:
         """Build the problem that a scenario describes; its model is named `module:factory`."""

@@ -89,7 +89,7 @@ class Judge:
 
     def _build(self, parameters: Parameters) -> LearnableController:
         run = self._run
-        return build_controller(run.controller, run.scenario, self._problem, parameters)
+        return build_controller(run.controller, run.scenario, parameters)
 
     def controller(self, theta: NDArray[np.float64]) -> Controller:
         """The greedy controller at θ (n_θ,); the same one, moved, at every call."""

@@ -25,7 +25,7 @@ class Learner:
     ) -> None:
         problem = Problem.from_scenario(run.scenario)
         self.start = starting_parameters(problem, run.configuration, run.start)
-        self.controller = build_controller(run.controller, run.scenario, problem, self.start)
+        self.controller = build_controller(run.controller, run.scenario, self.start)
         strategy = build_strategy(run.configuration, run.scenario, run.samples)
         self._plant_seed, self.rng = spawn_seeds(run.seed)
         self.algorithm_rng = np.random.default_rng(run.spawned(ALGORITHM))

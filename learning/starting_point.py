@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.converged import ConvergedNmpc
 from controllers.economic.tuning import tune
-from controllers.factories import rti
+from controllers.factories import nmpc
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.theta import ThetaBlocks
@@ -51,10 +50,7 @@ def starting_parameters(
 def _value_offset(problem: Problem, configuration: Configuration) -> float | None:
     """c_lambda at the start, None for ℓ_s; the level of V is that of the TD error's discount."""
     chosen: float | None = getattr(configuration, "discount", None)
-    discount = problem.discount if chosen is None else chosen
-    if configuration.value_offset == "discounted" and discount < 1:
-        return problem.reference_cost / (1 - discount)
-    return None
+    return problem.value_level(chosen) if configuration.value_offset == "discounted" else None
 
 
 def _slack_weights(problem: Problem, configuration: Configuration) -> dict[str, Vector]:
@@ -96,18 +92,13 @@ def _extended(problem: Problem, configuration: Configuration, path: str) -> Para
     return Parameters.naive(problem, blocks).replace(values)
 
 
-def build_controller(
-    kind: str, scenario: Scenario, problem: Problem, parameters: Parameters
-) -> LearnableController:
+def build_controller(kind: str, scenario: Scenario, parameters: Parameters) -> LearnableController:
     """`rti` or `converged`; raises ConfigurationError on another kind."""
-    settings = scenario.controller
-    if kind == "rti":
-        return rti(scenario, parameters)
-    if kind == "converged":
-        return ConvergedNmpc(problem, parameters, backend=settings.backend)
-    raise ConfigurationError(
-        f"there is no learnable controller '{kind}'; there are {', '.join(CONTROLLERS)}"
-    )
+    if kind not in CONTROLLERS:
+        raise ConfigurationError(
+            f"there is no learnable controller '{kind}'; there are {', '.join(CONTROLLERS)}"
+        )
+    return nmpc(scenario, parameters, kind)
 
 
 def build_strategy(configuration: Configuration, scenario: Scenario, samples: int) -> Strategy:

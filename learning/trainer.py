@@ -96,7 +96,7 @@ class Trainer:
             path = Path(name, "parameters.toml")
             path.write_text(parameters, "utf-8")
             theta = Parameters.load(path, problem)
-        found = build_controller(training.nmpc, training.scenario, problem, theta)
+        found = build_controller(training.nmpc, training.scenario, theta)
         return found
 
     def controller(self, name: str, scenario: Scenario) -> Controller:

@@ -30,10 +30,10 @@ def test_the_extended_theta_starts_at_the_configured_slack_weights(problem):
 
 
 def test_controllers_by_name(scenario, problem, parameters):
-    assert type(build_controller("rti", scenario, problem, parameters)) is RtiNmpc
-    assert type(build_controller("converged", scenario, problem, parameters)) is ConvergedNmpc
+    assert type(build_controller("rti", scenario, parameters)) is RtiNmpc
+    assert type(build_controller("converged", scenario, parameters)) is ConvergedNmpc
     with pytest.raises(ConfigurationError, match="'mpc'"):
-        build_controller("mpc", scenario, problem, parameters)
+        build_controller("mpc", scenario, parameters)
 
 
 STATED = {

@@ -19,6 +19,7 @@ from controllers.dynamics import stage_parameter_gradient
 from controllers.problem import Problem
 from controllers.qp.active_set import kkt_solve
 from controllers.qp.problem import QpSolution, SoftQp
+from controllers.qp.stagewise import LEAST_CONTROLS, StageMatrices, kkt_solve_by_stages
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Matrix = NDArray[np.float64]
@@ -182,15 +183,19 @@ def _direction(
 
 
 def adjoint_directions(
-    qp: SoftQp, solution: QpSolution, n_actions: int
+    qp: SoftQp, stages: StageMatrices, solution: QpSolution
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Solutions dv, dt, dλ of the KKT system for unit right-hand sides in u_0, a row an action.
 
     The KKT matrix of the active set is symmetric, so these rows of its inverse are all that dπ/dθ
-    and dπ/ds need.
+    and dπ/ds need. `stages` are those of the condensed `qp`; long horizons are solved by them.
     """
-    active = solution.active(qp)
-    dv, dlam = kkt_solve(qp, active, np.eye(n_actions, qp.f.size), np.zeros((n_actions, qp.w.size)))
+    n_actions = stages.B.shape[2]
+    active, seeds = solution.active(qp), np.eye(n_actions, qp.f.size)
+    solved = None
+    if qp.f.size >= LEAST_CONTROLS:
+        solved = kkt_solve_by_stages(stages, qp.W, active, seeds)
+    dv, dlam = solved or kkt_solve(qp, active, seeds, np.zeros((n_actions, qp.w.size)))
     violated, dt = active[2], np.zeros_like(dlam)
     if violated.any():
         moved = (dv @ qp.rows.T)[:, violated]

@@ -14,6 +14,7 @@ from controllers.errors import ControllerError
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp.problem import QpSolution, Residuals, SoftQp
+from controllers.qp.stagewise import StageMatrices
 from controllers.rti.hessian import Spectrum
 from controllers.sensitivities import adjoint_directions, curvature_directions
 
@@ -210,7 +211,7 @@ class RtiSolution:
                 "the action was enforced, so this solution is Q(s, a) and has no policy; "
                 "call feedback(s) without an action"
             )
-        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, self.action.size)
+        dv, dt, dlam = adjoint_directions(self.qp, self._stages, self.multipliers)
         function = self.prepared.functions.policy
         self._write_solution(function)
         inputs = function.inputs
@@ -229,6 +230,18 @@ class RtiSolution:
         return (
             function.part("policy").reshape(m, -1).copy(),
             function.part("state").reshape(m, -1).copy(),
+        )
+
+    @property
+    def _stages(self) -> StageMatrices:
+        prepared = self.prepared
+        n, m = self.costates.shape[1], self.action.size
+        part = prepared.functions.preparation.part
+        return StageMatrices(
+            A=part("A", prepared.stack).reshape(-1, n, n),
+            B=part("B", prepared.stack).reshape(-1, n, m),
+            L=prepared.L.reshape(-1, n + m, n + m),
+            L_N=prepared.L_N.reshape(n, n),
         )
 
     def _write_solution(self, function: StackedFunction) -> None:

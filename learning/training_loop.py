@@ -25,7 +25,13 @@ from learning.evaluation import Judge
 from learning.learner import Learner
 from learning.log import COLUMNS, LogRow, Totals, to_csv
 from learning.protocols import Algorithm
-from learning.training_run import VALIDATION, TrainingRecorder, TrainingResult, TrainingRun
+from learning.training_run import (
+    VALIDATION,
+    TrainingRecorder,
+    TrainingResult,
+    TrainingRun,
+    late_movement,
+)
 from learning.validation import Validation
 
 Progress = Callable[[int, LogRow], None]
@@ -101,6 +107,7 @@ class TrainingLoop:
             self._plant_samples,
             0 if self._validation is None else self._validation.samples,
             mode_of(self._learner.controller),
+            late_movement(self._learner.start, self._rows) if self._rows else float("nan"),
         )
 
     @property

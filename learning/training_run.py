@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -108,7 +109,8 @@ class TrainingResult:
     ones where there was validation. `evaluation` is a `Verdict.summary`; `status` is `finished` or
     `diverged: …`, which changes nothing of what θ is; `plant_samples` counts those of training
     and validation, `validated` those of the latter; `functions` says whether the controller's were
-    `interpreted` or `compiled` at the end.
+    `interpreted` or `compiled` at the end; `late_movement` how far θ still went in the last fifth
+    of the run, as a share of its way from the start.
     """
 
     parameters: Parameters
@@ -118,3 +120,19 @@ class TrainingResult:
     plant_samples: int
     validated: int
     functions: str | None = None
+    late_movement: float = float("nan")
+
+
+def late_movement(start: Parameters, rows: Sequence[LogRow]) -> float:
+    """‖θ_K − θ_0.8K‖/‖θ_K − θ_0‖ in scaled entries: the criterion of convergence, below 0.05.
+
+    θ_0.8K is that of the last row within the first four fifths of the samples. NaN where θ never
+    moved or the log has no such row.
+    """
+    early = [row for row in rows if row["samples"] <= 0.8 * rows[-1]["samples"]]
+    if not early:
+        return float("nan")
+    last, scale = rows[-1].parameters.theta, start.blocks.scale
+    way = float(np.linalg.norm((last - start.theta) / scale))
+    moved = float(np.linalg.norm((last - early[-1].parameters.theta) / scale))
+    return moved / way if way > 0 else float("nan")

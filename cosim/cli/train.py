@@ -276,6 +276,7 @@ def summarise(run: TrainingRun, result: TrainingResult) -> dict[str, Any]:
         **result.evaluation,
         "smallest_eigenvalue": last.get("smallest_eigenvalue"),
         "td_error": last.get("td_error"),
+        "late_movement": result.late_movement,
         "training_failures": last.get("failures"),
         "weakly_active": last.get("weakly_active"),
         "licq_failed": last.get("licq_failed"),

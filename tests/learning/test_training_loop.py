@@ -13,12 +13,12 @@ from controllers.rti.solution import RtiSolution
 from cosim import FmuPlant
 from learning.errors import CheckpointError, ConfigurationError
 from learning.evaluation import HeldOutRuns, held_out
-from learning.log import to_csv
+from learning.log import LogRow, to_csv
 from learning.protocols import Update
 from learning.q_learning import StepwiseQLearning
 from learning.registry import load_algorithm
 from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun
+from learning.training_run import TrainingRun, late_movement
 
 SETTINGS = {
     "q-learning": {"rule": "gauss-newton", "warm_up": 20},
@@ -348,3 +348,15 @@ def test_kill_minus_nine_at_any_moment_then_resume_gives_the_same_files(name, tm
     assert process.wait() == 0
     for file in ("learning.csv", "parameters.toml"):
         assert (whole / file).read_bytes() == (killed / file).read_bytes()
+
+
+def test_the_late_movement_is_that_of_the_last_fifth(problem):
+    start = Parameters.naive(problem)
+
+    def row(samples, back_off):
+        return LogRow({"samples": samples}, start.replace({"x_l": [25.0 + back_off, 40.0]}))
+
+    rows = [row(20, 0.5), row(80, 1.5), row(90, 1.9), row(100, 2.0)]
+    assert late_movement(start, rows) == pytest.approx(0.25)
+    assert np.isnan(late_movement(start, [row(100, 2.0)]))
+    assert np.isnan(late_movement(start, [row(50, 0.0), row(100, 0.0)]))

@@ -27,17 +27,22 @@ TD_WINDOW = 10_000
 """Samples over which a TD error is averaged (paper.tex, fig. nmpc_learn)."""
 
 
+def undefined() -> Interval:
+    """No interval."""
+    return None
+
+
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its 95 % intervals, (low, high): Student's t, and a bootstrap over seeds.
+    """A value with its 95 % intervals, (low, high): `t` is Student's, `bootstrap` over seeds.
 
     The intervals are None where one seed, or none of the two methods, can say anything. The
-    bootstrap, which takes much longer, is drawn when it is first asked for.
+    bootstrap, which takes much longer, is drawn by `resample` when it is first asked for.
     """
 
     value: float
     t: Interval = None
-    resample: Callable[[], Interval] = field(default=lambda: None, repr=False, compare=False)
+    resample: Callable[[], Interval] = field(default=undefined, repr=False, compare=False)
 
     @cached_property
     def bootstrap(self) -> Interval:

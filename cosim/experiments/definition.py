@@ -28,7 +28,11 @@ CHECKPOINT = 5000
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much noise a scenario's figures are measured on."""
+    """How much noise a scenario's figures are measured on.
+
+    Evaluation: the noise `seeds`, `steps` samples on each. Learning curves: `curve_seeds` held-out
+    runs of `curve_steps` samples.
+    """
 
     seeds: tuple[int, ...]
     steps: int

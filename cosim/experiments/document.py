@@ -116,9 +116,11 @@ class TrajectoryTable(Table):
     """A table `[[trajectory]]`: one run of each case on the same noise, kept sample by sample."""
 
     name: Name
+    """What files and figures call it."""
     seed: Seed = 1
     """Noise seed."""
     steps: Count = 240
+    """Samples of the run."""
     cases: list[Source] | None = None
     """Names of cases; a trained one runs with its first training seed. All, if left out."""
     scenarios: list[Source] | None = None
@@ -131,18 +133,27 @@ class StudyTable(Table):
     """A study file."""
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
+    """`schema` in the file: 1."""
     name: Name
+    """What tables and messages call the study."""
     title: str = ""
+    """Heading of the report; the name, if left out."""
     description: str = ""
+    """A paragraph for readers."""
     scenarios: Annotated[list[Source], Field(min_length=1)]
     """Presets, scenario files, or names of the file's own `[[scenario]]` tables."""
     scenario: list[dict[str, Any]] = []
     """Scenarios as they stand in their own files, `extends` and all."""
     training_seeds: SeedsTable = SeedsTable()
+    """Table `[training_seeds]`: those of every case that has none of its own."""
     evaluation: EvaluationTable = EvaluationTable()
+    """Table `[evaluation]`."""
     curves: CurvesTable = CurvesTable()
+    """Table `[curves]`."""
     case: Annotated[list[CaseTable], Field(min_length=1)]
+    """Tables `[[case]]`."""
     trajectory: list[TrajectoryTable] = []
+    """Tables `[[trajectory]]`."""
     logs: list[Source] = []
     """Trained cases whose log and θ are kept beside the tables, and drawn: first training seed."""
     tables: list[Literal["paper"]] = []

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
+from cosim.errors import StudyError
 from cosim.experiments.plan import Plan, Run
+from cosim.experiments.protocols import Training
 from cosim.experiments.units import simulated
 
-TRIED, SIMULATED = 1000, 200
-"""Samples of a training, and of a closed loop, that are timed."""
+TRIED, SIMULATED = (500, 1500), 200
+"""Samples of two trainings, and of a closed loop, that are timed."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,17 @@ def estimate(plan: Plan) -> tuple[list[Cost], float]:
         first = runs[0]
         trained = 0 if first.training is None else first.training.samples
         if case not in rates:
-            rates[case] = _seconds_per_sample(plan, first)
+            try:
+                rates[case] = _seconds_per_sample(plan, first)
+            except Exception as error:  # anything, from a user's algorithm
+                raise StudyError(f"case '{case}': {type(error).__name__}: {error}") from error
         simulation = "" if first.training is not None else case
         if simulation not in rates:
             rates[simulation] = _seconds_per_step(plan, first)
         evaluated = first.samples - trained
-        # The evaluations during training are part of its samples' time.
+        if first.training is not None:
+            greedy = first.training.evaluation_seeds * first.training.evaluation_steps
+            evaluated += greedy * (trained // first.training.evaluate_every + 1)
         seconds = len(runs) * (trained * rates[case] + evaluated * rates[simulation])
         costs.append(
             Cost(scenario, case, len(runs), len(runs) * trained, len(runs) * evaluated, seconds)
@@ -49,26 +56,26 @@ def estimate(plan: Plan) -> tuple[list[Cost], float]:
 
 
 def _seconds_per_sample(plan: Plan, run: Run) -> float:
+    """From the difference of two short trainings, so that building and evaluating do not count."""
     if run.training is None:
         return 0.0
-    samples = min(TRIED, run.training.samples)
+    spent = {samples: _seconds(plan, run.training, samples) for samples in TRIED}
+    short, long = TRIED
+    return max(spent[long] - spent[short], 0.0) / (long - short)
+
+
+def _seconds(plan: Plan, training: Training, samples: int) -> float:
     short = replace(
-        run.training,
+        training,
         samples=samples,
         log_every=samples,
         evaluate_every=samples,
         checkpoint_every=samples,
+        options={},
     )
-    trainer = plan.definition.trainer
-    nothing = replace(short, samples=1, log_every=1, evaluate_every=1, checkpoint_every=1)
-    trainer.advance(nothing, b"", 1e9)
     begin = time.process_time()
-    trainer.advance(nothing, b"", 1e9)
-    middle = time.process_time()
-    trainer.advance(short, b"", 1e9)
-    learning = max(time.process_time() - middle - (middle - begin), 0.0) / samples
-    points = run.training.samples / run.training.evaluate_every
-    return learning + (middle - begin) * points / run.training.samples
+    plan.definition.trainer.advance(short, b"", 1e9)
+    return time.process_time() - begin
 
 
 def _seconds_per_step(plan: Plan, run: Run) -> float:

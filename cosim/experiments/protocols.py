@@ -18,11 +18,12 @@ GROUP = "cosim.trainers"
 class Training:
     """One training, complete: equal trainings give equal θ, wherever and in however many pieces.
 
-    `settings` are the `algorithm`'s hyperparameters; `start` is `naive`, `tuned` or a parameters
-    file; `nmpc` (`rti` or `converged`) carries θ. The log has a row every `log_every` samples, a
-    greedy evaluation every `evaluate_every`, on `evaluation_seeds` × `evaluation_steps` held-out
-    samples; a training can be handed over every `checkpoint_every`. `options` go to the training
-    loop as they are.
+    `samples` of the `scenario`'s plant with this `seed` of noise and exploration; `settings` are
+    the `algorithm`'s hyperparameters; `start` is `naive`, `tuned` or a parameters file; `nmpc`
+    (`rti` or `converged`) carries θ. The log has a row every `log_every` samples, a greedy
+    evaluation every `evaluate_every`, on `evaluation_seeds` × `evaluation_steps` held-out samples;
+    a training can be handed over every `checkpoint_every`. `options` go to the training loop as
+    they are.
     """
 
     algorithm: str
@@ -42,7 +43,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training stands.
+    """Where a training stands after `samples` samples and `wall_seconds` (of the last piece).
 
     While it goes on, `status` is empty and `checkpoint` is what it goes on from. At its end
     `status` is `finished` or `diverged: …`, `log` the whole learning.csv, `parameters` the θ that

@@ -17,9 +17,10 @@ CURVE = ("samples", "J", "greedy_J", "td_error")
 
 @dataclass(frozen=True)
 class CaseResult:
-    """A case as the tables know it; `samples` is 0 and `settings` empty for a controller.
+    """A case as the tables know it: its `name`, and the `group` of the panel that shows it.
 
-    `scenarios` are those that it runs on, `group` the panel that shows it.
+    `target` is the algorithm if it is `trained`, else the controller; `scenarios` are those that it
+    runs on. For a controller `samples` is 0, and `start`, `nmpc` and `settings` are empty.
     """
 
     name: str
@@ -35,10 +36,11 @@ class CaseResult:
 
 @dataclass(frozen=True)
 class RunResult:
-    """One run, finished: a controller, or a training with the evaluation of the θ it ended with.
+    """One run of a `case` on a `scenario`, finished: a controller, or a training and its last θ.
 
     `seed` is the training seed, None for a controller; `status` is `evaluated`, `finished` or
-    `diverged: …`. `plant_samples` are all samples that the plant gave for it. `seeds` (S,) are the
+    `diverged: …`. `samples` are those of training, `plant_samples` all that the
+    plant gave for it. `seeds` (S,) are the
     noise seeds, `steps` the samples on each, `indicators` (S,) each by name. `curve` (K,) each by
     name, empty for a controller; `greedy_J` is a controller's J on the noise of the curves.
     """

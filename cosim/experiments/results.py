@@ -24,7 +24,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class StudyResults:
-    """What a study measured.
+    """What a study measured, in `folder`.
 
     `about` says what the study is and what it was made with; `runs` are those that are finished.
     """

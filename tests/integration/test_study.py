@@ -23,20 +23,20 @@ schema = 1
 name = "mine"
 scenarios = ["paper", "other.toml"]
 training_seeds = { first = 0, count = 3 }
-evaluation = { seeds = 3, steps = { default = 60, other = 50 } }
-curves = { points = 4, seeds = 2, steps = 50 }
+evaluation = { seeds = 2, steps = { default = 40, other = 30 } }
+curves = { points = 2, seeds = 2, steps = 40 }
 
 [[case]]
 name = "mine"
 algorithm = "my_algorithm:CappedTd"
-samples = 1200
+samples = 600
 settings = { cap = [0.02, 0.05] }
 training = { checkpoint_every = 300 }
 
 [[case]]
 name = "q"
 algorithm = "q-learning"
-samples = 1200
+samples = 600
 settings = { exploration_probability = [0.5, 1.0] }
 training = { checkpoint_every = 300 }
 
@@ -115,7 +115,7 @@ def contents(out):
 def undisturbed(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed")
     summary = finish(start(folder, out, "--jobs", "1"))
-    assert summary["runs"] == 2 * (2 * 2 * 3 + 2) + 1, "two algorithms, settings, scenarios; J*"
+    assert summary["runs"] == 2 * (2 * 2 * 3 + 2 + 1), "two algorithms, settings, scenarios; J*"
     return contents(out)
 
 
@@ -139,9 +139,9 @@ def kill_after(process, out, samples):
 
 
 def test_a_run_that_was_killed_twice_ends_in_the_same_bytes(folder, undisturbed, tmp_path):
-    first = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, 1500)
-    second = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, first + 6000)
-    assert second < 2 * 12 * 1200, "it was killed before its end"
+    first = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, 600)
+    second = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, first + 3000)
+    assert second < 2 * 12 * 600, "it was killed before its end"
     assert list(tmp_path.glob("runs/*/*/*/checkpoint.npz")), "a training was under way"
     finish(start(folder, tmp_path, "--jobs", "2"))
     assert contents(tmp_path) == undisturbed
@@ -159,7 +159,7 @@ def test_a_cluster_of_two_ends_in_the_same_bytes(folder, undisturbed, tmp_path):
 
 def test_a_worker_that_is_killed_loses_only_its_piece(folder, undisturbed, tmp_path):
     process = start(folder, tmp_path, "--jobs", "2")
-    while trained(tmp_path) < 1500:
+    while trained(tmp_path) < 600:
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
     os.kill(worker_of(process.pid), signal.SIGKILL)

@@ -55,7 +55,8 @@ def plant_parameters(scenario: StochasticScenario, problem: Problem) -> Vector:
         if name not in known:
             raise OptimumError(
                 f"the optimum needs a model of the plant: plant.parameters sets '{name}', which "
-                f"model '{model.name}' does not have"
+                f"model '{model.name}' does not have: give the model that parameter, or, where it "
+                "only shapes the noise, name it in plant.mapping.ranges and set disturbance.ranges"
             )
         parameters[known.index(name)] = value
     return parameters

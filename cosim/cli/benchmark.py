@@ -66,16 +66,16 @@ def evaluation(
     with output(json) as out_:
         from functools import partial
 
+        from cosim.cli.compose import load_scenario
         from cosim.cli.evaluate import named_controllers
         from cosim.evaluation.benchmark import measure
         from cosim.lookup import build_controller
-        from cosim.scenario import Scenario
 
         factories = {
             name: partial(build_controller, spec)
             for name, spec in named_controllers(controllers).items()
         }
-        result = measure(Scenario.load(scenario), factories, seeds, steps, jobs)
+        result = measure(load_scenario(scenario), factories, seeds, steps, jobs)
         rows = [
             (f"{workers} workers", *(f"{value:.2f}" for value in sorted(values)))
             for workers, values in result["timing"]["seconds_by_jobs"].items()
@@ -109,10 +109,10 @@ def controllers(
     """
     with output(json) as out_:
         from cosim.cli.benchmark_controllers import BACKENDS, measure
-        from cosim.scenario import Scenario
+        from cosim.cli.compose import load_scenario
 
         with out_.progress("controllers", len(BACKENDS) * steps) as progress:
-            result = measure(Scenario.load(scenario), steps, every, progress)
+            result = measure(load_scenario(scenario), steps, every, progress)
         rows = [
             (
                 f"{row['solver']}: {row['phase']}",
@@ -148,10 +148,10 @@ def learning(
 ) -> None:
     """Samples per second of each learning rule on one core, the FMU included."""
     with output(json) as out_:
-        from cosim.scenario import Scenario
+        from cosim.cli.compose import load_scenario
         from learning.benchmark import measure
 
-        result = measure(Scenario.load(scenario), samples)
+        result = measure(load_scenario(scenario), samples)
         rows = [
             (
                 row["algorithm"],

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cosim.lookup import import_from_here
+from cosim.lookup import import_from, import_from_here
 
 if TYPE_CHECKING:
     from cosim.cli.output import Output
     from cosim.plant import FmuPlant
     from cosim.scenario import Scenario
+
+
+def load_scenario(name: str) -> Scenario:
+    """Load a preset or TOML file, so that its `module:function` may lie beside it or here.
+
+    Raises ScenarioError.
+    """
+    from cosim.scenario import Scenario
+
+    import_from_here()
+    if Path(name).is_file():
+        import_from(Path(name).resolve().parent)
+    return Scenario.load(name)
 
 
 def build_plant(scenario: Scenario, output: Output | None = None) -> FmuPlant:

@@ -78,9 +78,9 @@ def _solve(
     from controllers.dynamic_programming.solution import solve
     from controllers.dynamic_programming.study import Row, study
     from controllers.problem import Problem
-    from cosim.scenario import Scenario
+    from cosim.cli.compose import load_scenario
 
-    scenario = Scenario.load(name)
+    scenario = load_scenario(name)
     problem = Problem.from_scenario(scenario)
     law, parameters = plant_law(scenario, problem), plant_parameters(scenario, problem)
     settings = Settings(criterion=criterion.value)

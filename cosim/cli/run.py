@@ -31,14 +31,13 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     Returns the trajectory and the summary. Everything that a clock measured is in timing.csv and
     the summary's `timing`; all other bytes are the same for the same command and seed.
     """
-    from cosim.cli.compose import announce
+    from cosim.cli.compose import announce, load_scenario
     from cosim.files import write_atomically
     from cosim.lookup import build_controller
     from cosim.plant import FmuPlant, IsolatedPlant
-    from cosim.scenario import Scenario
     from cosim.simulation import simulate
 
-    scenario = Scenario.load(run.scenario)
+    scenario = load_scenario(run.scenario)
     folder = open_folder(run.out)
     announce(scenario, output)
     with IsolatedPlant(scenario) if run.isolate else FmuPlant(scenario) as plant:

@@ -27,9 +27,9 @@ def tuning(
         from controllers.economic import tune
         from controllers.factories import value_offset
         from controllers.problem import Problem
-        from cosim.scenario import Scenario
+        from cosim.cli.compose import load_scenario
 
-        loaded = Scenario.load(scenario)
+        loaded = load_scenario(scenario)
         problem = Problem.from_scenario(loaded)
         result = tune(problem, value_offset=value_offset(loaded, problem))
         steady, convex = result.steady_state, result.convexification

@@ -37,9 +37,11 @@ def build_plant(scenario: Scenario, output: Output | None = None) -> FmuPlant:
 
 
 def announce(scenario: Scenario, output: Output) -> None:
-    """Say which native code is about to run, unless it is the package's own."""
+    """Say which native code is about to run, unless it is the package's own, and watch it."""
+    from cosim.cli.supervision import watch
     from cosim.plant.archive import SHIPPED, unpack
 
     if scenario.plant.fmu not in SHIPPED:
         fmu = unpack(scenario.plant.fmu)
+        watch(fmu.path, output.stdout)
         output.note(f"native code of {fmu.path}, sha256 {fmu.sha256}")

@@ -62,7 +62,7 @@ def evaluate(
         named = named_controllers(controllers)
         options = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
         options |= {"first-seed": first_seed} if first_seed else {}
-        folder = open_folder(out)
+        folder = open_folder(out).absolute()
         announce(task, out_)
         optimum = partial(build_controller, "optimal") if has_stored_optimum(task) else None
         extra = seeds if optimum is not None and "optimal" not in named else 0

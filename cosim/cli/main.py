@@ -20,6 +20,7 @@ from cosim.cli import (
     scenario,
     simulate,
     study,
+    supervision,
     train,
     tuning,
     view,
@@ -105,6 +106,14 @@ def main() -> None:
     """
     open_streams()
     unwind_on_sigterm()
+    supervision.enter()
+    try:
+        _run()
+    finally:
+        supervision.finish()
+
+
+def _run() -> None:
     try:
         app()
     except tuple(_known_errors()) as error:

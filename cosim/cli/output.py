@@ -38,6 +38,11 @@ class Output:
         self._stdout = -1
         self._live: Console | None = None
 
+    @property
+    def stdout(self) -> int | None:
+        """The descriptor of standard output while another stands in its place, else None."""
+        return self._stdout if self._stdout >= 0 else None
+
     def console(self) -> Console:
         """Console of standard error, for progress and notes; a note goes above a bar."""
         from rich.console import Console

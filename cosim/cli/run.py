@@ -38,7 +38,7 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     from cosim.simulation import simulate
 
     scenario = load_scenario(run.scenario)
-    folder = open_folder(run.out)
+    folder = open_folder(run.out).absolute()  # an FMU may change the working directory
     announce(scenario, output)
     with IsolatedPlant(scenario) if run.isolate else FmuPlant(scenario) as plant:
         controller = build_controller(run.controller, scenario)

@@ -162,7 +162,7 @@ def train(
             validate_every=validate_every,
             validation_samples=validation_samples,
         )
-        folder = open_folder(out)
+        folder = open_folder(out).absolute()
         if overwrite:
             for name in FILES:
                 (folder / name).unlink(missing_ok=True)

@@ -14,8 +14,8 @@ from fmus.description import MODEL_IDENTIFIER, build_description, model_descript
 from fmus.documentation import RESOURCES, documentation_page
 from fmus.errors import BuildError
 from fmus.header import c_header
+from fmus.model import FmiVersion
 from fmus.own import binaries, compilers
-from fmus.variables import FmiVersion
 
 PACKAGE = Path(__file__).parent
 SOURCES = PACKAGE / "sources"

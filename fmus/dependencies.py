@@ -4,34 +4,34 @@ from __future__ import annotations
 
 from functools import cache
 
-from fmus.variables import BY_NAME, VARIABLES, Kind
+from fmus.model import Kind, Model
+from fmus.variables import EVAPORATOR
 
 _CALCULATED = (Kind.OUTPUT, Kind.DERIVATIVE)
 
 
 @cache
-def closure(name: str) -> frozenset[str]:
+def closure(name: str, model: Model = EVAPORATOR) -> frozenset[str]:
     """All variables that calculated variable `name` depends on, states not resolved further."""
     found: set[str] = set()
-    for used in BY_NAME[name].uses:
+    for used in model.by_name[name].uses:
         found.add(used)
-        if BY_NAME[used].kind in _CALCULATED:
-            found |= closure(used)
+        if model.by_name[used].kind in _CALCULATED:
+            found |= closure(used, model)
     return frozenset(found)
 
 
-def continuous_dependencies(name: str) -> tuple[str, ...]:
+def continuous_dependencies(name: str, model: Model = EVAPORATOR) -> tuple[str, ...]:
     """States and inputs that `name` depends on during the simulation, in table order."""
-    if BY_NAME[name].kind is Kind.STATE:
+    if model.by_name[name].kind is Kind.STATE:
         return (name,)
-    return tuple(
-        v.name for v in VARIABLES if v.name in closure(name) and v.kind in (Kind.STATE, Kind.INPUT)
-    )
+    known = closure(name, model)
+    return tuple(n for n in model.names(Kind.STATE, Kind.INPUT) if n in known)
 
 
-def initial_dependencies(name: str) -> tuple[str, ...]:
+def initial_dependencies(name: str, model: Model = EVAPORATOR) -> tuple[str, ...]:
     """Parameters and inputs that `name` depends on at initialisation, in table order."""
-    names = set(closure(name))
-    for state in [n for n in names if BY_NAME[n].kind is Kind.STATE]:
-        names |= closure(state)
-    return tuple(v.name for v in VARIABLES if v.name in names and v.settable)
+    names = set(closure(name, model))
+    for state in [n for n in names if model.by_name[n].kind is Kind.STATE]:
+        names |= closure(state, model)
+    return tuple(v.name for v in model.variables if v.name in names and v.settable)

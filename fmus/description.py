@@ -5,23 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from xml.etree import ElementTree
 
+from fmus.model import LAWS, FmiVersion, Kind, Model, Type, Unit, Variable
 from fmus.structure import add_structure, index
-from fmus.variables import (
-    LAWS,
-    UNITS,
-    FmiVersion,
-    Kind,
-    Type,
-    Unit,
-    Variable,
-    exported,
-    value_reference,
-)
+from fmus.variables import EVAPORATOR
 
-MODEL_NAME = "Evaporator"
-MODEL_IDENTIFIER = "evaporator"
-MODEL_VERSION = "1.0.0"
-DESCRIPTION = "Stochastic evaporation process, the plant of the RTI co-simulation benchmark"
+MODEL_IDENTIFIER = EVAPORATOR.identifier
 LICENSE = "MIT"
 
 _LOG_CATEGORIES = {
@@ -43,30 +31,36 @@ _INT32 = ("-2147483648", "2147483647")
 _COMMON_CAPABILITIES = {"canBeInstantiatedOnlyOncePerProcess": "false"}
 
 
-def model_description(version: FmiVersion, token: str) -> str:
+def model_description(version: FmiVersion, token: str, model: Model = EVAPORATOR) -> str:
     """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
-    root = _root(version, token)
-    _interfaces(root, version)
-    add_units(root, UNITS)
-    _types(root, version)
+    root = _root(version, token, model)
+    _interfaces(root, version, model)
+    add_units(root, model.units)
+    if any(variable.type is Type.LAW for variable in model.variables):
+        _types(root, version)
     add_categories(root)
     ElementTree.SubElement(
-        root, "DefaultExperiment", startTime="0", stopTime="6000", tolerance="1e-8", stepSize="60"
+        root,
+        "DefaultExperiment",
+        startTime="0",
+        stopTime=f"{model.stop_time:g}",
+        tolerance="1e-8",
+        stepSize=f"{model.step_size:g}",
     )
     variables = ElementTree.SubElement(root, "ModelVariables")
-    for variable in exported(version):
-        (_variable2 if version == 2 else _variable3)(variables, variable)
-    add_structure(root, version)
+    for variable in model.exported(version):
+        (_variable2 if version == 2 else _variable3)(variables, variable, model)
+    add_structure(root, version, model)
     return to_text(root)
 
 
-def build_description(version: FmiVersion) -> str:
+def build_description(version: FmiVersion, model: Model = EVAPORATOR) -> str:
     """The text of sources/buildDescription.xml: one C99 source file, linked with libm."""
     root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
     build = ElementTree.SubElement(
         root,
         "BuildConfiguration",
-        modelIdentifier=MODEL_IDENTIFIER,
+        modelIdentifier=model.identifier,
         description="Shared library; -ffp-contract=off keeps the results bit-identical",
     )
     sources = ElementTree.SubElement(
@@ -84,14 +78,14 @@ def to_text(root: ElementTree.Element) -> str:
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{body}\n'
 
 
-def _root(version: FmiVersion, token: str) -> ElementTree.Element:
+def _root(version: FmiVersion, token: str, model: Model) -> ElementTree.Element:
     key = "guid" if version == 2 else "instantiationToken"
     attributes = {
         "fmiVersion": f"{version}.0",
-        "modelName": MODEL_NAME,
+        "modelName": model.name,
         key: token,
-        "description": DESCRIPTION,
-        "version": MODEL_VERSION,
+        "description": model.description,
+        "version": model.version,
         "license": LICENSE,
         "generationTool": "rti-cosim",
         "variableNamingConvention": "structured",
@@ -101,24 +95,27 @@ def _root(version: FmiVersion, token: str) -> ElementTree.Element:
     return ElementTree.Element("fmiModelDescription", attributes)
 
 
-def _interfaces(root: ElementTree.Element, version: FmiVersion) -> None:
-    exchange = {"modelIdentifier": MODEL_IDENTIFIER, **_COMMON_CAPABILITIES}
+def _interfaces(root: ElementTree.Element, version: FmiVersion, model: Model) -> None:
+    derivatives = "true" if model.derivatives else "false"
+    exchange = {"modelIdentifier": model.identifier, **_COMMON_CAPABILITIES}
     if version == 2:
         exchange |= {
             "canNotUseMemoryManagementFunctions": "true",
             "canGetAndSetFMUstate": "true",
             "canSerializeFMUstate": "true",
-            "providesDirectionalDerivative": "true",
+            "providesDirectionalDerivative": derivatives,
         }
     else:
         exchange |= {
             "canGetAndSetFMUState": "true",
             "canSerializeFMUState": "true",
-            "providesDirectionalDerivatives": "true",
-            "providesAdjointDerivatives": "true",
+            "providesDirectionalDerivatives": derivatives,
+            "providesAdjointDerivatives": derivatives,
         }
     simulation = {**exchange, "canHandleVariableCommunicationStepSize": "true"}
     for tag, attributes in (("ModelExchange", exchange), ("CoSimulation", simulation)):
+        if tag == "ModelExchange" and not model.model_exchange:
+            continue
         element = ElementTree.SubElement(root, tag, attributes)
         if version == 2:
             sources = ElementTree.SubElement(element, "SourceFiles")
@@ -189,9 +186,9 @@ def _state_of(variable: Variable) -> str:
     return variable.name.removeprefix("der(").removesuffix(")")
 
 
-def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
+def _variable2(parent: ElementTree.Element, variable: Variable, model: Model) -> None:
     scalar = ElementTree.SubElement(
-        parent, "ScalarVariable", common_attributes(variable, value_reference(variable.name))
+        parent, "ScalarVariable", common_attributes(variable, model.value_reference(variable.name))
     )
     if variable.type is Type.BOOLEAN:
         ElementTree.SubElement(scalar, "Boolean", _boolean(variable))
@@ -204,12 +201,12 @@ def _variable2(parent: ElementTree.Element, variable: Variable) -> None:
     else:
         attributes = real_attributes(variable)
         if variable.kind is Kind.DERIVATIVE:
-            attributes["derivative"] = str(index(_state_of(variable)))
+            attributes["derivative"] = str(index(_state_of(variable), model))
         ElementTree.SubElement(scalar, "Real", attributes)
 
 
-def _variable3(parent: ElementTree.Element, variable: Variable) -> None:
-    attributes = common_attributes(variable, value_reference(variable.name))
+def _variable3(parent: ElementTree.Element, variable: Variable, model: Model) -> None:
+    attributes = common_attributes(variable, model.value_reference(variable.name))
     if variable.type is Type.BOOLEAN:
         ElementTree.SubElement(parent, "Boolean", attributes | _boolean(variable))
     elif variable.type is Type.LAW:
@@ -221,5 +218,5 @@ def _variable3(parent: ElementTree.Element, variable: Variable) -> None:
     else:
         attributes |= real_attributes(variable)
         if variable.kind is Kind.DERIVATIVE:
-            attributes["derivative"] = str(value_reference(_state_of(variable)))
+            attributes["derivative"] = str(model.value_reference(_state_of(variable)))
         ElementTree.SubElement(parent, "Float64", attributes)

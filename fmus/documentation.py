@@ -6,8 +6,9 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from fmus.description import DESCRIPTION, LICENSE, MODEL_VERSION
-from fmus.variables import FmiVersion, Variable, exported, value_reference
+from fmus.description import LICENSE
+from fmus.model import FmiVersion, Variable
+from fmus.variables import EVAPORATOR, exported, value_reference
 
 RESOURCES = Path(__file__).parent / "resources"
 
@@ -16,9 +17,9 @@ def documentation_page(version: FmiVersion, build_file: str) -> str:
     """The text of documentation/index.html; `build_file` names the record of the build."""
     template = Template((RESOURCES / "documentation.html").read_text(encoding="utf-8"))
     return template.substitute(
-        description=escape(DESCRIPTION),
+        description=escape(EVAPORATOR.description),
         fmi_version=f"{version}.0",
-        model_version=MODEL_VERSION,
+        model_version=EVAPORATOR.version,
         license=LICENSE,
         diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
         rows="\n".join(_row(variable) for variable in exported(version)),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 
-from fmus.variables import VARIABLES, Kind, Type, Variable
+from fmus.model import Kind, Type, Variable
+from fmus.variables import VARIABLES
 
 _TYPES = {
     Type.REAL: "REAL",

@@ -1,74 +1,17 @@
-"""The one table of the evaporator's variables.
+"""The table of the evaporator's variables.
 
-Both model descriptions, the C header and the documentation page are generated from `VARIABLES`.
-A variable's value reference is its position in the table, the same in FMI 2.0 and FMI 3.0.
+Both model descriptions, the C header and the documentation page are generated from it. A
+variable's value reference is its position in the table, the same in FMI 2.0 and FMI 3.0.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
-from enum import StrEnum
-from typing import Literal
+from fmus.model import LAWS, FmiVersion, Kind, Model, Type, Unit, Variable
 
-
-class Kind(StrEnum):
-    """What a variable is to an importer."""
-
-    INDEPENDENT = "independent"
-    INPUT = "input"
-    STATE = "state"
-    DERIVATIVE = "derivative"
-    OUTPUT = "output"
-    FIXED = "fixed parameter"
-    TUNABLE = "tunable parameter"
-
-
-class Type(StrEnum):
-    """Value type; `SEED_HIGH` is the upper half of the seed and exists in FMI 2.0 alone."""
-
-    REAL = "Real"
-    BOOLEAN = "Boolean"
-    LAW = "Law"
-    SEED = "Seed"
-    SEED_HIGH = "SeedHigh"
-
-
-@dataclass(frozen=True)
-class Variable:
-    """One variable: its unit, range and the variables that its equation names (`uses`)."""
-
-    name: str
-    kind: Kind
-    type: Type
-    unit: str
-    start: float | None
-    min: float | None
-    max: float | None
-    nominal: float | None
-    description: str
-    uses: tuple[str, ...] = ()
-
-    @property
-    def settable(self) -> bool:
-        """Whether an importer gives its value (parameters and inputs)."""
-        return self.kind in (Kind.INPUT, Kind.FIXED, Kind.TUNABLE)
-
-    @property
-    def identifier(self) -> str:
-        """The name as a C identifier: ``der(X2)`` becomes ``der_X2``, ``p.x[0]`` ``p_x_0_``."""
-        return re.sub(r"\W", "_", self.name.replace(")", ""))
-
-
-@dataclass(frozen=True)
-class Unit:
-    """A unit and its SI form: value_SI = factor · value + offset, with exponents of base units."""
-
-    name: str
-    factor: float = 1.0
-    offset: float = 0.0
-    exponents: tuple[tuple[str, int], ...] = ()
-
+__all__ = [
+    "BY_NAME", "DISTURBANCES", "EVAPORATOR", "LAWS", "STATES", "UNITS", "VARIABLES", "FmiVersion",
+    "Kind", "Type", "Unit", "Variable", "exported", "value_reference",
+]  # fmt: skip
 
 UNITS = (
     Unit("1"),
@@ -90,11 +33,6 @@ UNITS = (
     Unit("kW/K", 1e3, 0.0, (("kg", 1), ("m", 2), ("s", -3), ("K", -1))),
     Unit("kW.min/kg", 6e4, 0.0, (("m", 2), ("s", -2))),
     Unit("kW.min/(kg.K)", 6e4, 0.0, (("m", 2), ("s", -2), ("K", -1))),
-)
-
-LAWS = (
-    ("uniform", 1, "nominal + range (2 U - 1), U uniform on [0, 1)"),
-    ("normal", 2, "nominal + range Z, Z standard normal"),
 )
 
 DISTURBANCES = ("X1", "F1", "T1", "T200")
@@ -232,21 +170,27 @@ VARIABLES: tuple[Variable, ...] = (
             "UA2 fouling_rate fouling_floor cleaning_period sampling_time time"),
 )  # fmt: skip
 
-FmiVersion = Literal[2, 3]
+EVAPORATOR = Model(
+    name="Evaporator",
+    identifier="evaporator",
+    version="1.0.0",
+    description="Stochastic evaporation process, the plant of the RTI co-simulation benchmark",
+    variables=VARIABLES,
+    units=UNITS,
+    stop_time=6000.0,
+    step_size=60.0,
+    model_exchange=True,
+    derivatives=True,
+)
 
-BY_NAME = {variable.name: variable for variable in VARIABLES}
+BY_NAME = EVAPORATOR.by_name
 
 
 def value_reference(name: str) -> int:
-    """The value reference of variable `name`; KeyError when there is none."""
-    return VARIABLES.index(BY_NAME[name])
+    """The value reference of the evaporator's variable `name`; KeyError when there is none."""
+    return EVAPORATOR.value_reference(name)
 
 
 def exported(version: FmiVersion) -> list[Variable]:
-    """The variables of the table that FMI `version` shows.
-
-    FMI 3.0 has the whole seed in one variable; FMI 2.0 shows no time, which FMI Library refuses.
-    """
-    if version == 2:
-        return [v for v in VARIABLES if v.kind is not Kind.INDEPENDENT]
-    return [v for v in VARIABLES if v.type is not Type.SEED_HIGH]
+    """The evaporator's variables that FMI `version` shows."""
+    return EVAPORATOR.exported(version)

@@ -73,6 +73,8 @@ class Instance:
         self._slave = self._load()
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
+        self._free_instance = self._slave.dll[f"{self.prefix}FreeInstance"]
+        self._free_instance.restype = None
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
         self.inputs, self.inputs_view, self._set_inputs = self._exchange(wiring.inputs)
@@ -220,7 +222,10 @@ class Instance:
         return f": {text}" if text else ""
 
     def close(self) -> None:
-        """Free the instance; after a fatal error FMI forbids every call, this one too."""
+        """Free the instance; after a fatal error FMI forbids every call, this one too.
+
+        The library stays loaded, as fmpy would not leave it: the FMU may have started threads.
+        """
         _alive[self.fmu.sha256] -= 1
         if not self.fatal:
-            self._slave.freeInstance()
+            self._free_instance(self._component)

@@ -1,4 +1,4 @@
-/* The standardised disturbances of sample k: one Philox block for (X1, F1), one for (T1, T200).
+/* The standardised disturbances of sample k: one Philox block for each two of them.
  *
  * key = (seed, seedHigh); counter = (low word of k, high word of k, block, 0). Words 0 and 1 of a
  * block give U of its first disturbance, words 2 and 3 that of its second. They are a function of
@@ -11,12 +11,13 @@
 
 #include "elementary.h"
 #include "philox.h"
+#include "states.h"
 
-enum { LAW_UNIFORM = 1, LAW_NORMAL = 2, N_DISTURBANCES = 4 };
+enum { LAW_UNIFORM = 1, LAW_NORMAL = 2, N_BLOCKS = (N_DISTURBANCES + 1) / 2 };
 
 static void standard_draws(const uint32_t key[2], int64_t sample, int law,
-                           double draws[N_DISTURBANCES]) {
-    for (uint32_t block = 0; block < 2; block++) {
+                           double draws[2 * N_BLOCKS]) {
+    for (uint32_t block = 0; block < N_BLOCKS; block++) {
         const uint64_t k = (uint64_t)sample;
         const uint32_t counter[4] = {(uint32_t)k, (uint32_t)(k >> 32), block, 0};
         uint32_t word[4];

@@ -7,18 +7,9 @@
 #define EVENTS_H
 
 #include "outputs.h"
-
-enum { N_STATES = 2 };
-
-static const unsigned STATE_REFERENCES[N_STATES] = {VR_X2, VR_P2};
-static const unsigned DERIVATIVE_REFERENCES[N_STATES] = {VR_der_X2, VR_der_P2};
+#include "states.h"
 
 #include "exchange.h"
-
-static int has_time_events(const State *state) {
-    const int draws = state->v[VR_stochastic] != 0.0 && state->v[VR_override] == 0.0;
-    return draws || fouls(state->v);
-}
 
 static double next_event_time(const State *state) {
     return (double)(state->sample + 1) * state->v[VR_sampling_time];
@@ -26,7 +17,7 @@ static double next_event_time(const State *state) {
 
 static Status update_discrete_state(Instance *instance, const char *function) {
     State *state = &instance->state;
-    const Grid grid = make_grid(state->v[VR_sampling_time]);
+    const Grid grid = model_grid(state);
     const Status status = check_stop_time(instance, function, state->v[VR_time]);
     if (status != OK) return status;
     move_to_sample(state, sample_of(grid, locate(grid, state->v[VR_time]).point));

@@ -6,7 +6,7 @@
 
 typedef struct {
     int64_t drawn; /* whether `draws` is that of the sample in force */
-    double draws[N_DISTURBANCES];
+    double draws[2 * N_BLOCKS];
 } ModelState;
 
 /* Interfaces beside co-simulation. */

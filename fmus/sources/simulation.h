@@ -3,25 +3,11 @@
 #define SIMULATION_H
 
 #include "experiment.h"
+#include "integration.h"
+#include "states.h"
 
 /* Integration steps in one call: half a year of seconds, at most about two seconds of computing. */
 #define MAX_STEPS_PER_CALL 16777216
-
-/* Integrate between two positions of one sample, in which inputs, disturbances and fouling are constant. */
-static void integrate(double v[N_VARIABLES], Grid grid, GridPosition from, GridPosition to) {
-    const Rates rates = held_rates(v);
-    int64_t whole = to.point - from.point;
-    if (whole == 0) {
-        runge_kutta(v, rates, (to.fraction - from.fraction) * grid.step, 1);
-        return;
-    }
-    if (from.fraction > 0.0) {
-        runge_kutta(v, rates, (1.0 - from.fraction) * grid.step, 1);
-        whole--;
-    }
-    runge_kutta(v, rates, grid.step, whole);
-    if (to.fraction > 0.0) runge_kutta(v, rates, to.fraction * grid.step, 1);
-}
 
 /* Go through the samples between two positions. */
 static void advance(State *state, Grid grid, GridPosition from, GridPosition to) {
@@ -41,7 +27,7 @@ static void advance(State *state, Grid grid, GridPosition from, GridPosition to)
 
 static Status do_step(Instance *instance, const char *function, double time, double h) {
     State *state = &instance->state;
-    const Grid grid = make_grid(state->v[VR_sampling_time]);
+    const Grid grid = model_grid(state);
     const double end = time + h;
     State before;
     const Status status = check_step(instance, function, time, h);
@@ -52,7 +38,8 @@ static Status do_step(Instance *instance, const char *function, double time, dou
                       function, h, MAX_STEPS_PER_CALL);
     before = *state;
     advance(state, grid, from, to);
-    if (!isfinite(state->v[VR_X2]) || !isfinite(state->v[VR_P2])) {
+    for (int i = 0; i < N_STATES; i++) {
+        if (isfinite(state->v[STATE_REFERENCES[i]])) continue;
         *state = before;
         return report(instance, ERROR, "%s: the states left the finite numbers.", function);
     }

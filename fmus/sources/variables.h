@@ -2,7 +2,7 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{e8350973-0974-5d25-895e-cf69be22819b}"
+#define MODEL_TOKEN "{8bbeae57-d549-5faf-aa93-a261ae94030f}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
 #define LAYOUT_DIGEST UINT64_C(0xe41af7b351f96337)

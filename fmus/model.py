@@ -1,0 +1,118 @@
+"""What an FMU of ours is made of: its variables, units and interfaces, for any model."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import Literal
+
+FmiVersion = Literal[2, 3]
+
+
+class Kind(StrEnum):
+    """What a variable is to an importer."""
+
+    INDEPENDENT = "independent"
+    INPUT = "input"
+    STATE = "state"
+    DERIVATIVE = "derivative"
+    OUTPUT = "output"
+    FIXED = "fixed parameter"
+    TUNABLE = "tunable parameter"
+
+
+class Type(StrEnum):
+    """Value type; `SEED_HIGH` is the upper half of the seed and exists in FMI 2.0 alone."""
+
+    REAL = "Real"
+    BOOLEAN = "Boolean"
+    LAW = "Law"
+    SEED = "Seed"
+    SEED_HIGH = "SeedHigh"
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable: its unit, range and the variables that its equation names (`uses`)."""
+
+    name: str
+    kind: Kind
+    type: Type
+    unit: str
+    start: float | None
+    min: float | None
+    max: float | None
+    nominal: float | None
+    description: str
+    uses: tuple[str, ...] = ()
+
+    @property
+    def settable(self) -> bool:
+        """Whether an importer gives its value (parameters and inputs)."""
+        return self.kind in (Kind.INPUT, Kind.FIXED, Kind.TUNABLE)
+
+    @property
+    def identifier(self) -> str:
+        """The name as a C identifier: ``der(X2)`` becomes ``der_X2``, ``p.x[0]`` ``p_x_0_``."""
+        return re.sub(r"\W", "_", self.name.replace(")", ""))
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit and its SI form: value_SI = factor · value + offset, with exponents of base units."""
+
+    name: str
+    factor: float = 1.0
+    offset: float = 0.0
+    exponents: tuple[tuple[str, int], ...] = ()
+
+
+LAWS = (
+    ("uniform", 1, "nominal + range (2 U - 1), U uniform on [0, 1)"),
+    ("normal", 2, "nominal + range Z, Z standard normal"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A model: its name, C identifier, table of variables with their units, and interfaces.
+
+    A variable's value reference is its position in the table. `stop_time` and `step_size` [s] are
+    the default experiment's; `model_exchange` and `derivatives` (directional, in FMI 3.0 adjoint,
+    too) say what it offers beside co-simulation.
+    """
+
+    name: str
+    identifier: str
+    version: str
+    description: str
+    variables: tuple[Variable, ...]
+    units: tuple[Unit, ...]
+    stop_time: float
+    step_size: float
+    model_exchange: bool = False
+    derivatives: bool = False
+
+    @cached_property
+    def by_name(self) -> dict[str, Variable]:
+        """Each variable by its name."""
+        return {variable.name: variable for variable in self.variables}
+
+    def value_reference(self, name: str) -> int:
+        """The value reference of variable `name`; KeyError when there is none."""
+        return self.variables.index(self.by_name[name])
+
+    def names(self, *kinds: Kind) -> list[str]:
+        """The names of the variables of these kinds, in table order."""
+        return [variable.name for variable in self.variables if variable.kind in kinds]
+
+    def exported(self, version: FmiVersion) -> list[Variable]:
+        """The variables of the table that FMI `version` shows.
+
+        FMI 3.0 has the whole seed in one variable; FMI 2.0 shows no time: FMI Library refuses it.
+        """
+        if version == 2:
+            return [v for v in self.variables if v.kind is not Kind.INDEPENDENT]
+        return [v for v in self.variables if v.type is not Type.SEED_HIGH]

@@ -14,7 +14,8 @@ AREA = {"A1": 28.0, "A2": 32.0, "A3": 28.0, "A4": 32.0}  # cm2
 HOLE = {"a1": 0.071, "a2": 0.057, "a3": 0.071, "a4": 0.057}  # cm2
 PUMP = {"k1": 3.33, "k2": 3.35}  # cm3/(V s)
 SPLIT = {"split1": 0.70, "split2": 0.60}  # shares of a pump that go to the lower tank
-LEVELS = ("h1", "h2", "h3", "h4")
+START = {"h1": 10.0, "h2": 10.0, "h3": 2.0, "h4": 2.0}
+LEVELS = tuple(START)
 
 
 def table():
@@ -22,8 +23,7 @@ def table():
     return plant_model(
         "quadruple_tank",
         description="Quadruple tank with water drawn at random from the lower tanks",
-        states=[Signal(h, "cm", 10.0 if h in ("h1", "h2") else 2.0, 0.0, 50.0, f"level of tank {h[1]}")
-                for h in LEVELS],
+        states=[Signal(h, "cm", START[h], 0.0, 50.0, f"level of tank {h[1]}") for h in LEVELS],
         inputs=[Signal(v, "V", 3.0, 0.0, 10.0, f"voltage of pump {v[1]}") for v in ("v1", "v2")],
         disturbances=[Signal(d, "cm3/s", 3.0, -20.0, 20.0, f"water drawn from tank {d[1]}", 3.0)
                       for d in ("d1", "d2")],
@@ -31,7 +31,7 @@ def table():
         parameters=[
             *(Signal(n, "cm2", x, 1.0, 1e3, f"area of tank {n[1]}") for n, x in AREA.items()),
             *(Signal(n, "cm2", x, 1e-3, 1.0, f"hole of tank {n[1]}") for n, x in HOLE.items()),
-            *(Signal(n, "cm3/(V.s)", x, 0.0, 20.0, f"flow of pump {n[1]}") for n, x in PUMP.items()),
+            *(Signal(n, "cm3/(V.s)", x, 0.0, 20.0, f"pump {n[1]}'s flow") for n, x in PUMP.items()),
             *(Signal(n, "1", x, 0.0, 1.0, f"share of pump {n[-1]} into the lower tank")
               for n, x in SPLIT.items()),
         ],

@@ -1,0 +1,174 @@
+"""The example plants: built, in agreement with the controller's model, run and learnt from."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from controllers.factories import naive
+from cosim import FmuPlant, Scenario, simulate
+from fmus.checks import Status, check
+from fmus.plant import build_plant
+from tests.helpers.tank import edited, without_attribute
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+NAMES = ("quadruple_tank", "reactor")
+
+
+class Example:
+    """A copy of an example with its FMU built, for FMI 2.0 and 3.0."""
+
+    def __init__(self, name, folder):
+        self.name, self.folder = name, folder
+        for path in (EXAMPLES / name).glob("*.[pth]*"):
+            shutil.copy(path, folder)
+        self.module = __import__(name)
+        self.equations = (folder / "equations.h").read_bytes()
+        self.fmu = self.build(folder / f"{name}.fmu", 2)
+        self.fmu3 = self.build(folder / f"{name}3.fmu", 3)
+        self.scenario = Scenario.load(folder / f"{name}.toml")
+
+    def build(self, target, version):
+        return build_plant(self.module.table(), self.equations, target, version)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def example(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLES / request.param))
+        yield Example(request.param, folder)
+
+
+def cosim(folder, *words):
+    command = [sys.executable, "-m", "cosim", *words, "--json"]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def test_each_is_a_hundred_lines_of_equations_table_and_model(example):
+    files = ["equations.h", f"{example.name}.py", f"{example.name}.toml"]
+    assert sum(len((example.folder / name).read_text().splitlines()) for name in files) <= 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", [2, 3])
+def test_every_installed_importer_passes(example, version):
+    findings = check(example.fmu if version == 2 else example.fmu3)
+    allowed = (Status.PASSED, Status.NOT_INSTALLED, Status.NOT_OFFERED)
+    assert [f for f in findings if f.status not in allowed] == []
+    assert sum(f.status is Status.PASSED for f in findings) >= 4
+
+
+@pytest.mark.slow
+def test_two_builds_are_byte_identical(example, tmp_path):
+    again = example.build(tmp_path / example.fmu.name, 2)
+    assert again.read_bytes() == example.fmu.read_bytes()
+
+
+def test_both_fmi_versions_give_the_same_bits(example):
+    rows = []
+    for fmu in (example.fmu, example.fmu3):
+        with FmuPlant(example.scenario, fmu) as plant:
+            rows.append(simulate(plant, naive(example.scenario), 100, seed=2**40 + 1))
+    np.testing.assert_array_equal(rows[0].states, rows[1].states)
+    np.testing.assert_array_equal(rows[0].disturbances, rows[1].disturbances)
+    np.testing.assert_array_equal(rows[0]["stage_cost"], rows[1]["stage_cost"])
+
+
+def test_plant_and_model_agree_where_their_parameters_do(example):
+    """CVODES on the controller's model against the FMU's steps, under random actions."""
+    scenario = example.scenario
+    model = example.module.model()
+    n, m, k = len(model.states), len(model.actions), len(model.disturbances)
+    x, u, d = ca.MX.sym("x", n), ca.MX.sym("u", m), ca.MX.sym("d", k)
+    p = ca.DM([quantity.nominal for quantity in model.parameters])
+    dae = {"x": x, "p": ca.vertcat(u, d), "ode": model.ode(x, u, d, p)}
+    span = scenario.sampling_time / model.time_unit
+    flow = ca.integrator("flow", "cvodes", dae, 0.0, span, {"reltol": 1e-10, "abstol": 1e-12})
+    cost = ca.Function("cost", [x, u, d], [model.economic_cost(x, u, d, p)])
+    lower, upper = scenario.action_lower, scenario.action_upper
+    rng = np.random.default_rng(0)
+    nominal = {q.name: q.nominal for q in model.parameters}
+    true = {name: nominal[name] for name in scenario.plant.parameters}
+    with FmuPlant(scenario.replace({"plant": {"parameters": true}})) as plant:
+        state = plant.reset(1)
+        for _ in range(20):
+            action = scenario.reference_action + 0.1 * (upper - lower) * rng.uniform(-1, 1, m)
+            step = plant.step(action)
+            after = flow(x0=state, p=np.concatenate([action, step.disturbance]))["xf"]
+            np.testing.assert_allclose(step.s, np.array(after).ravel(), rtol=1e-6)
+            expected = float(cost(state, action, step.disturbance))
+            assert step.stage_cost == pytest.approx(expected, rel=1e-10)
+            state = step.s
+
+
+def test_draws_fill_their_ranges_and_repeat_with_the_seed(example):
+    scenario = example.scenario
+    with FmuPlant(scenario) as plant:
+        first, again, other = (simulate(plant, naive(scenario), 300, seed=s) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first.disturbances, again.disturbances)
+    assert not np.isin(first.disturbances, other.disturbances).any()
+    law = scenario.disturbance
+    offset = (first.disturbances - law.nominal) / law.ranges
+    assert np.abs(offset).max() <= 1.0
+    np.testing.assert_allclose(offset.std(axis=0), 1 / np.sqrt(3), rtol=0.1)
+
+
+def test_snapshots_are_carried_to_another_process(example):
+    action = example.scenario.reference_action
+    with FmuPlant(example.scenario) as plant, FmuPlant(example.scenario) as other:
+        plant.reset(3)
+        plant.step(action)
+        data = plant.serialise(plant.snapshot())
+        expected = plant.step(action).s
+        other.restore(other.deserialise(data))
+        np.testing.assert_array_equal(other.step(action).s, expected)
+
+
+@pytest.mark.slow
+def test_it_runs_from_the_command_line(example):
+    words = ["simulate", "--scenario", f"{example.name}.toml", "--steps", "200", "--out", "run"]
+    summary = cosim(example.folder, *words)
+    assert summary["failures"] == 0
+    assert summary["statuses"] == {"solved": 200}
+
+
+def test_a_bound_is_active_so_that_the_naive_controller_pays(example):
+    """Not a toy: the noise alone costs more than a tenth of the steady state's cost."""
+    scenario = example.scenario
+    with FmuPlant(scenario) as plant:
+        summary = simulate(plant, naive(scenario), 500, seed=0).summary()
+    assert summary["violating_share"] > 0.3
+    assert summary["J"] > 1.1 * scenario.controller.reference_cost
+
+
+@pytest.mark.slow
+def test_tuning_finds_the_stored_reference_from_beside_the_scenario(example, tmp_path):
+    found = cosim(tmp_path, "tuning", "--scenario", str(example.folder / f"{example.name}.toml"))
+    steady = found["steady_state"]
+    np.testing.assert_allclose(steady["states"], example.scenario.reference_state, rtol=1e-6)
+    np.testing.assert_allclose(steady["actions"], example.scenario.reference_action, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_plant_that_cannot_save_its_state_leaves_no_checkpoint_and_says_so(example):
+    drop = without_attribute("canGetAndSetFMUstate", "canSerializeFMUstate")
+    plain = edited(example.fmu, example.folder / "plain.fmu", drop)
+    text = (example.folder / f"{example.name}.toml").read_text()
+    (example.folder / "plain.toml").write_text(text.replace(example.fmu.name, plain.name))
+    command = [sys.executable, "-m", "cosim", "train", "-s", "plain.toml", "-a", "q-learning"]
+    command += ["--samples", "60", "--log-every", "60", "--evaluate-every", "60"]
+    command += ["--checkpoint-every", "60", "--out", "short"]
+    result = subprocess.run(
+        command, cwd=example.folder, capture_output=True, text=True, check=False
+    )
+    assert "canGetAndSetFMUstate" in result.stderr
+    assert "native code of" in result.stderr
+    assert not (example.folder / "short" / "checkpoint.npz").exists()

@@ -43,8 +43,9 @@ def hold(folder: Path) -> None:
     (folder / HOLDER).write_text(json.dumps(holder), "utf-8")
 
 
-def release() -> None:
-    """Give back every lock that this process holds, and leave no trace of them."""
+def release() -> list[Path]:
+    """Give back every lock that this process holds, and leave no trace of them; the folders."""
+    folders = list(_held)
     while _held:
         folder, lock = _held.popitem()
         # Removed while it is held: whoever opens it meanwhile finds it gone and makes another.
@@ -52,6 +53,7 @@ def release() -> None:
             with suppress(OSError):
                 (folder / name).unlink()
         lock.release()
+    return folders
 
 
 def _holder(folder: Path) -> str:

@@ -14,7 +14,8 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-from cosim.errors import PlantError
+from cosim.cli.locking import hold, release
+from cosim.errors import CosimError, PlantError
 from cosim.lifetime import Terminated, follow_parent
 
 MARK = "COSIM_FINISHED"
@@ -51,13 +52,17 @@ def watch(fmu: Path, stdout: int | None) -> None:
         return
     flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
     command = [sys.executable, *flags, "-m", "cosim", *sys.argv[1:]]
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as folder:
-        mark = Path(folder) / "finished"
+    folders = release()  # for the process that does the work
+    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
+        mark = Path(temporary) / "finished"
         child = subprocess.Popen(command, stdout=stdout, env=os.environ | {MARK: str(mark)})
         code = _outcome(child)
         finished = mark.exists()
     if finished and code >= 0:
         sys.exit(code)
+    for folder in folders:  # so that the locks of a process that was killed are cleared away
+        with suppress(CosimError, OSError):
+            hold(folder)
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
     raise PlantError(
         f"FMU '{fmu}', or other native code, ended the process {how} before the command finished"

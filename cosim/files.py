@@ -141,6 +141,16 @@ def read_csv(path: str | Path, error: type[Exception]) -> list[list[str]]:
     return rows
 
 
+def parse_rows(text: str) -> list[list[str]]:
+    """Rows of CSV text, its header first."""
+    return list(csv.reader(io.StringIO(text)))
+
+
+def parse_records(text: str) -> list[dict[str, str]]:
+    """Rows of CSV text by column."""
+    return list(csv.DictReader(io.StringIO(text)))
+
+
 def read_records(path: str | Path, error: type[Exception]) -> list[dict[str, str]]:
     """Rows of a CSV file by column; raises `error` where it cannot be read or a row is torn."""
     header, *rows = read_csv(path, error)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,7 +24,7 @@ from cosim.experiments.summary import (
 )
 from cosim.experiments.tables import CURVES, RUNS, TIMING, curves_csv, evaluation_csv, to_csv
 from cosim.experiments.traces import draw, keep
-from cosim.files import write_atomically
+from cosim.files import parse_records, write_atomically
 
 Array = NDArray[np.float64]
 SUMMARY, AGGREGATE = "summary.csv", "aggregate.csv"
@@ -112,7 +110,7 @@ def _result(run: Run, store: RunStore) -> RunResult | None:
 
 
 def _curve(log: str) -> dict[str, Array]:
-    rows = list(csv.DictReader(io.StringIO(log)))
+    rows = parse_records(log)
     return {
         name: np.array([float(row.get(name) or "nan") for row in rows], dtype=np.float64)
         for name in CURVE

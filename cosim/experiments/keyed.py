@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from cosim.errors import ResultsError
+from cosim.files import csv_text, parse_rows
 from cosim.trajectory import Signal
 
 Key = tuple[str, ...]
@@ -42,7 +41,7 @@ def read(text: str, keys: Sequence[str], drop: Sequence[str], origin: str) -> Ke
     Raises ResultsError if a key's column is missing, two rows have the same keys, or another column
     holds something else than numbers.
     """
-    header, *body = list(csv.reader(io.StringIO(text)))
+    header, *body = parse_rows(text)
     names = [title.partition(" [")[0] for title in header]
     for key in keys:
         if key not in names:
@@ -65,12 +64,8 @@ def read(text: str, keys: Sequence[str], drop: Sequence[str], origin: str) -> Ke
 
 def rounded_csv(text: str) -> str:
     """A CSV with numbers of eight digits, as tables are stored: a last bit is no change."""
-    rows = list(csv.reader(io.StringIO(text)))
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(rows[0])
-    writer.writerows([rounded(cell) for cell in row] for row in rows[1:])
-    return stream.getvalue()
+    header, *rows = parse_rows(text)
+    return csv_text(header, ([rounded(cell) for cell in row] for row in rows))
 
 
 def rounded(cell: str) -> str:

@@ -8,7 +8,6 @@ Only the process that runs the study writes, so workers need no shared disk.
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import shutil
@@ -20,7 +19,7 @@ from typing import Any
 from cosim.errors import StudyError
 from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Progress
-from cosim.files import cell, csv_text, write_atomically
+from cosim.files import cell, csv_text, read_records, write_atomically
 
 RUNS = "runs"
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
@@ -141,13 +140,12 @@ class RunStore:
         if not path.is_file():
             return {}
         try:
-            with path.open(newline="", encoding="utf-8") as stream:
-                return {
-                    int(row["seed"]): {name: float(row[name] or "nan") for name in INDICATORS}
-                    for row in csv.DictReader(stream)
-                    if int(row["steps"]) == steps
-                }
-        except (OSError, UnicodeDecodeError, csv.Error, KeyError, TypeError, ValueError):
+            return {
+                int(row["seed"]): {name: float(row[name] or "nan") for name in INDICATORS}
+                for row in read_records(path, StudyError)
+                if int(row["steps"]) == steps
+            }
+        except (StudyError, KeyError, ValueError):
             raise StudyError(f"'{path}' is damaged; delete it to evaluate again") from None
 
     def evaluate(self, file: str, steps: int, fresh: Indicators) -> None:

@@ -15,6 +15,7 @@ from learning.critic import AdvantageRegression, lstdv
 from learning.exploration import Strategy
 from learning.fit import policy_gradient_fit
 from learning.globalised import GlobalisedLearning, Rule
+from learning.kalman_q_learning import KalmanConfiguration, KalmanQLearning
 from learning.protocols import LearnableController, Transition, Update
 from learning.schedule import Geometric
 
@@ -38,12 +39,19 @@ class ActorCriticConfiguration(Configuration):
     ridge: Positive = Field(
         1e-4, description="ridge of regression and metric, relative to the mean of their diagonals"
     )
-    step_size: Positive = Field(2.0, description="α of the fit, before the trust region")
+    step_size: Positive = Field(0.08, description="α of the fit, before the trust region")
     radius: Positive = Field(
-        2.0, description="trust region at the start: RMS change of the action, in its units"
+        0.4,
+        description="trust region at the start: RMS change of the action, in the exploration's "
+        "standard deviations",
     )
     radius_end: Positive = Field(
-        0.2, description="trust region at the end, approached geometrically"
+        0.04, description="trust region at the end, approached geometrically"
+    )
+    q_learning_first: bool = Field(
+        True,
+        description="validated: phases of Q-learning by the Kalman filter come first and in turn, "
+        "since a policy gradient finds no way out of a start that violates its bounds",
     )
 
 
@@ -73,6 +81,8 @@ class PolicyGradient:
         )
         self._discount = configuration.critic_discount
         self._step = ConstrainedStep(controller, configuration)
+        # Actions count in the exploration's standard deviations.
+        self._unit = np.broadcast_to(configuration.deviation(scenario), scenario.action_lower.shape)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
         rows = configuration.batch_size
         self._batch: dict[str, NDArray[Any]] = {
@@ -112,12 +122,12 @@ class PolicyGradient:
         bias = self._strategy.bias(batch["policy"][explored], batch["number"][explored])
         deviation = np.zeros_like(batch["deviation"])
         deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
-        return deviation
+        return deviation / self._unit
 
     def _update(self, number: int) -> Update:
         settings, batch = self._configuration, self._batch
         errors = lstdv(batch["states"], batch["next_states"], batch["reward"], self._discount)
-        jacobian = batch["jacobian"] * self._step.scale
+        jacobian = batch["jacobian"] * self._step.scale / self._unit[:, None]
         advantage = np.einsum("kmi,km->ki", jacobian, self._deviation())
         self._advantage.add(advantage, errors)
         weights = self._advantage.weights()
@@ -156,14 +166,18 @@ class ActorCritic(GlobalisedLearning):
 
     Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
 
+    _made = 0
+
     def rule(self, samples: int, width: float) -> Rule:
-        """The policy gradient with a trust region `width` times as wide."""
-        return PolicyGradient(
-            self._controller,
-            self._scenario,
-            self._configuration,
-            samples,
-            self._strategy,
-            self._rng,
-            width=width,
-        )
+        """The policy gradient, in turn with Q-learning where that comes first.
+
+        Its trust region, or the prior's width, is `width` times as wide.
+        """
+        settings: ActorCriticConfiguration = self._configuration
+        shared = (samples, self._strategy, self._rng)
+        self._made += 1
+        if settings.q_learning_first and settings.globalised and self._made % 2:
+            common = {name: getattr(settings, name) for name in Configuration.model_fields}
+            q = KalmanConfiguration(**common)
+            return KalmanQLearning(self._controller, self._scenario, q, *shared, width=width)
+        return PolicyGradient(self._controller, self._scenario, settings, *shared, width=width)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
 from cosim.scenario import Scenario
 from learning.average_cost import AverageCost
-from learning.configuration import Configuration, Count, Positive
+from learning.batch_configuration import BatchQLearningConfiguration
+from learning.configuration import Configuration
 from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
 from learning.fit import Fit, damped, least_squares
 from learning.globalised import GlobalisedLearning, Rule
+from learning.iterated_kalman import IteratedKalman
 from learning.protocols import LearnableController, Transition, Update
-from learning.q_configuration import FinalGain, Gain, QConfiguration
 from learning.replay import ReplayBuffer, Replayed
 
 Vector = NDArray[np.float64]
@@ -38,26 +38,6 @@ class Trial(NamedTuple):
     target: Vector
     error: Vector
     predicted: Vector
-
-
-class BatchQLearningConfiguration(QConfiguration):
-    """Hyperparameters of batch Q-learning."""
-
-    gain: Gain = 0.5
-    gain_end: FinalGain = 0.05
-    rule: Literal["first-order", "gauss-newton", "lstdq"] = Field(
-        "gauss-newton",
-        description="normalised gradient; Gauss–Newton on Q's fit; or the projected Bellman error",
-    )
-    batch_size: Count = Field(500, description="samples between two updates")
-    buffer_size: Count = Field(1000, description="transitions that are replayed, the latest ones")
-    iterations: Count = Field(1, description="replays and steps of θ per update")
-    radius: Positive = Field(
-        1.0, description="trust region: largest scaled entry of a step, before definiteness"
-    )
-    radius_minimum: Positive = Field(
-        0.01, description="size below which the trust region does not shrink"
-    )
 
 
 class ReplayedQLearning:
@@ -182,12 +162,16 @@ class ReplayedQLearning:
 
 
 class BatchQLearning(GlobalisedLearning):
-    """`ReplayedQLearning`, globalised unless the configuration says otherwise."""
+    """`IteratedKalman` or `ReplayedQLearning`, globalised unless the configuration says not."""
 
     Configuration: ClassVar[type[Configuration]] = BatchQLearningConfiguration
 
     def rule(self, samples: int, width: float) -> Rule:
-        """The replaying rule with a trust region `width` times as wide."""
+        """The replaying rule, its prior or trust region `width` times as wide."""
+        if self._configuration.rule == "kalman":
+            return IteratedKalman(
+                self._controller, self._scenario, self._configuration, width=width
+            )
         return ReplayedQLearning(
             self._controller,
             self._scenario,

@@ -73,7 +73,7 @@ class Interaction:
         self._policy: LearnableSolution | None = None
         self._point: LinearisationPoint | None = None
         self.s: Vector = scenario.initial_state
-        self._marked: tuple[Any, Vector] | None = None
+        self._marked: tuple[Any, Vector, LinearisationPoint | None] | None = None
         self.number = 0
         self.failures = 0
         self.explored = 0
@@ -89,15 +89,14 @@ class Interaction:
 
     def mark(self) -> None:
         """Remember the plant as it is now; raises CapabilityError where it cannot be."""
-        self._marked = (self._plant.snapshot(), self.s)
+        self._marked = (self._plant.snapshot(), self.s, self._point)
 
     def rewind(self) -> None:
-        """Put the plant back to where it was remembered, and solve there from the reference."""
+        """Put plant and guess back to where they were remembered, and solve there."""
         assert self._marked is not None
-        snapshot, self.s = self._marked
+        snapshot, self.s, self._point = self._marked
         self._plant.restore(snapshot)
-        self._controller.reset()
-        self._policy = self._solve()
+        self.restart()
 
     def next(self) -> tuple[Transition | None, float]:
         """One sample of the plant; returns it, or None after a failure, and its cost."""
@@ -173,11 +172,11 @@ class Interaction:
     def state(self) -> tuple[dict[str, int], dict[str, Vector]]:
         """Numbers and arrays from which `resume` goes on."""
         arrays = {"s": self.s, "applied": self._applied}
-        if self._point is not None:
-            arrays |= {f"point_{key}": value for key, value in self._point._asdict().items()}
+        arrays |= _stored("point", self._point)
         if self._marked is not None:
             content = self._plant.serialise(self._marked[0])
             arrays |= {"marked_s": self._marked[1], "marked": np.frombuffer(content, np.uint8)}
+            arrays |= _stored("marked_point", self._marked[2])
         return {name: getattr(self, name) for name in COUNTS}, arrays
 
     def resume(self, numbers: dict[str, int], arrays: dict[str, Vector]) -> None:
@@ -188,11 +187,8 @@ class Interaction:
         self._point = self._marked = None
         if "marked" in arrays:
             snapshot = self._plant.deserialise(arrays["marked"].tobytes())
-            self._marked = (snapshot, arrays["marked_s"])
-        if "point_x" in arrays:
-            self._point = LinearisationPoint(
-                *(arrays[f"point_{name}"] for name in LinearisationPoint._fields)
-            )
+            self._marked = (snapshot, arrays["marked_s"], _point("marked_point", arrays))
+        self._point = _point("point", arrays)
         self.restart()
 
     def _solve(self) -> LearnableSolution | None:
@@ -238,3 +234,15 @@ class Interaction:
             controller.theta = theta
             controller.prepare_at(point)
             controller.feedback(self.s)
+
+
+def _stored(name: str, point: LinearisationPoint | None) -> dict[str, Vector]:
+    if point is None:
+        return {}
+    return {f"{name}_{key}": value for key, value in point._asdict().items()}
+
+
+def _point(name: str, arrays: dict[str, Vector]) -> LinearisationPoint | None:
+    if f"{name}_x" not in arrays:
+        return None
+    return LinearisationPoint(*(arrays[f"{name}_{key}"] for key in LinearisationPoint._fields))

@@ -78,9 +78,44 @@ class KnownPenalty:
         penalty: Vector = (violation * (self._linear + self._quadratic * violation)).sum(axis=-1)
         return penalty
 
-    def expected(self, predictions: Matrix, errors: Matrix) -> float:
-        """Mean of p(f + e) over predictions f (K, n) and errors e (M, n), all pairs."""
-        return float(self(predictions[:, None, :] + errors[None, :, :]).mean())
+    def expected(self, predictions: Matrix, errors: SortedErrors) -> float:
+        """Mean of p(f + e) over predictions f (K, n) and the errors, all pairs.
+
+        The penalty is a sum over states and bounds, so sums over the errors beyond a bound do.
+        """
+        total = 0.0
+        for i, column in enumerate(predictions.T):
+            low = errors.beyond(i, self._lower[i] - column)
+            high = errors.beyond(i, self._upper[i] - column, above=True)
+            for first, second in (low, high):
+                total += float((self._linear[i] * first + self._quadratic[i] * second).mean())
+        return total
+
+
+class SortedErrors:
+    """Errors (M, n) sorted state by state, for means of what lies beyond a threshold."""
+
+    def __init__(self, errors: Matrix) -> None:
+        self._sorted = np.sort(errors, axis=0)
+        zero = np.zeros((1, errors.shape[1]))
+        self._sum = np.concatenate([zero, np.cumsum(self._sorted, axis=0)])
+        self._squares = np.concatenate([zero, np.cumsum(self._sorted**2, axis=0)])
+
+    def __len__(self) -> int:
+        """Number of errors, M."""
+        return len(self._sorted)
+
+    def beyond(self, i: int, threshold: Vector, *, above: bool = False) -> tuple[Vector, Vector]:
+        """Means of v and v² with v = max(t − e_i, 0), or max(e_i − t, 0), for each t of (K,)."""
+        count = np.searchsorted(self._sorted[:, i], threshold)
+        number, first, second = count, self._sum[count, i], self._squares[count, i]
+        if above:
+            number = len(self) - count
+            first, second = self._sum[-1, i] - first, self._squares[-1, i] - second
+        sign = -1.0 if above else 1.0
+        linear = sign * (number * threshold - first) / len(self)
+        quadratic = (number * threshold**2 - 2.0 * threshold * first + second) / len(self)
+        return np.maximum(linear, 0.0), np.maximum(quadratic, 0.0)
 
 
 class PredictionErrors:

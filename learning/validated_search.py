@@ -18,7 +18,7 @@ from controllers.parameters import Parameters
 from controllers.theta import ThetaBlocks
 from cosim.scenario import Scenario
 from learning.definiteness import certificate, clip_eigenvalues
-from learning.prediction_errors import KnownPenalty
+from learning.prediction_errors import KnownPenalty, SortedErrors
 from learning.prior import prior_deviation
 
 Vector = NDArray[np.float64]
@@ -97,7 +97,6 @@ class Candidate:
     theta: Vector
     realised: list[float] = field(default_factory=list)
     expected: list[float] = field(default_factory=list)
-    errors: list[Matrix] = field(default_factory=list)
 
     @property
     def costs(self) -> Vector:
@@ -114,7 +113,8 @@ class ValidatedSearch:
     """Phases of learning, each followed by line searches on common noise; the incumbent survives.
 
     One round: the rule learns from the incumbent; the θ that it passed through are raced against
-    it; then comes a line search along the back-off of all state bounds. A candidate takes the
+    it; then come line searches along the back-off of all state bounds and the weight of the inputs,
+    what an engineer would turn. A candidate takes the
     incumbent's place only if it is cheaper on the same noise. If no learnt θ did, the next phase
     begins anew with half the width, a trust region about the incumbent, and before it come line
     searches along the directions in θ that move the policy most (leading eigenvectors of
@@ -129,12 +129,14 @@ class ValidatedSearch:
     """
 
     DIRECTIONS = 6
-    FINAL = 0.1
+    MEMORY = 6000
+    """Prediction errors over which a penalty is expected: the tail is what counts."""
+    FINAL = 0.15
     """Share of the samples for the last race."""
+    DECADES = 2.0
+    """Longest step of the weight of the inputs."""
     CAP = 1.5
     """Longest first step of a line search, in the prior's standard deviations."""
-    SURE = 3.0
-    """Standard errors at which a race is decided early."""
 
     def __init__(
         self,
@@ -157,7 +159,8 @@ class ValidatedSearch:
         self._least = 0.5 * max(certificate(start.blocks, start.theta).smallest, 0.0)
         self._rng = np.random.default_rng(seed)
         self._spent, self._limit = 0, samples
-        self._pool: Matrix = np.zeros((0, scenario.state_lower.size))
+        self._errors: Matrix = np.zeros((0, scenario.state_lower.size))
+        self._pool = SortedErrors(self._errors)
         self._scale: Vector = np.ones(start.theta.size)
         self.incumbent = Candidate(start.theta)
         self.accepted = 0
@@ -170,31 +173,34 @@ class ValidatedSearch:
     def plan(self) -> Plan:
         """The whole run."""
         past = [self._start.theta]
-        width, back_off, reach = 1.0, 1.0, np.full(self.DIRECTIONS, 0.5)
+        width, back_off, agility, reach = 1.0, 1.0, 1.0, np.full(self.DIRECTIONS, 0.5)
         self._limit = int((1.0 - self.FINAL) * self._samples)
         try:
-            number, better = 0, True
+            number, better, failed, rest = 0, True, 0, 0
             while True:
                 before = self.incumbent.theta
                 # What is left at the end may be too little to learn from, not to search with.
-                if self._limit - self._spent >= self._phase + self._blocks * self._block:
+                enough = self._limit - self._spent >= self._phase + self._blocks * self._block
+                if enough and rest == 0:
                     better = yield from self._learn(width, goes_on=better)
+                    failed = 0 if better else failed + 1
+                    width, rest = (width, 0) if better else (0.5 * width, failed)
                 else:
                     better = False
                     yield from self._renew(self._blocks)
-                for _ in range(2):
-                    back_off = yield from self._line(self._tightening(), min(back_off, 1.0))
+                rest = max(rest - 1, 0)
+                back_off = yield from self._along(self._tightening(), min(back_off, 1.0))
                 if better:
                     # While learning pays, searching would only cost samples.
                     past.append(self.incumbent.theta)
                     continue
-                width *= 0.5
+                agility = yield from self._retuned(float(np.clip(agility, 0.1, 1.0)), 0.25)
                 directions = yield from self._directions(turned=number > 0)
                 for j, direction in enumerate(directions.T):
-                    reach[j] = yield from self._line(direction, float(np.clip(reach[j], 0.05, 1)))
+                    reach[j] = yield from self._along(direction, float(np.clip(reach[j], 0.05, 1)))
                 way = (self.incumbent.theta - before) / self._scale
                 if way.any():
-                    yield from self._line(way, 0.5)
+                    yield from self._along(way, 0.5)
                 past.append(self.incumbent.theta)
                 number += 1
         except Spent:
@@ -211,7 +217,7 @@ class ValidatedSearch:
         rivals = [past[0], *past[:0:-1][:3]]
         for theta in rivals:
             if not np.array_equal(theta, self.incumbent.theta):
-                yield from self._race(theta)
+                yield from self._race(theta, margin=0.0)
 
     def _learn(self, width: float, *, goes_on: bool) -> Step:
         """Learn from the incumbent and race what came of it, the latest θ first."""
@@ -236,7 +242,11 @@ class ValidatedSearch:
             abs(float(start["c_lambda"])),
             0.3,
         )
-        self._pool = learned.errors
+        self._remember(learned.errors)
+
+    def _remember(self, errors: Matrix) -> None:
+        """Keep prediction errors for the pools of the rounds to come."""
+        self._errors = np.concatenate([self._errors, errors])[-self.MEMORY :]
 
     def _spend(self, samples: int) -> None:
         if self._spent + samples > self._limit:
@@ -250,31 +260,27 @@ class ValidatedSearch:
         assert isinstance(block, Block)
         expected = block.penalty
         if len(block.predictions) and len(self._pool):
-            # Every other error: half the cost, the same mean.
-            expected = self._penalty.expected(block.predictions, self._pool[::2])
+            expected = self._penalty.expected(block.predictions, self._pool)
         candidate.realised.append(block.stage_cost + block.penalty)
         candidate.expected.append(block.stage_cost + expected)
-        candidate.errors.append(block.errors)
+        self._remember(block.errors)
 
     def _renew(self, blocks: int) -> Generator[Request, Learned | Block, None]:
-        """Run the incumbent on from where the plant is, and take its errors for the pool."""
+        """Run the incumbent on from where the plant is, on new noise."""
         self._spend(self._block)
         yield Settle(self.incumbent.theta)
+        # One pool for the whole round, or two θ would not be judged alike.
+        self._pool = SortedErrors(self._errors)
         self.incumbent = Candidate(self.incumbent.theta)
-        yield from self._complete(blocks)
-        errors = np.concatenate(self.incumbent.errors)
-        if len(errors):
-            self._pool = errors[-1000:]
+        for _ in range(blocks):
+            yield from self._run(self.incumbent)
 
-    def _complete(self, blocks: int) -> Generator[Request, Learned | Block, None]:
-        """Run the incumbent's episode anew if it has fewer blocks than a race may need."""
-        if len(self.incumbent.realised) < blocks:
-            self.incumbent = Candidate(self.incumbent.theta)
-            while len(self.incumbent.realised) < blocks:
-                yield from self._run(self.incumbent)
+    def _race(self, theta: Vector, margin: float = 1.0) -> Step:
+        """Whether θ takes the incumbent's place: cheaper on the same noise, by standard errors.
 
-    def _race(self, theta: Vector) -> Step:
-        """Whether θ takes the incumbent's place: cheaper on the same noise, block by block."""
+        It is given up as soon as it is dearer over those that it has run; to win it must run all,
+        since a slow state shows late what a policy does to it.
+        """
         admissible = self._admissible(theta)
         if admissible is None:
             return False
@@ -284,32 +290,81 @@ class ValidatedSearch:
             difference = candidate.costs - costs[:count]
             if difference.mean() >= 0.0:
                 return False
-            realised = np.subtract(candidate.realised, self.incumbent.realised[:count])
-            early = 2 * count >= len(costs) and count > 2
-            error = float(difference.std(ddof=1)) / count**0.5 if early else np.inf
-            if difference.mean() + self.SURE * error < 0.0 and realised.mean() < 0.0:
-                break
+        if not _cheaper(difference, margin):
+            return False
         self.incumbent = candidate
         self.accepted += 1
         return True
 
-    def _line(self, direction: Vector, reach: float) -> Generator[Request, Learned | Block, float]:
-        """Search along ±direction (n_θ,), scaled, doubling steps that win; the next first reach."""
-        # A win that was declared early left fewer blocks than the next race should have.
-        yield from self._complete(self._blocks)
+    def _retuned(self, reach: float, back_off: float) -> Generator[Request, Learned | Block, float]:
+        """Try another weight of the inputs, each time with a back-off of its own; the next step.
+
+        A quicker controller lets the states spread less, which pays only once the back-off is
+        smaller: so the race is between the two θ at their best back-offs.
+        """
         for sign in (1.0, -1.0):
-            step = sign * reach * direction
-            step *= min(1.0, self.CAP / float(np.abs(step).max()))
-            found = False
-            while (yield from self._race(self.incumbent.theta + self._scale * step)):
+            step, found = sign * reach, False
+            while abs(step) <= self.DECADES:
+                kept = self.incumbent
+                rival = yield from self._rival(self._agile(kept.theta, step))
+                if rival is None:
+                    break
+                self.incumbent = rival
+                yield from self._along(self._tightening(), back_off)
+                if not _cheaper(self.incumbent.costs - kept.costs):
+                    self.incumbent = kept
+                    break
                 found = True
                 step *= 2.0
-                reach *= 1.5
-                if np.abs(step).max() > 4.0 * self.CAP:
-                    break
             if found:
-                return reach
+                return 0.5 * abs(step)
         return 0.5 * reach
+
+    def _rival(self, theta: Vector) -> Generator[Request, Learned | Block, Candidate | None]:
+        """θ run for all blocks, or None where it is far dearer than the incumbent."""
+        admissible = self._admissible(theta)
+        if admissible is None:
+            return None
+        candidate, costs = Candidate(admissible), self.incumbent.costs
+        far = float(costs.std()) if len(costs) > 1 else np.inf
+        for count in range(1, len(costs) + 1):
+            yield from self._run(candidate)
+            if float((candidate.costs - costs[:count]).mean()) > far:
+                return None
+        return candidate
+
+    def _along(self, direction: Vector, reach: float) -> Generator[Request, Learned | Block, float]:
+        """Line search both ways along a direction in scaled θ, (n_θ,), doubling steps that win.
+
+        The first step is `reach`; returns that of the next time.
+        """
+        longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
+        for sign in (1.0, -1.0):
+            step, found = sign * min(reach, longest), False
+            while abs(step) <= 4.0 * longest:
+                moved = self.incumbent.theta + self._scale * (step * direction)
+                if not (yield from self._race(moved)):
+                    break
+                found = True
+                step *= 2.0
+            if found:
+                return 0.5 * abs(step)
+        return 0.5 * reach
+
+    def _agile(self, theta: Vector, decades: float) -> Vector:
+        """θ with the stage cost's weight of the inputs divided by 10^decades, cross terms by half.
+
+        It keeps B_l definite, and is what decides how fast the controller acts.
+        """
+        parameters = self._start.with_theta(theta)
+        factor = np.ones(parameters["b_l"].size)
+        factor[-self._action_deviation.size :] = 10.0 ** (-0.5 * decades)
+        return parameters.replace(
+            {
+                "B_l": parameters["B_l"] * np.outer(factor, factor),
+                "b_l": parameters["b_l"] * factor**2,
+            }
+        ).theta
 
     def _tightening(self) -> Vector:
         """All state bounds moved inwards by half their prior's deviation, (n_θ,), scaled."""
@@ -346,3 +401,10 @@ class ValidatedSearch:
             if name in blocks and not (theta[slices[name]] > 0).all():
                 return None
         return theta
+
+
+def _cheaper(difference: Vector, margin: float = 1.0) -> bool:
+    """Whether costs that differ so, block by block, are lower by `margin` standard errors."""
+    blocks = len(difference)
+    error = float(difference.std(ddof=1)) / blocks**0.5 if blocks > 1 else 0.0
+    return float(difference.mean()) + margin * error < 0.0

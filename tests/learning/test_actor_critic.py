@@ -77,7 +77,7 @@ def test_the_trust_region_bounds_the_rms_change_of_the_action(problem, scenario,
     where = carrier.parameters.blocks.slices["b_l"]
     before = carrier.theta[where].copy()
     feed(actor, carrier, rng, np.array([30.0, -10.0]), np.array([200.0, 200.0]))
-    assert np.linalg.norm((carrier.theta[where] - before)[2:] * -0.5) == pytest.approx(0.4)
+    assert np.linalg.norm((carrier.theta[where] - before)[2:] * -0.5) == pytest.approx(0.4 * 5)
 
 
 def test_saturation_does_not_bias_the_gradient(problem, scenario, rng):

@@ -55,6 +55,7 @@ class Bench:
                 "parametrisation": "paper",
                 "value_offset": "stage-cost",
                 "globalisation": "none",
+                "rule": "gauss-newton",
                 "exploration_deviation": (1.0,),
                 "batch_size": 20,
                 "buffer_size": 40,

@@ -5,7 +5,12 @@ from controllers.model import discretise
 from controllers.parameters import Parameters
 from controllers.theta import ThetaBlocks
 from cosim.penalty import Penalty
-from learning.prediction_errors import KnownPenalty, OneStepModel, PredictionErrors
+from learning.prediction_errors import (
+    KnownPenalty,
+    OneStepModel,
+    PredictionErrors,
+    SortedErrors,
+)
 
 
 def test_the_penalty_of_many_states_is_that_of_each(scenario, rng):
@@ -54,9 +59,10 @@ def test_the_oldest_errors_are_forgotten(scenario):
 
 def test_all_pairs_are_averaged(scenario, rng):
     penalty = KnownPenalty(scenario)
-    predictions, errors = 25.0 + rng.normal(size=(5, 2)), rng.normal(size=(7, 2))
+    predictions = np.array([25.0, 80.0]) + rng.normal(size=(5, 2))
+    errors = rng.normal(size=(7, 2))
     one_by_one = [penalty(f + e) for f in predictions for e in errors]
-    assert penalty.expected(predictions, errors) == pytest.approx(np.mean(one_by_one))
+    assert penalty.expected(predictions, SortedErrors(errors)) == pytest.approx(np.mean(one_by_one))
 
 
 def test_errors_are_those_of_the_model_with_thetas_parameters_and_offset(scenario, problem, rng):

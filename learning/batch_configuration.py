@@ -1,0 +1,33 @@
+"""Hyperparameters of batch Q-learning."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from learning.configuration import Count, Positive
+from learning.kalman_q_learning import KalmanConfiguration
+from learning.q_configuration import FinalGain, Gain
+
+
+class BatchQLearningConfiguration(KalmanConfiguration):
+    """Hyperparameters of batch Q-learning."""
+
+    gain: Gain = 0.5
+    gain_end: FinalGain = 0.05
+    rule: Literal["kalman", "first-order", "gauss-newton", "lstdq"] = Field(
+        "kalman",
+        description="iterated Kalman filter with a prior on θ; normalised gradient; Gauss–Newton "
+        "on Q's fit; or the projected Bellman error",
+    )
+    batch_size: Count = Field(500, description="samples between two updates")
+    buffer_size: Count = Field(1000, description="transitions that are replayed, the latest ones")
+    iterations: Count = Field(1, description="replays and steps of θ per update")
+    relinearisations: Count = Field(2, description="kalman: replays and steps of θ per batch")
+    radius: Positive = Field(
+        1.0, description="trust region: largest scaled entry of a step, before definiteness"
+    )
+    radius_minimum: Positive = Field(
+        0.01, description="size below which the trust region does not shrink"
+    )

@@ -1,0 +1,184 @@
+"""Batch Q-learning with a prior on θ: an iterated Kalman filter, batch after batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from cosim.scenario import Scenario
+from learning.average_cost import AverageCost
+from learning.batch_configuration import BatchQLearningConfiguration
+from learning.constrained_step import ConstrainedStep
+from learning.errors import DivergenceError
+from learning.fit import Fit
+from learning.kalman import OUTLIER
+from learning.prediction_errors import OneStepModel, PredictionErrors
+from learning.prior import prior_deviation
+from learning.protocols import LearnableController, Transition, Update
+from learning.replay import ReplayBuffer, Replayed
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+class IteratedKalman:
+    """The measurements and the prior of `KalmanQLearning`, replayed at the present θ.
+
+    Each batch of `batch_size` transitions is a measurement of d = (θ−θ₀)/σ with the information
+    GᵀG/r, G the rows ∇Qᵀσ. The prior of a batch is the posterior of the one before:
+
+        min_d Σ (δ − ∇Qᵀ(d − d_now))²/r + (d − m)ᵀΛ(d − m),  then Λ ← Λ + GᵀG/r, m ← d
+
+    `relinearisations` times a batch, linearised anew where the last step led to: the iterated
+    filter (Gauss–Newton on the posterior). TD errors hold the next penalty's expectation and are
+    cut at ±`innovation_clip`·√r. The first batch gives noise, widths and c_f as well.
+    """
+
+    needs_action_value = False
+    needs_points = True
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: BatchQLearningConfiguration,
+        *,
+        width: float = 1.0,
+    ) -> None:
+        self._controller, self._scenario, self._configuration = controller, scenario, configuration
+        self._width = width * configuration.prior_width
+        self._model = OneStepModel(scenario)
+        self._errors = PredictionErrors(scenario, configuration.prediction_errors)
+        rows, n = configuration.batch_size, scenario.state_lower.size
+        self._buffer = ReplayBuffer(rows)
+        self._batch = {
+            "states": np.zeros((rows, n)),
+            "prediction_errors": np.zeros((rows, n)),
+            "corrections": np.zeros(rows),
+        }
+        self._filled, self._last = 0, -1
+        self._anchor = controller.theta.copy()
+        self._adopt(np.ones(controller.theta.size))
+        self._information: Matrix = np.eye(controller.theta.size)
+        self._mean: Vector = np.zeros(controller.theta.size)
+        self._variance = 0.0
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Take one sample; the last of a batch moves θ."""
+        prediction = self._model(transition.s, transition.a)
+        error, row = transition.next_s - prediction, self._filled
+        self._errors.add(error)
+        batch = self._batch
+        batch["states"][row], batch["prediction_errors"][row] = transition.s, error
+        expected = self._errors.expected_penalty(prediction)
+        batch["corrections"][row] = expected - transition.next_penalty
+        self._buffer.add(transition)
+        self._filled, self._last = row + 1, transition.number
+        if self._filled < self._configuration.batch_size:
+            return None
+        self._filled = 0
+        return self._update()
+
+    def _update(self) -> Update:
+        settings, update, failures = self._configuration, None, 0
+        information = self._information
+        for _ in range(settings.relinearisations):
+            replayed = self._buffer.replay(self._controller, self._average_cost)
+            failures += replayed.failures
+            if not len(replayed.number):
+                break
+            td_error = self._td_error(replayed)
+            if self._variance == 0.0:
+                self._begin(td_error)
+                information = self._information
+            gradient = replayed.gradient * self._step.scale
+            limit = settings.innovation_clip * self._variance**0.5
+            innovation = np.clip(td_error, -limit, limit)
+            information = self._information + gradient.T @ gradient / self._variance
+            slope = gradient.T @ innovation / self._variance
+            slope -= self._information @ (self._present - self._mean)
+            minimiser = cho_solve(cho_factor(information), slope)
+            fit = Fit(slope, minimiser, _constant(information))
+            size = float(np.sqrt(np.mean(td_error**2)))
+            update = self._step.take(self._average_cost.take(fit), size)
+        if update is None:
+            raise DivergenceError("no transition of a batch can be replayed")
+        self._information, self._mean = information, self._present
+        squares = np.minimum(td_error**2, OUTLIER * self._variance)
+        share = min(len(td_error) / settings.variance_memory, 1.0)
+        self._variance += share * (float(squares.mean()) - self._variance)
+        return update._replace(failures=failures)
+
+    def _td_error(self, replayed: Replayed) -> Vector:
+        """δ with the next penalty's expectation in place of the penalty, (K,)."""
+        rows = self._configuration.batch_size - 1 - (self._last - replayed.number)
+        discount = self._average_cost.discount
+        td_error: Vector = replayed.td_error + discount * self._batch["corrections"][rows]
+        if not np.isfinite(td_error).all():
+            raise DivergenceError("TD errors are not finite")
+        return td_error
+
+    @property
+    def _present(self) -> Vector:
+        """d of the controller's θ."""
+        present: Vector = (self._controller.theta - self._anchor) / self._step.scale
+        return present
+
+    def _begin(self, td_error: Vector) -> None:
+        """Take the noise, the widths and c_f from the first batch."""
+        batch = self._batch
+        self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
+        start = self._controller.parameters
+        start = start.replace({"c_f": batch["prediction_errors"].mean(axis=0)})
+        self._controller.theta = start.theta
+        self._anchor = start.theta.copy()
+        scale = prior_deviation(
+            start,
+            batch["states"].std(axis=0),
+            batch["prediction_errors"].std(axis=0),
+            self._configuration.deviation(self._scenario),
+            max(abs(float(start["c_lambda"])), self._variance**0.5),
+            self._width,
+        )
+        self._adopt(scale)
+
+    def _adopt(self, scale: Vector) -> None:
+        """Work in coordinates of this scale, (n_θ,)."""
+        settings = self._configuration
+        self._step = ConstrainedStep(self._controller, settings, scale=scale)
+        self._average_cost = AverageCost.of(settings.discount, self._scenario, self._step)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Filter, errors and the open batch."""
+        sums = [self._filled, self._last, self._variance, self._average_cost.mean_cost]
+        return {
+            **{name: values.copy() for name, values in self._batch.items()},
+            **self._errors.state(),
+            "scale": self._step.scale.copy(),
+            "anchor": self._anchor.copy(),
+            "information": self._information.copy(),
+            "mean": self._mean.copy(),
+            "sums": np.array(sums),
+            **{f"buffer_{name}": values for name, values in self._buffer.state().items()},
+        }
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._batch = {name: state[name].copy() for name in self._batch}
+        self._errors.restore(state)
+        self._adopt(state["scale"].copy())
+        self._anchor, self._mean = state["anchor"].copy(), state["mean"].copy()
+        self._information = state["information"].copy()
+        filled, last, self._variance, self._average_cost.mean_cost = (
+            float(value) for value in state["sums"]
+        )
+        self._filled, self._last = int(filled), int(last)
+        buffer = {k.removeprefix("buffer_"): v for k, v in state.items() if k.startswith("buffer_")}
+        self._buffer.restore(buffer)
+
+
+def _constant(matrix: Matrix) -> Any:
+    return lambda: matrix

@@ -70,7 +70,7 @@ def run(search, plant):
 
 
 def test_line_searches_alone_come_near_the_best(scenario, problem):
-    sought = search(scenario, problem)
+    sought = search(scenario, problem, 40_000)
     plant = Quadratic(scenario, sought._start)
     before = plant.cost(sought._start.theta)
     run(sought, plant)

@@ -28,7 +28,6 @@ StoredOption = Annotated[
         show_default=False,
     ),
 ]
-WORK = ".work"
 
 
 @app.callback()
@@ -87,7 +86,14 @@ def update(
     What long studies have finished is kept in the folder's `.work`; run again to go on.
     """
     with output(json) as out_:
-        from cosim.experiments.stored import chosen, report, store, stored_studies, write_readme
+        from cosim.experiments.stored import (
+            WORK,
+            chosen,
+            report,
+            store,
+            stored_studies,
+            write_readme,
+        )
 
         studies = stored_studies(folder)
         for name in chosen(studies, names or list(studies)):

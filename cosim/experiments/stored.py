@@ -20,6 +20,8 @@ from cosim.experiments.tables import TIMING
 from cosim.files import markdown_table, write_atomically
 from cosim.validation import suggestion
 
+WORK = ".work"
+"""Folder within the folder: what long studies have finished."""
 LARGEST = 1_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
 SUFFIXES = (".csv", ".toml", ".md", ".svg", ".png")
@@ -70,7 +72,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     Left out: the runs' own folders, whatever a clock said, and tables of more than `LARGEST` bytes.
     """
     target = folder / name
-    fresh = folder / f".{name}.fresh"
+    fresh = folder / WORK / f"{name}.fresh"
     shutil.rmtree(fresh, ignore_errors=True)
     left_out = []
     for path in sorted(out.rglob("*")):

@@ -192,3 +192,41 @@ def test_update_repeats_its_bytes(mini, tmp_path):
     assert run("update", "--results", again, "--jobs", 2).exit_code == 0
     for path in (mini / "mini").rglob("*.*"):
         assert path.read_bytes() == (again / path.relative_to(mini)).read_bytes(), path.name
+
+
+PAPER = """\
+schema = 1
+name = "reproduce"
+scenarios = ["paper", "cheap"]
+training_seeds = { count = 1 }
+evaluation = { seeds = 2, steps = 30 }
+curves = { points = 2, seeds = 1, steps = 20 }
+logs = ["q"]
+tables = ["paper"]
+[[scenario]]
+extends = "paper"
+name = "cheap"
+penalty = { linear = [1e3, 1e3] }
+[[case]]
+controller = ["naive", "tuned"]
+[[case]]
+name = "q"
+algorithm = "q-learning"
+samples = 400
+"""
+
+
+def test_the_reproduction_is_a_study_with_the_paper_s_table_and_figure(tmp_path, monkeypatch):
+    (tmp_path / "reproduce.toml").write_text(PAPER)
+    monkeypatch.setattr("cosim.experiments.stored.stored_results", lambda: tmp_path)
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["reproduce", "--out", str(out), "--jobs", "1"])
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    report = (out / "report.md").read_text()
+    assert "The paper's comparison: it gives about 21 % over (a) and 15 % over (b)" in report
+    assert "| cheap | q |" in report
+    for name in ("parameters-paper-q", "parameters-cheap-q"):
+        assert (out / "figures" / f"{name}.png").stat().st_size > 10_000
+        assert f"alt='{name}'" in (out / "report.html").read_text()
+    log = read_numbers(out / "logs" / "paper-q.csv")
+    assert log["samples"][0] == 0, "increments of θ are counted from its start"

@@ -15,6 +15,9 @@ settings.load_profile("repeatable")
 
 # pytest's own filter ends with this process; what tests start has to be as strict.
 os.environ.setdefault("PYTHONWARNINGS", "error")
+# Compiled functions give the same bits (tests/controllers/test_compilation.py turns them on); a
+# cache that begins empty would have every test process compile them anew beside the others.
+os.environ.setdefault("COSIM_COMPILE", "never")
 OWN = "COSIM_CACHE" not in os.environ
 if OWN:
     # Before any test module is imported, and inherited by pytest's and our own worker processes.

@@ -13,7 +13,7 @@ from cosim.evaluation.parallel import run_all
 from cosim.evaluation.provenance import code_hash, controller_hash, parameters_hash, versions
 from cosim.evaluation.store import Store, unit_key
 from cosim.evaluation.table import Evaluation
-from cosim.evaluation.unit import Factory, Result, Unit, release, run
+from cosim.evaluation.unit import Factory, RunUnit, UnitResult, release, run
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 
@@ -66,7 +66,7 @@ def evaluate(
     report = progress or (lambda _: None)
     report(len(results))
 
-    def done(key: str, result: Result) -> None:
+    def done(key: str, result: UnitResult) -> None:
         store.save(key, result)
         results[key] = result
         report(len(results))
@@ -120,7 +120,7 @@ class _Plan:
             "fmu_sha256": fmu,
         }
         self._parameters: dict[str, str] = {}
-        self._units: dict[str, Unit] = {}
+        self._units: dict[str, RunUnit] = {}
         self._of_controller: dict[str, dict[str, Any]] = {}
         session = secrets.token_hex(8)
         for name, factory in every.items():
@@ -132,7 +132,7 @@ class _Plan:
                 "controller_hash": controller_hash(controller),
                 "parameters_hash": self._parameters[name],
             }
-            self._units[name] = Unit(session, name, factory, scenario, None, steps, code)
+            self._units[name] = RunUnit(session, name, factory, scenario, None, steps, code)
 
     def runs(self) -> Iterator[tuple[str, int | None]]:
         """Controller and seed of every unit; without a seed it is the settling run."""
@@ -145,11 +145,11 @@ class _Plan:
         """Key of a unit, made when it is asked for: a million of them take half a gigabyte."""
         return unit_key(self._of_controller[name] | {"seed": seed})
 
-    def unit(self, name: str, seed: int | None) -> tuple[str, Unit]:
+    def unit(self, name: str, seed: int | None) -> tuple[str, RunUnit]:
         """A unit under its key."""
         return self.key(name, seed), replace(self._units[name], seed=seed)
 
-    def assemble(self, results: Mapping[str, Result], command: str) -> Evaluation:
+    def assemble(self, results: Mapping[str, UnitResult], command: str) -> Evaluation:
         names = self._names
         return Evaluation(
             controllers=names,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from cosim.errors import EvaluationError
-from cosim.evaluation.unit import Result, as_document, from_document
+from cosim.evaluation.unit import UnitResult, as_document, from_document
 from cosim.files import write_atomically
 
 FOLDER = ".units"
@@ -27,7 +27,7 @@ class Store:
         if self._folder is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
 
-    def load(self, key: str) -> Result | None:
+    def load(self, key: str) -> UnitResult | None:
         """The stored result, or None; raises EvaluationError where the file is damaged."""
         if self._folder is None or not (path := self._folder / f"{key}.json").is_file():
             return None
@@ -38,7 +38,7 @@ class Store:
                 f"the finished work unit '{path}' is damaged; delete it to compute it again"
             ) from None
 
-    def save(self, key: str, result: Result) -> None:
+    def save(self, key: str, result: UnitResult) -> None:
         """Store a result, whole or not at all."""
         if self._folder is not None:
             write_atomically(self._folder / f"{key}.json", json.dumps(as_document(result)))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.evaluation.statistics import gain, gap_closed, mean, regret
-from cosim.evaluation.unit import Result
+from cosim.evaluation.unit import UnitResult
 from cosim.files import cell, csv_text, write_atomically
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ class Evaluation:
 
     controllers: Sequence[str]
     seeds: Sequence[int]
-    results: Mapping[tuple[str, int], Result]
+    results: Mapping[tuple[str, int], UnitResult]
     settling: Mapping[str, float]
     parameters: Mapping[str, str]
     facts: Mapping[str, Any]

@@ -19,7 +19,7 @@ Factory = Callable[[Scenario], Controller]
 
 
 @dataclass(frozen=True)
-class Unit:
+class RunUnit:
     """What a worker needs to know; `seed` None is the settling run without disturbances.
 
     `session` tells evaluations apart, so that a worker keeps its controllers within one; `code`
@@ -36,14 +36,14 @@ class Unit:
 
 
 @dataclass(frozen=True)
-class Result:
+class UnitResult:
     """Indicators of a unit, and what the clock said: `timing` in s and µs, never in the table."""
 
     indicators: dict[str, float]
     timing: dict[str, float]
 
 
-class _Kept:
+class _Reused:
     """Controllers and plants of the present session: building one costs more than a run."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class _Kept:
                 plant.close()
             self.controllers, self.plants, self.session = {}, {}, session
 
-    def controller(self, unit: Unit) -> Controller:
+    def controller(self, unit: RunUnit) -> Controller:
         if unit.controller not in self.controllers:
             self.controllers[unit.controller] = unit.factory(unit.scenario)
         return self.controllers[unit.controller]
@@ -68,15 +68,15 @@ class _Kept:
         return self.plants[scenario.hash]
 
 
-_kept = _Kept()
+_reused = _Reused()
 
 
 def release() -> None:
     """Close what this process keeps for the evaluation that it worked on."""
-    _kept.enter("")
+    _reused.enter("")
 
 
-def run(unit: Unit) -> Result:
+def run(unit: RunUnit) -> UnitResult:
     """Run a unit; the result depends on nothing but the unit, so any worker may do it.
 
     Raises EvaluationError if this worker has other code than the evaluation was started with, and
@@ -87,36 +87,36 @@ def run(unit: Unit) -> Result:
             f"a worker runs other code ({code_hash()}) than the evaluation ({unit.code}); install "
             "the same version of rti-cosim everywhere"
         )
-    _kept.enter(unit.session)
-    controller = _kept.controller(unit)
+    _reused.enter(unit.session)
+    controller = _reused.controller(unit)
     if unit.seed is None:
-        return _settle(unit, controller)
+        return _settling_run(unit, controller)
     begin = perf_counter()
     trajectory = simulate(
-        _kept.plant(unit.scenario), controller, unit.steps, unit.seed, residuals=False
+        _reused.plant(unit.scenario), controller, unit.steps, unit.seed, residuals=False
     )
     timing = {"wall_time_s": perf_counter() - begin}
     for name, quantiles in trajectory.timing_summary().items():
         timing |= {f"{name}_{key}": value for key, value in quantiles.items()}
-    return Result(indicators(trajectory), timing)
+    return UnitResult(indicators(trajectory), timing)
 
 
-def _settle(unit: Unit, controller: Controller) -> Result:
+def _settling_run(unit: RunUnit, controller: Controller) -> UnitResult:
     scenario = displaced(unit.scenario)
     if scenario is None:
-        return Result({"settling_time": float("nan")}, {})
-    trajectory = simulate(_kept.plant(scenario), controller, unit.steps, 0, residuals=False)
-    return Result({"settling_time": settling_time(trajectory)}, {})
+        return UnitResult({"settling_time": float("nan")}, {})
+    trajectory = simulate(_reused.plant(scenario), controller, unit.steps, 0, residuals=False)
+    return UnitResult({"settling_time": settling_time(trajectory)}, {})
 
 
-def as_document(result: Result) -> dict[str, Any]:
+def as_document(result: UnitResult) -> dict[str, Any]:
     """A result as a JSON document."""
     return {"indicators": result.indicators, "timing": result.timing}
 
 
-def from_document(document: dict[str, Any]) -> Result:
+def from_document(document: dict[str, Any]) -> UnitResult:
     """Read back what `as_document` gave; raises KeyError, TypeError or ValueError."""
-    return Result(
+    return UnitResult(
         {str(key): float(value) for key, value in document["indicators"].items()},
         {str(key): float(value) for key, value in document["timing"].items()},
     )

@@ -14,7 +14,7 @@ from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import EvaluationError, PlantError, RecordingError, ScenarioError, TrajectoryError
 from cosim.evaluation.store import Store
-from cosim.evaluation.unit import Result
+from cosim.evaluation.unit import UnitResult
 from cosim.plant.archive import unpack
 from cosim.recording import RerunRecorder
 from cosim.recording.reader import read_recording
@@ -106,7 +106,7 @@ def readers(folder: Path) -> dict[str, Reader]:
     (folder / "scenario.toml").write_text(scenario.to_toml())
     (folder / "plant.fmu").write_bytes(shipped().read_bytes())
     Parameters.naive(problem).save(folder / "theta.toml")
-    Store(folder).save("unit", Result({"J": 6400.0, "failures": 0.0}, {"median_us": 60.0}))
+    Store(folder).save("unit", UnitResult({"J": 6400.0, "failures": 0.0}, {"median_us": 60.0}))
     kinds: list[tuple[str, str, Any, type[Exception], Any]] = [
         ("scenario", "scenario.toml", Scenario.load, ScenarioError, None),
         ("theta", "theta.toml", lambda p: Parameters.load(p, problem), ParameterError,

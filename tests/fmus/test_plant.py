@@ -1,0 +1,75 @@
+"""The table of a plant of one's own, and the FMUs that come of it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import fmpy
+import numpy as np
+import pytest
+
+from fmus.errors import BuildError
+from fmus.model import Kind
+from fmus.plant import Signal, build_plant, plant_model
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
+)
+EQUATIONS = """
+#ifndef EQUATIONS_H
+#define EQUATIONS_H
+#include "variables.h"
+static void evaluate(double v[N_VARIABLES]) {
+    v[VR_der_x] = v[VR_gain] * v[VR_u] - v[VR_x];
+    v[VR_y] = 2.0 * v[VR_x];
+}
+#endif
+"""
+
+
+def model(disturbances: int = 0):
+    names = [f"d{i}" for i in range(disturbances)]
+    return plant_model(
+        "lag",
+        states=[Signal("x", "m", 1.0, -10.0, 10.0, "level")],
+        inputs=[Signal("u", "m", 0.0, -10.0, 10.0, "inflow")],
+        disturbances=[Signal(name, "m", 0.5, -9.0, 9.0, "noise", 0.25) for name in names],
+        outputs=[Signal("y", "m", 2.0, -20.0, 20.0, "twice the level")],
+        parameters=[Signal("gain", "1", 1.0, 0.0, 10.0, "gain")],
+        sampling_time=0.5,
+    )
+
+
+def test_the_table_has_what_the_layer_adds() -> None:
+    table = model(1)
+    assert table.names(Kind.STATE) == ["x"]
+    assert table.names(Kind.DERIVATIVE) == ["der(x)"]
+    assert table.names(Kind.OUTPUT) == ["d0", "y"]
+    assert {"x_start", "d0_nominal", "d0_range", "seed", "law"} <= set(table.by_name)
+
+
+@needs_compiler
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("disturbances", [0, 1, 3])
+def test_any_number_of_disturbances(tmp_path: Path, version, disturbances: int) -> None:
+    """The step response is exact to the integrator's order; draws of odd numbers fit."""
+    fmu = build_plant(model(disturbances), EQUATIONS, tmp_path / "lag.fmu", version)
+    names = [f"d{i}" for i in range(disturbances)]
+    result = fmpy.simulate_fmu(
+        str(fmu), stop_time=5.0, output_interval=0.5, output=["x", "y", *names],
+        start_values={"u": 3.0, "seed": 4}, fmi_type="CoSimulation",
+    )  # fmt: skip
+    exact = 3.0 - 2.0 * np.exp(-result["time"])
+    np.testing.assert_allclose(result["x"], exact, rtol=2e-3)
+    np.testing.assert_array_equal(result["y"], 2.0 * result["x"])
+    for name in names:
+        assert np.all(np.abs(result[name] - 0.5) <= 0.25)
+        assert len(set(result[name])) == 11
+
+
+@needs_compiler
+def test_equations_that_do_not_compile_are_told(tmp_path: Path) -> None:
+    with pytest.raises(BuildError, match="VR_nothing"):
+        build_plant(model(), EQUATIONS.replace("VR_gain", "VR_nothing"), tmp_path / "lag.fmu")

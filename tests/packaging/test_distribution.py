@@ -99,7 +99,10 @@ def test_the_wheel_holds_the_committed_data_to_the_byte(wheel, checkout):
         stored = {name: archive.read(name) for name in archive.namelist()}
     packages = ("fmus", "cosim", "controllers", "learning")
     assert {f"{package}/py.typed" for package in packages} <= stored.keys()
-    patterns = ("fmus/*.fmu", "fmus/sources/*", "fmus/resources/*", "cosim/presets/*.toml")
+    patterns = (
+        "fmus/*.fmu", "fmus/sources/*", "fmus/plant_sources/*", "fmus/resources/*",
+        "cosim/presets/*.toml",
+    )  # fmt: skip
     files = [path for pattern in patterns for path in checkout.glob(pattern)]
     assert len(files) > 20
     for path in files:

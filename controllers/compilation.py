@@ -196,8 +196,12 @@ class Compilation:
             self._advance()
 
     def finish(self) -> str:
-        """Do at once, and wait for, what `count` would do in time; returns `mode`."""
-        if self.mode == INTERPRETED and self._prepare() and not self._take(self._stored()):
+        """Do at once, and wait for, what `count` would do in time; returns `mode`.
+
+        With COSIM_COMPILE=never that is nothing.
+        """
+        wanted = self.mode == INTERPRETED and switch() != "never"
+        if wanted and self._prepare() and not self._take(self._stored()):
             if self._build is None:
                 self._start(wait=True)
             if self._build is not None:

@@ -165,3 +165,39 @@ def learning(
         header = ("samples per second", "median", "lowest", "highest", "µs per sample")
         out_.table(f"learning on {result['scenario']}, one core", header, rows)
         out_.json(result)
+
+
+@app.command()
+def scaling(
+    scenario: ScenarioOption = "paper",
+    horizons: Annotated[
+        str, typer.Option("--horizons", help="Comma-separated horizons N, from 1 to 1000.")
+    ] = "5,10,20,40",
+    json: JsonOption = False,
+) -> None:
+    """Time of a sample's phases by horizon and θ, compiled, and the interpreter's ratio to it.
+
+    CPU time. The first run compiles a library for each row, which takes seconds.
+    """
+    with output(json) as out_:
+        from cosim.cli.benchmark_scaling import PHASES, measure
+        from cosim.errors import CosimError
+        from cosim.scenario import Scenario
+
+        try:
+            numbers = [int(part) for part in horizons.split(",")]
+        except ValueError:
+            numbers = []
+        if not numbers or not all(1 <= number <= 1000 for number in numbers):
+            raise CosimError(f"--horizons must be numbers from 1 to 1000, not '{horizons}'")
+        with out_.progress("scaling", len(numbers) + 2) as progress:
+            result = measure(Scenario.load(scenario), numbers, progress)
+        rows = []
+        for row in result["rows"]:
+            mode, spent = list(row["microseconds"].items())[-1]
+            cells = (f"{spent[phase]:.1f} ({row['ratios'][phase]:.1f})" for phase in PHASES)
+            name = f"N = {row['horizon']}, θ {row['theta']} ({row['n_theta']}), {mode}"
+            rows.append((name, f"{row['construction_s']:.2f}", *cells))
+        header = ("µs of a sample (interpreter ×)", "construction s", *PHASES)
+        out_.table(f"scaling on {result['scenario']}", header, rows)
+        out_.json(result)

@@ -1,4 +1,7 @@
+import json
+import os
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -169,6 +172,12 @@ def test_a_compiler_that_fails_leaves_the_interpreter(folder, monkeypatch):
     assert libraries(folder) == []
 
 
+def test_never_means_never(folder, monkeypatch):
+    monkeypatch.setenv("COSIM_COMPILE", "never")
+    assert Compilation([small_function()]).finish() == "interpreted"
+    assert libraries(folder) == []
+
+
 def test_an_unknown_word_in_the_switch_is_refused(monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "yes")
     with pytest.raises(ControllerError, match="COSIM_COMPILE is 'yes'; it must be auto"):
@@ -191,3 +200,25 @@ def test_another_compiler_or_other_flags_do_not_share_a_library(folder, monkeypa
     run._prepare()
     names.add(run._name)
     assert len(names) == 3 - (find_compiler() is None)
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["q-learning", "batch-q-learning", "actor-critic"])
+def test_training_gives_the_same_bytes_compiled_and_interpreted(tmp_path, algorithm):
+    written = {}
+    for mode in ("never", "now"):
+        out = tmp_path / mode
+        command = ["train", "--algorithm", algorithm, "--samples", "2500", "--out", str(out)]
+        command += ["--evaluation-seeds", "1", "--evaluation-steps", "100"]
+        subprocess.run(
+            [sys.executable, "-m", "cosim", *command],
+            env=os.environ | {"COSIM_COMPILE": mode},
+            check=True,
+            capture_output=True,
+        )
+        summary = json.loads((out / "summary.json").read_text())
+        used = summary["timing"]["functions"]
+        assert used == {"never": "interpreted", "now": "compiled"}[mode]
+        written[mode] = [(out / name).read_bytes() for name in ("learning.csv", "parameters.toml")]
+    assert written["never"] == written["now"]

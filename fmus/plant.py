@@ -26,7 +26,7 @@ _SI = ("1", "s")
 
 @dataclass(frozen=True)
 class Signal:
-    """A variable of a plant: its unit, value at the start and range.
+    """A variable of a plant: its `name`, unit, value at the start, `min`, `max`, `description`.
 
     `start` is a state's initial value, an input's or parameter's default, a disturbance's mean;
     outputs have none. `range` is a disturbance's half width (uniform) or standard deviation.

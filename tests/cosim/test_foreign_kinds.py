@@ -9,6 +9,7 @@ import fmus
 from cosim import FmuPlant, Scenario
 from cosim.errors import CapabilityError, PlantError, ScenarioError
 from cosim.plant.archive import unpack
+from cosim.plant.library import library_path
 from cosim.plant.suitability import refusals
 from tests.helpers.kinds import REALS, build_kind, scenario_for
 
@@ -269,3 +270,34 @@ def test_snapshots_are_refused_where_they_are_not_offered(tmp_path, version):
         np.testing.assert_array_equal(plant.step([2.0]).s, [1.5])
         with pytest.raises(CapabilityError, match="canGetAndSetFMUstate"):
             plant.snapshot()
+
+
+@pytest.mark.parametrize(
+    ("machine", "place", "library"),
+    [
+        ("aarch64-linux", "aarch64-linux", "aarch64-linux/evaporator.so"),
+        ("aarch64-linux", "linux64", "aarch64-linux/evaporator.so"),
+        ("aarch64-darwin", "aarch64-darwin", "aarch64-darwin/evaporator.dylib"),
+        ("aarch64-darwin", "darwin64", "darwin64/evaporator.dylib"),
+    ],
+)
+def test_on_arm_the_folder_of_fmi3_or_of_x86_serves(tmp_path, monkeypatch, machine, place, library):
+    """FMI 2.0 names no folder for ARM; what counts is what the library is made for."""
+    from fmus.platforms import PLATFORMS
+
+    platform = next(p for p in PLATFORMS if p.tuple == machine)
+    monkeypatch.setattr("cosim.plant.library.present", lambda: platform)
+    with zipfile.ZipFile(fmus.path()) as shipped:
+        data = shipped.read(f"binaries/{library}")
+    fmu = unpack(build_kind(tmp_path, 2, place=place, data=data))
+    assert library_path(fmu).parent.name == place
+
+
+def test_on_arm_a_library_for_x86_is_named(tmp_path, monkeypatch):
+    from fmus.platforms import PLATFORMS
+
+    platform = next(p for p in PLATFORMS if p.tuple == "aarch64-linux")
+    fmu = unpack(build_kind(tmp_path, 2, place="linux64"))
+    monkeypatch.setattr("cosim.plant.library.present", lambda: platform)
+    with pytest.raises(PlantError, match=r"no binary for aarch64-linux .*made for x86_64-linux"):
+        library_path(fmu)

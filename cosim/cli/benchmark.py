@@ -128,6 +128,41 @@ def controllers(
         out_.json(result)
 
 
+@app.command()
+def export(
+    scenario: ScenarioOption = "paper",
+    controller: Annotated[
+        str, typer.Option("--controller", "-c", help="naive, tuned or a parameters file.")
+    ] = "tuned",
+    steps: Annotated[
+        int, typer.Option("--steps", "-n", min=50, max=1_000_000, help="Samples of the run.")
+    ] = 2000,
+    json: JsonOption = False,
+) -> None:
+    """Time of a sample of the exported controller's FMU beside the Python controller's.
+
+    Both act on each state of one closed loop; it also says how far their actions are apart.
+    """
+    with output(json) as out_:
+        from cosim.cli.benchmark_export import measure
+        from cosim.scenario import Scenario
+
+        with out_.progress("samples", steps) as progress:
+            result = measure(Scenario.load(scenario), controller, steps, progress)
+        rows = [
+            (row["name"], *(f"{row[key]:.1f}" for key in ("median_us", "minimum_us", "p95_us")))
+            for row in result["rows"]
+        ]
+        header = ("a sample", "median µs", "minimum µs", "95 % µs")
+        out_.table(f"{controller} on {result['scenario']}, {steps} samples", header, rows)
+        met = "met" if result["met"] else "MISSED"
+        out_.note(
+            f"FMU {result['ratio']:.1f} times as fast; target {result['target_us']:g} µs: {met}"
+        )
+        out_.note(f"actions differ by {result['largest_difference']:.1e} at most")
+        out_.json(result)
+
+
 def _verdict(row: dict[str, Any]) -> str:
     """How a row stands to its target, or to what it is compared with."""
     if row["target_us"] is not None:

@@ -1,0 +1,87 @@
+"""Times a sample of the exported controller's FMU beside the Python controller, in one run."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from controllers import RtiNmpc
+from cosim.cli.compose import build_plant
+from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
+from cosim.scenario import Scenario
+from cosim.simulation import spawn_seeds
+from fmus.sampled import SampledInstance
+
+TARGET = 30.0
+WARM_UP = 20
+
+
+def measure(
+    scenario: Scenario, controller: str, steps: int, progress: Callable[[int], None]
+) -> dict[str, Any]:
+    """Time each sample of one closed loop in both, in µs, and compare their actions.
+
+    The FMU is built by the local compiler and called through preallocated buffers: state in,
+    `doStep`, action out. Python's time is `prepare` and `feedback` with the scenario's backend.
+    Raises ControllerLookupError on a controller that cannot be exported.
+    """
+    python = rti_controller(controller, scenario)
+    with build_plant(scenario) as plant, tempfile.TemporaryDirectory() as folder:
+        system = sampled_controller(python, scenario, plant.units)
+        path = write_fmu(system, python, scenario, Path(folder) / "controller.fmu", 2, False)
+        fmu = SampledInstance(path, scenario.plant.states, scenario.plant.actions)
+        try:
+            seconds, differences = _run(plant, python, fmu, steps, progress)
+        finally:
+            fmu.close()
+    rows: list[dict[str, Any]] = [
+        {
+            "name": name,
+            "median_us": 1e6 * median(values),
+            "minimum_us": 1e6 * min(values),
+            "p95_us": 1e6 * float(np.quantile(values, 0.95)),
+        }
+        for name, values in seconds.items()
+    ]
+    ratios = [a / b for a, b in zip(seconds["Python"], seconds["FMU"], strict=True)]
+    return {
+        "scenario": scenario.name,
+        "controller": controller,
+        "hessian": scenario.controller.hessian,
+        "steps": steps,
+        "largest_difference": max(differences),
+        "ratio": median(ratios),
+        "target_us": TARGET,
+        "met": rows[1]["median_us"] <= TARGET,
+        "rows": rows,
+    }
+
+
+def _run(
+    plant: Any, python: RtiNmpc, fmu: SampledInstance, steps: int, progress: Callable[[int], None]
+) -> tuple[dict[str, list[float]], list[float]]:
+    seconds: dict[str, list[float]] = {"Python": [], "FMU": []}
+    differences = []
+    lower, upper = plant.scenario.action_lower, plant.scenario.action_upper
+    s = plant.reset(spawn_seeds(0)[0])
+    for k in range(WARM_UP + steps):
+        begin = perf_counter()
+        python.prepare()
+        solution = python.feedback(s)
+        middle = perf_counter()
+        action = fmu.sample(s)
+        end = perf_counter()
+        applied = np.clip(solution.action, lower, upper)
+        if k >= WARM_UP:
+            seconds["Python"].append(middle - begin)
+            seconds["FMU"].append(end - middle)
+            differences.append(float(np.abs(action - applied).max()))
+            progress(k - WARM_UP + 1)
+        s = plant.step(applied).s
+    return seconds, differences

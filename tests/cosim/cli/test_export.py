@@ -20,7 +20,7 @@ from fmus.checks import Status, check
 pytestmark = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
 )
-EXAMPLE = Path(__file__).parents[3] / "examples" / "ssp_loop.py"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "fmpy_ssp.py"
 SAMPLES = 60
 ACTION = 1e-9
 
@@ -106,10 +106,18 @@ def test_theta_set_in_the_fmu_is_the_controller_with_that_theta(exported):
         np.testing.assert_allclose(found, action, rtol=0, atol=ACTION)
 
 
-def test_libcosim_runs_the_ssp_with_an_error_of_first_order_in_its_step(exported):
-    """Its components step side by side: an action arrives one communication step late."""
-    pytest.importorskip("libcosimpy")
-    code = Path(__file__).parents[2] / "helpers" / "ssp_by_libcosim.py"
+@pytest.mark.parametrize(
+    ("master", "package"), [("libcosim", "libcosimpy"), ("ecos", "ecospy.EcosSimulation")]
+)
+def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
+    exported, master, package
+):
+    """They step plant and controller side by side: an action arrives one step of theirs late."""
+    pytest.importorskip(package, exc_type=Exception)
+    code = Path(__file__).parents[2] / "helpers" / f"ssp_by_{master}.py"
+    scenario = Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        expected = simulate(plant, tuned(scenario), 20, 5)
     errors = []
     for step in ("6.0", "3.0"):
         result = subprocess.run(
@@ -118,11 +126,18 @@ def test_libcosim_runs_the_ssp_with_an_error_of_first_order_in_its_step(exported
         )  # fmt: skip
         lines = [line.split()[1] for line in result.stdout.splitlines() if line[:4] == "row "]
         rows = np.array([list(map(float, line.split(","))) for line in lines])
-        with FmuPlant("paper") as plant:
-            expected = simulate(plant, tuned(Scenario.load("paper")), 20, 5)
         errors.append(np.abs(rows[1:, 0] - expected["X2"][1:]).max())
     assert errors[0] < 0.5
     assert errors[1] < 0.6 * errors[0]
+
+
+@pytest.mark.slow
+def test_the_benchmark_times_both_and_compares_their_actions(cosim):
+    code, out, _ = cosim("benchmark", "export", "--steps", "100", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["largest_difference"] < ACTION
+    assert [row["name"] for row in document["rows"]] == ["Python", "FMU"]
 
 
 @pytest.mark.parametrize(

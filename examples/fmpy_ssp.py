@@ -1,4 +1,4 @@
-"""Run the closed loop of an SSP with fmpy alone: python examples/ssp_loop.py loop.ssp 100
+"""Run the closed loop of an SSP with fmpy alone: python examples/fmpy_ssp.py loop.ssp 100
 
 At each sample the controller acts on the plant's present state, then the plant takes the step: the
 order of the components in the file. `cosim export tuned --out c.fmu --ssp loop.ssp` writes one.

@@ -38,7 +38,7 @@ def _check(solver: CompiledQpSolver, count: int, peers: tuple[type, ...], seed: 
                 backend = peer()
                 backend.load(qp)
                 with np.errstate(invalid="ignore"):  # of rows without a limit
-                    other = polish(qp, backend.solve(qp))
+                    other = polish(qp, backend.solve(qp), 1e-13)
             except QpError:
                 continue
             if not other.residuals(qp).largest < RESIDUAL:

@@ -23,7 +23,7 @@ _TYPES = ("Real", "Integer", "Boolean", "Enumeration", "String")
 
 @dataclass(frozen=True)
 class Component:
-    """An FMU in a system: its name there, its file, and the start values of its parameters.
+    """An FMU in a system: its `name` there, its file `fmu`, and `starts` of its parameters.
 
     A start value is a number with its FMI 2.0 type, `Real`, `Integer`, `Boolean` or `Enumeration`.
     """
@@ -35,7 +35,7 @@ class Component:
 
 @dataclass(frozen=True)
 class Connection:
-    """A signal from one component's output to another's input, each as (component, variable)."""
+    """A signal from one component's output `start` to an input `end`: (component, variable)."""
 
     start: tuple[str, str]
     end: tuple[str, str]

@@ -28,7 +28,7 @@ STATUSES = ("solved", "not convex", "iteration limit", "not finite", "θ not wel
 
 @dataclass(frozen=True)
 class Core:
-    """A controller in C: its `sources` by file name, and the `parameters` that it starts from.
+    """A controller in C: `sources` by file name, and the `parameters` θ that it starts from.
 
     `core.h` is what to include: it defines CoreState, core_reset, core_evaluate, core_commit and
     core_outputs, all static. `problem` is the one it was made for.

@@ -9,7 +9,10 @@ from controllers.export.core import STATUSES, Core
 
 
 class Entry(NamedTuple):
-    """A variable: `start` is that of an input or parameter; None where there is no bound."""
+    """A variable by `name`, with its `unit` and `meaning` in words.
+
+    `start` is that of an input or parameter; `lower` or `upper` is None where there is no bound.
+    """
 
     name: str
     unit: str
@@ -20,7 +23,7 @@ class Entry(NamedTuple):
 
 
 class Table(NamedTuple):
-    """The variables in the order of the arrays that the C functions take."""
+    """Variables in the order of the arrays that the C takes: `inputs`, `outputs`, `parameters`."""
 
     inputs: tuple[Entry, ...]
     outputs: tuple[Entry, ...]

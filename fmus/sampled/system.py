@@ -18,7 +18,10 @@ _LARGEST = sys.float_info.max
 
 @dataclass(frozen=True)
 class Signal:
-    """A real input, output or parameter; `start` is what an input or a parameter begins with."""
+    """A real input, output or parameter by its `name`, with `unit`, `description` and range.
+
+    `start` is what an input or a parameter begins with; `min` or `max` is None where there is none.
+    """
 
     name: str
     unit: str
@@ -41,10 +44,11 @@ class Signal:
 class SampledSystem:
     """A function of `inputs` and `parameters` that is evaluated once a `sampling_time` [s].
 
-    `identifier` is the model's C identifier. `sources` are C headers by name, of which ``core.h``
-    defines what ``sampled/sources/model_state.h`` lists; the arrays it is given and fills are
-    ordered like `inputs`, `outputs` and `parameters`. Raises BuildError on an identifier that is
-    none in C, on names that are taken twice and on a sampling time that is not positive.
+    `name` and `description` are for people, `identifier` is the model's C identifier. `sources`
+    are C headers by name, of which ``core.h`` defines what ``sampled/sources/model_state.h`` lists;
+    the arrays it is given and fills are ordered like `inputs`, `outputs` and `parameters`. Raises
+    BuildError on an identifier that is none in C, on names that are taken twice and on a sampling
+    time that is not positive.
     """
 
     name: str

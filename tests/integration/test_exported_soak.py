@@ -1,0 +1,46 @@
+"""The exported controller under AddressSanitizer and UBSan, with good and wild states and θ."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import fmpy
+import pytest
+
+from controllers.factories import tuned
+from cosim import FmuPlant, Scenario
+from cosim.cli.controller_fmu import sampled_controller
+from fmus.sampled.build import sampled_sources
+
+SOAK = Path(__file__).parents[1] / "fmus" / "sampled" / "soak.c"
+COMPILER = os.environ.get("CC", "cc")
+FLAGS = (
+    "-std=c99", "-g", "-O1", "-Wall", "-Wextra", "-Wno-unused-function",
+    "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+def test_nothing_is_allocated_or_broken_while_it_steps(tmp_path: Path, hessian: str) -> None:
+    if shutil.which(COMPILER) is None:
+        pytest.skip("there is no C compiler")
+    scenario = Scenario.load("paper").replace({"controller": {"hessian": hessian}})
+    with FmuPlant(scenario) as plant:
+        system = sampled_controller(tuned(scenario), scenario, plant.units)
+    for name, data in sampled_sources(system, 2).items():
+        (tmp_path / name).write_bytes(data)
+    headers = Path(fmpy.__file__).parent / "c-code"
+    program = tmp_path / "soak"
+    subprocess.run(
+        [COMPILER, *FLAGS, "-isystem", headers, "-I", tmp_path, SOAK, "-o", program, "-lm"],
+        check=True,
+    )
+    result = subprocess.run([program, "20000"], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    steps, failures = map(int, result.stdout.split())
+    assert steps == 20000
+    assert 0 < failures < steps

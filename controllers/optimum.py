@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.dynamic_programming import archive
 from controllers.dynamic_programming.bellman import BellmanOperator
-from controllers.dynamic_programming.plant import StochasticScenario, plant_law, plant_parameters
+from controllers.dynamic_programming.plant import PlantProblem, StochasticScenario
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum, Progress, solve
@@ -93,38 +93,44 @@ class OptimalPolicy:
         scenario: StochasticScenario,
         settings: Settings | None = None,
         *,
+        overrides: Mapping[str, float | None] | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> OptimalPolicy:
         """Optimal policy of a scenario: shipped, cached, or solved now and then cached.
 
-        The plant is the scenario's model with the physical parameters and the law that the scenario
-        sets. Raises OptimumError where they are not the model's, or a stored file is damaged.
+        The plant is the scenario's model of it with the physical parameters and the law that the
+        scenario sets; `overrides` replaces plant parameters by name. Raises OptimumError where
+        they are not the model's, or a stored file is damaged.
         """
-        problem = Problem.from_scenario(scenario)
-        law, parameters = plant_law(scenario, problem), plant_parameters(scenario, problem)
+        plant = PlantProblem.from_scenario(scenario, overrides)
         settings = settings or Settings()
-        name = archive.key(problem, law, parameters, settings)
+        problem, law, parameters = plant.problem, plant.law, plant.parameters
         optimum = archive.obtain(
-            name,
+            archive.key(plant, settings),
+            problem,
             lambda: solve(problem, law, settings, parameters=parameters, progress=progress),
         )
         return cls(problem, law, optimum, parameters)
 
     @classmethod
-    def stored(cls, scenario: StochasticScenario) -> OptimalPolicy | None:
+    def stored(
+        cls, scenario: StochasticScenario, *, overrides: Mapping[str, float | None] | None = None
+    ) -> OptimalPolicy | None:
         """Optimal policy of a scenario if its solution is shipped or cached, else None.
 
         None too where the scenario is none that could be solved. Raises OptimumError on a damaged
         file.
         """
         try:
-            problem = Problem.from_scenario(scenario)
-            law, parameters = plant_law(scenario, problem), plant_parameters(scenario, problem)
+            plant = PlantProblem.from_scenario(scenario, overrides)
         except (ModelError, OptimumError):
             return None
-        name = archive.key(problem, law, parameters, Settings())
+        name = archive.key(plant, Settings())
         path = archive.stored(name)
-        return None if path is None else cls(problem, law, archive.read(path, name), parameters)
+        if path is None:
+            return None
+        optimum = archive.read(path, name, plant.problem)
+        return cls(plant.problem, plant.law, optimum, plant.parameters)
 
     @property
     def gain(self) -> float:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from controllers.optimum import OptimalPolicy
+from controllers.yardstick import yardstick
 from cosim.plant.archive import SHIPPED
 from cosim.scenario import Scenario
 
 
 def has_stored_optimum(scenario: Scenario) -> bool:
-    """Whether `optimal` is J* of the scenario's plant and can be had without solving anything.
+    """Whether `optimal` is the scenario's yardstick and can be had without solving anything.
 
-    A foreign FMU may be another plant than the controller's model, whose optimum it is.
+    A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
+    scenario names the plant's own model.
     """
-    if scenario.plant.fmu not in SHIPPED:
+    if scenario.plant.fmu not in SHIPPED and scenario.plant.model is None:
         return False
-    return OptimalPolicy.stored(scenario) is not None
+    return yardstick(scenario) is not None

@@ -9,34 +9,36 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.dynamic_programming.bellman import Accuracy
+from controllers.dynamic_programming.certificate import Certificate
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum
 from controllers.errors import OptimumError
 from controllers.problem import Problem
 from controllers.storage import CACHE_VARIABLE, read_arrays, user_cache, write_atomically
 
-Array = NDArray[np.float64]
 # Part of every key: raise it when the solver changes what it finds.
-VERSION = 1
+VERSION = 2
+MEND = "delete it to have the policy computed anew"
 SHIPPED = Path(__file__).parent.parent / "optima"
 
 
-def key(problem: Problem, law: DisturbanceLaw, parameters: Array, settings: Settings) -> str:
+def key(plant: PlantProblem, settings: Settings) -> str:
     """First 16 hexadecimal digits of the SHA-256 of all that the solution depends on.
 
     That is: the model's equations, physical parameters, sampling, bounds, penalty, reference,
     the disturbance's law, the solver's settings and, for the discounted criterion, γ.
     """
+    problem, law, parameters = plant.problem, plant.law, plant.parameters
     symbols = problem.model.symbols()
     content: dict[str, Any] = {
         "version": VERSION,
@@ -99,8 +101,8 @@ def require_cache() -> Path:
 
 
 def stored(name: str) -> Path | None:
-    """File of a solved problem by its key: the user's, else shipped, else None."""
-    for folder in (cache_folder(), SHIPPED):
+    """File of a solved problem by its key: the package's own, else the user's, else None."""
+    for folder in (SHIPPED, cache_folder()):
         path = folder / f"{name}.npz"
         if path.is_file():
             return path
@@ -110,36 +112,50 @@ def stored(name: str) -> Path | None:
 def write(path: Path, optimum: Optimum, name: str) -> Path:
     """Write a solved problem as a compressed .npz; equal content gives equal bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    document = {
+    certificate = optimum.certificate
+    document: dict[str, Any] = {
         "key": name,
         "gain": optimum.gain,
         "lower": optimum.lower,
         "upper": optimum.upper,
         "discount": optimum.discount,
         "accuracy": asdict(optimum.accuracy),
+        "smooth": optimum.grid.smooth,
+        "certificate": None if certificate is None else certificate.to_list(),
     }
     arrays: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(optimum.grid.axes)}
-    arrays |= {
-        "actions": optimum.actions,
-        "W": optimum.W,
-        "distribution": optimum.distribution,
-        "document": np.array(json.dumps(document, sort_keys=True)),
-    }
+    arrays |= {name: getattr(optimum, name) for name in ("actions", "W", "distribution")}
+    document["sha256"] = _checksum(document, arrays)
+    arrays["document"] = np.array(json.dumps(document, sort_keys=True))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     return write_atomically(path, buffer.getvalue())
 
 
-def read(path: Path, name: str) -> Optimum:
-    """Read a solved problem; raises OptimumError where the file is damaged or another problem's."""
-    mend = "delete it to have the policy computed anew"
+def _checksum(document: dict[str, Any], arrays: dict[str, Any]) -> str:
+    digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def read(path: Path, name: str, problem: Problem) -> Optimum:
+    """Read a solved problem and check that it can be one of `problem`.
+
+    Raises OptimumError where the file is damaged or another problem's, where its checksum does not
+    fit, or where its bounds, its distribution or its actions are none.
+    """
     try:
         arrays = read_arrays(path)
         document = json.loads(str(arrays.pop("document")))
+        checksum = document.pop("sha256")
         axes = [arrays[f"axis_{i}"] for i in range(sum(e.startswith("axis_") for e in arrays))]
-        accuracy = document["accuracy"]
+        accuracy, figures = document["accuracy"], document["certificate"]
+        smooth = document["smooth"]
         optimum = Optimum(
-            Grid(tuple(axes)),
+            Grid(tuple(axes), smooth and tuple((float(a), float(b)) for a, b in smooth)),
             arrays["actions"],
             arrays["W"],
             float(document["gain"]),
@@ -152,35 +168,59 @@ def read(path: Path, name: str) -> Optimum:
                 tuple(accuracy["nodes"]),
                 tuple(accuracy["penalty_nodes"]),
             ),
+            None if figures is None else Certificate.from_list(figures),
         )
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise OptimumError(f"{path}: not a readable optimal policy ({error}); {mend}") from error
-    size = optimum.grid.size
-    shapes_fit = (
-        optimum.actions.ndim == 2
-        and optimum.actions.shape[0] == size
-        and optimum.W.shape == optimum.distribution.shape == (size,)
-    )
-    values = (optimum.actions, optimum.W, optimum.distribution)
-    if not shapes_fit or not all(np.isfinite(array).all() for array in values):
-        raise OptimumError(f"{path}: its arrays do not fit its grid or are not finite; {mend}")
-    if document["key"] != name:
+        fits = checksum == _checksum(document, arrays)
+        stored_name = document["key"]
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
+        raise OptimumError(f"{path}: not a readable optimal policy ({error}); {MEND}") from error
+    if not fits:
+        raise OptimumError(f"{path}: its checksum does not fit its content; {MEND}")
+    if reason := _unsound(optimum, problem):
+        raise OptimumError(f"{path}: {reason}; {MEND}")
+    if stored_name != name:
         raise OptimumError(
-            f"{path}: it holds the policy of problem {document['key']}, not of {name}; {mend}"
+            f"{path}: it holds the policy of problem {stored_name}, not of {name}; {MEND}"
         )
     return optimum
 
 
-def obtain(name: str, make: Callable[[], Optimum]) -> Optimum:
+def _unsound(optimum: Optimum, problem: Problem) -> str | None:
+    """Why an optimum cannot be one of the problem, None where it can."""
+    size, numbers = optimum.grid.size, (optimum.lower, optimum.gain, optimum.upper)
+    arrays = (optimum.actions, optimum.W, optimum.distribution)
+    if not all(array.dtype == np.float64 and np.isfinite(array).all() for array in arrays):
+        return "its arrays are not finite numbers"
+    if (
+        len(optimum.grid.axes) != problem.n_states
+        or optimum.actions.shape != (size, problem.n_actions)
+        or not optimum.W.shape == optimum.distribution.shape == (size,)
+    ):
+        return "its arrays do not fit its grid or the problem"
+    ordered = optimum.discount < 1.0 or numbers[0] <= numbers[1] <= numbers[2]
+    if not (all(map(isfinite, numbers)) and numbers[0] <= numbers[2] and ordered):
+        return f"its bounds {numbers[0]} and {numbers[2]} do not enclose its gain {numbers[1]}"
+    if (optimum.distribution < 0).any() or not optimum.distribution.sum() > 0:
+        return "its distribution is none"
+    rounding = 1e-9 * (problem.action_upper - problem.action_lower)
+    if (
+        (optimum.actions < problem.action_lower - rounding)
+        | (optimum.actions > problem.action_upper + rounding)
+    ).any():
+        return "it has actions beyond their bounds"
+    return None
+
+
+def obtain(name: str, problem: Problem, make: Callable[[], Optimum]) -> Optimum:
     """Stored solution of the problem with this key, or `make` it and keep it for the user."""
     path = stored(name)
-    return renew(name, make) if path is None else read(path, name)
+    return keep(name, make) if path is None else read(path, name, problem)
 
 
-def renew(name: str, make: Callable[[], Optimum]) -> Optimum:
-    """`make` the solution of the problem with this key and keep it, whatever is stored.
+def keep(name: str, make: Callable[[], Optimum]) -> Optimum:
+    """`make` the solution of the problem with this key and keep it in the user's folder.
 
-    Raises OptimumError before it begins where the user's folder cannot be written.
+    Raises OptimumError before it begins where the folder cannot be written.
     """
     folder = require_cache()
     optimum = make()

@@ -76,6 +76,7 @@ class BellmanOperator:
         workers: int = 1,
     ) -> None:
         self.problem = problem
+        self.law = law
         self.discount = discount
         self._step = Elementwise(
             discretise(problem.model, problem.sampling_time, accuracy.substeps)
@@ -99,9 +100,11 @@ class BellmanOperator:
     def values(self, states: Array, actions: Array, grid: Grid, W: Array) -> Array:
         """Q at states (B, n) and actions (B, m) for W (G,) on the grid; shape (B,)."""
 
+        smooth = grid.interpolant(W)
+
         def block(part: slice) -> Array:
             cost, x_next = self._expected_cost(states[part], actions[part])
-            return cost + self.discount * _mean(grid.interpolate(W, x_next), self._weights)
+            return cost + self.discount * _mean(smooth(x_next), self._weights)
 
         return np.concatenate(list(self._map(block, len(states))))
 
@@ -116,7 +119,7 @@ class BellmanOperator:
             count, nodes = x_next[0].shape
             rows = np.repeat(np.arange(count), nodes)
             matrix = sparse.csr_array((count, grid.size))
-            for index, weight in grid.corners(x_next):
+            for index, weight in grid.weights(x_next):
                 data = (weight * self._weights).reshape(-1)
                 matrix += sparse.csr_array(
                     (data, (rows, index.reshape(-1))), shape=(count, grid.size)

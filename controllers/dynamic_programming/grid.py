@@ -1,15 +1,16 @@
-"""A rectangular state grid with multilinear interpolation."""
+"""A rectangular state grid with multilinear interpolation, cubic where the value is smooth."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers.dynamic_programming.interpolation import AxisInterpolant, axis_interpolant
 from controllers.errors import OptimumError
 
 Array = NDArray[np.float64]
@@ -20,13 +21,15 @@ Indices = NDArray[np.intp]
 class Grid:
     """The product of increasing axes, one per state, at least two points each.
 
-    Interpolation weights are non-negative and sum to one, so that they are the row of a stochastic
-    matrix: the interpolated dynamic programme is that of a Markov chain on the grid, with the
-    contraction and the gain bounds that belong to it. A state outside is moved to the nearest
-    state of the box.
+    `smooth` has an interval per state within which interpolation is cubic; elsewhere, and without
+    it, it is multilinear. Multilinear weights are non-negative and sum to one, so that they are the
+    row of a stochastic matrix: the interpolated dynamic programme is that of a Markov chain on the
+    grid, with the contraction and the gain bounds that belong to it. Cubic ones sum to one, too,
+    but some are negative. A state outside is moved to the nearest state of the box.
     """
 
     axes: tuple[Array, ...]
+    smooth: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
         """Freeze and check the axes."""
@@ -68,34 +71,79 @@ class Grid:
         index = [int(np.abs(axis - x).argmin()) for axis, x in zip(self.axes, state, strict=True)]
         return int(np.ravel_multi_index(index, self.shape))
 
-    def corners(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
-        """Grid indices and weights of the 2ⁿ corners around states given as one array per entry."""
-        cells, fractions = [], []
-        for axis, values in zip(self.axes, x, strict=True):
-            cell = np.clip(np.searchsorted(axis, values) - 1, 0, len(axis) - 2)
-            left = axis[cell]
-            fractions.append(np.clip((values - left) / (axis[cell + 1] - left), 0.0, 1.0))
-            cells.append(cell)
+    def weights(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
+        """Grid indices and weights of interpolation at states given as one array per entry."""
+        positions, factors = [], []
         strides = np.cumprod((1, *self.shape[:0:-1]))[::-1]
-        base = sum(cell * stride for cell, stride in zip(cells, strides, strict=True))
+        for interpolant, stride, values in zip(self._interpolants, strides, x, strict=True):
+            cell, offset = interpolant.locate(values)
+            start = interpolant.first[cell]
+            points = interpolant.weights.shape[1]
+            positions.append([stride * (start + j) for j in range(points)])
+            factors.append(
+                [_polynomial(interpolant.weights[:, j], cell, offset) for j in range(points)]
+            )
         result = []
-        for upper in itertools.product((False, True), repeat=len(cells)):
-            weight: Array = np.ones(())
-            for fraction, high in zip(fractions, upper, strict=True):
-                weight = weight * (fraction if high else 1.0 - fraction)
-            result.append((base + int(np.dot(upper, strides)), weight))
+        for stencil in itertools.product(*(range(len(row)) for row in positions)):
+            index, weight = np.zeros((), dtype=np.intp), np.ones(())
+            for position, factor, j in zip(positions, factors, stencil, strict=True):
+                index, weight = index + position[j], weight * factor[j]
+            result.append((index, weight))
         return result
+
+    def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
+        """Function that interpolates `values` (G,) at states given as one array per entry."""
+        table = values.reshape(self.shape)
+        for interpolant in self._interpolants:
+            stencil = interpolant.first + np.arange(interpolant.weights.shape[1])[:, None]
+            # The first axis becomes (power, cell), and both go last.
+            table = np.einsum("ijc,jc...->...ic", interpolant.weights, table[stencil])
+        n = len(self.axes)
+        table = table.transpose(*range(0, 2 * n, 2), *range(1, 2 * n, 2))
+        table = np.ascontiguousarray(table.reshape(*table.shape[:n], -1))
+
+        def function(x: Sequence[Array]) -> Array:
+            index: Indices = np.zeros((), dtype=np.intp)
+            offsets = []
+            for interpolant, entry in zip(self._interpolants, x, strict=True):
+                cell, offset = interpolant.locate(entry)
+                index = index * (len(interpolant.axis) - 1) + cell
+                offsets.append(offset)
+            return _horner(table, index, offsets)
+
+        return function
 
     def interpolate(self, values: Array, x: Sequence[Array]) -> Array:
         """Interpolate `values` (G,) at states given as one array per entry of the state."""
-        total: Array = np.zeros(())
-        for index, weight in self.corners(x):
-            total = total + weight * values[index]
-        return total
+        return self.interpolant(values)(x)
+
+    @cached_property
+    def _interpolants(self) -> list[AxisInterpolant]:
+        smooth = self.smooth or (None,) * len(self.axes)
+        return [axis_interpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
 
     def resample(self, values: Array, other: Grid) -> Array:
-        """Values (G,) or (G, k) of this grid, interpolated at the states of another one."""
+        """Values (G,) or (G, k), interpolated multilinearly at the states of another grid."""
         x = list(other.points.T)
+        linear = Grid(self.axes)
         if values.ndim == 1:
-            return self.interpolate(values, x)
-        return np.stack([self.interpolate(column, x) for column in values.T], axis=1)
+            return linear.interpolate(values, x)
+        return np.stack([linear.interpolate(column, x) for column in values.T], axis=1)
+
+
+def _polynomial(coefficients: Array, cell: Indices, offset: Array) -> Array:
+    total: Array = coefficients[-1][cell]
+    for row in coefficients[-2::-1]:
+        total = total * offset + row[cell]
+    return total
+
+
+def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
+    if not offsets:
+        values: Array = table[index]
+        return values
+    first, *rest = offsets
+    total = _horner(table[-1], index, rest)
+    for part in table[-2::-1]:
+        total = total * first + _horner(part, index, rest)
+    return total

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -9,9 +11,10 @@ from numpy.typing import NDArray
 
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.errors import OptimumError
-from controllers.problem import Problem, ScenarioLike
+from controllers.problem import Problem, ScenarioLike, load_model
 
 Vector = NDArray[np.float64]
+MEND = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
 
 
 class StochasticScenario(ScenarioLike, Protocol):
@@ -24,6 +27,38 @@ class StochasticScenario(ScenarioLike, Protocol):
     @property
     def disturbance(self) -> Any:
         """The law of its disturbances."""
+
+
+@dataclass(frozen=True)
+class PlantProblem:
+    """The control problem with the plant's own model, and what is random in it.
+
+    `parameters` (n_p,) are the plant's physical ones.
+    """
+
+    problem: Problem
+    law: DisturbanceLaw
+    parameters: Vector
+
+    @classmethod
+    def from_scenario(
+        cls,
+        scenario: StochasticScenario,
+        overrides: Mapping[str, float | None] | None = None,
+    ) -> PlantProblem:
+        """What a scenario says of its plant; `overrides` replaces plant parameters by name.
+
+        One that is overridden by None is left out. The plant's model is `plant.model`, where the
+        scenario names one, else the controller's. Raises OptimumError where it does not fit the
+        plant, ModelError where it cannot be loaded.
+        """
+        named = scenario.plant.model
+        problem = Problem.from_scenario(scenario)
+        if named is not None:
+            problem = replace(problem, model=load_model(named))
+        merged = {**scenario.plant.parameters, **(overrides or {})}
+        given = {name: value for name, value in merged.items() if value is not None}
+        return cls(problem, plant_law(scenario, problem), plant_parameters(given, problem))
 
 
 def plant_law(scenario: StochasticScenario, problem: Problem) -> DisturbanceLaw:
@@ -39,24 +74,25 @@ def plant_law(scenario: StochasticScenario, problem: Problem) -> DisturbanceLaw:
         if ours != theirs:
             raise OptimumError(
                 f"the optimum needs a model of the plant: model '{model.name}' has the {kind} "
-                f"{', '.join(ours)}, the plant {', '.join(theirs)}"
+                f"{', '.join(ours)}, the plant {', '.join(theirs)}; {MEND}"
             )
     nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
     ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(names)))
     return DisturbanceLaw(table.law, nominal, ranges)
 
 
-def plant_parameters(scenario: StochasticScenario, problem: Problem) -> Vector:
-    """Physical parameters (n_p,): the model's nominal ones with what the scenario's plant sets."""
+def plant_parameters(given: Mapping[str, float], problem: Problem) -> Vector:
+    """Physical parameters (n_p,): the model's nominal ones with those that the plant is given."""
     model = problem.model
     parameters = model.nominal_parameters
-    for name, value in scenario.plant.parameters.items():
-        known = [quantity.name for quantity in model.parameters]
+    known = [quantity.name for quantity in model.parameters]
+    for name, value in given.items():
         if name not in known:
             raise OptimumError(
                 f"the optimum needs a model of the plant: plant.parameters sets '{name}', which "
-                f"model '{model.name}' does not have: give the model that parameter, or, where it "
-                "only shapes the noise, name it in plant.mapping.ranges and set disturbance.ranges"
+                f"model '{model.name}' does not have: give the model that parameter, {MEND}, or, "
+                "where it only shapes the noise, name it in plant.mapping.ranges and set "
+                "disturbance.ranges"
             )
         parameters[known.index(name)] = value
     return parameters

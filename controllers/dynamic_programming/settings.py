@@ -38,7 +38,7 @@ class Settings:
     tail: float = 1e-7
     nodes: tuple[int, ...] = ()
     penalty_nodes: tuple[int, ...] = ()
-    integration_tolerance: float = 1e-7
+    integration_tolerance: float = 1e-6
     tolerance: float = 1e-4
     rounds: int = 40
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from controllers.dynamic_programming.axes import finer_grid, first_grid
 from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
+from controllers.dynamic_programming.certificate import Certificate
 from controllers.dynamic_programming.grid import Grid
 from controllers.dynamic_programming.howard import Iterate, begin, iterate_policy
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
@@ -37,7 +38,8 @@ class Optimum:
     """A solved problem: the policy and smooth value on the grid, and what certifies them.
 
     `actions` (G, m), `W` (G,) with V = penalty + W; `gain` J*, the mean cost per sample;
-    `lower` and `upper` as in `Iterate`; `distribution` (G,) the stationary one.
+    `lower` and `upper` as in `Iterate`; `distribution` (G,) the stationary one; `certificate` what
+    was compared with the gain, if anything.
     """
 
     grid: Grid
@@ -49,6 +51,7 @@ class Optimum:
     distribution: Array
     discount: float
     accuracy: Accuracy
+    certificate: Certificate | None = None
 
     @property
     def edge_mass(self) -> float:
@@ -84,11 +87,15 @@ def solve(
     actions = np.tile(problem.reference_action, (grid.size, 1))
     iterate = begin(draft, grid, actions)
     report = _Reporter(progress)
-    for level in range(settings.level):
-        iterate = _approach(operator if level else draft, iterate, settings, report)
-        grid = finer_grid(problem, law, grid, iterate.distribution, settings, level + 1)
-        iterate = _transfer(operator, iterate, grid)
-        report.level = level + 1
+    # Linear interpolation is monotone, so that it finds its way from anywhere, and it smears the
+    # closed loop over its cells, so that the support is known only once these are fine.
+    for level, smooth in ((1, False), *((k + 1, True) for k in range(settings.level))):
+        if settings.level:
+            iterate = _approach(draft, iterate, settings, report)
+            grid = _finer(draft, iterate, settings, level, smooth=smooth)
+            iterate = _transfer(draft, iterate, grid)
+            report.level = level
+    iterate = _scan(draft, _approach(draft, iterate, settings, report), report)
     return _optimum(_converge(operator, iterate, settings, report), operator, accuracy)
 
 
@@ -98,24 +105,25 @@ def refine(
     settings: Settings,
     optimum: Optimum,
     *,
-    grid: Grid | None = None,
+    level: int | None = None,
     accuracy: Accuracy | None = None,
     parameters: Array | None = None,
     workers: int = 2,
     progress: Callable[[Progress], None] | None = None,
 ) -> Optimum:
-    """Solve again from a solution, on another grid or with another accuracy.
+    """Solve again from a solution, on the grid of another level or with another accuracy.
 
     Raises OptimumError as `solve` does.
     """
-    grid, accuracy = grid or optimum.grid, accuracy or optimum.accuracy
+    accuracy = accuracy or optimum.accuracy
     parameters = problem.model.nominal_parameters if parameters is None else parameters
     operator = BellmanOperator(
         problem, law, parameters, accuracy, discount=optimum.discount, workers=workers
     )
     start = begin(operator, optimum.grid, optimum.actions)
     report = _Reporter(progress)
-    report.level = settings.level
+    report.level = settings.level if level is None else level
+    grid = optimum.grid if level is None else _finer(operator, start, settings, level)
     iterate = _converge(operator, _transfer(operator, start, grid), settings, report)
     return _optimum(iterate, operator, accuracy)
 
@@ -134,8 +142,8 @@ def _optimum(iterate: Iterate, operator: BellmanOperator, accuracy: Accuracy) ->
         iterate.actions,
         iterate.W,
         iterate.gain,
-        iterate.lower,
-        iterate.upper,
+        min(iterate.lower, iterate.gain) if operator.discount == 1.0 else iterate.lower,
+        max(iterate.upper, iterate.gain) if operator.discount == 1.0 else iterate.upper,
         np.maximum(iterate.distribution, 0.0),
         operator.discount,
         accuracy,
@@ -182,24 +190,44 @@ def _approach(
     )
 
 
+def _scan(operator: BellmanOperator, iterate: Iterate, report: _Reporter) -> Iterate:
+    """One round that looks for better actions in the whole action box."""
+    return iterate_policy(
+        operator, iterate, rounds=1, scan_points=9, enough=lambda *_: True, report=report
+    )
+
+
 def _converge(
     operator: BellmanOperator, iterate: Iterate, settings: Settings, report: _Reporter
 ) -> Iterate:
-    """Iterate until the bounds meet, and meet again with a scan of the whole action box."""
+    """Iterate until the bounds meet."""
+    return iterate_policy(
+        operator,
+        iterate,
+        rounds=settings.rounds,
+        scan_points=3,
+        enough=lambda _, after: after.spread <= settings.tolerance * abs(after.gain),
+        report=report,
+    )
 
-    def close(_: Iterate, after: Iterate) -> bool:
-        return after.spread <= settings.tolerance * abs(after.gain)
 
-    for scan_points in (3, 9):
-        iterate = iterate_policy(
-            operator,
-            iterate,
-            rounds=settings.rounds,
-            scan_points=scan_points,
-            enough=close,
-            report=report,
-        )
-    return iterate
+def _finer(
+    operator: BellmanOperator,
+    found: Iterate,
+    settings: Settings,
+    level: int,
+    *,
+    smooth: bool = True,
+) -> Grid:
+    return finer_grid(
+        operator,
+        found.grid,
+        found.actions,
+        found.distribution,
+        settings,
+        level,
+        smooth=smooth,
+    )
 
 
 def _transfer(operator: BellmanOperator, iterate: Iterate, grid: Grid) -> Iterate:

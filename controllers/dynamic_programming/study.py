@@ -1,16 +1,18 @@
-"""How far J* depends on the grid and on the quadrature."""
+"""How far J* depends on the grid and on the quadrature, and what its policy costs in simulation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.dynamic_programming.axes import finer_grid
+from controllers.dynamic_programming.certificate import Certificate, Figure
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
+from controllers.dynamic_programming.simulation import simulate_policy
 from controllers.dynamic_programming.solution import Optimum, Progress, refine
 from controllers.problem import Problem
 
@@ -55,7 +57,7 @@ def study(
             law,
             settings,
             before,
-            grid=finer_grid(problem, law, before.grid, before.distribution, settings, level),
+            level=level,
             parameters=parameters,
             progress=progress,
         )
@@ -72,6 +74,26 @@ def study(
         progress=progress,
     )
     return [*rows, Row("quadrature finer", after, _change(optimum, after))]
+
+
+def certify(
+    plant: PlantProblem, rows: Sequence[Row], *, paths: int = 2000, steps: int = 5000
+) -> Optimum:
+    """The first refinement of a study, with its certificate.
+
+    It is what is kept, since it is nearer to J* than the solution that the study began with. The
+    simulation is that of its policy, by `simulate_policy`.
+    """
+    solution, refinement = rows[0].optimum, rows[1].optimum
+    found = simulate_policy(plant, refinement, paths=paths, steps=steps)
+    figures = (
+        Figure("solution", solution.gain, solution.lower, solution.upper),
+        Figure("refinement", refinement.gain, refinement.lower, refinement.upper),
+        Figure(
+            "simulation", found.mean, found.mean - found.half_width, found.mean + found.half_width
+        ),
+    )
+    return replace(refinement, certificate=Certificate(figures))
 
 
 def _change(before: Optimum, after: Optimum) -> float:

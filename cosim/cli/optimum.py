@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -14,10 +15,15 @@ from cosim.cli.output import JsonOption, Output, output
 from cosim.cli.simulate import ScenarioOption
 
 if TYPE_CHECKING:
-    from controllers.dynamic_programming.solution import Progress
+    from controllers.dynamic_programming.certificate import Certificate, Figure
+    from controllers.dynamic_programming.plant import PlantProblem
+    from controllers.dynamic_programming.settings import Settings
+    from controllers.dynamic_programming.solution import Optimum, Progress
     from controllers.dynamic_programming.study import Row
+    from cosim.scenario import Scenario
 
 UNSTABLE = 1
+_SEARCH_SEEDS, _SEARCH_STEPS = range(900_000, 900_010), 10_000
 
 
 class Criterion(StrEnum):
@@ -29,8 +35,8 @@ class Criterion(StrEnum):
 
 # Bounds of J* itself, or of how far the optimal value may lie from the one found.
 _BOUNDS = {
-    Criterion.AVERAGE: ("J* above", "J* below"),
-    Criterion.DISCOUNTED: ("(1-γ)(V*-V) above", "below"),
+    Criterion.AVERAGE: ("J* ≥", "J* ≤"),
+    Criterion.DISCOUNTED: ("(1-γ)(V*-V) ≥", "(1-γ)(V*-V) ≤"),
 }
 
 
@@ -42,8 +48,20 @@ def optimum(
     ] = Criterion.AVERAGE,
     refine: Annotated[
         bool,
-        typer.Option("--refine", help="Refine grid and quadrature until J* is stable to 0.1 %."),
+        typer.Option(
+            "--refine",
+            help="Solve, refine grid and quadrature, simulate the policy; keep the certificate.",
+        ),
     ] = False,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            "--against",
+            help="With --refine: a policy search's θ, compared with the policy on the same noise.",
+            exists=True,
+            dir_okay=False,
+        ),
+    ] = None,
     recompute: Annotated[
         bool, typer.Option("--recompute", help="Solve even if the policy is stored.")
     ] = False,
@@ -51,57 +69,105 @@ def optimum(
 ) -> None:
     """Mean cost per sample J* of the optimal policy, by dynamic programming, with its bounds.
 
-    The policy is stored and serves as controller `optimal`. With --refine, exit code 1 if J* is
-    not stable.
+    The policy is stored and serves as controller `optimal`. It is called J* where solution,
+    refinement and long simulation agree within 0.05 % and no policy search is below; else
+    it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
+    A plant that fouls has the quasi-static reference: J* along its heat transfer.
     """
+    from controllers.quasi_static import Fouling
+    from cosim.cli.compose import load_scenario
+
     with output(json) as out_:
-        rows, document = _solve(scenario, criterion, refine, recompute, out_)
-        header = ("", "J", *_BOUNDS[criterion], "states", "nodes", "penalty nodes", "change")
-        out_.table(
-            f"optimum of {scenario}, {criterion} criterion", header, [_cells(row) for row in rows]
+        task = load_scenario(scenario)
+        if Fouling.of(task) is not None:
+            _quasi_static(task, out_)
+            return
+        rows, certificate, document = _solve(
+            task, scenario, criterion, refine, against, recompute, out_
         )
+        header = ("", "J", *_BOUNDS[criterion], "states", "nodes", "penalty nodes", "change")
+        cells = [_cells(row) for row in rows]
+        out_.table(f"{document['kind']} of {scenario}, {criterion} criterion", header, cells)
+        if certificate is not None:
+            figures = [_figure_cells(figure) for figure in certificate.figures]
+            out_.table("certificate", ("", "J", "from", "to"), figures)
+        if document["objection"] is not None:
+            out_.note(f"not called J*: {document['objection']}")
         out_.json(document)
-    if not document["stable"]:
+    if refine and not document["stable"]:
         raise typer.Exit(UNSTABLE)
 
 
-def _solve(
-    name: str, criterion: Criterion, refine: bool, recompute: bool, out_: Output
-) -> tuple[list[Row], dict[str, Any]]:
+def _quasi_static(task: Scenario, out_: Output) -> None:
+    from controllers.quasi_static import QuasiStaticPolicy
 
-    from controllers.dynamic_programming import archive
-    from controllers.dynamic_programming.plant import (
-        plant_law,
-        plant_parameters,
+    with _progress(out_) as show:
+        policy = QuasiStaticPolicy.from_scenario(task, progress=show)
+    out_.table(
+        f"quasi-static reference of {task.name}: a reference, not a bound",
+        ("UA2", "J*"),
+        [(f"{value:.4f}", f"{gain:.4f}") for value, gain in policy.gains]
+        + [("mean over a cycle", f"{policy.gain:.4f}")],
     )
+    out_.json(
+        {
+            "scenario": task.name,
+            "criterion": "average",
+            "kind": "reference",
+            "objection": "quasi-static: J* along UA2(t), no bound",
+            "J": policy.gain,
+            "table": [{"UA2": value, "J": gain} for value, gain in policy.gains],
+        }
+    )
+
+
+def _solve(
+    task: Scenario,
+    name: str,
+    criterion: Criterion,
+    refine: bool,
+    against: Path | None,
+    recompute: bool,
+    out_: Output,
+) -> tuple[list[Row], Certificate | None, dict[str, Any]]:
+    from controllers.dynamic_programming import archive
+    from controllers.dynamic_programming.plant import PlantProblem
     from controllers.dynamic_programming.settings import Settings
     from controllers.dynamic_programming.solution import solve
-    from controllers.dynamic_programming.study import Row, study
-    from controllers.problem import Problem
-    from cosim.cli.compose import load_scenario
+    from controllers.dynamic_programming.study import Row
 
-    scenario = load_scenario(name)
-    problem = Problem.from_scenario(scenario)
-    law, parameters = plant_law(scenario, problem), plant_parameters(scenario, problem)
+    plant = PlantProblem.from_scenario(task)
+    problem, law, parameters = plant.problem, plant.law, plant.parameters
     settings = Settings(criterion=criterion.value)
-    key = archive.key(problem, law, parameters, settings)
+    key = archive.key(plant, settings)
     with _progress(out_) as show:
-        solved = (archive.renew if recompute else archive.obtain)(
-            key, lambda: solve(problem, law, settings, parameters=parameters, progress=show)
-        )
-        rows = [Row("solution", solved)]
+
+        def make() -> Optimum:
+            return solve(problem, law, settings, parameters=parameters, progress=show)
+
         if refine:
-            rows = study(problem, law, settings, solved, parameters=parameters, progress=show)
-    stable = all(row.stable for row in rows[-2:])
+            archive.require_cache()
+            rows, solved = _study(plant, settings, make(), task, against, show)
+            archive.keep(key, lambda: solved)
+        else:
+            solved = archive.keep(key, make) if recompute else archive.obtain(key, problem, make)
+            rows = [Row("stored" if solved.certificate else "solution", solved)]
+    certificate = solved.certificate
+    objection = "no certificate; make one with --refine"
+    if criterion is Criterion.DISCOUNTED:
+        objection = "its mean cost need not be the least"
     document = {
         "scenario": name,
         "criterion": criterion.value,
+        "kind": "",
+        "objection": certificate.objection() if certificate else objection,
         "J": solved.gain,
         "lower": solved.lower,
         "upper": solved.upper,
         "edge_mass": solved.edge_mass,
         "file": str(archive.stored(key)),
-        "stable": stable,
+        "stable": all(row.stable for row in rows[-2:]),
+        "certificate": certificate.to_list() if certificate else None,
         "rows": [
             {
                 "what": row.what,
@@ -115,7 +181,64 @@ def _solve(
             for row in rows
         ],
     }
-    return rows, document
+    called = document["objection"] is None
+    document["kind"] = "optimum" if called else "reference"
+    document["stable"] = document["stable"] and (called or criterion is Criterion.DISCOUNTED)
+    return rows, certificate, document
+
+
+def _study(
+    plant: PlantProblem,
+    settings: Settings,
+    solved: Optimum,
+    task: Scenario,
+    against: Path | None,
+    show: Callable[[Progress], None],
+) -> tuple[list[Row], Optimum]:
+    """The solution and what refines it, and the refinement that is kept with its certificate."""
+    from dataclasses import replace
+
+    from controllers.dynamic_programming.study import certify, study
+
+    rows = study(
+        plant.problem, plant.law, settings, solved, parameters=plant.parameters, progress=show
+    )
+    certified = certify(plant, rows)
+    if against is not None and certified.certificate is not None:
+        found = replace(
+            certified.certificate,
+            figures=(*certified.certificate.figures, _searched(task, plant, certified, against)),
+        )
+        certified = replace(certified, certificate=found)
+    return rows, certified
+
+
+def _searched(task: Scenario, plant: PlantProblem, found: Optimum, against: Path) -> Figure:
+    """J of a θ: the policy's simulated J and the paired difference to it on the FMU."""
+    import numpy as np
+    from scipy.stats import t
+
+    from controllers import factories
+    from controllers.dynamic_programming.certificate import SEARCH, Figure
+    from controllers.optimum import OptimalPolicy
+    from cosim.plant import FmuPlant
+    from cosim.simulation import simulate
+
+    policy = OptimalPolicy(plant.problem, plant.law, found, plant.parameters)
+    searched = factories.from_file(task, against)
+    difference = np.zeros(len(_SEARCH_SEEDS))
+    with FmuPlant(task) as fmu:
+        for i, seed in enumerate(_SEARCH_SEEDS):
+            for sign, controller in ((1.0, searched), (-1.0, policy)):
+                run = simulate(fmu, controller, _SEARCH_STEPS, seed)
+                difference[i] += sign * (run["stage_cost"] + run["penalty"]).mean()
+    assert found.certificate is not None
+    base = found.certificate["simulation"]
+    assert base is not None
+    spread = t.ppf(0.975, len(difference) - 1) * difference.std(ddof=1) / len(difference) ** 0.5
+    value = base.value + float(difference.mean())
+    half_width = float(np.hypot(spread, 0.5 * (base.upper - base.lower)))
+    return Figure(SEARCH, value, value - half_width, value + half_width)
 
 
 def _cells(row: Row) -> tuple[str, ...]:
@@ -130,6 +253,10 @@ def _cells(row: Row) -> tuple[str, ...]:
         "×".join(map(str, found.accuracy.penalty_nodes)),
         "" if row.change is None else f"{100 * row.change:.5f} %",
     )
+
+
+def _figure_cells(figure: Figure) -> tuple[str, ...]:
+    return (figure.name, f"{figure.value:.2f}", f"{figure.lower:.2f}", f"{figure.upper:.2f}")
 
 
 @contextmanager

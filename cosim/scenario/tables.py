@@ -66,6 +66,8 @@ class PlantTable(Table):
     """State at k = 0, (n,)."""
     parameters: dict[str, float | bool] = {}
     """Further start values, by variable, that each reset writes."""
+    model: Annotated[str, Field(pattern=r"^[\w.]+:\w+$")] | None = None
+    """Model of the plant for its optimum, `module:factory`, where the controller's is another."""
     mapping: MappingTable = MappingTable()
     """Table `[plant.mapping]`."""
 

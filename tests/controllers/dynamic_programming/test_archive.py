@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from controllers.dynamic_programming import archive
+from controllers.dynamic_programming.certificate import Certificate, Figure
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import solve
@@ -18,7 +20,9 @@ P = PROBLEM.model.nominal_parameters
 
 @pytest.fixture(scope="module")
 def optimum():
-    return solve(SCALAR.problem, SCALAR.law, Settings(level=1))
+    found = solve(SCALAR.problem, SCALAR.law, Settings(level=1))
+    figure = Figure("solution", found.gain, found.lower, found.upper)
+    return replace(found, certificate=Certificate((figure,)))
 
 
 @pytest.fixture
@@ -27,13 +31,15 @@ def stored(optimum, tmp_path):
 
 
 def test_a_solution_survives_storage_bit_for_bit(optimum, stored):
-    found = archive.read(stored, "abc")
+    found = archive.read(stored, "abc", SCALAR.problem)
     for name in ("actions", "W", "distribution"):
         np.testing.assert_array_equal(getattr(found, name), getattr(optimum, name))
     for ours, theirs in zip(found.grid.axes, optimum.grid.axes, strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert (found.gain, found.lower, found.upper) == (optimum.gain, optimum.lower, optimum.upper)
     assert (found.discount, found.accuracy) == (optimum.discount, optimum.accuracy)
+    assert found.grid.smooth == optimum.grid.smooth
+    assert found.certificate == optimum.certificate
 
 
 def test_equal_solutions_make_equal_bytes(optimum, stored, tmp_path):
@@ -53,30 +59,60 @@ DAMAGE = {
 def test_a_damaged_file_has_one_clear_error(stored, how):
     stored.write_bytes(DAMAGE[how](stored.read_bytes()))
     with pytest.raises(OptimumError, match=r"policy\.npz: .*delete it"):
-        archive.read(stored, "abc")
+        archive.read(stored, "abc", SCALAR.problem)
 
 
 def test_a_pickle_is_refused(tmp_path):
     path = tmp_path / "policy.npz"
     np.savez(path, document=np.array([{"key": "abc"}], dtype=object))
     with pytest.raises(OptimumError, match="not a readable optimal policy"):
-        archive.read(path, "abc")
+        archive.read(path, "abc", SCALAR.problem)
 
 
-def test_arrays_that_do_not_fit_are_refused(optimum, tmp_path):
-    for broken in (
-        replace(optimum, W=optimum.W[:-1]),
-        replace(optimum, actions=optimum.actions[:, 0]),
-        replace(optimum, W=np.full_like(optimum.W, np.nan)),
-    ):
-        path = archive.write(tmp_path / "policy.npz", broken, "abc")
-        with pytest.raises(OptimumError, match="do not fit its grid or are not finite"):
-            archive.read(path, "abc")
+WRONG = {
+    "one value less": (lambda o: {"W": o.W[:-1]}, "do not fit its grid"),
+    "actions of one axis": (lambda o: {"actions": o.actions[:, 0]}, "do not fit its grid"),
+    "NaN": (lambda o: {"W": np.full_like(o.W, np.nan)}, "not finite"),
+    "infinite": (lambda o: {"actions": o.actions + np.inf}, "not finite"),
+    "complex": (lambda o: {"W": o.W.astype(complex)}, "not finite numbers"),
+    "gain below its bounds": (lambda o: {"gain": o.lower - 1.0}, "do not enclose"),
+    "gain above its bounds": (lambda o: {"gain": o.upper + 1.0}, "do not enclose"),
+    "bounds inverted": (lambda o: {"lower": o.upper + 1, "upper": o.lower}, "do not enclose"),
+    "bound NaN": (lambda o: {"upper": np.nan}, "do not enclose"),
+    "huge actions": (lambda o: {"actions": o.actions + 1e9}, "actions beyond their bounds"),
+    "negative share": (lambda o: {"distribution": o.distribution - 1.0}, "distribution is none"),
+    "no share": (lambda o: {"distribution": 0.0 * o.distribution}, "distribution is none"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_content_that_cannot_be_is_refused_though_its_checksum_fits(optimum, tmp_path, what):
+    change, message = WRONG[what]
+    path = archive.write(tmp_path / "policy.npz", replace(optimum, **change(optimum)), "abc")
+    with pytest.raises(OptimumError, match=message):
+        archive.read(path, "abc", SCALAR.problem)
+
+
+def test_content_changed_by_hand_is_refused(stored):
+    with np.load(stored) as file:
+        arrays = dict(file)
+    arrays["W"] = arrays["W"] + 1e-9
+    np.savez_compressed(stored, **arrays)
+    with pytest.raises(OptimumError, match="its checksum does not fit its content; delete it"):
+        archive.read(stored, "abc", SCALAR.problem)
+
+
+def test_the_packages_own_is_preferred_to_the_users(optimum, tmp_path, monkeypatch):
+    for folder in ("shipped", "cache"):
+        archive.write(tmp_path / folder / "abc.npz", optimum, "abc")
+    monkeypatch.setattr(archive, "SHIPPED", tmp_path / "shipped")
+    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path / "cache")
+    assert archive.stored("abc") == tmp_path / "shipped" / "abc.npz"
 
 
 def test_another_problems_file_is_refused(stored):
     with pytest.raises(OptimumError, match="policy of problem abc, not of def"):
-        archive.read(stored, "def")
+        archive.read(stored, "def", SCALAR.problem)
 
 
 def test_what_is_solved_once_is_read_the_next_time(optimum, tmp_path, monkeypatch):
@@ -87,7 +123,7 @@ def test_what_is_solved_once_is_read_the_next_time(optimum, tmp_path, monkeypatc
         calls.append(1)
         return optimum
 
-    first, second = archive.obtain("abc", make), archive.obtain("abc", make)
+    first, second = (archive.obtain("abc", SCALAR.problem, make) for _ in range(2))
     assert len(calls) == 1
     np.testing.assert_array_equal(first.W, second.W)
 
@@ -97,12 +133,12 @@ def test_a_cache_that_cannot_be_written_is_refused_before_the_work(tmp_path, mon
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "file"))
     calls = []
     with pytest.raises(OptimumError, match=r"cannot be kept there .*COSIM_CACHE"):
-        archive.obtain("abc", lambda: calls.append(1))
+        archive.obtain("abc", SCALAR.problem, lambda: calls.append(1))
     assert not calls
 
 
 def changed_key(problem=PROBLEM, law=LAW, parameters=P, settings=None):
-    return archive.key(problem, law, parameters, settings or Settings())
+    return archive.key(PlantProblem(problem, law, parameters), settings or Settings())
 
 
 CHANGES = {

@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from controllers.dynamic_programming.axes import graded_axis, support
+from controllers.dynamic_programming.axes import Feature, graded_axis, support
 from controllers.dynamic_programming.grid import Grid
 from controllers.errors import OptimumError
 
@@ -32,7 +32,7 @@ def test_multilinear_functions_are_interpolated_exactly():
 
 def test_weights_are_a_row_of_a_stochastic_matrix_inside_and_outside():
     x = 3.0 * states() - 1.0
-    corners = GRID.corners(list(x.T))
+    corners = GRID.weights(list(x.T))
     weights = np.stack([weight for _, weight in corners])
     assert (weights >= 0).all()
     np.testing.assert_allclose(weights.sum(axis=0), 1.0, rtol=1e-14)
@@ -49,7 +49,7 @@ def test_states_outside_are_served_by_the_nearest_state_of_the_box():
 
 def test_resampling_on_the_same_grid_changes_nothing():
     values = np.random.default_rng(1).normal(size=(GRID.size, 2))
-    np.testing.assert_allclose(GRID.resample(values, GRID), values, rtol=1e-14)
+    np.testing.assert_allclose(GRID.resample(values, GRID), values, rtol=1e-12)
 
 
 def test_nearest_and_boundary():
@@ -65,19 +65,86 @@ def test_bad_axis_is_refused(axis):
         Grid((np.array(axis),))
 
 
-def test_graded_axis_is_dense_inside_grows_outside_and_meets_its_ends():
-    axis = graded_axis(-10.0, 100.0, 0.0, 2.0, 0.1, 1.3)
+SMOOTH = Grid(
+    (np.array([0.0, 0.5, 1.1, 1.4, 2.0, 3.0]), np.linspace(-1.0, 4.0, 8) ** 3),
+    ((0.0, 2.0), (-1.0, 30.0)),
+)
+
+
+def test_cubics_are_interpolated_exactly_within_the_smooth_intervals():
+    generator = np.random.default_rng(5)
+    coefficients = generator.normal(size=(4, 4))
+    upper = SMOOTH.axes[1][SMOOTH.axes[1] <= 30.0][-1]
+    x = generator.uniform([0.0, -1.0], [2.0, upper], (300, 2))
+
+    def function(x):
+        return np.polynomial.polynomial.polyval2d(*x.T, coefficients)
+
+    np.testing.assert_allclose(
+        SMOOTH.interpolate(function(SMOOTH.points), list(x.T)), function(x), rtol=1e-10, atol=1e-8
+    )
+
+
+def test_interpolation_is_linear_outside_the_smooth_intervals_and_continuous():
+    values = np.random.default_rng(6).normal(size=SMOOTH.size)
+    edge = np.array([2.0, 2.5, 3.0])
+    found = SMOOTH.interpolate(values, [edge, np.full(3, SMOOTH.axes[1][2])])
+    assert found[1] == pytest.approx(0.5 * (found[0] + found[2]), rel=1e-12)
+    for place in (1.1, 2.0):
+        sides = np.array([place - 1e-9, place + 1e-9])
+        left, right = SMOOTH.interpolate(values, [sides, np.zeros(2)])
+        assert left == pytest.approx(right, abs=1e-6)
+
+
+def test_a_kink_beyond_the_smooth_interval_does_not_reach_into_it():
+    values = SMOOTH.points[:, 0].copy()
+    values[SMOOTH.points[:, 0] > 2.0] = 1e6
+    x = np.linspace(0.0, 2.0, 50)
+    np.testing.assert_allclose(SMOOTH.interpolate(values, [x, np.zeros(50)]), x, atol=1e-12)
+
+
+def test_cubic_weights_are_what_interpolation_multiplies_with_and_sum_to_one():
+    generator = np.random.default_rng(7)
+    values = generator.normal(size=SMOOTH.size)
+    x = list(generator.uniform([-1.0, -5.0], [4.0, 70.0], (400, 2)).T)
+    weights = SMOOTH.weights(x)
+    np.testing.assert_allclose(sum(weight for _, weight in weights), 1.0, rtol=1e-10)
+    np.testing.assert_allclose(
+        sum(weight * values[index] for index, weight in weights),
+        SMOOTH.interpolate(values, x),
+        rtol=1e-9,
+        atol=1e-9,
+    )
+
+
+def test_too_few_points_within_the_smooth_interval_are_interpolated_linearly():
+    axes = (np.array([0.0, 1.0, 3.0, 4.0]),)
+    x = np.linspace(0.0, 4.0, 41)
+    values = np.array([0.0, 1.0, 0.0, 2.0])
+    np.testing.assert_array_equal(
+        Grid(axes, ((0.0, 3.5),)).interpolate(values, [x]), Grid(axes).interpolate(values, [x])
+    )
+
+
+def test_graded_axis_is_dense_at_features_grows_outside_and_meets_its_marks():
+    features = [Feature(0.0, 2.0, 0.1), Feature(50.0, 50.0, 0.02)]
+    axis = graded_axis([-10.0, 50.0, 100.0], features, 1.3)
     cells = np.diff(axis)
-    inside = (axis[:-1] >= -1e-12) & (axis[1:] <= 2 + 1e-12)
-    assert axis[0] == pytest.approx(-10.0)
-    assert axis[-1] == pytest.approx(100.0)
-    np.testing.assert_allclose(cells[inside], 0.1, rtol=1e-9)
-    assert (cells[1:] / cells[:-1] < 1.31).all()
-    assert len(axis) < 60
+    assert axis[[0, -1]].tolist() == [-10.0, 100.0]
+    assert 50.0 in axis
+    inside = (axis[:-1] >= 0.0) & (axis[1:] <= 2.0)
+    assert inside.sum() >= 18
+    assert (cells[inside] <= 0.1 + 1e-9).all()
+    beside = np.searchsorted(axis, 50.0)
+    assert cells[beside - 1 : beside + 1].max() < 0.03
+    # Growth is that of a continuous width, so that a cell may be a little wider than 1.3 times.
+    assert (cells[1:] / cells[:-1] < 1.5).all()
+    assert len(axis) < 100
 
 
 def test_graded_axis_without_room_outside_is_equidistant():
-    np.testing.assert_allclose(graded_axis(0.0, 1.0, -1.0, 2.0, 0.25, 1.3), np.arange(5) / 4)
+    axis = graded_axis([0.0, 1.0], [Feature(-1.0, 2.0, 0.25)], 1.3)
+    np.testing.assert_allclose(axis, np.arange(5) / 4)
 
 
 def test_support_leaves_out_the_tails_only():

@@ -14,19 +14,15 @@ def solved(plant, level, criterion="average", **settings):
 
 @pytest.fixture(scope="module")
 def scalar_levels():
-    return [solved(SCALAR, level) for level in (2, 3, 4)]
+    return [solved(SCALAR, level) for level in (1, 2)]
 
 
-def test_mean_cost_converges_to_riccati_with_the_square_of_the_cell(scalar_levels):
+def test_mean_cost_is_riccatis_on_the_coarsest_grid_that_knows_the_support(scalar_levels):
     exact = np.trace(SCALAR.riccati()[0] @ SCALAR.covariance)
-    errors = [optimum.gain - exact for optimum in scalar_levels]
-    # Multilinear interpolation of a convex W errs upwards, by O(h²).
-    assert errors[0] > errors[1] > errors[2] > 0
-    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.15)
-    assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.15)
-    assert errors[2] < 2e-3 * exact
-    extrapolated = scalar_levels[2].gain + (scalar_levels[2].gain - scalar_levels[1].gain) / 3
-    assert extrapolated == pytest.approx(exact, rel=2e-4)
+    for optimum in scalar_levels:
+        # W is quadratic, which the cubic holds exactly.
+        assert optimum.gain == pytest.approx(exact, rel=1e-5)
+    assert scalar_levels[0].grid.size < 50
 
 
 def test_policy_is_the_linear_quadratic_regulator(scalar_levels):
@@ -34,7 +30,7 @@ def test_policy_is_the_linear_quadratic_regulator(scalar_levels):
     optimum = scalar_levels[-1]
     x = optimum.grid.points
     near = np.abs(x[:, 0]) < 0.4
-    assert near.sum() > 50
+    assert near.sum() > 30
     np.testing.assert_allclose(optimum.actions[near], x[near] @ K.T, atol=4e-3)
     W = optimum.W - optimum.W[np.abs(x[:, 0]).argmin()]
     np.testing.assert_allclose(W[near], P[0, 0] * x[near, 0] ** 2, atol=1e-3)
@@ -42,16 +38,13 @@ def test_policy_is_the_linear_quadratic_regulator(scalar_levels):
 
 def test_discounted_value_and_its_mean_cost_are_riccatis():
     P, K = SCALAR.riccati(SCALAR.discount)
-    coarse, fine = (solved(SCALAR, level, "discounted") for level in (3, 4))
+    found = solved(SCALAR, 2, "discounted")
     gamma = SCALAR.discount
     x = np.array([-0.3, 0.0, 0.2])
     exact = P[0, 0] * x**2 + gamma / (1 - gamma) * np.trace(P @ SCALAR.covariance)
-    values = [optimum.grid.interpolate(optimum.W, [x]) for optimum in (coarse, fine)]
-    np.testing.assert_allclose(values[1], exact, rtol=5e-3)
-    np.testing.assert_allclose(values[1] + (values[1] - values[0]) / 3, exact, rtol=2e-3)
+    np.testing.assert_allclose(found.grid.interpolate(found.W, [x]), exact, rtol=1e-4)
     # The gain is the policy's own mean cost, not the least one.
-    extrapolated = fine.gain + (fine.gain - coarse.gain) / 3
-    assert extrapolated == pytest.approx(SCALAR.mean_cost(K), rel=2e-3)
+    assert found.gain == pytest.approx(SCALAR.mean_cost(K), rel=1e-4)
     assert SCALAR.mean_cost(K) > 1.001 * SCALAR.mean_cost(SCALAR.riccati()[1])
 
 
@@ -59,15 +52,11 @@ def test_discounted_value_and_its_mean_cost_are_riccatis():
 def test_two_states_and_two_disturbances_agree_with_riccati():
     P, K = PLANE.riccati()
     exact = np.trace(P @ PLANE.covariance)
-    coarse, fine = (
-        solved(PLANE, level, nodes=(3, 3), tail=1e-3, growth=1.6, tolerance=1e-3)
-        for level in (1, 2)
-    )
-    assert exact < fine.gain < coarse.gain
-    assert fine.gain + (fine.gain - coarse.gain) / 3 == pytest.approx(exact, rel=1e-2)
-    x = fine.grid.points
+    found = solved(PLANE, 1, nodes=(3, 3), tail=1e-3, growth=1.6, tolerance=1e-3)
+    assert found.gain == pytest.approx(exact, rel=1e-3)
+    x = found.grid.points
     near = np.abs(x).max(axis=1) < 0.2
-    np.testing.assert_allclose(fine.actions[near], x[near] @ K.T, atol=0.02)
+    np.testing.assert_allclose(found.actions[near], x[near] @ K.T, atol=0.02)
 
 
 def test_bounds_enclose_the_optimum_in_every_round_and_the_gain_falls():
@@ -76,7 +65,8 @@ def test_bounds_enclose_the_optimum_in_every_round_and_the_gain_falls():
     optimum = solve(SCALAR.problem, SCALAR.law, settings, progress=rounds.append)
     final = [progress for progress in rounds if progress.level == 2]
     assert len(final) >= 3
-    slack = 1e-6 * optimum.gain
+    # Two quadratures are at work, the draft's and the last one's.
+    slack = 1e-5 * optimum.gain
     for progress in final:
         assert progress.lower <= optimum.gain + slack
         assert progress.upper >= optimum.gain - slack
@@ -95,10 +85,13 @@ def test_number_of_workers_changes_no_bit():
 
 
 def test_refining_a_solution_equals_solving_finely(scalar_levels):
-    coarse, fine = scalar_levels[:2]
-    refined = refine(SCALAR.problem, SCALAR.law, Settings(), coarse, grid=fine.grid)
-    assert refined.gain == pytest.approx(fine.gain, rel=1e-4)
-    np.testing.assert_array_equal(refined.grid.points, fine.grid.points)
+    coarse, fine = scalar_levels
+    refined = refine(SCALAR.problem, SCALAR.law, Settings(), coarse, level=2)
+    assert refined.grid.size > 1.4 * coarse.grid.size
+    assert refined.gain == pytest.approx(fine.gain, rel=1e-5)
+    again = refine(SCALAR.problem, SCALAR.law, Settings(), coarse, accuracy=coarse.accuracy.finer())
+    np.testing.assert_array_equal(again.grid.points, coarse.grid.points)
+    assert again.gain == pytest.approx(coarse.gain, rel=1e-5)
 
 
 def test_unstable_plant_that_leaves_its_box_is_refused():

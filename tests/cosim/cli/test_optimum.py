@@ -1,17 +1,25 @@
 """`cosim optimum`: J*, bounds, files and errors."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from controllers.dynamic_programming import archive
+from controllers.dynamic_programming.certificate import Certificate
+from controllers.dynamic_programming.plant import PlantProblem
+from controllers.dynamic_programming.settings import Settings
+from cosim import Scenario
 
 
 def test_stored_optimum_as_json(cosim):
     code, out, _ = cosim("optimum", "--scenario", "paper", "--json")
     document = json.loads(out)
     assert code == 0
-    assert document["J"] == pytest.approx(6337.87, abs=0.01)
+    assert document["J"] == pytest.approx(6337.8, abs=0.1)
+    assert (document["kind"], document["objection"]) == ("optimum", None)
+    names = [figure["name"] for figure in document["certificate"]]
+    assert names[:3] == ["solution", "refinement", "simulation"]
     assert document["lower"] <= document["J"] <= document["upper"]
     assert document["upper"] - document["lower"] < 1e-3 * document["J"]
     assert document["stable"] is True
@@ -21,8 +29,40 @@ def test_stored_optimum_as_json(cosim):
 def test_table_shows_value_and_bounds(cosim):
     code, out, _ = cosim("optimum", "--scenario", "fast-sampling")
     assert code == 0
-    assert "J* above" in out
-    assert "6224.99" in out
+    assert "J* ≥" in out and "J* ≤" in out
+    assert "optimum of fast-sampling" in out
+    assert "6224.9" in out
+
+
+def test_without_a_certificate_it_is_a_reference(cosim, tmp_path, monkeypatch):
+    plant = PlantProblem.from_scenario(Scenario.load("paper"))
+    key = archive.key(plant, Settings())
+    known = archive.read(archive.SHIPPED / f"{key}.npz", key, plant.problem)
+    monkeypatch.setattr(archive, "SHIPPED", tmp_path / "none")
+    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
+    archive.write(tmp_path / f"{key}.npz", replace(known, certificate=None), key)
+    code, out, err = cosim("optimum", "--scenario", "paper")
+    assert code == 0
+    assert "reference of paper" in out
+    assert "not called J*: no certificate; make one with --refine" in out + err
+    figures = known.certificate.figures
+    apart = (replace(figures[0], value=6300.0, lower=6300.0, upper=6300.0), *figures[1:])
+    apart = replace(known, certificate=Certificate(apart))
+    archive.write(tmp_path / f"{key}.npz", apart, key)
+    code, out, _ = cosim("optimum", "--scenario", "paper", "--json")
+    document = json.loads(out)
+    assert document["kind"] == "reference"
+    assert "apart, more than 0.05 %" in document["objection"]
+
+
+def test_a_drifting_plant_has_the_quasi_static_reference(cosim):
+    code, out, _ = cosim("optimum", "--scenario", "drifting", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert document["kind"] == "reference"
+    gains = [row["J"] for row in document["table"]]
+    assert gains == sorted(gains, reverse=True)
+    assert gains[-1] < document["J"] < gains[0]
 
 
 def test_unknown_scenario_is_one_line_of_error(cosim):
@@ -42,6 +82,7 @@ def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):
     monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
     for shipped in archive.SHIPPED.glob("*.npz"):
         (tmp_path / shipped.name).write_bytes(b"damaged")
+    monkeypatch.setattr(archive, "SHIPPED", tmp_path / "none")
     code, out, err = cosim("optimum", "--scenario", "paper")
     assert (code, out) == (2, "")
     assert "not a readable optimal policy" in err
@@ -62,5 +103,5 @@ def test_solving_anew_ends_in_the_optimum_that_is_shipped(cosim, tmp_path, monke
     monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
     code, out, _ = cosim("optimum", "--scenario", "paper", "--recompute", "--json")
     assert code == 0
-    assert json.loads(out)["J"] == pytest.approx(6337.868736630078, rel=1e-6)
+    assert json.loads(out)["J"] == pytest.approx(6337.8, rel=3e-5)
     assert len(list(tmp_path.glob("**/*.npz"))) == 1

@@ -1,0 +1,46 @@
+import pytest
+
+from controllers.dynamic_programming.plant import PlantProblem
+from controllers.dynamic_programming.settings import Settings
+from controllers.dynamic_programming.simulation import simulate_policy
+from controllers.dynamic_programming.solution import solve
+from controllers.dynamic_programming.study import certify, study
+from tests.helpers.linear_plant import SCALAR
+
+PLANT = PlantProblem(SCALAR.problem, SCALAR.law, SCALAR.problem.model.nominal_parameters)
+
+
+@pytest.fixture(scope="module")
+def optimum():
+    return solve(SCALAR.problem, SCALAR.law, Settings())
+
+
+def test_the_simulated_mean_cost_is_the_linear_regulators(optimum):
+    found = simulate_policy(PLANT, optimum, paths=400, steps=1000)
+    exact = SCALAR.mean_cost(SCALAR.riccati()[1])
+    assert found.half_width < 0.01 * exact
+    assert abs(found.mean - exact) < 2 * found.half_width
+
+
+def test_equal_seeds_give_equal_means(optimum):
+    first, second, other = (
+        simulate_policy(PLANT, optimum, paths=20, steps=50, seed=seed) for seed in (1, 1, 2)
+    )
+    assert first == second
+    assert first.mean != other.mean
+
+
+def test_a_study_is_certified_by_what_it_found(optimum):
+    rows = study(SCALAR.problem, SCALAR.law, Settings(), optimum)
+    certified = certify(PLANT, rows, paths=200, steps=500)
+    certificate = certified.certificate
+    assert [figure.name for figure in certificate.figures] == [
+        "solution",
+        "refinement",
+        "simulation",
+    ]
+    assert certified.gain == rows[1].optimum.gain
+    assert certificate["solution"].value == optimum.gain
+    assert certificate["refinement"].value == rows[1].optimum.gain
+    # So short a simulation cannot certify.
+    assert certificate.objection() is not None

@@ -1,0 +1,117 @@
+"""The quasi-static reference of a plant that fouls, and the yardstick of any."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controllers.dynamic_programming import archive
+from controllers.errors import OptimumError
+from controllers.optimum import OptimalPolicy
+from controllers.quasi_static import Fouling, QuasiStaticPolicy
+from controllers.yardstick import yardstick
+from cosim import FmuPlant, Scenario
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    return Scenario.load("drifting")
+
+
+@pytest.fixture(scope="module")
+def policy(drifting):
+    return QuasiStaticPolicy.stored(drifting)
+
+
+def test_the_law_of_fouling_is_the_fmus(drifting):
+    fouling = Fouling.of(drifting)
+    seen = drifting.replace(
+        {
+            "sampling_time": 21600.0,
+            "plant": {"disturbances": ["UA2_present"], "mapping": {"nominal": [], "ranges": []}},
+            "disturbance": {"law": "none", "nominal": [], "ranges": []},
+        }
+    )
+    with FmuPlant(seen) as plant:
+        plant.reset(0)
+        found = [plant.step(seen.reference_action).disturbance[0] for _ in range(60)]
+    np.testing.assert_allclose(found, fouling.heat_transfer(0.25 * np.arange(60)), rtol=1e-9)
+    assert min(found) < 5.2
+    assert max(found) > 6.8
+
+
+def test_a_condenser_that_does_not_foul_has_no_law():
+    assert Fouling.of(Scenario.load("paper")) is None
+    still = Scenario.load("drifting").replace({"plant": {"parameters": {"fouling_floor": 1.0}}})
+    assert Fouling.of(still) is None
+    never = Scenario.load("drifting").replace({"plant": {"parameters": {"cleaning_period": 0.0}}})
+    with pytest.raises(OptimumError, match="cleaning_period above 0"):
+        Fouling.of(never)
+
+
+def test_the_reference_is_the_mean_of_the_optima_along_the_cycle(policy):
+    nodes, gains = np.array(policy.gains).T
+    assert nodes[-1] == 6.84
+    assert (np.diff(gains) < 0).all()
+    days = (np.arange(20_000) + 0.5) * 6.0 / 20_000
+    linear = np.interp(policy.fouling.heat_transfer(days), nodes, gains).mean()
+    assert policy.gain == pytest.approx(linear, rel=1e-3)
+    assert gains[-1] < policy.gain < gains[0]
+
+
+def test_the_policy_follows_the_clock_between_the_tables(policy):
+    s = [28.0, 60.0]
+    policy.reset()
+    policy.prepare()
+    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[-1].policy(s))
+    for _ in range(8639):
+        policy.prepare()
+    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[0].policy(s), rtol=1e-3)
+    policy.prepare()
+    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[-1].policy(s))
+    policy.reset()
+    for _ in range(2000):
+        policy.prepare()
+    low, high = policy.policies[0].policy(s), policy.policies[-1].policy(s)
+    between = policy.feedback(s).action
+    assert (between > np.minimum(low, high)).all()
+    assert (between < np.maximum(low, high)).all()
+
+
+@pytest.mark.parametrize("name", ["paper", "fast-sampling", "fouled", "mismatched"])
+def test_the_yardstick_of_a_preset_is_its_optimum(name):
+    found = yardstick(Scenario.load(name))
+    assert (found.kind, found.note) == ("optimum", "")
+    assert found.value == found.controller.gain
+
+
+def test_the_yardstick_of_the_drifting_plant_is_a_reference(drifting, policy):
+    found = yardstick(drifting)
+    assert found.kind == "reference"
+    assert "no bound" in found.note
+    assert found.value == policy.gain
+
+
+def test_what_is_not_stored_has_no_yardstick(tmp_path, monkeypatch):
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    assert (
+        yardstick(Scenario.load("paper").replace({"plant": {"parameters": {"UA2": 6.5}}})) is None
+    )
+    slower = Scenario.load("drifting").replace({"plant": {"parameters": {"cleaning_period": 7.0}}})
+    assert yardstick(slower) is None
+
+
+def test_without_its_certificate_an_optimum_is_a_reference(tmp_path, monkeypatch):
+    known = OptimalPolicy.stored(Scenario.load("paper"))
+    path = next(
+        path
+        for path in archive.SHIPPED.glob("*.npz")
+        if abs(np.load(path)["W"]).sum() == abs(known.optimum.W).sum()
+    )
+    archive.write(
+        tmp_path / "optima" / path.name, replace(known.optimum, certificate=None), path.stem
+    )
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    monkeypatch.setattr(archive, "SHIPPED", tmp_path / "none")
+    found = yardstick(Scenario.load("paper"))
+    assert (found.kind, found.note) == ("reference", "not certified")

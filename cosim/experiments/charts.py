@@ -161,21 +161,34 @@ def _last(values: Array) -> float:
 
 
 def _curve(runs: Sequence[RunResult], relative: Callable[[Array], Array]) -> LearningCurve:
-    """All runs on the samples of the longest one; one that diverged is held where it ended."""
-    samples = max((run.curve["samples"] for run in runs), key=len)
-    values = {}
-    for name in ("J", "greedy_J"):
-        table = np.full((len(runs), len(samples)), np.nan)
-        for line, run in zip(table, runs, strict=True):
-            own = run.curve[name]
-            line[: len(own)] = own
-            if len(own) < len(samples):
-                reference = max((other.curve[name] for other in runs), key=len)
-                later = ~np.isnan(reference)
-                later[: len(own)] = False
-                line[later] = _last(own)
-        values[name] = relative(table)
-    return LearningCurve(samples, values["J"], values["greedy_J"])
+    """Runs at their greedy evaluations; one that diverged is held where it ended.
+
+    What training cost is the mean since the evaluation before.
+    """
+    points = [_points(run) for run in runs]
+    samples = max((own for own, *_ in points), key=len)
+    training, greedy = (
+        np.array([_held(own[which], len(samples)) for own in points]) for which in (1, 2)
+    )
+    return LearningCurve(samples, relative(training), relative(greedy))
+
+
+def _held(values: Array, count: int) -> Array:
+    return np.append(values, np.full(count - len(values), _last(values)))
+
+
+def _points(run: RunResult) -> tuple[Array, Array, Array]:
+    """Samples, mean cost of training since the point before, and greedy cost, (K,) each."""
+    curve = run.curve
+    ends = np.flatnonzero(~np.isnan(curve["greedy_J"]))
+    begins = np.concatenate([[0], ends[:-1] + 1]) if ends.size else ends
+    training = [_mean(curve["J"][i : j + 1]) for i, j in zip(begins, ends, strict=True)]
+    return curve["samples"][ends], np.array(training), curve["greedy_J"][ends]
+
+
+def _mean(values: Array) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else float("nan")
 
 
 def _profiles(

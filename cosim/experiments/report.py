@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import shlex
 from collections.abc import Sequence
 from html import escape
@@ -152,9 +153,12 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _figure(folder: Path, name: str) -> str:
-    data = base64.b64encode((folder / FOLDER / f"{name}.svg").read_bytes()).decode()
+    drawing = (folder / FOLDER / f"{name}.svg").read_bytes()
+    data = base64.b64encode(drawing).decode()
+    width = re.search(rb'width="([\d.]+)pt"', drawing)
+    size = f" style='width:{1.7 * float(width[1]):.0f}px'" if width else ""
     caption = escape(CAPTIONS.get(name.partition("-")[0], name))
-    image = f"<img alt='{escape(name)}' src='data:image/svg+xml;base64,{data}'>"
+    image = f"<img{size} alt='{escape(name)}' src='data:image/svg+xml;base64,{data}'>"
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
@@ -194,7 +198,7 @@ th { cursor: pointer; color: var(--soft); font-weight: 600; vertical-align: bott
 th[aria-sort=ascending]::after { content: " \\25B2"; }
 th[aria-sort=descending]::after { content: " \\25BC"; }
 tbody tr:hover td { background: #f4f7fa; }
-figure { margin: 18px 0 26px; } img { width: 100%; max-width: 1000px; height: auto; }
+figure { margin: 18px 0 26px; } img { max-width: 100%; height: auto; }
 figcaption, footer { color: var(--soft); font-size: 13px; max-width: 85ch; }
 footer { margin-top: 3rem; border-top: 1px solid var(--line); }
 """

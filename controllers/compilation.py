@@ -195,6 +195,10 @@ class Compilation:
         if self._calls >= self._next:
             self._advance()
 
+    def postpone(self) -> None:
+        """Change nothing before `finish`, however many samples are counted."""
+        self._next = sys.maxsize
+
     def finish(self) -> str:
         """Do at once, and wait for, what `count` would do in time; returns `mode`.
 

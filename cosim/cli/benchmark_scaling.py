@@ -47,6 +47,7 @@ def _row(scenario: Scenario, horizon: int, kind: str) -> dict[str, Any]:
         problem, Parameters.naive(problem, blocks), hessian=scenario.controller.hessian
     )
     construction = process_time() - begin
+    controller.compilation.postpone()
     microseconds = {controller.compilation.mode: _phases(controller)}
     mode = controller.compilation.finish()
     microseconds[mode] = _phases(controller)

@@ -172,6 +172,17 @@ def test_a_compiler_that_fails_leaves_the_interpreter(folder, monkeypatch):
     assert libraries(folder) == []
 
 
+@needs_compiler
+def test_a_postponed_compilation_waits_to_be_finished(folder):
+    Compilation([small_function()]).finish()
+    run = Compilation([small_function()])
+    run.postpone()
+    for _ in range(2 * compilation.LOOK):
+        run.count()
+    assert run.mode == "interpreted"
+    assert run.finish() == "compiled"
+
+
 def test_never_means_never(folder, monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "never")
     assert Compilation([small_function()]).finish() == "interpreted"

@@ -15,6 +15,9 @@ from controllers.qp.proxqp_backend import ProxQpBackend
 from tests.helpers.compiled import FAMILIES, CompiledQpSolver, random_qps
 
 RESIDUAL = 1e-9
+# A peer whose residual is above this is no reference: with multipliers of 1e4 a residual of 4e-10
+# was seen to go with an error of 2e-4, and the higher objective.
+REFERENCE = 1e-12
 AGREEMENT = 1e-6
 NOT_CONVEX, NOT_FINITE = 1, 3
 
@@ -41,7 +44,7 @@ def _check(solver: CompiledQpSolver, count: int, peers: tuple[type, ...], seed: 
                     other = polish(qp, backend.solve(qp), 1e-13)
             except QpError:
                 continue
-            if not other.residuals(qp).largest < RESIDUAL:
+            if not other.residuals(qp).largest < REFERENCE:
                 continue
             solved[peer.__name__, family] += 1
             difference = np.abs(solution.v - other.v) / (1 + np.abs(other.v))

@@ -125,7 +125,7 @@ class ValidatedSearch:
     along the round's whole way. Races of a round all begin at
     the plant as it was when the round's learning ended, with the same noise to come; so slow states
     are where operation takes them, and each round has new noise.
-    The last samples go to a longer race between the start and the rounds' incumbents.
+    The last samples go to a longer race between the start and some of the rounds' incumbents.
 
     `scenario` gives bounds and penalty, `action_deviation` (m,) the exploration's σ, `samples` the
     budget, `block` samples make a block, at most `blocks` of them a race, `phase` a phase.
@@ -134,7 +134,7 @@ class ValidatedSearch:
     DIRECTIONS = 6
     MEMORY = 6000
     """Prediction errors over which a penalty is expected: the tail is what counts."""
-    FINAL = 0.15
+    FINAL = 0.25
     """Share of the samples for the last race."""
     CAP = 1.5
     """Longest first step of a line search, in the prior's standard deviations."""
@@ -211,29 +211,36 @@ class ValidatedSearch:
             return
 
     def _final(self, past: list[Vector]) -> Plan:
-        """Race the start and the latest incumbents against the present one, for longer."""
-        blocks = max(int(self.FINAL * self._samples / self._block / 2.5), 1)
+        """The cheapest of the incumbent, the start and earlier incumbents, in a long race.
+
+        A round's race is too short for what is rare, and the best of many moves is partly luck.
+        """
+        blocks = max(int(self.FINAL * self._samples / self._block / 4.2), 1)
         yield from self._renew(blocks)
-        rivals = [past[0], *past[:0:-1][:3]]
-        for theta in rivals:
-            if not np.array_equal(theta, self.incumbent.theta):
-                yield from self._race(theta, margin=0.0)
+        costs = self.incumbent.costs
+        far = float(costs.std()) if blocks > 1 else np.inf
+        last = len(past) - 1
+        order = [0, last // 2, last // 4, 3 * last // 4, *range(last - 1, 0, -1)]
+        for theta in (past[k] for k in dict.fromkeys(order)):
+            rival = Candidate(theta)
+            while len(rival.realised) < blocks:
+                yield from self._run(rival)
+                if float((rival.costs - costs[: len(rival.realised)]).mean()) > far:
+                    break
+            else:
+                self.incumbent = min(self.incumbent, rival, key=lambda candidate: candidate.cost)
 
     def _learn(self, width: float, *, goes_on: bool) -> Step:
-        """Learn from the incumbent and race what came of it, the latest θ first.
-
-        Whether it pays: the cost fell by more than the standard error of a race's mean.
-        """
+        """Learn from the incumbent and race what came of it, the latest θ first."""
         self._spend(self._phase)
         learned = yield Learn(self.incumbent.theta, self._phase, width, goes_on)
         assert isinstance(learned, Learned)
         self._measure(learned)
         yield from self._renew(self._blocks)
-        before = self.incumbent.costs
+        better = False
         for theta in learned.candidates[::-1]:
-            yield from self._race(theta)
-        spread = float(before.std()) / len(before) ** 0.5
-        return float(before.mean()) - self.incumbent.cost > spread
+            better |= yield from self._race(theta)
+        return better
 
     def _measure(self, learned: Learned) -> None:
         """Take the coordinates of the searches from the latest data about the incumbent."""
@@ -279,8 +286,8 @@ class ValidatedSearch:
         for _ in range(blocks):
             yield from self._run(self.incumbent)
 
-    def _race(self, theta: Vector, margin: float = 1.0) -> Step:
-        """Whether θ takes the incumbent's place: cheaper on the same noise, by standard errors.
+    def _race(self, theta: Vector) -> Step:
+        """Whether θ takes the incumbent's place: cheaper on the same noise by a standard error.
 
         It is given up as soon as it is dearer over those that it has run; to win it must run all,
         since a slow state shows late what a policy does to it.
@@ -294,7 +301,7 @@ class ValidatedSearch:
             difference = candidate.costs - costs[:count]
             if difference.mean() >= 0.0:
                 return False
-        if not _cheaper(difference, margin):
+        if not _cheaper(difference):
             return False
         self.incumbent = candidate
         self.accepted += 1
@@ -355,8 +362,8 @@ class ValidatedSearch:
         return theta
 
 
-def _cheaper(difference: Vector, margin: float = 1.0) -> bool:
-    """Whether costs that differ so, block by block, are lower by `margin` standard errors."""
+def _cheaper(difference: Vector) -> bool:
+    """Whether costs that differ so, block by block, are lower by a standard error."""
     blocks = len(difference)
     error = float(difference.std(ddof=1)) / blocks**0.5 if blocks > 1 else 0.0
-    return float(difference.mean()) + margin * error < 0.0
+    return float(difference.mean()) + error < 0.0

@@ -81,7 +81,8 @@ def test_the_samples_are_counted_and_never_exceeded(scenario, problem):
     sought = search(scenario, problem)
     plant = Quadratic(scenario, sought._start)
     run(sought, plant)
-    assert 0.85 * SAMPLES < plant.samples <= SAMPLES
+    # The last race ends early where nothing comes near the incumbent.
+    assert 0.9 * (1 - sought.FINAL) * SAMPLES < plant.samples <= SAMPLES
     assert plant.samples == sought._spent
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import fmpy
@@ -33,14 +34,41 @@ def test_nothing_is_allocated_or_broken_while_it_steps(tmp_path: Path, hessian: 
         system = sampled_controller(tuned(scenario), scenario, plant.units)
     for name, data in sampled_sources(system, 2).items():
         (tmp_path / name).write_bytes(data)
+    program = _compiled(tmp_path, "soak", COMPILER, *FLAGS)
+    steps, failures, _ = _run(program, "20000")
+    assert steps == "20000"
+    assert 0 < int(failures) < 20000
+
+
+@pytest.mark.slow
+def test_arm_computes_the_same_bits(tmp_path: Path) -> None:
+    """By Zig's compiler under qemu, against the local one here: a digest of every value read."""
+    pytest.importorskip("ziglang")
+    if shutil.which("qemu-aarch64") is None or shutil.which(COMPILER) is None:
+        pytest.skip("there is no qemu-aarch64 or no C compiler")
+    scenario = Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        system = sampled_controller(tuned(scenario), scenario, plant.units)
+    for name, data in sampled_sources(system, 2).items():
+        (tmp_path / name).write_bytes(data)
+    flags = ("-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-w")
+    here = _compiled(tmp_path, "here", COMPILER, *flags)
+    zig = (sys.executable, "-m", "ziglang", "cc", "-target", "aarch64-linux-musl", "-static")
+    there = _compiled(tmp_path, "there", *zig, *flags)
+    assert _run("qemu-aarch64", there, "10000") == _run(here, "10000")
+
+
+def _compiled(folder: Path, name: str, *command: str) -> Path:
     headers = Path(fmpy.__file__).parent / "c-code"
-    program = tmp_path / "soak"
+    program = folder / name
     subprocess.run(
-        [COMPILER, *FLAGS, "-isystem", headers, "-I", tmp_path, SOAK, "-o", program, "-lm"],
-        check=True,
+        [*command, "-isystem", headers, "-I", folder, SOAK, "-o", program, "-lm"], check=True
     )
-    result = subprocess.run([program, "20000"], capture_output=True, text=True, check=False)
+    return program
+
+
+def _run(*command: str | Path) -> list[str]:
+    """Steps, failures and digest."""
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    steps, failures = map(int, result.stdout.split())
-    assert steps == 20000
-    assert 0 < failures < steps
+    return result.stdout.split()

@@ -186,7 +186,6 @@ def test_converged_nmpc_learns_the_same_on_a_linear_plant(linear_quadratic):
         0.0,
         controller=ConvergedNmpc(linear_quadratic.problem, linear_quadratic.wrong()),
         rule="gauss-newton",
-        globalisation="none",
         batch_size=50,
         buffer_size=100,
         gain=1.0,

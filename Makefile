@@ -21,7 +21,7 @@ check: $(VENV)/installed-dev
 	$(BIN)/cosim fmu check evaporator_fmi3
 	$(BIN)/python -m pytest -m slow
 	$(BIN)/cosim results check
-	$(BIN)/cosim demo --steps 200 --out build/demo
+	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

@@ -1,18 +1,44 @@
-"""`cosim demo`: the benchmark's first look."""
+"""`cosim demo`: what the benchmark is about, in some seconds."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.output import JsonOption, output
-from cosim.cli.run import Run, execute, show
+from cosim.cli.output import JsonOption, Output, dump, open_folder, output
 from cosim.cli.simulate import SeedOption, StepsOption
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from cosim.protocols import Controller
+    from cosim.scenario import Scenario
+    from cosim.trajectory import Trajectory
+    from learning.log import LogRow
+    from learning.training_run import TrainingResult, TrainingRun
+
+SCENARIO = "fouled"
+LEARNT, BACKED_OFF, OPTIMAL = "learnt", "tuned + back-off", "optimal"
+BACKOFF_SAMPLES = 8000
+RUNS = 10
+"""Runs of the comparison; the first is drawn and recorded."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A training and what it cost."""
+
+    run: TrainingRun
+    result: TrainingResult
 
 
 def demo(
+    samples: Annotated[
+        int, typer.Option("--samples", min=1000, max=1_000_000, help="Plant samples of learning.")
+    ] = 20_000,
     steps: StepsOption = 500,
     seed: SeedOption = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
@@ -20,20 +46,220 @@ def demo(
     ),
     json: JsonOption = False,
 ) -> None:
-    """Control the stochastic evaporator by naive RTI-NMPC; write a table, a plot, a recording.
+    """Let a controller whose model is wrong learn from its plant, and compare it.
 
-    Writes trajectory.csv, trajectory.png, run.rrd, summary.json, timing.csv and scenario.toml.
+    The condenser of the evaporator is fouled and no controller is told. Writes demo.csv,
+    before-after.png, demo.rrd, learning.csv, parameters.toml and summary.json.
     """
     with output(json) as out_:
-        trajectory, summary = execute(Run("paper", "naive", steps, seed, out, True), out_)
-        from cosim.figures import plot_trajectory
+        from cosim.cli.train import summarise
+        from cosim.figures import plot_overlay
+        from cosim.files import write_atomically
+        from cosim.scenario import Scenario
+        from learning.log import to_csv
 
-        plot_trajectory(trajectory, trajectory.scenario, out / "trajectory.png")
-        show(summary, out_)
-        folder = out.resolve()
+        scenario = Scenario.load(SCENARIO)
+        folder = open_folder(out)
+        out_.note(f"{scenario.description}; the controllers are not told")
+        backed_off = _train(scenario, "backoff", "tuned", BACKOFF_SAMPLES, seed, out_)
+        learnt = _train(scenario, "q-learning", "naive", samples, seed, out_)
+        trained = {BACKED_OFF: backed_off, LEARNT: learnt}
+        runs = _simulate(scenario, _controllers(scenario, trained), steps, seed, out_)
+        rows = _table(runs, trained)
+        _show(rows, scenario, steps, out_)
+        shown = {name: runs[name][0] for name in ("naive", LEARNT, OPTIMAL)}
+        plot_overlay(shown, folder / "before-after.png")
+        _record(folder / "demo.rrd", shown, learnt, rows)
+        write_atomically(folder / "demo.csv", _csv(rows))
+        write_atomically(folder / "learning.csv", to_csv(learnt.result.rows))
+        learnt.result.parameters.save(folder / "parameters.toml")
+        summary: dict[str, Any] = {
+            "scenario": scenario.name,
+            "steps": steps,
+            "seed": seed,
+            "controllers": rows,
+            "training": summarise(learnt.run, learnt.result),
+        }
+        write_atomically(folder / "summary.json", dump(summary))
         out_.note(
-            f"plot       {folder / 'trajectory.png'}\n"
-            f"recording  {folder / 'run.rrd'}   (look at it with: cosim view {out / 'run.rrd'})\n"
-            f"signals    {folder / 'trajectory.csv'}"
+            f"picture    {folder / 'before-after.png'}\n"
+            f"recording  {folder / 'demo.rrd'}   (look at it with: cosim view {folder}/demo.rrd)\n"
+            f"learnt θ   {folder / 'parameters.toml'}   (a controller's name in every command)"
         )
         out_.json(summary | {"out": str(out)})
+
+
+def _train(
+    scenario: Scenario, algorithm: str, start: str, samples: int, seed: int, output: Output
+) -> Trained:
+    from cosim.lookup import build_controller
+    from cosim.plant import FmuPlant
+    from learning.registry import load_algorithm
+    from learning.training_loop import TrainingLoop
+    from learning.training_run import TrainingRun
+
+    found = load_algorithm(algorithm)
+    every = max(1, samples // 10)
+    run = TrainingRun(
+        algorithm=algorithm,
+        scenario=scenario,
+        samples=samples,
+        seed=seed,
+        configuration=found.Configuration.from_assignments([]),
+        start=start,
+        log_every=every,
+        evaluate_every=every,
+        checkpoint_every=every,
+    )
+    label = f"{algorithm} from {start}"
+    with (
+        FmuPlant(scenario) as plant,
+        FmuPlant(scenario) as other,
+        output.progress(label, samples) as progress,
+    ):
+        loop = TrainingLoop(run, found, plant, other, optimum=build_controller("optimal", scenario))
+        return Trained(run, loop.go(progress=_remark(scenario, progress)))
+
+
+def _remark(scenario: Scenario, progress: Any) -> Callable[[int, LogRow], None]:
+    """Behind the bar: regret, and how far θ keeps the states from their lower bounds."""
+    from math import isnan
+
+    def update(done: int, row: LogRow) -> None:
+        bounds = zip(scenario.plant.states, row.parameters["x_l"], strict=True)
+        kept = " ".join(f"{name} ≥ {bound:.2f}" for name, bound in bounds)
+        regret = row["regret"]
+        progress(done, kept if isnan(regret) else f"regret {100 * regret:.2f} %  θ: {kept}")
+
+    return update
+
+
+def _controllers(scenario: Scenario, trained: Mapping[str, Trained]) -> dict[str, Controller]:
+    from cosim.lookup import build_controller
+    from learning.starting_point import build_controller as build_learnt
+
+    learnt: dict[str, Controller] = {
+        name: build_learnt("rti", scenario, each.result.parameters)
+        for name, each in trained.items()
+    }
+    return {
+        "naive": build_controller("naive", scenario),
+        **learnt,
+        OPTIMAL: build_controller("optimal", scenario),
+    }
+
+
+def _simulate(
+    scenario: Scenario,
+    controllers: Mapping[str, Controller],
+    steps: int,
+    seed: int,
+    output: Output,
+) -> dict[str, list[Trajectory]]:
+    """Run each controller `RUNS` times on the same disturbances, which no training met."""
+    from cosim.plant import FmuPlant
+    from cosim.simulation import simulate
+    from learning.evaluation import HELD_OUT
+
+    runs = {}
+    with FmuPlant(scenario) as plant, output.progress("comparison", len(controllers)) as progress:
+        for count, (name, controller) in enumerate(controllers.items(), 1):
+            first = 2 * HELD_OUT + seed
+            seeds = range(first, first + RUNS)
+            runs[name] = [simulate(plant, controller, steps, number) for number in seeds]
+            progress(count, name)
+    return runs
+
+
+def _table(
+    runs: Mapping[str, list[Trajectory]], trained: Mapping[str, Trained]
+) -> list[dict[str, Any]]:
+    """A row per controller: what it cost to learn and what it costs to run."""
+    import numpy as np
+
+    from cosim.evaluation.statistics import regret
+
+    figures = {name: [run.summary() for run in each] for name, each in runs.items()}
+    costs = {name: np.array([run["J"] for run in each]) for name, each in figures.items()}
+    rows = []
+    for name, each in figures.items():
+        beyond = regret(costs[name], costs[OPTIMAL])
+        means = {
+            key: float(np.mean([run[key] for run in each]))
+            for key in ("J", "economic_cost", "violating_share")
+        }
+        rows.append(
+            {
+                "controller": name,
+                "plant_samples": trained[name].result.plant_samples if name in trained else 0,
+                "regret": beyond.value,
+                "regret_interval": None if name == OPTIMAL else beyond.t,
+                **means,
+                "failures": sum(run["failures"] for run in each),
+            }
+        )
+    return rows
+
+
+def _show(rows: list[dict[str, Any]], scenario: Scenario, steps: int, output: Output) -> None:
+    from cosim.evaluation.statistics import shown
+
+    output.table(
+        f"{scenario.name}, {RUNS} runs of {steps} samples, the same disturbances for all",
+        ("controller", "plant samples", "J", "regret %", "economic cost", "violating %"),
+        [
+            (
+                row["controller"],
+                str(row["plant_samples"]),
+                f"{row['J']:.1f}",
+                shown(row["regret"], row["regret_interval"], 100, 3),
+                f"{row['economic_cost']:.1f}",
+                f"{100 * row['violating_share']:.1f}",
+            )
+            for row in rows
+        ],
+    )
+
+
+def _csv(rows: list[dict[str, Any]]) -> str:
+    from cosim.files import cell, csv_text
+
+    columns = [name for name in rows[0] if name != "regret_interval"]
+    return csv_text(columns, ([cell(row[name]) for name in columns] for row in rows))
+
+
+def _record(
+    path: Path, runs: Mapping[str, Trajectory], learnt: Trained, rows: list[dict[str, Any]]
+) -> None:
+    import numpy as np
+
+    from cosim.recording.showcase import TrainingHistory, record_showcase
+
+    log, blocks = learnt.result.rows, learnt.result.parameters.blocks
+    theta = np.array([row.parameters.theta for row in log])
+    history = TrainingHistory(
+        samples=np.array([row["samples"] for row in log]),
+        curves={
+            "regret %": 100 * np.array([row["regret"] for row in log]),
+            "J of the training samples": np.array([row["J"] for row in log]),
+        },
+        theta={name: (theta - theta[0])[:, where] for name, where in blocks.slices.items()},
+        labels={name: tuple(blocks.labels[where]) for name, where in blocks.slices.items()},
+    )
+    lines = [
+        f"| {row['controller']} | {row['J']:.1f} | {100 * row['regret']:.2f} | "
+        f"{100 * row['violating_share']:.1f} |"
+        for row in rows
+    ]
+    about = "\n".join(
+        [
+            f"# {learnt.run.algorithm} on {learnt.run.scenario.name}",
+            "",
+            learnt.run.scenario.description,
+            "",
+            "| controller | J | regret % | violating % |",
+            "|---|---|---|---|",
+            *lines,
+        ]
+    )
+    record_showcase(path, runs, history, about)

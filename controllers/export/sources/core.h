@@ -62,7 +62,7 @@ static void core_commit(CoreState *state) {
 }
 
 /* Whether a state could be one that the functions above leave behind. */
-static int core_plausible(const CoreState *state) {
+static inline int core_plausible(const CoreState *state) {
     return all_finite(&state->guess.x[0][0], sizeof state->guess / sizeof(double)) &&
            all_finite(&state->solution.x[0][0], sizeof state->solution / sizeof(double)) &&
            all_finite(state->action, N_U) && all_finite(state->applied, N_U) &&

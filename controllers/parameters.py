@@ -162,7 +162,7 @@ class Parameters:
 def _read_document(path: Path) -> dict[str, Any]:
     try:
         if path.exists() and not path.is_file():
-            raise ParameterError(f"{path}: not a regular file")
+            raise ParameterError(f"{path}: not a readable TOML file (not a regular file)")
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ParameterError(f"{path}: there is no such parameters file") from error

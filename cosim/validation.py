@@ -65,7 +65,9 @@ def _is_union_branch(part: object) -> bool:
 def _dotted(path: list[Any]) -> str:
     text = ""
     for part in path:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+        # A key may be any text; a message is one line.
+        name = part if str(part).isprintable() else repr(part)
+        text += f"[{part}]" if isinstance(part, int) else f".{name}" if text else str(name)
     return text or "document"
 
 

@@ -2,6 +2,7 @@ import json
 import resource
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -123,7 +124,9 @@ def test_an_isolated_run_writes_the_same_bytes(cosim, tmp_path):
     assert files[0] == files[1]
 
 
-def test_a_crashing_fmu_ends_an_isolated_run_with_one_message(cosim, tmp_path):
+def test_a_crashing_fmu_ends_an_isolated_run_with_one_message(cosim, tmp_path, monkeypatch):
+    # A foreign FMU runs in a process of its own, which must find the helpers too.
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     scenario = write_scenario(tmp_path, build_tank(tmp_path, saves=False), fault=5)
     arguments = ["-s", scenario, "-c", "tank_controller:make", "--steps", 5, "--isolate"]
     (tmp_path / "tank_controller.py").write_text("from tests.helpers.loop import hold as make\n")

@@ -22,7 +22,12 @@ from cosim.errors import ScenarioError
 from learning.errors import ConfigurationError
 from learning.registry import algorithms, load_algorithm
 
-PAPER = Scenario.load("paper").to_dict()
+# What `paper` leaves open is stated, so that every field has a place.
+STATED = {
+    "exploration": {"kind": "additive", "probability": 0.1, "standard_deviation": [3.0, 3.0]},
+    "controller": {"value_offset": "discounted"},
+}
+PAPER = Scenario.load("paper").replace(STATED).to_dict()
 OPTIONS = settings(
     max_examples=150,
     deadline=None,
@@ -123,7 +128,7 @@ def test_a_field_left_out_is_named_or_its_default_is_written_out(path):
     else:
         written = at(scenario.to_dict(), path[:-1])
         # None means absent; every other default is there for a reader to see.
-        optional = {"model", "sampling_time", "stochastic", "law"}
+        optional = {"model", "sampling_time", "stochastic", "law", "exploration", "value_offset"}
         assert path[-1] in written or path[-1] in optional
 
 

@@ -1,5 +1,4 @@
 import re
-import subprocess
 import threading
 from pathlib import Path
 from time import sleep
@@ -134,12 +133,13 @@ def test_without_a_display_the_message_says_how_to_draw(recording, monkeypatch):
 def test_the_window_binds_loopback(recording, monkeypatch):
     commands = []
 
-    def run(command, **options):
+    def start(command, **options):
         commands.append(command)
-        return SimpleNamespace(returncode=0)
+        return SimpleNamespace(wait=lambda: 0)
 
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(viewer, "start_guarded", start)
+    monkeypatch.setattr(viewer, "end_guarded", lambda process: None)
     open_viewer(recording)
     command = commands[0]
     assert command[command.index("--bind") + 1] == "127.0.0.1"

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check clean
+.PHONY: demo test check campaign clean
 
 demo: $(VENV)/installed
 	$(BIN)/cosim demo --out demo
@@ -22,6 +22,10 @@ check: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m slow
 	$(BIN)/cosim results check
 	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo
+
+# What takes many minutes a test and is run by hand.
+campaign: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -m campaign
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

@@ -62,7 +62,7 @@ def test_daqp_and_proxqp_find_the_same_solution(solver: CompiledQpSolver) -> Non
         assert solved["DaqpBackend", family] + solved["ProxQpBackend", family] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_hundred_thousand_qps_against_daqp_and_proxqp(solver: CompiledQpSolver) -> None:
     solved = _check(solver, 100_000, (DaqpBackend, ProxQpBackend), seed=3)
     print(f"solved by peers: {dict(solved)}")

@@ -89,8 +89,8 @@ def test_the_seed_gives_the_noise_of_a_search():
 def test_tuned_with_back_off_is_within_a_thousandth_of_the_optimum(scenario, seed):
     from controllers.factories import optimal
 
-    run = make_run("backoff", scenario, samples=8000, seed=seed, log_every=500)
-    run = dataclasses.replace(run, evaluate_every=8000, checkpoint_every=8000)
+    run = make_run("backoff", scenario, samples=8000, seed=seed)
+    run = dataclasses.replace(run, log_every=500, evaluate_every=8000, checkpoint_every=8000)
     theta = train(run).parameters
     problem = Problem.from_scenario(run.scenario)
     with FmuPlant(run.scenario) as plant:

@@ -163,10 +163,7 @@ def train(
             validation_samples=validation_samples,
         )
         folder = open_folder(out).absolute()
-        if overwrite:
-            for name in FILES:
-                (folder / name).unlink(missing_ok=True)
-        elif not resume:
+        if not (resume or overwrite):
             _require_no_run(folder)
         begin = time.perf_counter()
         result = _execute(run, found, folder, optimum, resume, record, out_)
@@ -176,6 +173,9 @@ def train(
             "functions": result.functions,
         }
         _write(folder, run, result, summary)
+        if overwrite and not record:
+            # Only now: had this run failed, the one before it would have been lost.
+            (folder / "training.rrd").unlink(missing_ok=True)
         _show(summary, out_)
         out_.json(summary)
     if result.status != "finished":

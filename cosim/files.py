@@ -48,15 +48,19 @@ def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Pat
                 stream.write(piece.encode() if isinstance(piece, str) else piece)
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes the file private; a result is meant to be read like any other file.
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)
+        make_public(Path(temporary))
         Path(temporary).replace(path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
     return path
+
+
+def make_public(path: Path) -> None:
+    """Give a file that mkstemp made private the rights of any other new file of the user."""
+    umask = os.umask(0)
+    os.umask(umask)
+    path.chmod(0o666 & ~umask)
 
 
 def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:

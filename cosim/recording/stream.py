@@ -18,6 +18,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.errors import RecordingError
+from cosim.files import make_public
 from cosim.recording.channels import Channel, Range
 from cosim.recording.glyphs import drawable
 from cosim.recording.palette import packed_all
@@ -118,10 +119,7 @@ class Stream:
             written.seek(-min(len(FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
             if FOOTER not in written.read():
                 self._give_up("its end is missing")
-        # mkstemp makes the file private; a recording is meant to be read like any other file.
-        umask = os.umask(0)
-        os.umask(umask)
-        self._partial.chmod(0o666 & ~umask)
+        make_public(self._partial)
         self._partial.replace(self.path)
 
     def _bounded(self, call: Callable[[], None]) -> None:

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import casadi as ca
 
 from controllers.buffered import BufferedFunction
-from controllers.cache import read_own, sweep, trusted_folder
 from controllers.code_generation import c_source
 from controllers.errors import ControllerError
+from rti_storage.cache import read_own, sweep, trusted_folder
 
 if TYPE_CHECKING:
     import filelock

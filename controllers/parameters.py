@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError, ParameterError
 from controllers.problem import Problem
-from controllers.storage import write_atomically
 from controllers.theta import ThetaBlocks
+from rti_storage import write_atomically
+from rti_storage.documents import read_toml
 
 Vector = NDArray[np.float64]
 SCHEMA = 1
@@ -160,15 +160,7 @@ class Parameters:
 
 
 def _read_document(path: Path) -> dict[str, Any]:
-    try:
-        if path.exists() and not path.is_file():
-            raise ParameterError(f"{path}: not a readable TOML file (not a regular file)")
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ParameterError(f"{path}: there is no such parameters file") from error
-    # ValueError: not UTF-8, not TOML, a number of thousands of digits, a NUL in the path.
-    except (OSError, ValueError, RecursionError) as error:
-        raise ParameterError(f"{path}: not a readable TOML file ({error})") from error
+    document = read_toml(path, f"parameters file '{path}'", ParameterError)
     if document.get("schema") != SCHEMA:
         raise ParameterError(
             f"{path}: schema is {document.get('schema')!r}; this version reads schema = {SCHEMA}"

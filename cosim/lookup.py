@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 from cosim.errors import ControllerLookupError
-from cosim.plugins import blamed, load_plugin
+from cosim.plugins import OURS, blamed, load_plugin
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -105,7 +105,7 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
 def _is_ours(error: Exception) -> bool:
     """Whether an error is one of this project, whose words say enough."""
     packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
-    return bool(packages & {"cosim", "controllers", "learning", "fmus"})
+    return bool(packages & set(OURS))
 
 
 def _named(controller: Controller, name: str) -> Controller:

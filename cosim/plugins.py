@@ -11,6 +11,10 @@ from typing import Any
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 
 
+OURS = ("rti_storage", "fmus", "cosim", "controllers", "learning")
+"""The packages of this distribution; any other is a user's."""
+
+
 def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
     """Object that `module:Name` leads to; `what` is what messages call it.
 

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim import files
+from cosim import text_tables
 from cosim.errors import TrajectoryError
-from cosim.files import PIECE, csv_pieces, write_atomically
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
 from cosim.signals import signal_names, whole
+from cosim.text_tables import PIECE, csv_pieces
+from rti_storage import write_atomically
 
 Array = NDArray[np.float64]
 STATUS = "status"
@@ -179,7 +180,7 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
 
     Raises TrajectoryError with file and line.
     """
-    rows = files.read_csv(path, TrajectoryError)
+    rows = text_tables.read_csv(path, TrajectoryError)
     if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
     header, body = rows[0], rows[1:]

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.storage import read_arrays
-from cosim.files import write_atomically
 from learning.errors import CheckpointError
+from rti_storage import write_atomically
+from rti_storage.files import read_arrays
 
 SCHEMA = 4
 Array = NDArray[Any]

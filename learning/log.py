@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import inf, isnan
 
 from controllers.parameters import Parameters
-from cosim.files import csv_text
+from cosim.text_tables import csv_text
 from learning.protocols import Update
 
 COLUMNS = (

@@ -14,7 +14,6 @@ from controllers.compilation import mode_of
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError
 from cosim.evaluation.statistics import shown
-from cosim.files import write_atomically
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from learning import checkpoint
@@ -33,6 +32,7 @@ from learning.training_run import (
     late_movement,
 )
 from learning.validation import Validation
+from rti_storage import write_atomically
 
 Progress = Callable[[int, LogRow], None]
 """Gets the samples done and the last row of the log."""

@@ -24,7 +24,9 @@ from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum
 from controllers.errors import OptimumError
 from controllers.problem import Problem
-from controllers.storage import CACHE_VARIABLE, read_arrays, user_cache, write_atomically
+from rti_storage import user_cache, write_atomically
+from rti_storage.cache import CACHE_VARIABLE
+from rti_storage.files import read_arrays
 
 # Part of every key: raise it when the solver changes what it finds.
 VERSION = 2

@@ -54,9 +54,9 @@ def demo(
     with output(json) as out_:
         from cosim.cli.train import summarise
         from cosim.figures import plot_overlay
-        from cosim.files import write_atomically
         from cosim.scenario import Scenario
         from learning.log import to_csv
+        from rti_storage import write_atomically
 
         scenario = Scenario.load(SCENARIO)
         folder = open_folder(out)
@@ -222,7 +222,7 @@ def _show(rows: list[dict[str, Any]], scenario: Scenario, steps: int, output: Ou
 
 
 def _csv(rows: list[dict[str, Any]]) -> str:
-    from cosim.files import cell, csv_text
+    from cosim.text_tables import cell, csv_text
 
     columns = [name for name in rows[0] if name != "regret_interval"]
     return csv_text(columns, ([cell(row[name]) for name in columns] for row in rows))

@@ -157,7 +157,7 @@ def _thousands(samples: int) -> int:
 def write_summary(results: StudyResults) -> dict[str, Any]:
     """Write summary.json and return what it says."""
     from cosim.experiments.summary import aggregate_rows, summary_rows
-    from cosim.files import write_atomically
+    from rti_storage import write_atomically
 
     document = {
         **results.about,

@@ -296,8 +296,8 @@ def _validation(run: TrainingRun, result: TrainingResult) -> dict[str, int] | No
 
 
 def _write(folder: Path, run: TrainingRun, result: TrainingResult, summary: dict[str, Any]) -> None:
-    from cosim.files import write_atomically
     from learning.log import to_csv
+    from rti_storage import write_atomically
 
     write_atomically(folder / "learning.csv", to_csv(result.rows))
     result.parameters.save(folder / "parameters.toml")

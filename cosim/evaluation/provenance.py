@@ -10,10 +10,12 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 
+from cosim.plugins import OURS
 from cosim.protocols import Controller
 
 DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
-PACKAGES = ("fmus", "cosim", "controllers")
+EVALUATING = tuple(package for package in OURS if package != "learning")
+"""Packages that decide what a controller does on a plant."""
 SUFFIXES = (".py", ".toml", ".fmu", ".npz")
 # Nothing that these folders hold bears on an indicator.
 ASIDE = {"cli", "figures", "recording", "experiments", "__pycache__"}
@@ -32,7 +34,7 @@ def versions() -> str:
 
 
 @cache
-def code_hash(packages: tuple[str, ...] = PACKAGES) -> str:
+def code_hash(packages: tuple[str, ...] = EVALUATING) -> str:
     """First 16 hex digits of the SHA-256 of the code that results depend on, FMUs included."""
     digest = hashlib.sha256()
     for package in packages:
@@ -72,7 +74,7 @@ def source_hashes(target: str) -> dict[str, str]:
         return {path.name: _digest([path])}
     module, colon, _ = target.partition(":")
     package = module.partition(".")[0]
-    if not colon or package in (*PACKAGES, "learning"):
+    if not colon or package in OURS:
         return {}
     try:
         top, own = find_spec(package), find_spec(module)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cosim.errors import EvaluationError
 from cosim.evaluation.unit import UnitResult, as_document, from_document
-from cosim.files import write_atomically
+from rti_storage import write_atomically
 
 FOLDER = ".units"
 FORMAT = 1

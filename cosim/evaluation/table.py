@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from cosim.evaluation.statistics import gain, gap_closed, mean, regret
 from cosim.evaluation.unit import UnitResult
-from cosim.files import cell, csv_text, write_atomically
+from cosim.text_tables import cell, csv_text
+from rti_storage import write_atomically
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from cosim.errors import ResultsError
-from cosim.files import csv_text, parse_rows
+from cosim.text_tables import csv_text, parse_rows
 from cosim.trajectory import Signal
 
 Key = tuple[str, ...]

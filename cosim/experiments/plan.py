@@ -13,8 +13,8 @@ from cosim.experiments.definition import HELD_OUT, Definition, Sizes
 from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Training
 from cosim.experiments.store import EVALUATION, GREEDY, RunKey
-from cosim.experiments.units import PACKAGES
 from cosim.plant import FmuPlant
+from cosim.plugins import OURS
 from cosim.validation import suggestion
 
 BLOCK = 20_000
@@ -69,7 +69,7 @@ class Plan:
 
 def plan(definition: Definition) -> Plan:
     """Everything that a study has to do, checked; raises what scenarios and trainer raise."""
-    code = code_hash(PACKAGES)
+    code = code_hash(OURS)
     plants = {}
     for name, described in definition.scenarios.items():
         with FmuPlant(described) as plant:

@@ -20,7 +20,8 @@ from cosim.experiments.layout import (
 )
 from cosim.experiments.paper import further
 from cosim.experiments.results import StudyResults
-from cosim.files import markdown_table, write_atomically
+from cosim.text_tables import markdown_table
+from rti_storage import write_atomically
 
 PAGE, TABLES = "report.html", "report.md"
 CAPTIONS = {

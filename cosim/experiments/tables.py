@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cosim.errors import StudyError
 from cosim.experiments.records import CURVE, RunResult
 from cosim.experiments.store import INDICATORS
-from cosim.files import cell, csv_text, read_records
+from cosim.text_tables import cell, csv_text, read_records
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]

@@ -15,11 +15,11 @@ from cosim.experiments.store import INDICATORS, Indicators
 from cosim.kpis import indicators
 from cosim.lookup import import_from
 from cosim.plant import FmuPlant
+from cosim.plugins import OURS
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 
-PACKAGES = ("fmus", "cosim", "controllers", "learning")
 KEPT = 4
 """Controllers and plants that a worker keeps: building one costs more than a short run."""
 
@@ -36,7 +36,7 @@ class Place:
         """Let foreign modules be imported; raises StudyError where the code is another."""
         for folder in self.folders:
             import_from(Path(folder))
-        if (here := code_hash(PACKAGES)) != self.code:
+        if (here := code_hash(OURS)) != self.code:
             raise StudyError(
                 f"a worker runs other code ({here}) than the study ({self.code}); install the same "
                 "version of rti-cosim everywhere"

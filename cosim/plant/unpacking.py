@@ -5,49 +5,36 @@ A folder that belonged to one process would outlive each that is killed; this on
 
 from __future__ import annotations
 
-import atexit
 import os
 import shutil
 import tempfile
-import time
 import zipfile
 from contextlib import suppress
 from pathlib import Path
 
-from cosim.files import user_cache
+from rti_storage.cache import sweep, trusted_folder
 
-UNUSED_DAYS = 30
 _CHUNK = 1 << 20
 
 
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
-    Where the user's cache cannot be written, a temporary folder that ends with this process.
-    Raises OSError and what zipfile raises where the archive cannot be unpacked.
+    Where others can write the user's cache, or the user cannot, it lies in a temporary folder that
+    ends with this process. Raises OSError and what zipfile raises where the archive cannot be
+    unpacked.
     """
-    cache = user_cache("fmus")
+    cache = trusted_folder("fmus")
     folder = cache / sha256
     if _holds(folder, archive):
         return folder
-    try:
-        cache.mkdir(mode=0o700, parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=cache))
-    except OSError:
-        return _own_folder(archive)
+    partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=cache))
     try:
         archive.extractall(partial)
         _publish(partial, folder, archive)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    _sweep(cache)
-    return folder
-
-
-def _own_folder(archive: zipfile.ZipFile) -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="cosim-fmu-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    archive.extractall(folder)
+    sweep(cache)
     return folder
 
 
@@ -89,12 +76,3 @@ def _publish(partial: Path, folder: Path, archive: zipfile.ZipFile) -> None:
         else:
             return
     raise OSError(f"folder '{folder}' cannot be replaced; delete it")
-
-
-def _sweep(cache: Path) -> None:
-    """Delete what nobody has used for long, and what killed processes left half done."""
-    oldest = time.time() - UNUSED_DAYS * 86400
-    for folder in cache.iterdir():
-        with suppress(FileNotFoundError):
-            if folder.stat().st_mtime < oldest:
-                shutil.rmtree(folder, ignore_errors=True)

@@ -15,9 +15,9 @@ from pathlib import Path
 from rerun.experimental import ViewerClient
 
 from cosim.errors import RecordingError
-from cosim.files import write_atomically
 from cosim.lifetime import end_guarded, start_guarded
 from cosim.recording.stream import SAMPLE, TIME
+from rti_storage import write_atomically
 
 LOOPBACK = "127.0.0.1"
 _NOWHERE = f"http://{LOOPBACK}:9"

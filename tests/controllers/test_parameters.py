@@ -115,7 +115,7 @@ def edited(text, pattern, replacement):
 
 
 BAD = {
-    "no toml": (r"\A", "= ", "not a readable TOML file"),
+    "no toml": (r"\A", "= ", "is not valid TOML"),
     "another schema": (r"^schema = 1", "schema = 2", "schema is 2; this version reads schema = 1"),
     "no schema": (r"^schema = 1\n", "", "schema is None"),
     "key unknown": (
@@ -167,7 +167,7 @@ def test_a_bad_file_has_one_clear_error_that_names_it(case, problem, rng, tmp_pa
     path.write_text(edited(path.read_text(), pattern, replacement))
     with pytest.raises(ParameterError, match=message) as caught:
         Parameters.load(path, problem)
-    assert str(caught.value).startswith(f"{path}: ")
+    assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -187,13 +187,13 @@ def test_a_hand_edited_file_without_hash_is_read(problem, tmp_path):
 
 @pytest.mark.parametrize("name", ["missing.toml", "."])
 def test_a_path_that_is_no_file_is_refused(name, problem, tmp_path):
-    with pytest.raises(ParameterError, match=r"no such parameters file|not a readable TOML file"):
+    with pytest.raises(ParameterError, match=r"does not exist|is not a regular file"):
         Parameters.load(tmp_path / name, problem)
 
 
 def test_bytes_that_are_no_text_are_refused(problem, tmp_path):
     (tmp_path / "theta.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ParameterError, match="not a readable TOML file"):
+    with pytest.raises(ParameterError, match="is not UTF-8 text"):
         Parameters.load(tmp_path / "theta.toml", problem)
 
 

@@ -35,7 +35,7 @@ def test_a_file_written_in_pieces_is_the_whole_text(trajectory, tmp_path, monkey
     text = trajectory.to_csv()
     timing = trajectory.write_timing_csv(tmp_path / "timing.csv").read_text()
     monkeypatch.setattr("cosim.trajectory.PIECE", 7)
-    monkeypatch.setattr("cosim.files.PIECE", 5)
+    monkeypatch.setattr("cosim.text_tables.PIECE", 5)
     assert trajectory.write_csv(tmp_path / "run.csv").read_text() == text
     assert trajectory.write_timing_csv(tmp_path / "timing.csv").read_text() == timing
     assert len(text.splitlines()) == len(timing.splitlines()) == len(trajectory) + 1

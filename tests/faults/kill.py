@@ -36,7 +36,7 @@ from cosim.recording.reader import read_recording
 from learning.checkpoint import load as load_checkpoint
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("fmus", "cosim", "controllers", "learning")
+PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
 COSIM = (sys.executable, "-m", "cosim")
 STUDY = """\
 schema = 1

@@ -53,7 +53,7 @@ def test_a_file_gives_the_same_controller(paper, tmp_path):
 
 
 def test_a_missing_file_is_named(paper):
-    with pytest.raises(ParameterError, match=r"nowhere\.toml: there is no such parameters file"):
+    with pytest.raises(ParameterError, match=r"nowhere\.toml' does not exist"):
         from_file(paper, "nowhere.toml")
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("fmus", "cosim", "controllers", "learning")
+PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
 MAY = {
-    "fmus": set(),
-    "cosim": {"fmus"},
-    "controllers": set(),
-    "learning": {"controllers", "cosim"},
+    "rti_storage": set(),
+    "fmus": {"rti_storage"},
+    "cosim": {"fmus", "rti_storage"},
+    "controllers": {"rti_storage"},
+    "learning": {"controllers", "cosim", "rti_storage"},
 }
 """What a package may import of the others; the command line composes all of them."""
 ONLY = {"rerun": ("cosim.recording",), "fmpy": ("cosim.plant", "fmus", "cosim.cli.fmu")}

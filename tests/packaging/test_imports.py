@@ -1,11 +1,11 @@
-"""Every module of the four packages is imported once, with warnings as errors."""
+"""Every module of the packages is imported once, with warnings as errors."""
 
 import subprocess
 import sys
 
 CODE = """
 import importlib, pkgutil
-for package in ("fmus", "cosim", "controllers", "learning"):
+for package in ("rti_storage", "fmus", "cosim", "controllers", "learning"):
     root = importlib.import_module(package)
     for found in pkgutil.walk_packages(root.__path__, package + "."):
         if not found.name.endswith("__main__") and found.name not in OPTIONAL:

@@ -145,7 +145,7 @@ def test_the_benchmark_times_both_and_compares_their_actions(cosim):
     [
         (["converged", "--out", "c.fmu"], "is no RTI-NMPC and cannot be exported"),
         (["naive", "--out", "c.fmu", "--fmi", "3", "--ssp", "l.ssp"], "--ssp needs --fmi 2"),
-        (["nothing.toml", "--out", "c.fmu"], "no such parameters file"),
+        (["nothing.toml", "--out", "c.fmu"], "nothing.toml' does not exist"),
         (["naive", "--out", "no/such/folder/c.fmu", "--local"], "no/such/folder"),
     ],
 )

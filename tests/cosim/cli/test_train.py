@@ -65,7 +65,7 @@ def test_training_starts_from_tuned_and_from_a_file(cosim, tmp_path):
     assert code == 0 and summary["plant_samples"] == 200 + summary["validation"]["samples"]
     assert summary["validation"]["samples"] == 3 * 30
     code, _, err = cosim(*SHORT, "--start", "none.toml", "--out", "three")
-    assert code == 2 and "there is no such parameters file" in err
+    assert code == 2 and "does not exist" in err
 
 
 def test_a_recording_is_written(cosim, tmp_path):

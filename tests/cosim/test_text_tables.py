@@ -1,33 +1,8 @@
-import os
-
 import pytest
 
 from cosim.errors import CosimError
-from cosim.files import (
-    cell,
-    csv_text,
-    markdown_table,
-    read_csv,
-    read_records,
-    user_cache,
-    write_atomically,
-)
-
-
-def test_what_stood_there_survives_a_failure(tmp_path, monkeypatch):
-    path = write_atomically(tmp_path / "file", "old θ")
-    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(path, "new")
-    assert path.read_text("utf-8") == "old θ"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
-
-
-def test_the_cache_is_the_one_that_the_controllers_use(tmp_path, monkeypatch):
-    from controllers import storage
-
-    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    assert user_cache("fmus") == storage.user_cache("fmus") == tmp_path / "fmus"
+from cosim.text_tables import cell, csv_text, markdown_table, read_csv, read_records
+from rti_storage import write_atomically
 
 
 @pytest.mark.parametrize(
@@ -62,17 +37,3 @@ def test_a_markdown_table_has_text_left_and_numbers_right():
     assert markdown_table(["case", "J"], [["q", "1.5"]]) == (
         "| case | J |\n| --- | ---: |\n| q | 1.5 |\n"
     )
-
-
-def test_pieces_are_written_as_they_come_and_a_failure_between_them_leaves_nothing(tmp_path):
-    path = write_atomically(tmp_path / "file", (f"{i}\n" for i in range(3)))
-    assert path.read_text() == "0\n1\n2\n"
-
-    def broken():
-        yield "half"
-        raise RuntimeError("no more")
-
-    with pytest.raises(RuntimeError, match="no more"):
-        write_atomically(path, broken())
-    assert path.read_text() == "0\n1\n2\n"
-    assert list(tmp_path.iterdir()) == [path]

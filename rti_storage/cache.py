@@ -11,10 +11,21 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from controllers.storage import user_cache
+import platformdirs
 
+CACHE_VARIABLE = "COSIM_CACHE"
 UNUSED_DAYS = 30
 _temporary: dict[Path, Path] = {}
+
+
+def user_cache(kind: str) -> Path:
+    """The user's folder for cached files of a kind, which need not exist yet.
+
+    It lies under the environment's COSIM_CACHE, else where the platform keeps caches.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE)
+    root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
+    return root.absolute() / kind
 
 
 def trusted_folder(kind: str) -> Path:

@@ -4,7 +4,8 @@ import stat
 import numpy as np
 import pytest
 
-from controllers.storage import read_arrays, user_cache, write_atomically
+from rti_storage import write_atomically
+from rti_storage.files import read_arrays
 
 
 def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path):
@@ -32,16 +33,18 @@ def test_a_folder_that_is_not_there_raises_oserror(tmp_path):
         write_atomically(tmp_path / "missing" / "file", "")
 
 
-def test_the_cache_lies_where_the_environment_says_else_where_the_platform_does(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    assert user_cache("optima") == tmp_path / "optima"
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COSIM_CACHE", "here")
-    assert user_cache("fmus") == tmp_path / "here" / "fmus"
-    monkeypatch.setenv("COSIM_CACHE", "")
-    assert user_cache("fmus").parts[-2:] == ("rti-cosim", "fmus")
+def test_pieces_are_written_as_they_come_and_a_failure_between_them_leaves_nothing(tmp_path):
+    path = write_atomically(tmp_path / "file", (f"{i}\n" for i in range(3)))
+    assert path.read_text() == "0\n1\n2\n"
+
+    def broken():
+        yield "half"
+        raise RuntimeError("no more")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        write_atomically(path, broken())
+    assert path.read_text() == "0\n1\n2\n"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_arrays_with_any_byte_changed_are_read_as_they_were_or_refused(tmp_path):

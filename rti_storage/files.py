@@ -1,52 +1,46 @@
-"""Files that are there whole or not at all, arrays in files, and the user's cache folder."""
+"""Files that are there whole or not at all, and arrays read from files that may be damaged."""
 
 from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import platformdirs
 from numpy.typing import NDArray
 
-CACHE_VARIABLE = "COSIM_CACHE"
 
-
-def user_cache(kind: str) -> Path:
-    """The user's folder for cached files of a kind, which need not exist yet.
-
-    It lies under the environment's COSIM_CACHE, else where the platform keeps caches.
-    """
-    chosen = os.environ.get(CACHE_VARIABLE)
-    root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
-    return root.absolute() / kind
-
-
-def write_atomically(path: str | Path, data: bytes | str) -> Path:
+def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Path:
     """Write a file under a temporary name in its folder, then rename it into place.
 
     A reader never sees half a file, and what stood under the name before survives any failure.
-    Text is encoded as UTF-8. Raises OSError where the folder cannot be written.
+    Text, whole or in pieces that are written as they come, is encoded as UTF-8. Raises OSError
+    where the folder cannot be written.
     """
     path = Path(path)
-    content = data.encode() if isinstance(data, str) else data
+    pieces = (data,) if isinstance(data, bytes | str) else data
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+            for piece in pieces:
+                stream.write(piece.encode() if isinstance(piece, str) else piece)
             stream.flush()
             os.fsync(stream.fileno())
-        # mkstemp makes the file private; a result is meant to be read like any other file.
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)
+        make_public(Path(temporary))
         Path(temporary).replace(path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
     return path
+
+
+def make_public(path: Path) -> None:
+    """Give a file that mkstemp made private the rights of any other new file of the user."""
+    umask = os.umask(0)
+    os.umask(umask)
+    path.chmod(0o666 & ~umask)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

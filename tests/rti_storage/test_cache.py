@@ -3,8 +3,8 @@ import stat
 
 import pytest
 
-from controllers import cache
-from controllers.cache import is_own_folder, read_own, sweep, trusted_folder
+from rti_storage import cache
+from rti_storage.cache import is_own_folder, read_own, sweep, trusted_folder, user_cache
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
 
@@ -14,6 +14,18 @@ def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(cache, "_temporary", {})
     return tmp_path / "cache"
+
+
+def test_the_cache_lies_where_the_environment_says_else_where_the_platform_does(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    assert user_cache("optima") == tmp_path / "optima"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COSIM_CACHE", "here")
+    assert user_cache("fmus") == tmp_path / "here" / "fmus"
+    monkeypatch.setenv("COSIM_CACHE", "")
+    assert user_cache("fmus").parts[-2:] == ("rti-cosim", "fmus")
 
 
 def test_the_folder_is_made_and_closed_to_others(own_cache):

@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 DISPLACEMENT = 0.1
 BAND = 0.05
 LAST = 0.25
+ROUNDING = 1e-6
+"""Share of a state's value below which a way is none: a state that starts where it ends."""
 
 
 def indicators(run: Trajectory) -> dict[str, float]:
@@ -44,6 +46,11 @@ def input_effort(actions: Array, lower: Array, upper: Array) -> float:
     return float(np.mean(np.sum(np.abs(np.diff(actions, axis=0)) / (upper - lower), axis=1)))
 
 
+def comes_to_rest(scenario: Scenario) -> bool:
+    """Whether the plant can settle at all: under permanent disturbances it never does."""
+    return scenario.disturbance.law == "none"
+
+
 def displaced(scenario: Scenario) -> Scenario | None:
     """The scenario without disturbances, started away from x_s; None where that is impossible.
 
@@ -72,7 +79,7 @@ def settling_time(run: Trajectory) -> float:
     tail = max(1, round(LAST * len(states)))
     final = states[-tail:].mean(axis=0)
     distance = np.abs(states - final)
-    band = BAND * distance[0]
+    band = np.maximum(BAND * distance[0], ROUNDING * np.abs(final))
     if np.any(np.ptp(states[-tail:], axis=0) > band / 2):
         return float("nan")
     outside = np.any(distance > band, axis=1)

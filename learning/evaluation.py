@@ -106,6 +106,19 @@ class Judge:
         )
 
     @property
+    def baselines(self) -> dict[str, float]:
+        """J on the held-out runs of naive and, where it is known, optimal."""
+        found = {"naive": float(self._naive_cost.mean())}
+        if self._optimum is not None:
+            found["optimal"] = float(self._optimal_cost.mean())
+        return found
+
+    @property
+    def start_J(self) -> float:
+        """J on the held-out runs of θ where the run starts."""
+        return float(self._start_cost.mean())
+
+    @property
     def limit(self) -> float:
         """Greedy J above which a run has diverged."""
         # A cost may be negative, a profit say: the margin counts in its magnitude.

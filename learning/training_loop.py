@@ -106,6 +106,9 @@ class TrainingLoop:
             status,
             self._plant_samples,
             0 if self._validation is None else self._validation.samples,
+            self._learner.start,
+            self._judge.start_J,
+            self._judge.baselines,
             mode_of(self._learner.controller),
             late_movement(self._learner.start, self._rows) if self._rows else float("nan"),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -110,7 +110,8 @@ class TrainingResult:
     `diverged: …`, which changes nothing of what θ is; `plant_samples` counts those of training
     and validation, `validated` those of the latter; `functions` says whether the controller's were
     `interpreted` or `compiled` at the end; `late_movement` how far θ still went in the last fifth
-    of the run, as a share of its way from the start.
+    of the run, as a share of its way from the start; `start` is θ there and `start_J` its
+    greedy J, `baselines` that of `naive` and `optimal` on the same noise.
     """
 
     parameters: Parameters
@@ -119,6 +120,9 @@ class TrainingResult:
     status: str
     plant_samples: int
     validated: int
+    start: Parameters
+    start_J: float
+    baselines: Mapping[str, float]
     functions: str | None = None
     late_movement: float = float("nan")
 

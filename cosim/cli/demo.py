@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,21 +17,13 @@ if TYPE_CHECKING:
     from cosim.scenario import Scenario
     from cosim.trajectory import Trajectory
     from learning.log import LogRow
-    from learning.training_run import TrainingResult, TrainingRun
+    from learning.training import Training
 
 SCENARIO = "fouled"
 LEARNT, BACKED_OFF, OPTIMAL = "learnt", "tuned + back-off", "optimal"
 BACKOFF_SAMPLES = 8000
 RUNS = 10
 """Runs of the comparison; the first is drawn and recorded."""
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A training and what it cost."""
-
-    run: TrainingRun
-    result: TrainingResult
 
 
 def demo(
@@ -49,10 +40,9 @@ def demo(
     """Let a controller whose model is wrong learn from its plant, and compare it.
 
     The condenser of the evaporator is fouled and no controller is told. Writes demo.csv,
-    before-after.png, demo.rrd, learning.csv, parameters.toml and summary.json.
+    before-after.png, demo.rrd, learning.csv, learning.png, parameters.toml and summary.json.
     """
     with output(json) as out_:
-        from cosim.cli.train import summarise
         from cosim.figures import plot_overlay
         from cosim.scenario import Scenario
         from learning.log import to_csv
@@ -69,6 +59,7 @@ def demo(
         _show(rows, scenario, steps, out_)
         shown = {name: runs[name][0] for name in ("naive", LEARNT, OPTIMAL)}
         plot_overlay(shown, folder / "before-after.png")
+        learnt.plot(folder / "learning.png")
         _record(folder / "demo.rrd", shown, learnt, rows)
         write_atomically(folder / "demo.csv", _csv(rows))
         write_atomically(folder / "learning.csv", to_csv(learnt.result.rows))
@@ -78,11 +69,11 @@ def demo(
             "steps": steps,
             "seed": seed,
             "controllers": rows,
-            "training": summarise(learnt.run, learnt.result),
+            "training": learnt.summary(),
         }
         write_atomically(folder / "summary.json", dump(summary))
         out_.note(
-            f"picture    {folder / 'before-after.png'}\n"
+            f"pictures   {folder / 'before-after.png'}, {folder / 'learning.png'}\n"
             f"recording  {folder / 'demo.rrd'}   (look at it with: cosim view {folder}/demo.rrd)\n"
             f"learnt θ   {folder / 'parameters.toml'}   (a controller's name in every command)"
         )
@@ -91,34 +82,22 @@ def demo(
 
 def _train(
     scenario: Scenario, algorithm: str, start: str, samples: int, seed: int, output: Output
-) -> Trained:
-    from cosim.lookup import build_controller
-    from cosim.plant import FmuPlant
-    from learning.registry import load_algorithm
-    from learning.training_loop import TrainingLoop
-    from learning.training_run import TrainingRun
+) -> Training:
+    from learning.training import train
 
-    found = load_algorithm(algorithm)
     every = max(1, samples // 10)
-    run = TrainingRun(
-        algorithm=algorithm,
-        scenario=scenario,
-        samples=samples,
-        seed=seed,
-        configuration=found.Configuration.from_assignments([]),
-        start=start,
-        log_every=every,
-        evaluate_every=every,
-        checkpoint_every=every,
-    )
-    label = f"{algorithm} from {start}"
-    with (
-        FmuPlant(scenario) as plant,
-        FmuPlant(scenario) as other,
-        output.progress(label, samples) as progress,
-    ):
-        loop = TrainingLoop(run, found, plant, other, optimum=build_controller("optimal", scenario))
-        return Trained(run, loop.go(progress=_remark(scenario, progress)))
+    with output.progress(f"{algorithm} from {start}", samples) as progress:
+        return train(
+            algorithm,
+            scenario,
+            samples,
+            seed=seed,
+            start=start,
+            progress=_remark(scenario, progress),
+            log_every=every,
+            evaluate_every=every,
+            checkpoint_every=every,
+        )
 
 
 def _remark(scenario: Scenario, progress: Any) -> Callable[[int, LogRow], None]:
@@ -134,7 +113,7 @@ def _remark(scenario: Scenario, progress: Any) -> Callable[[int, LogRow], None]:
     return update
 
 
-def _controllers(scenario: Scenario, trained: Mapping[str, Trained]) -> dict[str, Controller]:
+def _controllers(scenario: Scenario, trained: Mapping[str, Training]) -> dict[str, Controller]:
     from cosim.lookup import build_controller
     from learning.starting_point import build_controller as build_learnt
 
@@ -172,7 +151,7 @@ def _simulate(
 
 
 def _table(
-    runs: Mapping[str, list[Trajectory]], trained: Mapping[str, Trained]
+    runs: Mapping[str, list[Trajectory]], trained: Mapping[str, Training]
 ) -> list[dict[str, Any]]:
     """A row per controller: what it cost to learn and what it costs to run."""
     import numpy as np
@@ -229,7 +208,7 @@ def _csv(rows: list[dict[str, Any]]) -> str:
 
 
 def _record(
-    path: Path, runs: Mapping[str, Trajectory], learnt: Trained, rows: list[dict[str, Any]]
+    path: Path, runs: Mapping[str, Trajectory], learnt: Training, rows: list[dict[str, Any]]
 ) -> None:
     import numpy as np
 

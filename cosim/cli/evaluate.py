@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,13 +47,14 @@ def evaluate(
 ) -> None:
     """Compare controllers on the same disturbances, seed by seed.
 
-    Writes evaluation.csv (a row per controller and seed), summary.json, timing.csv and
-    scenario.toml. Run again with the same --out to go on after an interruption.
+    Writes evaluation.csv (a row per controller and seed), evaluation.png, summary.json, timing.csv
+    and scenario.toml. Run again with the same --out to go on after an interruption.
     """
     with output(json) as out_:
         from cosim.cli.compose import announce
         from cosim.evaluation import evaluate as run
         from cosim.evaluation.parallel import cores
+        from cosim.kpis import comes_to_rest
         from cosim.lookup import build_controller
         from cosim.scenario import Scenario
         from learning.optimum import has_stored_optimum
@@ -66,7 +68,7 @@ def evaluate(
         announce(task, out_)
         optimum = partial(build_controller, "optimal") if has_stored_optimum(task) else None
         extra = seeds if optimum is not None and "optimal" not in named else 0
-        units = len(named) * (seeds + 1) + extra
+        units = len(named) * (seeds + comes_to_rest(task)) + extra
         with out_.progress(f"{', '.join(named)} on {task.name}", units) as progress:
             evaluation = run(
                 task,
@@ -152,14 +154,22 @@ def show(summary: dict[str, Any], output: Output) -> None:
             f"regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "
             f"{shown(summary['optimal_J'], digits=6)}"
         )
+    settling = {name: row["settling_time"] for name, row in controllers}
+    settles = any(map(isfinite, settling.values()))
     output.table(
         "behaviour",
-        ("controller", "input effort", "settling time s", "failures", "median step µs"),
+        (
+            "controller",
+            "input effort",
+            *(["settling time s"] if settles else []),
+            "failures",
+            "median step µs",
+        ),
         [
             (
                 name,
                 f"{row['input_effort']:.4f}",
-                f"{row['settling_time']:.0f}",
+                *([_seconds(settling[name])] if settles else []),
                 str(row["failures"]),
                 f"{_step_time(summary['timing'][name]):.1f}",
             )
@@ -182,14 +192,20 @@ def show(summary: dict[str, Any], output: Output) -> None:
     )
 
 
+def _seconds(time: float) -> str:
+    return f"{time:.0f}" if isfinite(time) else "not settled"
+
+
 def _step_time(timing: dict[str, float]) -> float:
     return timing["prepare_median_us"] + timing["feedback_median_us"]
 
 
 def interval(estimate: dict[str, Any], scale: float = 1.0, digits: int = 3) -> str:
-    """An estimate of a summary with its t interval."""
+    """An estimate of a summary with its t interval; nothing where it is undefined."""
     from cosim.evaluation.statistics import shown
 
+    if not isfinite(estimate["value"]):
+        return ""
     return shown(estimate["value"], estimate["t"], scale, digits)
 
 

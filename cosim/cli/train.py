@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,9 +14,17 @@ from cosim.cli.simulate import ScenarioOption
 
 if TYPE_CHECKING:
     from learning.log import LogRow
-    from learning.training_run import TrainingResult, TrainingRun
+    from learning.training import Training
+    from learning.training_run import TrainingRun
 
-FILES = ("checkpoint.npz", "learning.csv", "parameters.toml", "summary.json", "training.rrd")
+FILES = (
+    "checkpoint.npz",
+    "learning.csv",
+    "learning.png",
+    "parameters.toml",
+    "summary.json",
+    "training.rrd",
+)
 """What a training leaves in its folder; each belongs to the same run."""
 # Columns of the log behind the progress bar: name, text, scale, format.
 FIGURES = (
@@ -131,7 +138,7 @@ def train(
     record: Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Train a controller's θ and write parameters.toml, learning.csv and summary.json.
+    """Train a controller's θ; write parameters.toml, learning.csv, learning.png, summary.json.
 
     Exit code 1: learning diverged; the files hold the run's own last θ and the summary says why.
     """
@@ -139,19 +146,19 @@ def train(
         from cosim.lookup import import_from_here
         from cosim.scenario import Scenario
         from learning.registry import load_algorithm
-        from learning.training_run import TrainingRun
+        from learning.training import prepare
 
         import_from_here()
         found = load_algorithm(algorithm)
         if explain:
             _explain(algorithm, found.Configuration.documentation(), out_)
             return
-        run = TrainingRun(
-            algorithm=algorithm,
-            scenario=Scenario.load(scenario),
-            samples=getattr(found, "budget", 50_000) if samples is None else samples,
+        run = prepare(
+            algorithm,
+            Scenario.load(scenario),
+            samples,
+            found.Configuration.from_assignments(assignments or []),
             seed=seed,
-            configuration=found.Configuration.from_assignments(assignments or []),
             controller=controller,
             log_every=log_every,
             evaluate_every=evaluate_every,
@@ -165,20 +172,20 @@ def train(
         folder = open_folder(out).absolute()
         if not (resume or overwrite):
             _require_no_run(folder)
-        begin = time.perf_counter()
-        result = _execute(run, found, folder, optimum, resume, record, out_)
-        summary = summarise(run, result)
+        training = _execute(run, folder, optimum, resume, record, out_)
+        summary = training.summary()
         summary["timing"] = {
-            "wall_seconds": time.perf_counter() - begin,
-            "functions": result.functions,
+            "wall_seconds": training.wall_seconds,
+            "functions": training.result.functions,
         }
-        _write(folder, run, result, summary)
+        _write(folder, training, summary)
         if overwrite and not record:
             # Only now: had this run failed, the one before it would have been lost.
             (folder / "training.rrd").unlink(missing_ok=True)
         _show(summary, out_)
+        out_.note(f"the learning curve is {folder / 'learning.png'}")
         out_.json(summary)
-    if result.status != "finished":
+    if training.status != "finished":
         raise typer.Exit(1)
 
 
@@ -193,45 +200,29 @@ def _require_no_run(folder: Path) -> None:
 
 
 def _execute(
-    run: TrainingRun,
-    algorithm: Any,
-    folder: Path,
-    optimum: str | None,
-    resume: bool,
-    record: bool,
-    output: Output,
-) -> TrainingResult:
-    from cosim.cli.compose import build_plant
-    from cosim.lookup import build_controller
-    from learning.optimum import has_stored_optimum
-    from learning.training_loop import TrainingLoop
-
-    if optimum is None and has_stored_optimum(run.scenario):
-        optimum = "optimal"
+    run: TrainingRun, folder: Path, optimum: str | None, resume: bool, record: bool, output: Output
+) -> Training:
+    from cosim.cli.compose import announce
+    from learning.training import carry_out
 
     recorder: Any = None
     if record:
         from cosim.recording import TrainingRecorder
 
         recorder = TrainingRecorder(folder / "training.rrd")
-    with (
-        build_plant(run.scenario, output) as plant,
-        build_plant(run.scenario) as evaluation_plant,
-        output.progress(run.algorithm, run.samples) as progress,
-    ):
-        training = TrainingLoop(
+    announce(run.scenario, output)
+    with output.progress(run.algorithm, run.samples) as progress:
+        training = carry_out(
             run,
-            algorithm,
-            plant,
-            evaluation_plant,
-            optimum=build_controller(optimum, run.scenario) if optimum else None,
             out=folder,
+            resume=resume,
+            optimum=optimum,
             recorder=recorder,
+            progress=_remark(progress),
         )
-        result = training.go(resume=resume, progress=_remark(progress))
     if training.without_checkpoint:
         output.note(f"left no checkpoint, --resume is not possible: {training.without_checkpoint}")
-    return result
+    return training
 
 
 def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:
@@ -252,56 +243,10 @@ def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:
     return update
 
 
-def summarise(run: TrainingRun, result: TrainingResult) -> dict[str, Any]:
-    """What `summary.json` says of a run, but for its timing."""
-    from importlib.metadata import version
-
-    last: Mapping[str, float] = result.rows[-1] if result.rows else {}
-    return {
-        "version": version("rti-cosim"),
-        "algorithm": run.algorithm,
-        "scenario": run.scenario.name,
-        "scenario_hash": run.scenario.hash,
-        "controller": run.controller,
-        "start": run.start,
-        "samples": int(last.get("samples", 0)),
-        "plant_samples": result.plant_samples,
-        "validation": _validation(run, result),
-        "seed": run.seed,
-        "status": result.status,
-        "hyperparameters": run.configuration.model_dump(mode="json"),
-        "parameters_hash": result.parameters.hash,
-        "evaluation_seeds": run.evaluation_seeds,
-        "evaluation_steps": run.evaluation_steps,
-        **result.evaluation,
-        "smallest_eigenvalue": last.get("smallest_eigenvalue"),
-        "td_error": last.get("td_error"),
-        "late_movement": result.late_movement,
-        "training_failures": last.get("failures"),
-        "weakly_active": last.get("weakly_active"),
-        "licq_failed": last.get("licq_failed"),
-    }
-
-
-def _validation(run: TrainingRun, result: TrainingResult) -> dict[str, int] | None:
-    """How θ was chosen among those of the run, None where it is simply the last one."""
-    if not run.validate_every:
-        return None
-    return {
-        "validate_every": run.validate_every,
-        "validation_samples": run.validation_samples,
-        "samples": result.validated,
-        "accepted": int(result.rows[-1]["accepted"]) if result.rows else 0,
-    }
-
-
-def _write(folder: Path, run: TrainingRun, result: TrainingResult, summary: dict[str, Any]) -> None:
-    from learning.log import to_csv
+def _write(folder: Path, training: Training, summary: dict[str, Any]) -> None:
     from rti_storage import write_atomically
 
-    write_atomically(folder / "learning.csv", to_csv(result.rows))
-    result.parameters.save(folder / "parameters.toml")
-    write_atomically(folder / "scenario.toml", run.scenario.to_toml())
+    training.save(folder)
     write_atomically(folder / "summary.json", dump(summary))
 
 

@@ -14,6 +14,7 @@ from cosim.evaluation.provenance import code_hash, controller_hash, parameters_h
 from cosim.evaluation.store import Store, unit_key
 from cosim.evaluation.table import Evaluation
 from cosim.evaluation.unit import Factory, RunUnit, UnitResult, release, run
+from cosim.kpis import comes_to_rest
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 
@@ -52,8 +53,8 @@ def evaluate(
     folder : where finished work units are kept and found again; None keeps none.
     jobs : worker processes; 1 works in this process.
     scheduler : address of a Dask scheduler, used in place of `jobs`.
-    progress : called with the number of units done, of controllers × (seeds + 1) in all, and
-        `seeds` more for an `optimum`.
+    progress : called with the number of units done, of controllers × seeds in all, one more for
+        each controller whose settling is measured, and `seeds` more for an `optimum`.
     command : the text of the column `command`.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
@@ -109,7 +110,7 @@ class _Plan:
         self._optimum = OPTIMUM if OPTIMUM in every else None
         with FmuPlant(scenario) as plant:
             fmu = plant.fmu_sha256
-        code = code_hash()
+        code, self._rests = code_hash(), comes_to_rest(scenario)
         self._facts: dict[str, Any] = {
             "scenario": scenario.name,
             "steps": steps,
@@ -137,7 +138,7 @@ class _Plan:
     def runs(self) -> Iterator[tuple[str, int | None]]:
         """Controller and seed of every unit; without a seed it is the settling run."""
         for name in self._units:
-            if name in self._names:
+            if name in self._names and self._rests:
                 yield name, None
             yield from ((name, seed) for seed in self._seeds)
 
@@ -160,7 +161,10 @@ class _Plan:
                 if seed is not None
             },
             settling={
-                name: results[self.key(name, None)].indicators["settling_time"] for name in names
+                name: results[self.key(name, None)].indicators["settling_time"]
+                if self._rests
+                else float("nan")
+                for name in names
             },
             parameters={name: self._parameters[name] for name in names},
             facts=self._facts | {"command": command},

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cosim.evaluation.statistics import gain, gap_closed, mean, regret
 from cosim.evaluation.unit import UnitResult
+from cosim.figures.evaluation import Costs, evaluation_figure
+from cosim.figures.style import save
 from cosim.text_tables import cell, csv_text
 from rti_storage import write_atomically
 
@@ -40,6 +43,8 @@ PROVENANCE = (
     "parameters_hash",
     "command",
 )
+DRAWN = ("J", "economic_cost", "mean_violation")
+FIGURE = "evaluation.png"
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
 COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
 COLUMNS = (*TEXT, "seed", "steps", *NUMBERS, "failures", *PROVENANCE)
@@ -50,10 +55,10 @@ class Evaluation:
     """Indicators of controllers × seeds on common random numbers.
 
     `results` maps (controller, seed) to a unit's result; `settling` a controller to its settling
-    time in s; `facts` are the columns that do not vary, `parameters` each controller's hash.
-    `reference` is the controller that gains are measured against, `naive` the one that the gap is
-    measured from, `optimum` the one that gives J*, in `results` whether it is among the
-    `controllers` or not; None where there is none.
+    time in s, NaN where permanent disturbances let nothing settle; `facts` are the columns that do
+    not vary, `parameters` each controller's hash. `reference` is the controller that gains are
+    measured against, `naive` the one that the gap is measured from, `optimum` the one that gives
+    J*, in `results` whether it is among the `controllers` or not; None where there is none.
     """
 
     controllers: Sequence[str]
@@ -127,9 +132,23 @@ class Evaluation:
         )
         return csv_text(["controller", "seed", *names], rows)
 
+    def figure(self) -> Figure:
+        """Regret (J where J* is not known) with its intervals; economic cost against violation."""
+        return evaluation_figure(
+            {name: Costs(*(self.column(name, key) for key in DRAWN)) for name in self.controllers},
+            title=f"{self.facts['scenario']}, {self.facts['steps']} samples × {len(self.seeds)} "
+            "seeds, the same disturbances for all",
+            optimal=None if self.optimum is None else self.optimal,
+        )
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw `figure` to a PNG or SVG file; raises FigureError where it cannot be written."""
+        return save(self.figure(), path)
+
     def write(self, folder: Path) -> None:
-        """Write evaluation.csv and timing.csv, each whole or not at all."""
+        """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""
         write_atomically(folder / "evaluation.csv", self.to_csv())
+        self.plot(folder / FIGURE)
         write_atomically(folder / "timing.csv", self.timing_csv())
 
 
@@ -141,8 +160,9 @@ def summarise(evaluation: Evaluation) -> dict[str, Any]:
     """An evaluation as a JSON document: controllers, comparisons, provenance, timing.
 
     `controllers`: per controller the means over all seeds and samples, `failures` in total,
-    `settling_time` [s], `intervals` of each mean, where J* is known the `regret` (J − J*)/|J*|,
-    and where the naive controller is there too `gap_closed` = (J_naive − J)/(J_naive − J*).
+    `settling_time` [s], null under permanent disturbances, `intervals` of each mean, where J* is
+    known the `regret` (J − J*)/|J*|, and where the naive controller is there too `gap_closed` =
+    (J_naive − J)/(J_naive − J*).
     `comparisons`: for each pair, the paired difference controller − reference of each mean, and
     `gain_in_J`, (J_ref − J)/|J_ref|. Every interval is of 95 %, paired over seeds, once by
     Student's t and once by BCa bootstrap. `optimal_J` is J* on the same seeds.

@@ -129,11 +129,15 @@ def shortened(cases: Sequence[str]) -> dict[str, str]:
 
 
 def _values(settings: str) -> str:
-    """`a=1 b=word` as `a=1 word`: a word says what it is of, a number does not."""
+    """`a=1 b=word` as `a=1 word`: a word says what it is of, a number does not.
+
+    A start is `from naive`, since `naive` alone is the baseline's name.
+    """
     parts = []
     for part in settings.split():
-        _, _, value = part.partition("=")
-        parts.append(value if re.match(r"[A-Za-z]", value) else part)
+        key, _, value = part.partition("=")
+        said = value if re.match(r"[A-Za-z]", value) else part
+        parts.append(f"from {value}" if key == "start" else said)
     return " ".join(parts)
 
 

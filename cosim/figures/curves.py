@@ -122,12 +122,12 @@ def _ends(curves: Mapping[str, LearningCurve], kind: str) -> list[EndLabel]:
         values: Array = getattr(curve, kind)
         known = ~np.isnan(values).all(axis=0)
         if known.any():
-            found.append(EndLabel(name, float(np.nanmedian(values[:, known][:, -1])), color))
+            found.append(EndLabel(plain(name), float(np.nanmedian(values[:, known][:, -1])), color))
     return found
 
 
 def _levels(levels: Mapping[str, float]) -> list[EndLabel]:
-    return [EndLabel(name, level, REFERENCE) for name, level in levels.items()]
+    return [EndLabel(plain(name), level, REFERENCE) for name, level in levels.items()]
 
 
 def chunks(names: Sequence[str]) -> list[list[str]]:

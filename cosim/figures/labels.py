@@ -9,13 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from cosim.figures.style import plain
-
 Array = NDArray[np.float64]
 
 
 class EndLabel(NamedTuple):
-    """A line's name, the ordinate at which it ends (data coordinates), and its colour."""
+    """A line's name as it is to be set, the ordinate at its end (data), and its colour."""
 
     text: str
     y: float
@@ -40,7 +38,7 @@ def label_ends(axes: Axes, labels: Sequence[EndLabel], size: float = 6.5) -> Non
         item = labels[index]
         end = float(np.clip(wanted[index], 0.0, 1.0))
         axes.annotate(
-            plain(item.text),
+            item.text,
             xy=(1.0, end),
             xytext=(1.035, position),
             xycoords="axes fraction",

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.style import SERIES, figure, plain, save
+from cosim.figures.style import SERIES, figure, save, symbol
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def plot_parameters_and_td_error(
             first = first or axes
             for entry, color in zip(values.T, cycle(SERIES), strict=False):
                 axes.plot(samples, entry, color=color, linewidth=0.8)
-            axes.set_title(rf"$\Delta$ {_symbol(name)}", loc="left", fontsize=8.0)
+            axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
             axes.tick_params(labelbottom=i + columns >= len(moving))
             axes.set_xlim(0.0, end)
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -71,15 +71,3 @@ def plot_parameters_and_td_error(
 def _ordinals(color: int, entries: int) -> str:
     """Numbers, from 1, of the entries that have a colour of the cycle."""
     return ", ".join(str(i + 1) for i in range(color, entries, len(SERIES)))
-
-
-def _symbol(name: str) -> str:
-    """`B_Vf` as mathematics, B with the block's subscript."""
-    head, _, subscript = name.partition("_")
-    if not head.isalpha() or "$" in name:
-        return plain(name)
-    known = {"lambda": r"\lambda", "sigma": r"\sigma", "Vf": r"V^\mathrm{f}"}
-    # The stage cost's blocks are set with ℓ; x_l is the lower bound.
-    if head in ("B", "b"):
-        known["l"] = r"\ell"
-    return f"${head}_{{{known.get(subscript, subscript)}}}$" if subscript else f"${head}$"

@@ -6,50 +6,64 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from cosim.figures.style import REFERENCE, colors, figure, plain, save
 
 Array = NDArray[np.float64]
+XLABEL = "mean violation per sample, in the states' units"
+YLABEL = "economic cost per sample"
 
 
 def plot_pareto(
     points: Mapping[str, tuple[Array, Array]],
     path: str | Path,
     *,
-    xlabel: str = "mean violation per sample, in the states' units",
-    ylabel: str = "economic cost per sample",
+    xlabel: str = XLABEL,
+    ylabel: str = YLABEL,
 ) -> Path:
+    """Draw `draw_pareto` to a PNG or SVG file, with a legend; raises FigureError as `save` does."""
+    with figure(3.0, 4.6) as drawn:
+        axes = drawn.subplots()
+        draw_pareto(axes, points, colors(list(points)), xlabel=xlabel, ylabel=ylabel)
+        axes.legend(loc="best")
+    return save(drawn, path)
+
+
+def draw_pareto(
+    axes: Axes,
+    points: Mapping[str, tuple[Array, Array]],
+    color: Mapping[str, str],
+    *,
+    xlabel: str = XLABEL,
+    ylabel: str = YLABEL,
+) -> None:
     """Draw controllers by (violation (S,), economic cost (S,)) over S seeds.
 
     Small dots are seeds, the large ones means with 95 % t intervals. The grey line joins the
     controllers that no other one beats in both.
     """
-    with figure(3.0, 4.6) as drawn:
-        axes = drawn.subplots()
-        color = colors(list(points))
-        means = {name: (float(np.mean(v)), float(np.mean(c))) for name, (v, c) in points.items()}
-        front = nondominated(np.array(list(means.values())))
-        best = sorted(mean for mean, keep in zip(means.values(), front, strict=True) if keep)
-        axes.plot(*np.array(best).T, color=REFERENCE, linewidth=0.9, linestyle=(0, (4, 2)))
-        for name, (violation, cost) in points.items():
-            axes.plot(violation, cost, ".", color=color[name], markersize=3, alpha=0.35, mew=0)
-            axes.errorbar(
-                *means[name],
-                xerr=half_width(violation),
-                yerr=half_width(cost),
-                fmt="o",
-                color=color[name],
-                markersize=5,
-                capsize=2,
-                linewidth=1.0,
-                label=plain(name),
-            )
-        axes.set_xlabel(xlabel)
-        axes.set_ylabel(ylabel)
-        axes.legend(loc="best")
-    return save(drawn, path)
+    means = {name: (float(np.mean(v)), float(np.mean(c))) for name, (v, c) in points.items()}
+    front = nondominated(np.array(list(means.values())))
+    best = sorted(mean for mean, keep in zip(means.values(), front, strict=True) if keep)
+    axes.plot(*np.array(best).T, color=REFERENCE, linewidth=0.9, linestyle=(0, (4, 2)))
+    for name, (violation, cost) in points.items():
+        axes.plot(violation, cost, ".", color=color[name], markersize=3, alpha=0.35, mew=0)
+        axes.errorbar(
+            *means[name],
+            xerr=half_width(violation),
+            yerr=half_width(cost),
+            fmt="o",
+            color=color[name],
+            markersize=5,
+            capsize=2,
+            linewidth=1.0,
+            label=plain(name),
+        )
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
 
 
 def half_width(values: Array, level: float = 0.95) -> float:

@@ -112,6 +112,18 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def symbol(name: str) -> str:
+    """`B_Vf` as mathematics, B with the block's subscript."""
+    head, _, subscript = name.partition("_")
+    if not head.isalpha() or "$" in name:
+        return plain(name)
+    known = {"lambda": r"\lambda", "sigma": r"\sigma", "Vf": r"V^\mathrm{f}"}
+    # The stage cost's blocks are set with ℓ; x_l is the lower bound.
+    if head in ("B", "b"):
+        known["l"] = r"\ell"
+    return f"${head}_{{{known.get(subscript, subscript)}}}$" if subscript else f"${head}$"
+
+
 def label(name: str, unit: str) -> str:
     """Axis label `name [unit]`; `X2` prints with its digits as a subscript."""
     head = name.rstrip("0123456789")

@@ -49,6 +49,16 @@ def test_a_state_that_still_drifts_has_not_settled(paper):
     assert np.isnan(settling_time(run_with_states(paper, time, states)))
 
 
+def test_a_state_that_never_moves_has_settled_from_the_start(paper):
+    time = np.arange(100) * 1.0
+    moving = np.exp(-time / 5.0)
+    constant = np.full(100, 0.1 + 0.2)
+    states = np.stack([moving, constant], axis=1)
+    assert settling_time(run_with_states(paper, time, states)) == pytest.approx(15.0, abs=1.0)
+    states = np.stack([constant, constant], axis=1)
+    assert settling_time(run_with_states(paper, time, states)) == 0.0
+
+
 def test_the_displaced_plant_starts_off_the_operating_point_and_is_not_disturbed(paper):
     away = displaced(paper)
     np.testing.assert_allclose(away.initial_state, 1.1 * paper.reference_state)

@@ -32,7 +32,7 @@ def test_what_was_learned_is_a_controller(cosim):
 def test_the_same_command_and_seed_give_the_same_bytes(cosim, tmp_path):
     for folder in ("one", "two"):
         assert cosim(*SHORT, "--out", folder)[0] == 0
-    for file in ("learning.csv", "parameters.toml"):
+    for file in ("learning.csv", "learning.png", "parameters.toml"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
 
 

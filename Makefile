@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# One process a core; tests of one file share what they build.
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
 
 .PHONY: demo test check campaign clean
 
@@ -9,7 +11,7 @@ demo: $(VENV)/installed
 	$(BIN)/cosim demo --out demo
 
 test: $(VENV)/installed
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 # What CI runs after `make test`: lint, types, the FMUs in every importer, the slow tests, the stored
 # results and the main job on a small budget.
@@ -19,7 +21,7 @@ check: $(VENV)/installed-dev
 	$(BIN)/mypy
 	$(BIN)/cosim fmu check evaporator
 	$(BIN)/cosim fmu check evaporator_fmi3
-	$(BIN)/python -m pytest -m slow
+	$(PYTEST) -m slow
 	$(BIN)/cosim results check
 	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo
 

@@ -79,7 +79,7 @@ def test_every_stored_study_is_a_valid_study_that_can_be_planned():
 
 
 def test_the_benchmark_evaluates_on_ten_thousand_samples_where_the_state_mixes_slowly():
-    steps = read(STORED / "learning-full.toml").evaluation.steps
+    steps = read(STORED / "learning.toml").evaluation.steps
     assert steps["fast-sampling"] == 10_000
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -32,7 +32,7 @@ def _spaces(plant: FmuPlant) -> tuple[gymnasium.Space[Array], gymnasium.Space[Ar
     observation = Box(*plant.state_range, dtype=np.float64)
     lower, upper = plant.scenario.action_lower.copy(), plant.scenario.action_upper.copy()
     action = Box(lower, upper, dtype=np.float64)
-    return cast("gymnasium.Space[Array]", observation), cast("gymnasium.Space[Array]", action)
+    return observation, action
 
 
 class PlantEnv(gymnasium.Env[Array, Array]):

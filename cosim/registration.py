@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 EPISODE_STEPS = 500
 ENVIRONMENTS = {
@@ -48,11 +49,11 @@ class _WhenImported:
 
         spec = find_spec(name)
         if spec is not None and spec.loader is not None:
-            spec.loader = cast("Any", _Registering(spec.loader))
+            spec.loader = _Registering(spec.loader)
         return spec
 
 
-class _Registering:
+class _Registering(Loader):
     """Executes a module as its own loader does, then adds our environments."""
 
     def __init__(self, loader: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +132,7 @@ class Judge:
 
     @cached_property
     def _start_cost(self) -> NDArray[np.float64]:
-        return self._evaluation.costs(cast("Controller", self._build(self._start)))["J"]
+        return self._evaluation.costs(self._build(self._start))["J"]
 
     @cached_property
     def _optimal_cost(self) -> NDArray[np.float64]:

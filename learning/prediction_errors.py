@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -26,7 +26,7 @@ class OneStepModel:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        problem = Problem.from_scenario(cast("Any", scenario))
+        problem = Problem.from_scenario(scenario)
         model = problem.model
         step = discretise(model, problem.sampling_time, problem.substeps)
         x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)

@@ -6,13 +6,15 @@ from controllers.yardstick import yardstick
 from cosim.plant.archive import SHIPPED
 from cosim.scenario import Scenario
 
+OPTIMAL = "optimal"
 
-def has_stored_optimum(scenario: Scenario) -> bool:
-    """Whether `optimal` is the scenario's yardstick and can be had without solving anything.
+
+def stored_optimum(scenario: Scenario) -> str | None:
+    """`optimal` where it is the scenario's yardstick and can be had without solving anything.
 
     A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
     scenario names the plant's own model.
     """
     if scenario.plant.fmu not in SHIPPED and scenario.plant.model is None:
-        return False
-    return yardstick(scenario) is not None
+        return None
+    return None if yardstick(scenario) is None else OPTIMAL

@@ -21,7 +21,7 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from learning.errors import ConfigurationError
 from learning.log import COLUMNS, LogRow, to_csv
-from learning.optimum import has_stored_optimum
+from learning.optimum import stored_optimum
 from learning.registry import GROUP as ALGORITHMS
 from learning.registry import load_algorithm
 from learning.starting_point import build_controller, starting_parameters
@@ -29,7 +29,6 @@ from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun
 
 CHECKPOINT = "checkpoint.npz"
-OPTIMUM = "optimal"
 SEQUENCES = (list, tuple, set, frozenset)
 
 
@@ -105,7 +104,7 @@ class Trainer:
 
     def optimum(self, scenario: Scenario) -> str | None:
         """`optimal` where the scenario's optimal policy is stored."""
-        return OPTIMUM if has_stored_optimum(scenario) else None
+        return stored_optimum(scenario)
 
     def sources(self, target: str) -> Mapping[str, str]:
         """Hashes of the foreign files that an algorithm or a controller is made of."""

@@ -23,7 +23,7 @@ from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.log import to_csv
-from learning.optimum import has_stored_optimum
+from learning.optimum import stored_optimum
 from learning.protocols import LearnableController
 from learning.registry import load_algorithm
 from learning.starting_point import build_controller as build_learnt
@@ -242,8 +242,7 @@ def carry_out(
 ) -> Training:
     """Train as `run` says; the other arguments and the errors are those of `train`."""
     begin = time.perf_counter()
-    if optimum is None and has_stored_optimum(run.scenario):
-        optimum = "optimal"
+    optimum = optimum or stored_optimum(run.scenario)
     with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
         loop = TrainingLoop(
             run,

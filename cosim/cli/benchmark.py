@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cosim.cli.output import JsonOption, output
-from cosim.cli.simulate import ScenarioOption
+from cosim.cli.options import JsonOption, ScenarioOption
+from cosim.cli.output import output
 
 app = typer.Typer(help="Measure speed: medians, and ratios within one run.", no_args_is_help=True)
 

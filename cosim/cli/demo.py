@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.output import JsonOption, Output, dump, open_folder, output
-from cosim.cli.simulate import SeedOption, StepsOption
+from cosim.cli.options import JsonOption, OutOption, SeedOption, StepsOption
+from cosim.cli.output import Output, dump, open_folder, output
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -32,9 +32,7 @@ def demo(
     ] = 20_000,
     steps: StepsOption = 500,
     seed: SeedOption = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
-        "cosim-demo"
-    ),
+    out: OutOption = Path("cosim-demo"),
     json: JsonOption = False,
 ) -> None:
     """Let a controller whose model is wrong learn from its plant, and compare it.

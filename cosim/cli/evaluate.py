@@ -10,13 +10,15 @@ from typing import Annotated, Any
 
 import typer
 
-from cosim.cli.output import JsonOption, Output, dump, open_folder, output
-from cosim.cli.simulate import ScenarioOption, StepsOption
-
-JobsOption = Annotated[
-    int | None,
-    typer.Option("--jobs", "-j", min=1, max=1024, help="Processes; default: one per core."),
-]
+from cosim.cli.options import (
+    JobsOption,
+    JsonOption,
+    OutOption,
+    ScenarioOption,
+    SchedulerOption,
+    StepsOption,
+)
+from cosim.cli.output import Output, dump, open_folder, output
 
 
 def evaluate(
@@ -35,14 +37,9 @@ def evaluate(
     ] = 10,
     first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
     steps: StepsOption = 1000,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
-        "cosim-evaluation"
-    ),
+    out: OutOption = Path("cosim-evaluation"),
     jobs: JobsOption = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs."),
-    ] = None,
+    scheduler: SchedulerOption = None,
     json: JsonOption = False,
 ) -> None:
     """Compare controllers on the same disturbances, seed by seed.
@@ -57,7 +54,7 @@ def evaluate(
         from cosim.kpis import comes_to_rest
         from cosim.lookup import build_controller
         from cosim.scenario import Scenario
-        from learning.optimum import has_stored_optimum
+        from learning.optimum import stored_optimum
         from rti_storage import write_atomically
 
         task = Scenario.load(scenario)
@@ -66,8 +63,9 @@ def evaluate(
         options |= {"first-seed": first_seed} if first_seed else {}
         folder = open_folder(out).absolute()
         announce(task, out_)
-        optimum = partial(build_controller, "optimal") if has_stored_optimum(task) else None
-        extra = seeds if optimum is not None and "optimal" not in named else 0
+        yardstick = stored_optimum(task)
+        optimum = None if yardstick is None else partial(build_controller, yardstick)
+        extra = seeds if yardstick is not None and yardstick not in named else 0
         units = len(named) * (seeds + comes_to_rest(task)) + extra
         with out_.progress(f"{', '.join(named)} on {task.name}", units) as progress:
             evaluation = run(

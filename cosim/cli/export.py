@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.output import JsonOption, output
-from cosim.cli.simulate import ScenarioOption
+from cosim.cli.options import JsonOption, ScenarioOption
+from cosim.cli.output import output
 
 
 def export(

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.output import JsonOption, output, writable_folder
+from cosim.cli.options import JsonOption
+from cosim.cli.output import output, writable_folder
 
 DIFFERENT = 1
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.output import JsonOption, Output, output
-from cosim.cli.simulate import ScenarioOption
+from cosim.cli.options import JsonOption, ScenarioOption
+from cosim.cli.output import Output, output
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming.certificate import Certificate, Figure

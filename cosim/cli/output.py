@@ -9,18 +9,12 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
-
-import typer
+from typing import TYPE_CHECKING, Any, Protocol
 
 from cosim.errors import CosimError
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print a JSON summary on standard output, nothing else.")
-]
 
 
 class Progressing(Protocol):

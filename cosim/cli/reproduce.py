@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.evaluate import JobsOption
-from cosim.cli.output import JsonOption, output
+from cosim.cli.options import JobsOption, JsonOption, OutOption
+from cosim.cli.output import output
 from cosim.cli.study import execute, show, write_summary
 
 
@@ -28,9 +28,7 @@ def reproduce(
             help="quick: minutes on 2 cores; full: hours, with more seeds and samples.",
         ),
     ] = BudgetName.quick,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
-        "cosim-reproduction"
-    ),
+    out: OutOption = Path("cosim-reproduction"),
     jobs: JobsOption = None,
     json: JsonOption = False,
 ) -> None:

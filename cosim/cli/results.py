@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.evaluate import JobsOption
-from cosim.cli.output import JsonOption, output
+from cosim.cli.options import JobsOption, JsonOption
+from cosim.cli.output import output
 from cosim.cli.study import execute
 
 app = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)

@@ -7,17 +7,16 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.output import JsonOption, output
+from cosim.cli.options import (
+    JsonOption,
+    OutOption,
+    RecordOption,
+    ScenarioOption,
+    SeedOption,
+    StepsOption,
+)
+from cosim.cli.output import output
 from cosim.cli.run import Run, execute, show
-
-ScenarioOption = Annotated[
-    str,
-    typer.Option("--scenario", "-s", help="Preset (paper, fouled, mismatched, …) or TOML file."),
-]
-StepsOption = Annotated[
-    int, typer.Option("--steps", "-n", min=1, max=100_000_000, help="Number of samples.")
-]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the disturbances.")]
 
 
 def simulate(
@@ -32,10 +31,8 @@ def simulate(
     ] = "naive",
     steps: StepsOption = 1000,
     seed: SeedOption = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
-        "cosim-run"
-    ),
-    record: Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")] = False,
+    out: OutOption = Path("cosim-run"),
+    record: RecordOption = False,
     isolate: Annotated[
         bool,
         typer.Option("--isolate", help="Run the FMU in a process of its own, in case it crashes."),

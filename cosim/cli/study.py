@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.evaluate import JobsOption
-from cosim.cli.output import JsonOption, Output, dump, open_folder, output
+from cosim.cli.options import JobsOption, JsonOption, OutOption, SchedulerOption
+from cosim.cli.output import Output, dump, open_folder, output
 
 if TYPE_CHECKING:
     from cosim.experiments.results import StudyResults
@@ -22,14 +22,9 @@ FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_de
 @app.command()
 def run(
     file: FileArgument,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
-        "cosim-study"
-    ),
+    out: OutOption = Path("cosim-study"),
     jobs: JobsOption = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs."),
-    ] = None,
+    scheduler: SchedulerOption = None,
     json: JsonOption = False,
 ) -> None:
     """Train and evaluate every case on every scenario with every training seed.

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.output import JsonOption, Output, Progressing, dump, open_folder, output
-from cosim.cli.simulate import ScenarioOption
+from cosim.cli.options import JsonOption, OutOption, RecordOption, ScenarioOption
+from cosim.cli.output import Output, Progressing, dump, open_folder, output
 
 if TYPE_CHECKING:
     from learning.log import LogRow
@@ -62,9 +62,7 @@ def train(
     seed: Annotated[
         int, typer.Option("--seed", min=0, max=999_999, help="Seed of noise and exploration.")
     ] = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path(
-        "cosim-train"
-    ),
+    out: OutOption = Path("cosim-train"),
     resume: Annotated[
         bool,
         typer.Option(
@@ -135,7 +133,7 @@ def train(
     explain: Annotated[
         bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")
     ] = False,
-    record: Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")] = False,
+    record: RecordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Train a controller's θ; write parameters.toml, learning.csv, learning.png, summary.json.

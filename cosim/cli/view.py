@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.output import JsonOption, output
+from cosim.cli.options import JsonOption
+from cosim.cli.output import output
 
 
 def view(

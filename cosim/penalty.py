@@ -53,14 +53,6 @@ class Penalty:
             total += linear * v + quadratic * v * v
         return float(total)
 
-    def total_violation(self, state: Sequence[float]) -> float:
-        """Σᵢ vᵢ of one state (n,)."""
-        total = 0.0
-        for x, (_, lower, upper, _, _) in zip(state, self._rows, strict=True):
-            if not lower <= x <= upper:
-                total += lower - x if x < lower else x - upper
-        return total
-
     def violation(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Violation v ≥ 0 of each bound for states (…, n), same shape and units."""
         outside: NDArray[np.float64] = np.maximum(self.lower - states, states - self.upper)

@@ -8,50 +8,63 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import nan
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from cosim.protocols import Array, Solution, Step
 from cosim.scenario import Scenario
 
 Group = Literal["states", "actions", "disturbances", "costs", "step_time", "unseen"]
 COST = "unit of the stage cost"
+RESIDUAL = "solution.residual"
+Derived = Callable[[Scenario, Mapping[str, Array]], Array]
+"""K values of a signal, (K,), from a scenario and K values of each signal declared before it."""
 
 
-class Sample(NamedTuple):
+class NoSolution:
+    """Stands where the controller failed: whatever a signal asks of it is NaN."""
+
+    def __getattr__(self, name: str) -> float:
+        """NaN."""
+        return nan
+
+
+NO_SOLUTION = NoSolution()
+
+
+@dataclass(slots=True)
+class Sample:
     """What the loop knows of a sample once the plant has stepped.
 
-    On the `scenario`: `time` in s, the measured state `s` (n,), the applied `action` (m,), the
-    plant's `step`, the controller's `solution`, None where it failed, whether the sample
-    `explored`, and what the clock said: `prepare_time`, `feedback_time`, `plant_time` in s.
+    `time` in s, the measured state `s` (n,), the applied `action` (m,), the plant's `step`, the
+    controller's `solution`, whether the controller `failed` and whether the sample `explored`, and
+    what the clock said: `prepare_time`, `feedback_time`, `plant_time` in s.
     """
 
-    scenario: Scenario
     time: float
     s: Array
     action: Array
     step: Step
-    solution: Solution | None
+    solution: Solution | NoSolution
+    failed: bool
     explored: bool
     prepare_time: float
     feedback_time: float
     plant_time: float
 
 
-RESIDUAL = "residual"
-
-
 @dataclass(frozen=True)
 class SignalKind:
-    """A declared signal: its `name`, how its value comes `of` a sample, its `unit`.
+    """A declared signal: its `name`, what it is `of`, its `unit`.
 
-    A `vector` is a signal per variable that the scenario's plant names under `name`, in the
-    variable's unit; `of` then gives all of them. `group` is where a recording shows it, None if it
-    is not recorded; `whole` marks 0 or 1, `clock` what a clock measured, which stays out of the
-    trajectory's file; `optional` signals may be missing from a file.
+    `of` is an attribute of a `Sample`, read at every sample, or a function of other signals. A
+    `vector` is a signal per variable that the scenario's plant names under `name`, in the
+    variable's unit; its attribute then holds all of them. `group` is where a recording shows it,
+    None if it is not recorded; `whole` marks 0 or 1, `clock` what a clock measured, which stays out
+    of the trajectory's file; `optional` signals may be missing from a file.
     """
 
     name: str
-    of: Callable[[Sample], float | list[float]]
+    of: str | Derived
     unit: str = ""
     group: Group | None = "unseen"
     vector: bool = False
@@ -70,27 +83,26 @@ class SignalKind:
         return (known.get(scenario.plant.stage_cost, "") if self.unit == COST else self.unit,)
 
 
-def _violation(sample: Sample) -> float:
-    return sample.scenario.state_penalty.total_violation(sample.s.tolist())
+def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
+    total: Array = scenario.state_penalty.violation(columns["states"]).sum(axis=1)
+    return total
 
 
 SIGNALS: tuple[SignalKind, ...] = (
-    SignalKind("time", lambda x: x.time, "s"),
-    SignalKind("states", lambda x: x.s.tolist(), group="states", vector=True),
-    SignalKind("actions", lambda x: x.action.tolist(), group="actions", vector=True),
-    SignalKind(
-        "disturbances", lambda x: x.step.disturbance.tolist(), group="disturbances", vector=True
-    ),
-    SignalKind("stage_cost", lambda x: x.step.stage_cost, COST, "costs"),
-    SignalKind("penalty", lambda x: x.step.penalty, COST, "costs"),
+    SignalKind("time", "time", "s"),
+    SignalKind("states", "s", group="states", vector=True),
+    SignalKind("actions", "action", group="actions", vector=True),
+    SignalKind("disturbances", "step.disturbance", group="disturbances", vector=True),
+    SignalKind("stage_cost", "step.stage_cost", COST, "costs"),
+    SignalKind("penalty", "step.penalty", COST, "costs"),
     SignalKind("violation", _violation),
-    SignalKind("value", lambda x: nan if x.solution is None else x.solution.value, COST),
-    SignalKind(RESIDUAL, lambda x: nan if x.solution is None else x.solution.residual),
-    SignalKind("explored", lambda x: x.explored, whole=True),
-    SignalKind("failed", lambda x: x.solution is None, whole=True),
-    SignalKind("prepare_time", lambda x: x.prepare_time, "s", "step_time", clock=True),
-    SignalKind("feedback_time", lambda x: x.feedback_time, "s", "step_time", clock=True),
-    SignalKind("plant_time", lambda x: x.plant_time, "s", None, clock=True),
+    SignalKind("value", "solution.value", COST),
+    SignalKind("residual", RESIDUAL),
+    SignalKind("explored", "explored", whole=True),
+    SignalKind("failed", "failed", whole=True),
+    SignalKind("prepare_time", "prepare_time", "s", "step_time", clock=True),
+    SignalKind("feedback_time", "feedback_time", "s", "step_time", clock=True),
+    SignalKind("plant_time", "plant_time", "s", None, clock=True),
 )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import nan
+from operator import attrgetter
 from time import perf_counter
 
 import numpy as np
@@ -82,8 +83,53 @@ def _no_record(_: SampleBlock) -> None:
     return None
 
 
+class _Columns:
+    """Every declared signal of a run, read sample by sample and stored by blocks, as `columns`.
+
+    Without `residuals` their column is NaN.
+    """
+
+    def __init__(self, scenario: Scenario, steps: int, residuals: bool) -> None:
+        unwanted = () if residuals else (signals.RESIDUAL,)
+        read = {kind: kind.of for kind in signals.SIGNALS if isinstance(kind.of, str)}
+        scalars = {k: of for k, of in read.items() if not k.vector and of not in unwanted}
+        vectors = {kind: of for kind, of in read.items() if kind.vector}
+        # Of all scalars, and of all vectors, one call a sample.
+        self._scalars, self._vectors = attrgetter(*scalars.values()), attrgetter(*vectors.values())
+        self._derived = {k.name: k.of for k in signals.SIGNALS if not isinstance(k.of, str)}
+        self._rows: list[list[float]] = []
+        self._scenario = scenario
+        stored = [*scalars, *vectors]
+        stored += [kind for kind in signals.SIGNALS if kind not in stored]
+        widths = [len(kind.names(scenario)) for kind in stored]
+        # Column-major, so that a signal is a column and not a copy of one.
+        self._table = np.full((steps, sum(widths)), nan, order="F")
+        parts = np.split(self._table, np.cumsum(widths)[:-1], axis=1)
+        self.columns: dict[str, Array] = {
+            kind.name: part if kind.vector else part[:, 0]
+            for kind, part in zip(stored, parts, strict=True)
+        }
+
+    def read(self, sample: signals.Sample) -> None:
+        """Take the values of a sample, since neither plant nor controller need keep theirs."""
+        row = list(self._scalars(sample))
+        for values in self._vectors(sample):
+            row += values.tolist()
+        self._rows.append(row)
+
+    def store(self, first: int) -> dict[str, Array]:
+        """Store what was read, from sample number `first` on, and return it by name."""
+        where = slice(first, first + len(self._rows))
+        self._table[where, : len(self._rows[0])] = self._rows
+        self._rows.clear()
+        stored = {name: column[where] for name, column in self.columns.items()}
+        for name, derive in self._derived.items():
+            stored[name][:] = derive(self._scenario, stored)
+        return stored
+
+
 class _Run:
-    """Preallocated columns of one run and the loop that fills them."""
+    """One run, and the loop that fills its columns."""
 
     def __init__(
         self,
@@ -96,15 +142,9 @@ class _Run:
     ) -> None:
         self._plant, self._controller = plant, controller
         self._scenario: Scenario = plant.scenario
-        self._exploration, self._residuals = exploration, residuals
+        self._exploration = exploration
         self._seed, self._steps = seed, steps
-        # Column-major, so that a signal is a column and not a copy of one.
-        self._columns = {
-            kind.name: np.empty(
-                (steps, len(kind.names(self._scenario))) if kind.vector else steps, order="F"
-            )
-            for kind in signals.SIGNALS
-        }
+        self._columns = _Columns(self._scenario, steps, residuals)
         self._status: list[str] = []
         self._predicted_states: Array | None = None
         self._predicted_actions: Array | None = None
@@ -115,14 +155,14 @@ class _Run:
     ) -> None:
         keeps_predictions = record is not _no_record
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
+        sampling_time, exploration = self._scenario.sampling_time, self._exploration
+        plant, read, solve = self._plant, self._columns.read, self._solve
         plant_seed, rng = spawn_seeds(self._seed)
-        s = self._plant.reset(plant_seed)
+        s = plant.reset(plant_seed)
         self._controller.reset()
         applied = self._scenario.reference_action
-        exploration, scenario = self._exploration, self._scenario
-        read, rows = [self._reader(kind) for kind in signals.SIGNALS], []
         for k in range(self._steps):
-            solution, *times = self._solve(s)
+            solution, prepare_time, feedback_time = solve(s)
             action, explores = applied if solution is None else solution.action, False
             if exploration is not None:
                 explored = exploration(action, rng)
@@ -136,29 +176,30 @@ class _Run:
                 )
             applied = saturate(action)
             begin = perf_counter()
-            step = self._plant.step(applied)
-            times.append(perf_counter() - begin)
-            time = k * scenario.sampling_time
-            sample = signals.Sample(scenario, time, s, applied, step, solution, explores, *times)
-            # Read now, since neither plant nor controller need keep what they returned.
-            rows.append([of(sample) for of in read])
+            step = plant.step(applied)
+            plant_time = perf_counter() - begin
+            read(
+                signals.Sample(
+                    k * sampling_time,
+                    s,
+                    applied,
+                    step,
+                    signals.NO_SOLUTION if solution is None else solution,
+                    solution is None,
+                    explores,
+                    prepare_time,
+                    feedback_time,
+                    plant_time,
+                )
+            )
             s = step.s
             if keeps_predictions and solution is not None:
                 self._keep_prediction(k % BLOCK, solution)
             if (k + 1) % BLOCK == 0 or k + 1 == self._steps:
-                first = k // BLOCK * BLOCK
-                columns = self._columns.values()
-                for column, values in zip(columns, zip(*rows, strict=True), strict=True):
-                    column[first : k + 1] = values
-                rows.clear()
-                record(self._block(first, k + 1))
+                record(self._block(k // BLOCK * BLOCK, k + 1))
                 if progress is not None:
                     progress(k + 1)
         self._final_state = s
-
-    def _reader(self, kind: signals.SignalKind) -> Callable[[signals.Sample], float | list[float]]:
-        wanted = self._residuals or kind.name != signals.RESIDUAL
-        return kind.of if wanted else lambda _: nan
 
     def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
         """Prepare and feed back, timed apart; None if the controller declares a failure."""
@@ -187,13 +228,13 @@ class _Run:
         self._predicted_actions[row] = actions
 
     def _block(self, first: int, end: int) -> SampleBlock:
-        rows, count = slice(first, end), end - first
+        count = end - first
         states, actions = self._predicted_states, self._predicted_actions
         self._predicted_states = self._predicted_actions = None
         return SampleBlock(
             first=first,
-            columns={name: values[rows] for name, values in self._columns.items()},
-            status=self._status[rows],
+            columns=self._columns.store(first),
+            status=self._status[first:end],
             predicted_states=None if states is None else states[:count],
             predicted_actions=None if actions is None else actions[:count],
         )
@@ -203,7 +244,7 @@ class _Run:
         units = signals.signal_units(scenario, self._plant.units)
         named, timing = {}, {}
         for kind in signals.SIGNALS:
-            values = self._columns[kind.name].reshape(self._steps, -1)
+            values = self._columns.columns[kind.name].reshape(self._steps, -1)
             if kind.clock:
                 timing[kind.name.removesuffix("_time")] = values[:, 0]
                 continue

@@ -11,7 +11,12 @@ from cosim.stored_run import load_run
 from cosim.trajectory import read_csv
 from tests.helpers.loop import Failing, Proportional
 
-TOY = SignalKind("distance", lambda x: x.s[0] - 25.0, "%", "costs", optional=True)
+
+def distance(scenario, columns):
+    return columns["states"][:, 0] - 25.0
+
+
+TOY = SignalKind("distance", distance, "%", "costs", optional=True)
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ SAMPLES = 50_000
 
 @dataclass(frozen=True)
 class Training:
-    """A training that has ended: what was run, what came of it, and how long it took in s.
+    """A training that has ended: its `run`, the `result`, and how long it took, `wall_seconds`.
 
     `without_checkpoint` says why it left no checkpoint, if it left none.
     """

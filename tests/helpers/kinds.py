@@ -10,33 +10,9 @@ from tempfile import mkdtemp
 import fmpy
 
 from fmus.platforms import present
+from tests.helpers.one_state import write_one_state
 
 SOURCE = Path(__file__).parent / "foreign" / "kinds.c"
-SCENARIO = """
-schema = 1
-name = "kind"
-sampling_time = {sampling_time}
-discount = 0.95
-[plant]
-fmu = "{fmu}"
-states = ["x"]
-actions = ["u"]
-stage_cost = "cost"
-initial_state = [1.0]
-{plant}
-[bounds]
-state_lower = [0.0]
-state_upper = [inf]
-action_lower = [0.0]
-action_upper = [3.0]
-[penalty]
-linear = [10.0]
-quadratic = [1.0]
-[controller]
-reference_state = [1.0]
-reference_action = [1.0]
-reference_cost = 1.0
-"""
 REALS = """
 u     0  input      -        0
 x     1  output     -        -
@@ -133,8 +109,4 @@ def scenario_for(folder, fmu, *, sampling_time=0.5, fault=0, parameters="", seed
     """Write a scenario for a kind; return its path."""
     mapping = 'mapping = { initial_state = ["x_start"]' + (', seed = ["seed"]' if seed else "")
     lines = [f"parameters = {{ fault = {fault}{parameters} }}", mapping + " }", plant]
-    path = folder / "kind.toml"
-    path.write_text(
-        SCENARIO.format(sampling_time=sampling_time, fmu=fmu, plant="\n".join(lines)),
-    )
-    return path
+    return write_one_state(folder / "kind.toml", fmu, "\n".join(lines), sampling_time)

@@ -7,36 +7,10 @@ from pathlib import Path
 
 import fmpy
 
+from tests.helpers.one_state import write_one_state
+
 SOURCE = Path(__file__).parent / "foreign" / "tank.c"
 DESCRIPTION = SOURCE.with_suffix(".xml")
-SCENARIO = """
-schema = 1
-name = "tank"
-sampling_time = 0.5
-discount = 0.95
-[plant]
-fmu = "{fmu}"
-states = ["x"]
-actions = ["u"]
-stage_cost = "cost"
-initial_state = [1.0]
-[plant.parameters]
-tau = 4.0
-fault = {fault}
-{mapping}
-[bounds]
-state_lower = [0.0]
-state_upper = [inf]
-action_lower = [0.0]
-action_upper = [3.0]
-[penalty]
-linear = [10.0]
-quadratic = [1.0]
-[controller]
-reference_state = [1.0]
-reference_action = [1.0]
-reference_cost = 1.0
-"""
 
 
 def build_tank(folder, saves):
@@ -58,10 +32,9 @@ def build_tank(folder, saves):
 
 def write_scenario(folder, fmu, fault=0, mapped=True):
     """Write a scenario for the tank."""
-    mapping = '[plant.mapping]\ninitial_state = ["x_start"]' if mapped else ""
-    path = folder / "tank.toml"
-    path.write_text(SCENARIO.format(fmu=fmu, fault=fault, mapping=mapping))
-    return path
+    mapping = 'mapping = { initial_state = ["x_start"] }' if mapped else ""
+    plant = f"parameters = {{ tau = 4.0, fault = {fault} }}\n{mapping}"
+    return write_one_state(folder / "tank.toml", fmu, plant)
 
 
 def edited(source, target, change):

@@ -6,18 +6,21 @@ from typing import Any
 
 import daqp
 import numpy as np
+from numpy.typing import NDArray
 
 from controllers.errors import QpError
 from controllers.qp.problem import QpSolution, SoftQp
 
+Matrix = NDArray[np.float64]
 SOFT, FIXED = 8, 5
+NOT_CONVEX = -5
 SETTINGS = {"primal_tol": 1e-10, "dual_tol": 1e-12}
 MEANING = {
     -1: "infeasible",
     -2: "cycling",
     -3: "unbounded",
     -4: "iteration limit",
-    -5: "not convex",
+    NOT_CONVEX: "not convex",
     -6: "overdetermined start",
     -7: "time limit",
 }
@@ -33,9 +36,25 @@ class DaqpBackend:
     def __init__(self) -> None:
         self._model: Any = None
         self._factorised = 0
+        self._limits: Matrix | None = None
 
     def load(self, qp: SoftQp) -> None:
-        """Factorise H and transform the rows; the first call allocates the workspace."""
+        """Factorise H and transform the rows; the first call allocates the workspace.
+
+        Where the QP brings a factor T of H, DAQP gets the QP in y with v = T y: its own
+        factorisation costs O(N³), looking through the factor's rows O(N²).
+        """
+        if qp.factor is None:
+            self._limits = None
+            self._load(qp, qp.H, qp.rows)
+            return
+        self._limits = qp.factor()
+        if np.isfinite(self._limits[0]).all():
+            self._load(qp, None, self._limits)
+        else:
+            self._factorised = NOT_CONVEX
+
+    def _load(self, qp: SoftQp, H: Matrix | None, A: Matrix) -> None:
         n, rows = qp.f.size, qp.w.size
         if self._model is None:
             self._lower, self._upper = np.zeros(n + rows), np.zeros(n + rows)
@@ -45,8 +64,9 @@ class DaqpBackend:
             self._model = daqp.Model()
             self._model.settings = SETTINGS
             self._write_limits(qp)
+            unit = np.eye(n) if H is None else H
             self._factorised, _ = self._model.setup(
-                qp.H, qp.f, qp.rows, self._upper, self._lower, self._sense
+                unit, qp.f, A, self._upper, self._lower, self._sense
             )
             self._weights(qp)
         else:
@@ -55,7 +75,7 @@ class DaqpBackend:
             # The limits go along, since an update is refused while those of a failed QP stand.
             self._write_limits(qp)
             self._factorised = self._model.update(
-                H=qp.H, A=qp.rows, bupper=self._upper, blower=self._lower, sense=self._free
+                H=H, A=A, bupper=self._upper, blower=self._lower, sense=self._free
             )
 
     def _weights(self, qp: SoftQp) -> None:
@@ -71,19 +91,25 @@ class DaqpBackend:
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the vectors of `qp`; raises QpError where DAQP does not."""
-        n = qp.f.size
-        self._write_limits(qp)
-        self._sense[:] = self._free
-        self._sense[:n][qp.lower == qp.upper] = FIXED
-        flag = self._factorised
+        n, flag = qp.f.size, self._factorised
+        # Not by BLAS, which would start threads for a long horizon's product.
+        T = None if self._limits is None else self._limits[:n]
         if flag >= 0:
+            self._write_limits(qp)
+            self._sense[:] = self._free
+            self._sense[:n][qp.lower == qp.upper] = FIXED
             flag = self._model.update(
-                f=qp.f, bupper=self._upper, blower=self._lower, sense=self._sense
+                f=qp.f if T is None else np.einsum("ij,i->j", T, qp.f),
+                bupper=self._upper,
+                blower=self._lower,
+                sense=self._sense,
             )
         if flag >= 0:
             v, _, flag, info = self._model.solve()
         if flag <= 0:
             status = MEANING.get(flag, f"exit flag {flag}")
             raise QpError(f"DAQP did not solve the QP: {status}", status=status, qp=qp.copy())
+        if T is not None:
+            v = np.einsum("ij,j->i", T, v)
         multipliers = info["lam"]
         return QpSolution(v, multipliers[:n], multipliers[n:])

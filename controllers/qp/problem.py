@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, NamedTuple
 
@@ -45,7 +46,9 @@ class SoftQp:
 
     The stacked controls V = (v_0, …, v_{N−1}) are the variables, the predicted states Γ V the
     rows; paper.tex eq. param_nlp_qp with the dynamics eliminated. `lower = upper` fixes a variable,
-    which is how u_0 = a is enforced. `stages`, where given, holds the QP with the dynamics. Shapes
+    which is how u_0 = a is enforced. `stages`, where given, holds the QP with the dynamics;
+    `factor`, where given, makes [T; ΓT] (d + c, d) of a T with TᵀHT = I from the data as they are,
+    cheaper than H is factorised, its first row not finite where H is not positive definite. Shapes
     for d variables and c rows: H (d, d), f, lower and upper (d,), rows Γ (c, d), else w, W: (c,).
     """
 
@@ -59,10 +62,12 @@ class SoftQp:
     w: Vector
     W: Vector
     stages: Stages | None = None
+    factor: Callable[[], Matrix] | None = None
 
     def copy(self) -> SoftQp:
-        """Deep copy, for a QP that is kept beyond the next sample."""
+        """Deep copy, for a QP that is kept beyond the next sample; without `factor`."""
         copied: SoftQp = _copied(self)
+        copied.factor = None
         return copied
 
     def require_convex(self) -> None:

@@ -10,6 +10,9 @@ from cosim.evaluation.paired import evaluate
 from cosim.evaluation.unit import Factory
 from cosim.scenario import Scenario
 
+WARM_UP = 3000
+"""Samples after which functions that are worth it have been compiled, or are about to be."""
+
 
 def measure(
     scenario: Scenario,
@@ -21,11 +24,14 @@ def measure(
 ) -> dict[str, Any]:
     """Wall times in s of one evaluation by 1 and by `jobs` workers in turn, and their ratio.
 
-    Starting the workers and building the controllers counts. `speed_up` is the ratio of the least
-    times; `same_bytes` whether every repetition gave the same table.
+    Starting the workers and building the controllers counts; in this process a controller is built
+    once too. `speed_up` is the ratio of the least times, which others on the machine spoil least;
+    `same_bytes` says whether every repetition gave the same table. A first, short evaluation by
+    one worker loads what is loaded once, and compiles what is compiled once.
     """
     times: dict[int, list[float]] = {1: [], jobs: []}
     tables = set()
+    evaluate(scenario, controllers, 1, min(steps, WARM_UP), jobs=1)
     for _ in range(repetitions):
         for workers, spent in times.items():
             begin = perf_counter()

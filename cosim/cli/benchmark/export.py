@@ -5,13 +5,12 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from controllers import RtiNmpc
+from cosim.cli.benchmark.figures import clock, figure
 from cosim.cli.compose import build_plant
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from cosim.scenario import Scenario
@@ -32,6 +31,7 @@ def measure(
     Raises ControllerLookupError on a controller that cannot be exported.
     """
     python = rti_controller(controller, scenario)
+    python.compilation.finish()
     with build_plant(scenario) as plant, tempfile.TemporaryDirectory() as folder:
         system = sampled_controller(python, scenario, plant.units)
         path = write_fmu(system, python, scenario, Path(folder) / "controller.fmu", 2, False)
@@ -40,26 +40,15 @@ def measure(
             seconds, differences = _run(plant, python, fmu, steps, progress)
         finally:
             fmu.close()
-    rows: list[dict[str, Any]] = [
-        {
-            "name": name,
-            "median_us": 1e6 * median(values),
-            "minimum_us": 1e6 * min(values),
-            "p95_us": 1e6 * float(np.quantile(values, 0.95)),
-        }
-        for name, values in seconds.items()
-    ]
-    ratios = [a / b for a, b in zip(seconds["Python"], seconds["FMU"], strict=True)]
+    row = figure("exported FMU", seconds["FMU"], "Python", seconds["Python"], at_most=TARGET)
     return {
         "scenario": scenario.name,
         "controller": controller,
         "hessian": scenario.controller.hessian,
         "steps": steps,
+        "functions": python.compilation.mode,
         "largest_difference": max(differences),
-        "ratio": median(ratios),
-        "target_us": TARGET,
-        "met": rows[1]["median_us"] <= TARGET,
-        "rows": rows,
+        "rows": [row, figure("Python", seconds["Python"])],
     }
 
 
@@ -71,12 +60,12 @@ def _run(
     lower, upper = plant.scenario.action_lower, plant.scenario.action_upper
     s = plant.reset(spawn_seeds(0)[0])
     for k in range(WARM_UP + steps):
-        begin = perf_counter()
+        begin = clock()
         python.prepare()
         solution = python.feedback(s)
-        middle = perf_counter()
+        middle = clock()
         action = fmu.sample(s)
-        end = perf_counter()
+        end = clock()
         applied = np.clip(solution.action, lower, upper)
         if k >= WARM_UP:
             seconds["Python"].append(middle - begin)

@@ -1,20 +1,25 @@
-"""`cosim benchmark`: speed, as medians and ratios of one run."""
+"""The commands of `cosim benchmark`: what they ask for, and what they print."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from cosim.cli.options import JsonOption, ScenarioOption
 from cosim.cli.output import output
 
-app = typer.Typer(help="Measure speed: medians, and ratios within one run.", no_args_is_help=True)
+app = typer.Typer(no_args_is_help=True)
 
 
 @app.callback()
 def benchmark() -> None:
-    """Measure speed: medians, and ratios within one run."""
+    """Measure speed: each figure in µs beside a reference from the same run.
+
+    Times are CPU time, but for `evaluation`; a ratio says how many times as long the reference
+    takes.
+    """
 
 
 @app.command()
@@ -33,15 +38,11 @@ def plant(
     A step sets the inputs, reads stage cost and disturbances, steps, and reads the states.
     """
     with output(json) as out_:
-        from cosim.plant.benchmark import measure
+        from cosim.cli.benchmark.figures import show
+        from cosim.cli.benchmark.plant import measure
 
         result = measure(scenario, fmu, steps)
-        rows = [
-            (row["name"], f"{row['median_us']:.2f}", f"{row['minimum_us']:.2f}", row["ratio_text"])
-            for row in result["rows"]
-        ]
-        header = ("per step", "median µs", "minimum µs", "ratio")
-        out_.table(f"plant {result['fmu']}, {steps} steps a repetition", header, rows)
+        show(f"plant {result['fmu']}, {steps} steps a repetition", result["rows"], out_)
         out_.json(result)
 
 
@@ -66,9 +67,9 @@ def evaluation(
     with output(json) as out_:
         from functools import partial
 
+        from cosim.cli.benchmark.evaluation import measure
         from cosim.cli.compose import load_scenario
         from cosim.cli.evaluate import named_controllers
-        from cosim.evaluation.benchmark import measure
         from cosim.lookup import build_controller
 
         factories = {
@@ -81,7 +82,7 @@ def evaluation(
             for workers, values in result["timing"]["seconds_by_jobs"].items()
         ]
         out_.table(f"{seeds} seeds × {steps} samples", ("wall time", "s", "s", "s"), rows)
-        out_.note(f"speed-up {result['timing']['speed_up']:.2f}")
+        out_.note(f"speed-up {result['timing']['speed_up']:.2f}, least times")
         out_.note("same bytes" if result["same_bytes"] else "the bytes DIFFER")
         out_.json(result)
     if not result["same_bytes"]:
@@ -102,29 +103,23 @@ def controllers(
     ] = 10,
     json: JsonOption = False,
 ) -> None:
-    """Time of each phase of an RTI-NMPC sample per QP backend, along closed-loop runs.
+    """Time of each phase of an RTI-NMPC's sample along a closed loop.
 
-    In the same run: ProxQP called cold through qpsolvers on the same QPs, and IPOPT on the
-    nonlinear programme at the same states.
+    References: the same functions interpreted, ProxQP in place of DAQP; ProxQP called cold through
+    qpsolvers on the same QPs, IPOPT on the nonlinear programme, and a Q-learning sample of mpcrl on
+    the same transitions, where that is installed (extra `outsiders`).
     """
     with output(json) as out_:
-        from cosim.cli.benchmark_controllers import BACKENDS, measure
+        from cosim.cli.benchmark.controllers import measure
+        from cosim.cli.benchmark.figures import show
         from cosim.cli.compose import load_scenario
 
-        with out_.progress("controllers", len(BACKENDS) * steps) as progress:
+        with out_.progress("controllers", steps) as progress:
             result = measure(load_scenario(scenario), steps, every, progress)
-        rows = [
-            (
-                f"{row['solver']}: {row['phase']}",
-                f"{row['median_us']:.1f}",
-                f"{row['minimum_us']:.1f}",
-                f"{row['p95_us']:.1f}",
-                _verdict(row),
-            )
-            for row in result["rows"]
-        ]
-        header = ("per sample", "median µs", "minimum µs", "95 % µs", "ratio or target")
-        out_.table(f"controllers on {result['scenario']}, {steps} samples", header, rows)
+        title = f"controllers on {result['scenario']}, {steps} samples, {result['functions']}"
+        show(title, result["rows"], out_)
+        for name in result["missing"]:
+            out_.note(f"not installed: {name}")
         out_.json(result)
 
 
@@ -144,32 +139,15 @@ def export(
     Both act on each state of one closed loop; it also says how far their actions are apart.
     """
     with output(json) as out_:
-        from cosim.cli.benchmark_export import measure
+        from cosim.cli.benchmark.export import measure
+        from cosim.cli.benchmark.figures import show
         from cosim.scenario import Scenario
 
         with out_.progress("samples", steps) as progress:
             result = measure(Scenario.load(scenario), controller, steps, progress)
-        rows = [
-            (row["name"], *(f"{row[key]:.1f}" for key in ("median_us", "minimum_us", "p95_us")))
-            for row in result["rows"]
-        ]
-        header = ("a sample", "median µs", "minimum µs", "95 % µs")
-        out_.table(f"{controller} on {result['scenario']}, {steps} samples", header, rows)
-        met = "met" if result["met"] else "MISSED"
-        out_.note(
-            f"FMU {result['ratio']:.1f} times as fast; target {result['target_us']:g} µs: {met}"
-        )
+        show(f"{controller} on {result['scenario']}, {steps} samples", result["rows"], out_)
         out_.note(f"actions differ by {result['largest_difference']:.1e} at most")
         out_.json(result)
-
-
-def _verdict(row: dict[str, Any]) -> str:
-    """How a row stands to its target, or to what it is compared with."""
-    if row["target_us"] is not None:
-        return f"≤ {row['target_us']:g} µs: {'met' if row['met'] else 'MISSED'}"
-    if row["ratio"] is None:
-        return ""
-    return f"{row['ratio']:.1f} × {row['ratio_to']}; {100 * row['solved_share']:.0f} % solved"
 
 
 @app.command()
@@ -179,26 +157,35 @@ def learning(
         int,
         typer.Option("--samples", "-n", min=100, max=100_000_000, help="Samples per repetition."),
     ] = 2000,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            "--against", help="Folder with another version's sources, such as a git worktree."
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Samples per second of each learning rule on one core, the FMU included."""
-    with output(json) as out_:
-        from cosim.cli.compose import load_scenario
-        from learning.benchmark import measure
+    """Time of a sample of each learning rule on one core, the FMU included.
 
-        result = measure(load_scenario(scenario), samples)
-        rows = [
-            (
-                row["algorithm"],
-                f"{row['median_samples_per_second']:.0f}",
-                f"{row['lowest_samples_per_second']:.0f}",
-                f"{row['highest_samples_per_second']:.0f}",
-                ", ".join(f"{k} {v:.0f}" for k, v in row["microseconds_per_sample"].items()),
-            )
-            for row in result["rows"]
+    References: the same with interpreted functions and, with --against, the same rule in another
+    version, each in a process of its own and in turn. Rules alone, as all versions have them, come
+    first, then the recommended ones.
+    """
+    with output(json) as out_:
+        from cosim.cli.benchmark.figures import show
+        from cosim.cli.benchmark.learning import CASES, measure
+        from cosim.cli.compose import load_scenario
+
+        load_scenario(scenario)
+        with out_.progress("rules", len(CASES)) as progress:
+            result = measure(scenario, samples, progress, against=against)
+        title = f"learning on {result['scenario']}, one core, functions {result['functions']}"
+        show(title, result["rows"], out_)
+        parts = [
+            (name, *(f"{value:.1f}" for value in row.values()))
+            for name, row in result["parts"].items()
         ]
-        header = ("samples per second", "median", "lowest", "highest", "µs per sample")
-        out_.table(f"learning on {result['scenario']}, one core", header, rows)
+        out_.table("µs of a sample by part", ("rule", *next(iter(result["parts"].values()))), parts)
         out_.json(result)
 
 
@@ -215,7 +202,7 @@ def scaling(
     CPU time. The first run compiles a library for each row, which takes seconds.
     """
     with output(json) as out_:
-        from cosim.cli.benchmark_scaling import PHASES, measure
+        from cosim.cli.benchmark.scaling import PHASES, measure
         from cosim.errors import CosimError
         from cosim.scenario import Scenario
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from time import process_time
 from typing import Any
 
 import numpy as np
 
 from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks
+from cosim.cli.benchmark.figures import clock
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 
@@ -42,11 +42,11 @@ def _row(scenario: Scenario, horizon: int, kind: str) -> dict[str, Any]:
         slack_weights=kind == "slack weights",
         model_parameters=MODEL_PARAMETERS if kind == "model parameters" else (),
     )
-    begin = process_time()
+    begin = clock()
     controller = RtiNmpc(
         problem, Parameters.naive(problem, blocks), hessian=scenario.controller.hessian
     )
-    construction = process_time() - begin
+    construction = clock() - begin
     controller.compilation.postpone()
     microseconds = {controller.compilation.mode: _phases(controller)}
     mode = controller.compilation.finish()
@@ -72,16 +72,16 @@ def _walk(controller: RtiNmpc) -> dict[str, float]:
     spent = dict.fromkeys(PHASES, 0.0)
     controller.reset()
     for s in _states(controller.problem):
-        clock = [process_time()]
+        read = [clock()]
         controller.prepare()
-        clock.append(process_time())
+        read.append(clock())
         solution = controller.feedback(s)
-        clock.append(process_time())
+        read.append(clock())
         solution.value_gradient  # noqa: B018 (computed on first access)
-        clock.append(process_time())
+        read.append(clock())
         solution.policy_jacobian  # noqa: B018
-        clock.append(process_time())
-        for phase, seconds in zip(PHASES, np.diff(clock), strict=True):
+        read.append(clock())
+        for phase, seconds in zip(PHASES, np.diff(read), strict=True):
             spent[phase] += float(seconds) / SAMPLES
     return spent
 

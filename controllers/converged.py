@@ -61,7 +61,6 @@ class ConvergedNmpc(RtiNmpc):
         self._programme = RtiNmpc(
             problem, parameters, hessian="exact-unlifted", backend=lambda: self._known
         )
-        self.iterations_used = 0
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
     def _compilable(self) -> list[BufferedFunction]:
@@ -90,7 +89,6 @@ class ConvergedNmpc(RtiNmpc):
                 / (1 + float(np.abs(before).max())),
             )
             if change < self._tolerance:
-                self.iterations_used = count + 1
                 return self._read_out(s, a, solution)
         raise QpError(
             f"SQP did not converge in {self._iterations} iterations at s = {at[0]}; "

@@ -1,7 +1,8 @@
-"""TOML documents, read with one clear message for each way in which they can be wrong."""
+"""TOML and JSON documents, read with one clear message for each way in which they can be wrong."""
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,22 @@ def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str
     Raises `error` where there is no such regular file, or where it is not UTF-8, not TOML, larger
     than `LARGEST` or nested deeper than `DEEPEST`.
     """
+    return parse_toml(_text(path, origin, error), origin, error)
+
+
+def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
+    """Document of a JSON file, an object; raises `error` as `read_toml` does."""
+    text = _text(path, origin, error)
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as cause:
+        raise error(f"{origin} is not valid JSON: {cause}") from None
+    if not isinstance(document, dict):
+        raise error(f"{origin} is not a JSON object")
+    return _shallow(document, origin, error)
+
+
+def _text(path: str | Path, origin: str, error: type[Exception]) -> str:
     try:
         if Path(path).exists() and not Path(path).is_file():
             raise error(f"{origin} is not a regular file")
@@ -30,7 +47,7 @@ def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str
     if len(content) > LARGEST:
         raise error(f"{origin} has {len(content)} bytes, more than any document of ours")
     try:
-        return parse_toml(content.decode("utf-8"), origin, error)
+        return content.decode("utf-8")
     except UnicodeDecodeError:
         raise error(f"{origin} is not UTF-8 text") from None
 
@@ -42,6 +59,11 @@ def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]
     # Nesting without end exhausts the parser's stack, a number without end Python's patience.
     except (ValueError, RecursionError) as cause:
         raise error(f"{origin} is not valid TOML: {cause}") from None
+    return _shallow(document, origin, error)
+
+
+def _shallow(document: dict[str, Any], origin: str, error: type[Exception]) -> dict[str, Any]:
+    """The document, unless it is nested beyond `DEEPEST`."""
     layer: list[Any] = [document]
     for _ in range(DEEPEST):
         layer = [

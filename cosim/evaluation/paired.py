@@ -11,9 +11,10 @@ from typing import Any
 from cosim.errors import EvaluationError
 from cosim.evaluation.parallel import run_all
 from cosim.evaluation.provenance import code_hash, controller_hash, parameters_hash, versions
+from cosim.evaluation.reuse import release
 from cosim.evaluation.store import Store, unit_key
 from cosim.evaluation.table import Evaluation
-from cosim.evaluation.unit import Factory, RunUnit, UnitResult, release, run
+from cosim.evaluation.unit import Factory, RunUnit, UnitResult, run
 from cosim.kpis import comes_to_rest
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario

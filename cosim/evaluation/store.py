@@ -10,6 +10,7 @@ from pathlib import Path
 from cosim.errors import EvaluationError
 from cosim.evaluation.unit import UnitResult, as_document, from_document
 from rti_storage import write_atomically
+from rti_storage.documents import read_json
 
 FOLDER = ".units"
 FORMAT = 1
@@ -32,8 +33,8 @@ class Store:
         if self._folder is None or not (path := self._folder / f"{key}.json").is_file():
             return None
         try:
-            return from_document(json.loads(path.read_text("utf-8")))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return from_document(read_json(path, f"'{path}'", EvaluationError))
+        except (EvaluationError, ValueError, KeyError, TypeError, AttributeError):
             raise EvaluationError(
                 f"the finished work unit '{path}' is damaged; delete it to compute it again"
             ) from None

@@ -8,9 +8,10 @@ from time import perf_counter
 from typing import Any
 
 from cosim.errors import EvaluationError
-from cosim.evaluation.provenance import code_hash
+from cosim.evaluation import reuse
+from cosim.evaluation.provenance import EVALUATING
+from cosim.evaluation.reuse import require_code
 from cosim.kpis import displaced, indicators, settling_time
-from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
@@ -43,57 +44,21 @@ class UnitResult:
     timing: dict[str, float]
 
 
-class _Reused:
-    """Controllers and plants of the present session: building one costs more than a run."""
-
-    def __init__(self) -> None:
-        self.session = ""
-        self.controllers: dict[str, Controller] = {}
-        self.plants: dict[str, FmuPlant] = {}
-
-    def enter(self, session: str) -> None:
-        if session != self.session:
-            for plant in self.plants.values():
-                plant.close()
-            self.controllers, self.plants, self.session = {}, {}, session
-
-    def controller(self, unit: RunUnit) -> Controller:
-        if unit.controller not in self.controllers:
-            self.controllers[unit.controller] = unit.factory(unit.scenario)
-        return self.controllers[unit.controller]
-
-    def plant(self, scenario: Scenario) -> FmuPlant:
-        if scenario.hash not in self.plants:
-            self.plants[scenario.hash] = FmuPlant(scenario)
-        return self.plants[scenario.hash]
-
-
-_reused = _Reused()
-
-
-def release() -> None:
-    """Close what this process keeps for the evaluation that it worked on."""
-    _reused.enter("")
-
-
 def run(unit: RunUnit) -> UnitResult:
     """Run a unit; the result depends on nothing but the unit, so any worker may do it.
 
     Raises EvaluationError if this worker has other code than the evaluation was started with, and
     whatever plant and controller raise.
     """
-    if code_hash() != unit.code:
-        raise EvaluationError(
-            f"a worker runs other code ({code_hash()}) than the evaluation ({unit.code}); install "
-            "the same version of rti-cosim everywhere"
-        )
-    _reused.enter(unit.session)
-    controller = _reused.controller(unit)
+    require_code(unit.code, EVALUATING, EvaluationError)
+    controller = reuse.controller(
+        f"{unit.session} {unit.controller}", lambda: unit.factory(unit.scenario)
+    )
     if unit.seed is None:
         return _settling_run(unit, controller)
     begin = perf_counter()
     trajectory = simulate(
-        _reused.plant(unit.scenario), controller, unit.steps, unit.seed, residuals=False
+        reuse.plant(unit.scenario), controller, unit.steps, unit.seed, residuals=False
     )
     timing = {"wall_time_s": perf_counter() - begin}
     for name, quantiles in trajectory.timing_summary().items():
@@ -105,7 +70,7 @@ def _settling_run(unit: RunUnit, controller: Controller) -> UnitResult:
     scenario = displaced(unit.scenario)
     if scenario is None:
         return UnitResult({"settling_time": float("nan")}, {})
-    trajectory = simulate(_reused.plant(scenario), controller, unit.steps, 0, residuals=False)
+    trajectory = simulate(reuse.plant(scenario), controller, unit.steps, 0, residuals=False)
     return UnitResult({"settling_time": settling_time(trajectory)}, {})
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -17,6 +16,7 @@ from cosim.experiments.keyed import KeyedTable, read
 from cosim.experiments.tables import CURVES, EVALUATION
 from cosim.experiments.traces import LOGS, TRAJECTORIES
 from cosim.validation import describe
+from rti_storage.documents import read_toml
 
 TOLERANCES = "tolerances.toml"
 
@@ -35,14 +35,13 @@ class _Tolerances(Table):
 def load_tolerances(folder: Path) -> dict[str, Tolerance]:
     """Tolerances by signal of a folder of stored studies; raises ResultsError."""
     path = folder / TOLERANCES
-    try:
-        return _Tolerances.model_validate(tomllib.loads(path.read_text("utf-8"))).tolerance
-    except FileNotFoundError:
+    if not path.exists():
         raise ResultsError(
             f"'{path}' does not exist; name the folder of the results with --results"
-        ) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ResultsError(f"'{path}' cannot be read: {error}") from None
+        )
+    document = read_toml(path, f"'{path}'", ResultsError)
+    try:
+        return _Tolerances.model_validate(document).tolerance
     except ValidationError as error:
         raise ResultsError(f"'{path}': {describe(error, _Tolerances)}") from None
 

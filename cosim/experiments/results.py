@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ from cosim.errors import StudyError
 from cosim.evaluation.statistics import Estimate, gap_closed, regret
 from cosim.experiments.records import CaseResult, RunResult
 from cosim.experiments.tables import read_runs
+from rti_storage.documents import read_json
 
 Array = NDArray[np.float64]
 ABOUT = "study.json"
@@ -37,14 +37,11 @@ class StudyResults:
     def load(cls, folder: str | Path) -> StudyResults:
         """Read a study's folder, or a stored one; raises StudyError."""
         path = Path(folder) / ABOUT
-        try:
-            about = json.loads(path.read_text("utf-8"))
-        except FileNotFoundError:
+        if not path.exists():
             raise StudyError(
                 f"'{folder}' holds no study ({ABOUT}); give the --out of a cosim study run"
-            ) from None
-        except (OSError, ValueError, RecursionError) as error:
-            raise StudyError(f"'{path}' cannot be read: {error}") from None
+            )
+        about = read_json(path, f"'{path}'", StudyError)
         if about.get("schema") != SCHEMA:
             raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
         return cls(Path(folder), about, read_runs(Path(folder)))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cosim.evaluation.parallel import run_all
+from cosim.evaluation.reuse import release
 from cosim.experiments.plan import BLOCK, Plan, Run
 from cosim.experiments.protocols import Progress
 from cosim.experiments.store import EVALUATION, RunStore
@@ -22,7 +23,6 @@ from cosim.experiments.units import (
     Traced,
     Unit,
     perform,
-    release,
 )
 
 SLICE = 5.0
@@ -31,10 +31,9 @@ SLICE = 5.0
 
 @dataclass(frozen=True)
 class State:
-    """How far a study is: plant samples and runs, done and in all, and what failed."""
+    """How far a study is: plant samples done, runs done and in all, and how many failed."""
 
     samples: int
-    all_samples: int
     runs: int
     all_runs: int
     failed: int
@@ -160,7 +159,6 @@ class Runner:
     def _tell(self, line: str) -> None:
         state = State(
             sum(self._done.values()),
-            self._plan.samples,
             len(self._finished),
             len(self._runs),
             len(self.failures),

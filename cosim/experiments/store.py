@@ -21,6 +21,7 @@ from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Progress
 from cosim.text_tables import cell, csv_text, read_records
 from rti_storage import write_atomically
+from rti_storage.documents import read_json
 
 RUNS = "runs"
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
@@ -72,7 +73,6 @@ class RunStore:
     def __init__(self, out: Path, key: RunKey, facts: Mapping[str, Any]) -> None:
         self.folder = out / key.folder
         self._facts = json.loads(json.dumps(facts))
-        self.other_code = False
         (self.folder / FAILURE).unlink(missing_ok=True)
         if not self._belongs():
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -81,20 +81,16 @@ class RunStore:
 
     def _belongs(self) -> bool:
         found = self._document().get("facts")
-        if found is None:
-            return False
-        self.other_code = found.get("code") != self._facts["code"]
-        return bool(found == self._facts)
+        return found is not None and bool(found == self._facts)
 
     def _document(self) -> dict[str, Any]:
         path = self.folder / RUN
         if not path.is_file():
             return {}
         try:
-            document: dict[str, Any] = json.loads(path.read_text("utf-8"))
-        except (OSError, ValueError, RecursionError):
-            raise StudyError(f"'{path}' is damaged; delete its folder to run it again") from None
-        return document
+            return read_json(path, f"'{path}'", StudyError)
+        except StudyError as error:
+            raise StudyError(f"{error}; delete its folder to run it again") from None
 
     def progress(self) -> Progress:
         """Where the run's training stands."""

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import traceback
-from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
 from cosim.errors import StudyError
-from cosim.evaluation.provenance import code_hash
+from cosim.evaluation import reuse
+from cosim.evaluation.reuse import require_code
 from cosim.experiments.protocols import Progress, Trainer, Training
 from cosim.experiments.store import INDICATORS, Indicators
 from cosim.kpis import indicators
 from cosim.lookup import import_from
-from cosim.plant import FmuPlant
 from cosim.plugins import OURS
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
-
-KEPT = 4
-"""Controllers and plants that a worker keeps: building one costs more than a short run."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +32,7 @@ class Place:
         """Let foreign modules be imported; raises StudyError where the code is another."""
         for folder in self.folders:
             import_from(Path(folder))
-        if (here := code_hash(OURS)) != self.code:
-            raise StudyError(
-                f"a worker runs other code ({here}) than the study ({self.code}); install the same "
-                "version of rti-cosim everywhere"
-            )
+        require_code(self.code, OURS, StudyError)
 
 
 @dataclass(frozen=True)
@@ -123,7 +115,7 @@ def perform(unit: Unit) -> Outcome:
             return unit.place.trainer.advance(unit.training, unit.checkpoint, unit.seconds)
         controller = _controller(unit)
         if isinstance(unit, Trace):
-            plant = _plant(unit.scenario)
+            plant = reuse.plant(unit.scenario)
             return Traced(simulate(plant, controller, unit.steps, unit.seed).to_csv())
         return _evaluate(unit, controller)
     except Exception as error:
@@ -131,22 +123,11 @@ def perform(unit: Unit) -> Outcome:
         return Failure(f"{type(error).__name__}: {text}", traceback.format_exc())
 
 
-_controllers: OrderedDict[str, Controller] = OrderedDict()
-_plants: OrderedDict[str, FmuPlant] = OrderedDict()
-
-
-def release() -> None:
-    """Close what this process keeps."""
-    _controllers.clear()
-    while _plants:
-        _plants.popitem()[1].close()
-
-
 def simulated(
     scenario: Scenario, controller: Controller, steps: int, seed: int
 ) -> dict[str, float]:
     """Indicators of a run of a controller on a scenario's plant, which this process keeps."""
-    figures = indicators(simulate(_plant(scenario), controller, steps, seed, residuals=False))
+    figures = indicators(simulate(reuse.plant(scenario), controller, steps, seed, residuals=False))
     return {name: figures[name] for name in INDICATORS}
 
 
@@ -156,25 +137,12 @@ def _evaluate(unit: Evaluate, controller: Controller) -> Evaluated:
     return Evaluated(found, perf_counter() - begin)
 
 
-def _plant(scenario: Scenario) -> FmuPlant:
-    key = f"{scenario.hash} {scenario.plant.fmu}"
-    if key not in _plants:
-        if len(_plants) == KEPT:
-            _plants.popitem(last=False)[1].close()
-        _plants[key] = FmuPlant(scenario)
-    _plants.move_to_end(key)
-    return _plants[key]
-
-
 def _controller(unit: Evaluate | Trace) -> Controller:
-    if unit.key not in _controllers:
-        if len(_controllers) == KEPT:
-            _controllers.popitem(last=False)
-        trainer = unit.place.trainer
-        _controllers[unit.key] = (
-            trainer.policy(unit.controller.training, unit.controller.parameters)
-            if isinstance(unit.controller, Learnt)
-            else trainer.controller(unit.controller, unit.scenario)
-        )
-    _controllers.move_to_end(unit.key)
-    return _controllers[unit.key]
+    trainer, wanted = unit.place.trainer, unit.controller
+
+    def build() -> Controller:
+        if isinstance(wanted, Learnt):
+            return trainer.policy(wanted.training, wanted.parameters)
+        return trainer.controller(wanted, unit.scenario)
+
+    return reuse.controller(unit.key, build)

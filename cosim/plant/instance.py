@@ -77,7 +77,7 @@ class Instance:
         self._free_instance.restype = None
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
-        self.inputs, self.inputs_view, self._set_inputs = self._exchange(wiring.inputs)
+        self.inputs, _, self._set_inputs = self._exchange(wiring.inputs)
         self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs)
         self.states, self.states_view, self._get_states = self._exchange(wiring.states)
         self._starts: list[tuple[str, Any, tuple[Any, ...]]] = []

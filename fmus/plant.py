@@ -21,7 +21,6 @@ _SHARED = (
     "access.h", "disturbance.h", "elementary.h", "events.h", "exchange.h", "experiment.h", "grid.h",
     "instance.h", "philox.h", "sampled.h", "seed.h", "simulation.h", "snapshot.h",
 )  # fmt: skip
-_SI = ("1", "s")
 
 
 @dataclass(frozen=True)

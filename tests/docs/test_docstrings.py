@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from tests.helpers.optional import OPTIONAL
+
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
-# Only with the extra that brings the tool that it drives.
-OPTIONAL = ("fmus.checks.ecospy_check", "fmus.checks.libcosimpy_check")
 
 
 def modules():

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+from tests.helpers.optional import OPTIONAL
+
 CODE = """
 import importlib, pkgutil
 for package in ("rti_storage", "fmus", "cosim", "controllers", "learning"):
@@ -12,8 +14,6 @@ for package in ("rti_storage", "fmus", "cosim", "controllers", "learning"):
             importlib.import_module(found.name)
             print(found.name)
 """
-# Only with the extra that brings the tool that it drives.
-OPTIONAL = ("fmus.checks.ecospy_check", "fmus.checks.libcosimpy_check")
 
 
 def test_no_module_warns_when_it_is_imported():

@@ -10,19 +10,12 @@ from numpy.typing import NDArray
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.definiteness import certificate
+from learning.episodes import Block, Learn, Learned, Request, Settle, Trial
 from learning.errors import DivergenceError
 from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel
 from learning.protocols import LearnableController, Transition, Update
-from learning.validated_search import (
-    Block,
-    Learn,
-    Learned,
-    Request,
-    Settle,
-    Trial,
-    ValidatedSearch,
-)
+from learning.validated_search import ValidatedSearch
 
 Vector = NDArray[np.float64]
 CANDIDATES = 3
@@ -214,6 +207,7 @@ class GlobalisedLearning:
             smallest_eigenvalue=certificate(
                 self._controller.parameters.blocks, self._controller.theta
             ).smallest,
+            episode=self._request.episode if isinstance(self._request, Settle) else None,
             mark=settled,
             rewind=isinstance(self._request, Trial) and self._request.begins,
         )

@@ -73,3 +73,19 @@ def test_a_restored_search_goes_on_as_the_first_one(scenario, name, at):
             assert np.array_equal(whole.interaction.s, resumed.interaction.s)
         assert np.array_equal(whole.controller.theta, resumed.controller.theta)
         assert np.array_equal(whole.parameters.theta, resumed.parameters.theta)
+
+
+def test_the_last_race_begins_a_new_episode(plant):
+    made, seeds = learner(plant, "q-learning"), []
+    begin = made.interaction.start
+
+    def start(seed):
+        seeds.append(made.interaction.number)
+        begin(seed)
+        assert np.array_equal(made.interaction.s, plant.scenario.initial_state)
+
+    made.interaction.start = start
+    for _ in range(1500):
+        made.advance()
+    assert len(seeds) == 1
+    assert 0.6 * 1500 < seeds[0] < 0.8 * 1500

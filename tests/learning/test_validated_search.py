@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from controllers.parameters import Parameters
-from learning.validated_search import Block, Learn, Learned, Settle, Trial, ValidatedSearch
+from learning.episodes import Block, Learn, Learned, Settle, Trial
+from learning.validated_search import ValidatedSearch
 
 SAMPLES = 20_000
 
@@ -83,7 +84,7 @@ def test_the_samples_are_counted_and_never_exceeded(scenario, problem):
     run(sought, plant)
     # The last race ends early where nothing comes near the incumbent.
     assert 0.9 * (1 - sought.FINAL) * SAMPLES < plant.samples <= SAMPLES
-    assert plant.samples == sought._spent
+    assert plant.samples == sought.spent
 
 
 @pytest.mark.parametrize("seed", range(3))

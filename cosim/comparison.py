@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,28 @@ from cosim.validation import suggestion
 Array = NDArray[np.float64]
 # Itself an error, of the size of rounding: no share of it is a tolerance.
 _ERROR = "residual"
+STEMS = ("trajectory", "run")
+"""Names of a run's files that say nothing of the run."""
 
 
 @dataclass(frozen=True)
 class RunSignals:
-    """A run's `signals` by name, all of K samples, and the status of each ([] if not known)."""
+    """A run's `signals` by name, all of K samples, and the status of each ([] if not known).
+
+    `name` is where it was read, `label` what figures call it; `bounds` are (lower, upper) of the
+    signals that have any, as far as the run says.
+    """
 
     name: str
     signals: Mapping[str, Signal]
     status: Sequence[str] = ()
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """The run's folder, or the file where it has another name than a folder's."""
+        path = Path(self.name)
+        return path.parent.name or path.stem if path.stem in STEMS else path.stem
 
     def __len__(self) -> int:
         """Return the number of samples K."""

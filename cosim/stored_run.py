@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from cosim.comparison import RunSignals
-from cosim.errors import ComparisonError
+from cosim.errors import ComparisonError, ScenarioError
+from cosim.scenario import Scenario
 from cosim.signals import clocked
 from cosim.trajectory import Signal, read_signals
 
-TRAJECTORY = "trajectory.csv"
+TRAJECTORY, SCENARIO = "trajectory.csv", "scenario.toml"
 
 
 def load_run(path: str | Path) -> RunSignals:
@@ -25,7 +26,7 @@ def load_run(path: str | Path) -> RunSignals:
     if not path.is_file():
         raise ComparisonError(f"there is no run at '{path}'; give a run's folder, CSV or .rrd")
     if path.suffix != ".rrd":
-        return RunSignals(str(path), *read_signals(path))
+        return RunSignals(str(path), *read_signals(path), _bounds(path.parent / SCENARIO))
     from cosim.recording.reader import read_recording  # noqa: PLC0415 - half a second, for .rrd only
 
     recording = read_recording(path)
@@ -35,3 +36,18 @@ def load_run(path: str | Path) -> RunSignals:
         if values.ndim == 1 and name not in clocked()
     }
     return RunSignals(str(path), signals, recording.status)
+
+
+def _bounds(path: Path) -> dict[str, tuple[float, float]]:
+    """Bounds of states and actions by name; none where no readable scenario lies beside a run."""
+    try:
+        scenario = Scenario.load(path) if path.is_file() else None
+    except ScenarioError:
+        return {}
+    if scenario is None:
+        return {}
+    names = [*scenario.plant.states, *scenario.plant.actions]
+    lower = [*scenario.state_lower, *scenario.action_lower]
+    upper = [*scenario.state_upper, *scenario.action_upper]
+    pairs = zip(map(float, lower), map(float, upper), strict=True)
+    return dict(zip(names, pairs, strict=True))

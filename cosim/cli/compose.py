@@ -38,10 +38,15 @@ def build_plant(scenario: Scenario, output: Output | None = None) -> FmuPlant:
 
 def announce(scenario: Scenario, output: Output) -> None:
     """Say which native code is about to run, unless it is the package's own, and watch it."""
+    announce_fmu(scenario.plant.fmu, output)
+
+
+def announce_fmu(name: str, output: Output) -> None:
+    """Do the same for an FMU by its path, or a shipped one's name."""
     from cosim.cli.supervision import watch
     from cosim.plant.archive import SHIPPED, unpack
 
-    if scenario.plant.fmu not in SHIPPED:
-        fmu = unpack(scenario.plant.fmu)
+    if name not in SHIPPED:
+        fmu = unpack(name)
         watch(fmu.path, output.stdout)
         output.note(f"native code of {fmu.path}, sha256 {fmu.sha256}")

@@ -1,16 +1,36 @@
-"""`cosim scenario`: show a scenario as it is after validation."""
+"""`cosim scenario`: show a scenario as it is after validation, or draft one for an FMU."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer.core import TyperGroup
 
 from cosim.cli.options import JsonOption
 from cosim.cli.output import output
 
+SHOW = "show"
 
-def scenario(
+
+class ShowByDefault(TyperGroup):
+    """`cosim scenario NAME` is `cosim scenario show NAME`."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """Put `show` first where no command is named."""
+        if not args or (args[0] not in self.commands and args[0] not in ctx.help_option_names):
+            args = [SHOW, *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=ShowByDefault, help="Show scenarios (cosim scenario NAME), or draft one for an FMU."
+)
+
+
+@app.command()
+def show(
     name: Annotated[
         str | None, typer.Argument(help="Preset or TOML file; none lists the presets.")
     ] = None,
@@ -32,3 +52,76 @@ def scenario(
             out_.json(chosen.to_dict() | {"hash": chosen.hash})
         else:
             print(f"# hash {chosen.hash}\n{chosen.to_toml()}", end="")
+
+
+@app.command()
+def init(
+    fmu: Annotated[str, typer.Argument(help="FMU: a path, or evaporator.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File; default: the FMU's name, .toml.")
+    ] = None,
+    states: Annotated[str, typer.Option("--states", help="Names, comma-separated.")] = "",
+    actions: Annotated[str, typer.Option("--actions", help="Names, comma-separated.")] = "",
+    cost: Annotated[
+        str | None, typer.Option("--cost", help="Output that is the stage cost.")
+    ] = None,
+    sampling_time: Annotated[
+        float | None, typer.Option("--sampling-time", min=1e-9, help="Sampling time in s.")
+    ] = None,
+    state: Annotated[
+        str, typer.Option("--state", help="Where to look for the steady state: numbers.")
+    ] = "",
+    action: Annotated[str, typer.Option("--action", help="The same of the actions.")] = "",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the file if it is there.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Draft a scenario for an FMU: a commented TOML file, to be read and corrected.
+
+    States, actions, cost, noise, ranges and what a reset can write are guessed from
+    modelDescription.xml; the steady state near the start values is found by stepping the FMU,
+    whose native code this runs.
+    """
+    with output(json) as out_:
+        from cosim.cli.compose import announce_fmu
+        from cosim.errors import CosimError
+        from cosim.plant.draft import draft_scenario
+        from cosim.scenario import Scenario
+        from rti_storage import write_atomically
+
+        target = (out or Path(f"{Path(fmu).stem}.toml")).absolute()
+        if target.exists() and not overwrite:
+            raise CosimError(
+                f"'{target}' is there already; replace it by --overwrite, or use --out"
+            )
+        announce_fmu(fmu, out_)
+        text = draft_scenario(
+            fmu,
+            target,
+            states=_words(states),
+            actions=_words(actions),
+            stage_cost=cost,
+            sampling_time=sampling_time,
+            state=_numbers(state, "--state"),
+            action=_numbers(action, "--action"),
+        )
+        write_atomically(target, text)
+        drafted = Scenario.load(target)
+        if not json:
+            print(text, end="")
+        out_.note(f"written to {target}: read the lines with CHECK")
+        out_.json({"file": str(target), **drafted.to_dict(), "hash": drafted.hash})
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _numbers(text: str, option: str) -> list[float]:
+    from cosim.errors import CosimError
+
+    try:
+        return [float(word) for word in _words(text)]
+    except ValueError:
+        raise CosimError(f"{option} takes numbers, comma-separated, not '{text}'") from None

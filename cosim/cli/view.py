@@ -17,7 +17,12 @@ def view(
         Path | None, typer.Option("--png", help="Draw it to a PNG instead; needs no screen.")
     ] = None,
     at: Annotated[
-        float | None, typer.Option("--at", help="Cursor of the PNG: time in s (training: sample).")
+        float | None,
+        typer.Option(
+            "--at",
+            help="Cursor of the PNG: time in s (training: sample); default: the worst violation of "
+            "a run, or the end.",
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:

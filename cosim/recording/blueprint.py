@@ -52,7 +52,7 @@ def run_blueprint(duration: float, channels: Sequence[Channel], predicts: bool) 
     group = {name: [c for c in channels if c.group == name] for name in GROUPS}
 
     def alone(channel: Channel) -> rrb.TimeSeriesView:
-        return series(channel.label, [f"/{channel.entity}/**"], axis, channel.window())
+        return series(channel.title, [f"/{channel.entity}/**"], axis, channel.window())
 
     def bundle(title: str, name: str) -> rrb.TimeSeriesView:
         return series(title, [f"/{name}"], axis, union(group[name]), legend=True)

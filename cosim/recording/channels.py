@@ -65,6 +65,13 @@ class Channel:
         """Name and unit, as axes print them."""
         return self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"
 
+    @property
+    def title(self) -> str:
+        """Label and bounds in words: the viewer's lines have no names, its font no sign for >=."""
+        sides = zip(("at least", "at most"), self.bounds, strict=True)
+        said = [f"{side} {bound:g}" for side, bound in sides if isfinite(bound)]
+        return ", ".join([self.label, *said])
+
     def with_values(self, values: Array) -> Channel:
         """Widen the range seen by values of any shape; NaN counts as no value."""
         values = values[np.isfinite(values)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,9 @@ import rerun.blueprint as rrb
 
 from cosim.comparison import Comparison, RunSignals
 from cosim.recording.blueprint import framed, series, time_axis, union
-from cosim.recording.channels import Channel
+from cosim.recording.channels import Channel, escaped
 from cosim.recording.glyphs import drawable
-from cosim.recording.palette import SERIES
+from cosim.recording.palette import BOUND, SERIES
 from cosim.recording.stream import Stream, line, sample_times
 
 _SIDES = ("A", "B")
@@ -25,7 +25,8 @@ def record_comparison(
 ) -> None:
     """Write a recording with runs A and B overlaid, and A − B; raises RecordingError.
 
-    Entities are `A/<signal>`, `B/<signal>` and `difference/<signal>`.
+    Entities are `A/<signal>`, `B/<signal>` and `difference/<signal>`; the lines have the runs'
+    names, and a signal's bounds are drawn where a run says what they are.
     """
     names = [d.name for d in comparison.differences if d.name != "time"]
     overlaid = {name: _channels(name, (a, b)) for name in names}
@@ -40,8 +41,15 @@ def record_comparison(
         times = sample_times(np.arange(len(run)), _time(run))
         for name in names:
             channel = overlaid[name][_SIDES.index(side)]
-            stream.static(channel.entity, line(side, channel.color))
+            stream.static(channel.entity, line(f"{side}: {run.label}", channel.color))
             stream.scalars(channel.entity, times, run.signals[name].values)
+    ends = sample_times(np.array([0, max(len(a), len(b)) - 1]), np.array([0.0, duration]))
+    for name, channels in overlaid.items():
+        for side, bound in zip(("lower", "upper"), channels[0].bounds, strict=True):
+            if isfinite(bound):
+                entity = f"bounds/{escaped(name)}/{side}"
+                stream.static(entity, line(f"{side} bound", BOUND))
+                stream.scalars(entity, ends, np.full(2, bound))
     common = min(len(a), len(b))
     times = sample_times(np.arange(common), _time(a)[:common])
     for channel, values in differences.values():
@@ -51,8 +59,11 @@ def record_comparison(
 
 
 def _channels(name: str, runs: tuple[RunSignals, RunSignals]) -> list[Channel]:
+    bounds = runs[0].bounds.get(name, (-inf, inf))
     return [
-        Channel(side, name, run.signals[name].unit, color).with_values(run.signals[name].values)
+        Channel(side, name, run.signals[name].unit, color, bounds).with_values(
+            run.signals[name].values
+        )
         for side, run, color in zip(_SIDES, runs, SERIES, strict=False)
     ]
 
@@ -78,13 +89,13 @@ def _blueprint(
     axis = time_axis(duration)
     runs = [
         series(
-            channels[0].label,
-            [f"/{channel.entity}" for channel in channels],
+            channels[0].title,
+            [*(f"/{channel.entity}" for channel in channels), f"/bounds/{escaped(name)}/**"],
             axis,
             union(channels),
             legend=True,
         )
-        for channels in overlaid.values()
+        for name, channels in overlaid.items()
     ]
     deviations = [
         series(f"A - B: {channel.label}", [f"/{channel.entity}"], axis, channel.window())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle
 from math import inf
 from pathlib import Path
@@ -71,7 +71,7 @@ def record_showcase(
         for name, values in history.theta.items()
     }
     every = [*(c for group in overlaid.values() for c in group), *curves.values(), *blocks.values()]
-    labels = {name: f"{name} [{first.signals[name].unit}]" for name in names}
+    labels = {name: replace(c[0], name=name).title for name, c in overlaid.items()}
     stream.layout(_blueprint(labels, overlaid, curves, blocks, steps, history), every)
     for name, channels in overlaid.items():
         step = name in plant.actions

@@ -16,6 +16,7 @@ from rerun.experimental import ViewerClient
 
 from cosim.errors import RecordingError
 from cosim.lifetime import end_guarded, start_guarded
+from cosim.recording.moment import telling_moment
 from cosim.recording.stream import SAMPLE, TIME
 from rti_storage import write_atomically
 
@@ -55,7 +56,8 @@ def render(
 ) -> None:
     """Draw a recording to a PNG without a screen, with the time cursor at `at`.
 
-    `at` is in seconds of the run, or a sample's number where there is no time (a training).
+    `at` is in seconds of the run, or a sample's number where there is no time (a training); without
+    it the cursor stands where there is most to see (`telling_moment`).
 
     Raises
     ------
@@ -64,6 +66,8 @@ def render(
     if at is not None and not isfinite(at):
         raise RecordingError(f"the time of the cursor (--at) must be finite, not {at}")
     path = _existing(path)
+    if at is None:
+        at = telling_moment(path)
     deadline = time.monotonic() + timeout
     with _headless(size, deadline) as client:
         client.open(str(path.resolve()))

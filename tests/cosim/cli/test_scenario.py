@@ -1,0 +1,124 @@
+"""`cosim scenario init`: what it drafts runs, and what it cannot guess it says."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim import FmuPlant, Scenario
+from fmus.plant import build_plant
+from tests.helpers.tank import build_tank, edited
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+
+
+def drift(scenario):
+    """How far a sample moves the undisturbed plant from its reference, as a share of it."""
+    quiet = scenario.replace({"disturbance": {"law": "none"}})
+    with FmuPlant(quiet) as plant:
+        s = plant.reset(0, scenario.reference_state)
+        step = plant.step(scenario.reference_action)
+    assert step.stage_cost == pytest.approx(scenario.controller.reference_cost, rel=1e-9)
+    return np.max(np.abs(step.s - s) / np.maximum(np.abs(s), 1e-2))
+
+
+def test_the_evaporators_draft_is_the_paper_but_for_what_nobody_could_know(cosim, tmp_path, paper):
+    code, out, err = cosim("scenario", "init", "evaporator")
+    assert code == 0
+    assert "CHECK" in out and "evaporator.toml" in err
+    drafted = Scenario.load(tmp_path / "evaporator.toml")
+    known = paper.to_dict()
+    found = drafted.to_dict()
+    for table in ("disturbance", "penalty"):
+        assert found[table] == known[table]
+    for field in ("states", "actions", "disturbances", "stage_cost", "mapping"):
+        assert found["plant"][field] == known["plant"][field], field
+    assert (found["sampling_time"], found["bounds"]["action_upper"]) == (60.0, [400.0, 400.0])
+    # The FMU's start values are the operating point with seven digits.
+    assert drafted.reference_state == pytest.approx(paper.reference_state, rel=1e-6)
+    assert drafted.reference_action == pytest.approx(paper.reference_action, rel=1e-6)
+    assert drift(drafted) < 1e-9
+    code, out, _ = cosim("simulate", "-s", "evaporator.toml", "-n", 20, "--json")
+    assert code == 0 and json.loads(out)["failures"] == 0
+
+
+@pytest.mark.parametrize("name", ["reactor", "quadruple_tank"])
+def test_an_examples_draft_has_the_roles_that_its_scenario_has(cosim, tmp_path, monkeypatch, name):
+    for path in (EXAMPLES / name).glob("*.[pth]*"):
+        shutil.copy(path, tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    module = __import__(name)
+    build_plant(module.table(), (tmp_path / "equations.h").read_bytes(), tmp_path / f"{name}.fmu")
+    code, out, _ = cosim("scenario", "init", f"{name}.fmu", "--out", "draft.toml", "--json")
+    assert code == 0
+    assert json.loads(out)["plant"]["states"]
+    drafted = Scenario.load(tmp_path / "draft.toml")
+    known = Scenario.load(tmp_path / f"{name}.toml")
+    for field in ("states", "actions", "disturbances", "stage_cost", "mapping"):
+        assert getattr(drafted.plant, field) == getattr(known.plant, field), field
+    assert drafted.sampling_time == known.sampling_time
+    assert drift(drafted) < 1e-9
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory):
+    return build_tank(tmp_path_factory.mktemp("tank"), saves=False)
+
+
+def test_a_foreign_fmu_needs_no_more_than_names_and_a_time(cosim, tank, tmp_path):
+    code, _, err = cosim("scenario", "init", tank)
+    assert code == 2 and "--sampling-time" in err
+    code, _, _ = cosim("scenario", "init", tank, "--sampling-time", 0.5, "--out", "tank.toml")
+    assert code == 0
+    drafted = Scenario.load(tmp_path / "tank.toml")
+    assert drafted.plant.states == ("x",)
+    assert drafted.plant.mapping.initial_state == ("x_start",)
+    assert drift(drafted) < 1e-9
+    text = (tmp_path / "tank.toml").read_text()
+    assert "CHECK: the FMU states no bound of x" in text
+    code, _, err = cosim("scenario", "init", tank, "--sampling-time", 0.5, "--out", "tank.toml")
+    assert code == 2 and "--overwrite" in err
+
+
+def test_what_cannot_be_guessed_is_asked_for(cosim, tank, tmp_path):
+    def changed(old, new):
+        return edited(tank, tmp_path / "other.fmu", lambda text: text.replace(old, new))
+
+    for old, new, words in (
+        ('name="cost"', 'name="outflow"', "give --cost NAME, one of x, outflow"),
+        ('name="x"', 'name="other_cost"', "other_cost and cost could be"),
+        ('name="x_start"', 'name="x0"', "--states A,B"),
+        ('"input"><Real start="0"', '"local"><Real', "no real input"),
+    ):
+        code, _, err = cosim("scenario", "init", changed(old, new), "--sampling-time", 0.5)
+        assert code == 2, err
+        assert words in err
+        assert "Traceback" not in err
+
+
+def test_wrong_names_and_numbers_are_named(cosim, tank):
+    for words, said in (
+        (("--states", "y"), "has no variable 'y'"),
+        (("--state", "1,2"), "--state takes 1 numbers"),
+        (("--action", "much"), "--action takes numbers"),
+    ):
+        code, _, err = cosim("scenario", "init", tank, "--sampling-time", 0.5, *words)
+        assert code == 2
+        assert said in err
+
+
+def test_a_plant_that_starts_where_it_likes_is_left_to_settle(cosim, tank, tmp_path):
+    other = edited(tank, tmp_path / "o.fmu", lambda text: text.replace('"x_start"', '"level0"'))
+    words = ("--states", "x", "--sampling-time", 0.5, "--action", 2)
+    code, out, err = cosim("scenario", "init", other, *words, "--json")
+    assert code == 0, err
+    drafted = json.loads(out)
+    assert drafted["plant"]["mapping"]["initial_state"] == []
+    assert drafted["controller"]["reference_action"] == [2.0]
+    with FmuPlant(Scenario.load(tmp_path / "o.toml")) as plant:
+        plant.reset(0)
+        for _ in range(400):
+            s = plant.step([2.0]).s
+    assert drafted["controller"]["reference_state"] == pytest.approx(s, rel=1e-6)

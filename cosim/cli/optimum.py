@@ -16,14 +16,11 @@ from cosim.cli.output import Output, output
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming.certificate import Certificate, Figure
-    from controllers.dynamic_programming.plant import PlantProblem
-    from controllers.dynamic_programming.settings import Settings
     from controllers.dynamic_programming.solution import Optimum, Progress
     from controllers.dynamic_programming.study import Row
     from cosim.scenario import Scenario
 
 UNSTABLE = 1
-_SEARCH_SEEDS, _SEARCH_STEPS = range(900_000, 900_010), 10_000
 
 
 class Criterion(StrEnum):
@@ -135,6 +132,7 @@ def _solve(
     from controllers.dynamic_programming.settings import Settings
     from controllers.dynamic_programming.solution import solve
     from controllers.dynamic_programming.study import Row
+    from cosim.cli.optimum_study import held_against, refined
 
     plant = PlantProblem.from_scenario(task)
     problem, law, parameters = plant.problem, plant.law, plant.parameters
@@ -147,7 +145,9 @@ def _solve(
 
         if refine:
             archive.require_cache()
-            rows, solved = _study(plant, settings, make(), task, against, show)
+            rows, solved = refined(plant, settings, make(), show)
+            if against is not None:
+                solved = held_against(against, solved, plant, task)
             archive.keep(key, lambda: solved)
         else:
             solved = archive.keep(key, make) if recompute else archive.obtain(key, problem, make)
@@ -185,60 +185,6 @@ def _solve(
     document["kind"] = "optimum" if called else "reference"
     document["stable"] = document["stable"] and (called or criterion is Criterion.DISCOUNTED)
     return rows, certificate, document
-
-
-def _study(
-    plant: PlantProblem,
-    settings: Settings,
-    solved: Optimum,
-    task: Scenario,
-    against: Path | None,
-    show: Callable[[Progress], None],
-) -> tuple[list[Row], Optimum]:
-    """The solution and what refines it, and the refinement that is kept with its certificate."""
-    from dataclasses import replace
-
-    from controllers.dynamic_programming.study import certify, study
-
-    rows = study(
-        plant.problem, plant.law, settings, solved, parameters=plant.parameters, progress=show
-    )
-    certified = certify(plant, rows)
-    if against is not None and certified.certificate is not None:
-        found = replace(
-            certified.certificate,
-            figures=(*certified.certificate.figures, _searched(task, plant, certified, against)),
-        )
-        certified = replace(certified, certificate=found)
-    return rows, certified
-
-
-def _searched(task: Scenario, plant: PlantProblem, found: Optimum, against: Path) -> Figure:
-    """J of a θ: the policy's simulated J and the paired difference to it on the FMU."""
-    import numpy as np
-    from scipy.stats import t
-
-    from controllers import factories
-    from controllers.dynamic_programming.certificate import SEARCH, Figure
-    from controllers.optimum import OptimalPolicy
-    from cosim.plant import FmuPlant
-    from cosim.simulation import simulate
-
-    policy = OptimalPolicy(plant.problem, plant.law, found, plant.parameters)
-    searched = factories.from_file(task, against)
-    difference = np.zeros(len(_SEARCH_SEEDS))
-    with FmuPlant(task) as fmu:
-        for i, seed in enumerate(_SEARCH_SEEDS):
-            for sign, controller in ((1.0, searched), (-1.0, policy)):
-                run = simulate(fmu, controller, _SEARCH_STEPS, seed)
-                difference[i] += sign * (run["stage_cost"] + run["penalty"]).mean()
-    assert found.certificate is not None
-    base = found.certificate["simulation"]
-    assert base is not None
-    spread = t.ppf(0.975, len(difference) - 1) * difference.std(ddof=1) / len(difference) ** 0.5
-    value = base.value + float(difference.mean())
-    half_width = float(np.hypot(spread, 0.5 * (base.upper - base.lower)))
-    return Figure(SEARCH, value, value - half_width, value + half_width)
 
 
 def _cells(row: Row) -> tuple[str, ...]:

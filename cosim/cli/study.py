@@ -165,7 +165,7 @@ def write_summary(results: StudyResults) -> dict[str, Any]:
 
 def show(results: StudyResults, out_: Output) -> None:
     """Print a table for each scenario."""
-    from cosim.experiments.layout import HEADER, lines
+    from cosim.experiments.formatting import HEADER, lines
 
     for scenario in results.scenarios:
         out_.table(f"{results.name}: {scenario}", HEADER, lines(results, scenario))

@@ -130,16 +130,10 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
 
 
 def _resampled_runs(strata: Sequence[Array]) -> Interval:
-    interval = stats.bootstrap(
-        tuple(strata),
-        lambda *resampled, axis: interquartile_mean(np.concatenate(resampled, axis=axis), axis),
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        confidence_level=LEVEL,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return float(interval.low), float(interval.high)
+    def statistic(*resampled: Array, axis: int) -> Any:
+        return interquartile_mean(np.concatenate(resampled, axis=axis), axis)
+
+    return _resampled(strata, statistic, paired=False, method="percentile")
 
 
 def td_error_mean(
@@ -204,7 +198,7 @@ def _t_interval(residuals: Array, value: float) -> tuple[float, float] | None:
 
 
 def _bootstrap(samples: Sequence[Array], statistic: Any) -> tuple[float, float] | None:
-    """BCa interval with a fixed seed: the same values give the same interval."""
+    """BCa interval of paired samples, None where there are fewer than two."""
     seeds = len(samples[0])
     if seeds < 2:
         return None
@@ -213,14 +207,21 @@ def _bootstrap(samples: Sequence[Array], statistic: Any) -> tuple[float, float] 
     # BCa is undefined for a statistic that no seed moves; its interval is the point.
     if np.ptp(jackknife) <= 1e-12 * max(1.0, abs(value)):
         return value, value
-    result = stats.bootstrap(
-        samples,
+    return _resampled(samples, statistic, paired=True, method="BCa")
+
+
+def _resampled(
+    samples: Sequence[Array], statistic: Any, *, paired: bool, method: str
+) -> tuple[float, float]:
+    """Bootstrap interval with a fixed seed: the same values give the same interval."""
+    interval = stats.bootstrap(
+        tuple(samples),
         statistic,
-        paired=True,
+        paired=paired,
         vectorized=True,
         n_resamples=RESAMPLES,
         confidence_level=LEVEL,
-        method="BCa",
+        method=method,
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return float(result.low), float(result.high)
+    return float(interval.low), float(interval.high)

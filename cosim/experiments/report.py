@@ -10,7 +10,7 @@ from html import escape
 from pathlib import Path
 
 from cosim.experiments.charts import FOLDER, draw
-from cosim.experiments.layout import (
+from cosim.experiments.formatting import (
     AGGREGATE_HEADER,
     HEADER,
     aggregate_lines,

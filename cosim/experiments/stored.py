@@ -11,8 +11,8 @@ from cosim.experiments.charts import draw
 from cosim.experiments.check import TOLERANCES
 from cosim.experiments.document import StudyTable
 from cosim.experiments.document import read as read_study
+from cosim.experiments.formatting import HEADER, lines
 from cosim.experiments.keyed import rounded_csv
-from cosim.experiments.layout import HEADER, lines
 from cosim.experiments.report import TABLES, report_markdown
 from cosim.experiments.results import ABOUT, StudyResults
 from cosim.experiments.store import RUNS

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import signal
-import struct
-import tomllib
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -25,8 +23,6 @@ from cosim.protocols import Step
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
-_RESET, _STEP, _SNAPSHOT, _RESTORE, _RELEASE = b"rspgx"
-_WORD = struct.Struct("<Q")
 
 
 class IsolatedSnapshot:
@@ -58,18 +54,17 @@ class IsolatedPlant(Resource):
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self.dropped: list[int] = []
         self._timeout = timeout
-        self._n = len(self.scenario.plant.states)
         self._k = 0
         context = multiprocessing.get_context("spawn")
         self._pipe, remote = context.Pipe()
         self._process = context.Process(
             target=_serve,
-            args=(remote, self.scenario.to_toml(), None if fmu is None else str(fmu)),
+            args=(remote, self.scenario.to_dict(), None if fmu is None else str(fmu)),
             daemon=True,
         )
         self._process.start()
         remote.close()
-        about: dict[str, Any] = json.loads(self._answer())
+        about: dict[str, Any] = self._answer()
         self.units: dict[str, str] = about["units"]
         self.fmi_version: str = about["fmi_version"]
         self.fmu_path = Path(about["fmu_path"])
@@ -87,34 +82,32 @@ class IsolatedPlant(Resource):
 
     def reset(self, seed: int, initial_state: Sequence[float] | Array | None = None) -> Array:
         """Start again at k = 0, as `FmuPlant.reset` does."""
-        document = {"seed": seed, "initial_state": _plain(initial_state)}
-        s = _array(self._call(_RESET, json.dumps(document).encode()))
+        state = initial_state.tolist() if isinstance(initial_state, np.ndarray) else initial_state
+        s = self._call("reset", seed, state)
         self._k = 0
-        return s
+        return np.array(s)
 
     def step(self, a: Sequence[float] | Array) -> Step:
         """Hold the action a (m,) for one sampling time, as `FmuPlant.step` does."""
         try:
-            action = np.asarray(a, dtype=np.float64)
+            action = np.asarray(a, dtype=np.float64).tolist()
         except (TypeError, ValueError):
-            action = np.array([np.nan])
-        values = _array(self._call(_STEP, action.tobytes()))
+            action = [np.nan]
+        s, stage_cost, penalty, disturbance = self._call("step", action)
         self._k += 1
-        n = self._n
-        return Step(values[:n], float(values[n]), float(values[n + 1]), values[n + 2 :])
+        return Step(np.array(s), stage_cost, penalty, np.array(disturbance))
 
     def snapshot(self) -> IsolatedSnapshot:
         """Save the state, as `FmuPlant.snapshot` does."""
-        number = _WORD.unpack(self._call(_SNAPSHOT, b""))[0]
-        return IsolatedSnapshot(self, number, self._k)
+        return IsolatedSnapshot(self, self._call("snapshot"), self._k)
 
     def restore(self, snapshot: IsolatedSnapshot) -> Array:
         """Go back to a snapshot of this very plant; return its state (n,)."""
         if snapshot.plant is not self:
             raise PlantError("this snapshot was taken from another plant")
-        s = _array(self._call(_RESTORE, _WORD.pack(snapshot.number)))
+        s = self._call("restore", snapshot.number)
         self._k = snapshot.k
-        return s
+        return np.array(s)
 
     def close(self) -> None:
         """End the process."""
@@ -124,21 +117,21 @@ class IsolatedPlant(Resource):
             self._process.kill()
             self._process.join()
 
-    def _call(self, operation: int, payload: bytes) -> bytes:
+    def _call(self, method: str, *arguments: Any) -> Any:
         if self._pipe.closed:
             raise PlantError("the plant is closed")
         while self.dropped:
-            self._ask(_RELEASE, _WORD.pack(self.dropped.pop()))
-        return self._ask(operation, payload)
+            self._ask("drop", self.dropped.pop())
+        return self._ask(method, *arguments)
 
-    def _ask(self, operation: int, payload: bytes) -> bytes:
+    def _ask(self, *request: Any) -> Any:
         try:
-            self._pipe.send_bytes(bytes([operation]) + payload)
+            _send(self._pipe, request)
         except OSError:
             self._report_death()
         return self._answer()
 
-    def _answer(self) -> bytes:
+    def _answer(self) -> Any:
         try:
             if not self._pipe.poll(self._timeout):
                 self._process.kill()
@@ -146,13 +139,12 @@ class IsolatedPlant(Resource):
                     f"the plant's process did not answer within {self._timeout:g} s at step "
                     f"{self._k}; it was ended"
                 )
-            answer = self._pipe.recv_bytes()
+            error, answer = _receive(self._pipe)
         except (EOFError, ConnectionError):
             self._report_death()
-        if answer[:1] == b"+":
-            return answer[1:]
-        name, _, message = answer[1:].decode().partition(":")
-        raise getattr(errors, name, PlantError)(message)
+        if error:
+            raise getattr(errors, error, PlantError)(answer)
+        return answer
 
     def _report_death(self) -> NoReturn:
         self._process.join(5.0)
@@ -163,23 +155,24 @@ class IsolatedPlant(Resource):
         ) from None
 
 
-def _array(data: bytes) -> Array:
-    return np.frombuffer(data, dtype=np.float64).copy()
+def _send(pipe: Connection, message: Any) -> None:
+    """Send a message as JSON, in which a float keeps its bits: nothing that is received is run."""
+    pipe.send_bytes(json.dumps(message).encode())
 
 
-def _plain(state: Sequence[float] | Array | None) -> Any:
-    return state.tolist() if isinstance(state, np.ndarray) else state
+def _receive(pipe: Connection) -> Any:
+    return json.loads(pipe.recv_bytes())
 
 
-def _serve(pipe: Connection, scenario: str, fmu: str | None) -> None:
+def _serve(pipe: Connection, scenario: dict[str, Any], fmu: str | None) -> None:
     """Answer the other process's calls until it closes the pipe."""
     # Ctrl-C reaches the whole group; the parent decides what becomes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     follow_parent()  # an FMU that hangs never sees the pipe close
     try:
-        plant = FmuPlant(Scenario.from_dict(tomllib.loads(scenario)), fmu)
+        plant = FmuPlant(Scenario.from_dict(scenario), fmu)
     except CosimError as error:
-        pipe.send_bytes(_error(error))
+        _send(pipe, (type(error).__name__, str(error)))
         return
     about = {
         "units": plant.units,
@@ -187,21 +180,17 @@ def _serve(pipe: Connection, scenario: str, fmu: str | None) -> None:
         "fmu_path": str(plant.fmu_path),
         "fmu_sha256": plant.fmu_sha256,
     }
-    pipe.send_bytes(b"+" + json.dumps(about).encode())
+    _send(pipe, ("", about))
     server = _Server(plant)
     while True:
         try:
-            request = pipe.recv_bytes()
+            method, *arguments = _receive(pipe)
         except (EOFError, OSError):
             return
         try:
-            pipe.send_bytes(b"+" + server.handle(request[0], request[1:]))
+            _send(pipe, ("", getattr(server, method)(*arguments)))
         except CosimError as error:
-            pipe.send_bytes(_error(error))
-
-
-def _error(error: CosimError) -> bytes:
-    return f"-{type(error).__name__}:{error}".encode()
+            _send(pipe, (type(error).__name__, str(error)))
 
 
 class _Server:
@@ -212,19 +201,20 @@ class _Server:
         self._snapshots: dict[int, Snapshot] = {}
         self._last = 0
 
-    def handle(self, operation: int, payload: bytes) -> bytes:
-        if operation == _STEP:
-            s, cost, penalty, disturbance = self._plant.step(np.frombuffer(payload))
-            return np.concatenate([s, [cost, penalty], disturbance]).tobytes()
-        if operation == _RESET:
-            document = json.loads(payload)
-            return self._plant.reset(document["seed"], document["initial_state"]).tobytes()
-        if operation == _SNAPSHOT:
-            self._last += 1
-            self._snapshots[self._last] = self._plant.snapshot()
-            return _WORD.pack(self._last)
-        number = _WORD.unpack(payload)[0]
-        if operation == _RESTORE:
-            return self._plant.restore(self._snapshots[number]).tobytes()
+    def step(self, action: list[float]) -> list[Any]:
+        s, stage_cost, penalty, disturbance = self._plant.step(action)
+        return [s.tolist(), stage_cost, penalty, disturbance.tolist()]
+
+    def reset(self, seed: int, initial_state: list[float] | None) -> Any:
+        return self._plant.reset(seed, initial_state).tolist()
+
+    def snapshot(self) -> int:
+        self._last += 1
+        self._snapshots[self._last] = self._plant.snapshot()
+        return self._last
+
+    def restore(self, number: int) -> Any:
+        return self._plant.restore(self._snapshots[number]).tolist()
+
+    def drop(self, number: int) -> None:
         del self._snapshots[number]
-        return b""

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from cosim.experiments.layout import HEADER, lines
+from cosim.experiments.formatting import HEADER, lines
 from cosim.experiments.report import write_report
 from cosim.experiments.results import StudyResults
 from cosim.experiments.summary import aggregate_rows, summary_rows

@@ -1,4 +1,4 @@
-"""A study's tables as they are shown: a few columns, significant digits, least regret first."""
+"""A study's tables as text: a few columns, significant digits, least regret first."""
 
 from __future__ import annotations
 

@@ -124,10 +124,15 @@ class QuasiStaticPolicy:
     @property
     def gain(self) -> float:
         """Mean of J*(UA2(t)) over one cycle, J* between the nodes by monotone cubics."""
-        curve = PchipInterpolator(self._nodes, [policy.gain for policy in self.policies])
         x, weights = np.polynomial.legendre.leggauss(40)
         values = self.fouling.heat_transfer(0.5 * self.fouling.period * (x + 1.0))
-        return float(curve(np.clip(values, self._nodes[0], self._nodes[-1])) @ weights / 2.0)
+        return float(self.gain_at(values) @ weights / 2.0)
+
+    def gain_at(self, heat_transfer: ArrayLike) -> Vector:
+        """J* of a condenser that stays at a heat transfer UA2, of any shape."""
+        curve = PchipInterpolator(self._nodes, [policy.gain for policy in self.policies])
+        found: Vector = curve(np.clip(heat_transfer, self._nodes[0], self._nodes[-1]))
+        return found
 
     def reset(self) -> None:
         """Start the clock at a clean condenser."""

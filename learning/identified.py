@@ -14,6 +14,7 @@ from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.model import Model
 from controllers.parameters import Parameters
+from learning.configuration import Count
 from learning.errors import DivergenceError
 from learning.practitioner import Practitioner, PractitionerConfiguration
 from learning.prediction_errors import OneStepModel
@@ -28,6 +29,11 @@ class IdentifiedConfiguration(PractitionerConfiguration):
     model_parameters: tuple[str, ...] = Field(
         (), description="parameters to fit; the model's uncertain ones if not given"
     )
+    every: Count | None = Field(
+        None,
+        description="fit again after so many samples, to these; once, at the end of the estimate, "
+        "if not given",
+    )
     retune: bool = Field(True, description="tune the cost by economics with the fitted model")
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
@@ -40,7 +46,7 @@ class Identified(Practitioner):
 
     σ is the standard deviation of the errors at the start's parameters. Then the cost is tuned at
     the fitted model's optimal steady state and the bounds are backed off: what a practitioner does
-    who knows which parameters of the plant have drifted.
+    who knows which parameters of the plant have drifted. With `every` he does so again and again.
     """
 
     Configuration = IdentifiedConfiguration
@@ -51,9 +57,14 @@ class Identified(Practitioner):
         self._model = OneStepModel(self._scenario)
         self._rows: list[Vector] = []
 
-    def learn(self, transition: Transition) -> None:
-        """Keep a transition."""
+    def learn(self, transition: Transition) -> Parameters | None:
+        """Keep a transition; the last of every `every` gives a new fit."""
         self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
+        if len(self._rows) != self._configuration.every:
+            return None
+        fitted = self.conclude()
+        self._rows.clear()
+        return fitted
 
     def conclude(self) -> Parameters:
         """θ with the fitted p and, unless told otherwise, the cost tuned with it.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from typing import Any, Protocol
 
 import numpy as np
@@ -53,7 +54,8 @@ class Interaction:
     `next` gives a sample, or None where the controller failed: then the last applied action is
     applied once more, `failures` counts it and the controller starts from its reference.
     `weakly_active` and `licq_failed` count, of every tenth sample, the policies whose derivatives
-    are one-sided and those whose active constraints are linearly dependent.
+    are one-sided and those whose active constraints are linearly dependent. After `rest_after`
+    samples nothing explores (`rests`).
     """
 
     def __init__(
@@ -63,8 +65,10 @@ class Interaction:
         algorithm: Algorithm,
         strategy: Strategy,
         rng: np.random.Generator,
+        rest_after: int | None = None,
     ) -> None:
         scenario = plant.scenario
+        self._rest_after = inf if rest_after is None else rest_after
         self._plant, self._controller, self._rng = plant, controller, rng
         self._strategy, self._algorithm = strategy, algorithm
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
@@ -86,6 +90,11 @@ class Interaction:
         self.s = self._plant.reset(seed)
         self._controller.reset()
         self._policy = self._solve()
+
+    @property
+    def rests(self) -> bool:
+        """Whether exploration and learning are over, and the rest is for the record."""
+        return self.number >= self._rest_after
 
     def mark(self) -> None:
         """Remember the plant as it is now; raises CapabilityError where it cannot be."""
@@ -133,7 +142,7 @@ class Interaction:
 
     def _choose(self, action: Vector) -> tuple[Vector, bool]:
         """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
-        if not getattr(self._algorithm, "explores", True):
+        if self.rests or not getattr(self._algorithm, "explores", True):
             return self._saturate(action), False
         try:
             explored = self._strategy(action, self._rng, self.number, self._perturbed)

@@ -37,7 +37,9 @@ class Learner:
             strategy,
             self.algorithm_rng,
         )
-        self.interaction = Interaction(plant, self.controller, self.algorithm, strategy, self.rng)
+        self.interaction = Interaction(
+            plant, self.controller, self.algorithm, strategy, self.rng, run.rest_after
+        )
 
     def begin(self) -> None:
         """Reset the plant and solve for its first state."""
@@ -56,7 +58,10 @@ class Learner:
 
         Raises DivergenceError where the rule finds that θ means nothing any more.
         """
+        rests = self.interaction.rests
         transition, cost = self.interaction.next()
+        if rests:
+            return cost, None
         update: Update | None = None
         if transition is not None:
             update = self.algorithm.observe(transition)

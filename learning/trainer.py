@@ -120,7 +120,7 @@ def _with_start(run: TrainingRun, rows: list[LogRow]) -> list[LogRow]:
     """The log with a first row of θ at the start, from which its increments are counted."""
     problem = Problem.from_scenario(run.scenario)
     start = starting_parameters(problem, run.configuration, run.start)
-    figures = dict.fromkeys(COLUMNS, float("nan")) | {"samples": 0.0}
+    figures = dict.fromkeys(rows[0] if rows else COLUMNS, float("nan")) | {"samples": 0.0}
     return [LogRow(figures, start), *rows]
 
 

@@ -19,6 +19,7 @@ from cosim.protocols import Controller
 from learning import checkpoint
 from learning.checkpoint import Checkpoint
 from learning.definiteness import certificate
+from learning.drift import Drift
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.evaluation import Judge
 from learning.learner import Learner
@@ -46,6 +47,8 @@ class TrainingLoop:
     learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on; a plant
     that cannot serialise its state leaves no checkpoint, and `without_checkpoint` says so.
 
+    The log of a plant that drifts has its present state too (`Drift`).
+
     Log, evaluations and files show the θ that the run would end with if it ended there.
     """
 
@@ -71,6 +74,7 @@ class TrainingLoop:
                 int(run.spawned(VALIDATION).generate_state(1, np.uint64)[0]),
                 run.validation_samples,
             )
+        self._drift = Drift.of(run.scenario)
         self._rows: list[LogRow] = []
         self._totals = Totals()
         self.without_checkpoint: str | None = None
@@ -190,6 +194,8 @@ class TrainingLoop:
             "validated_J": cost,
             "accepted": float("nan") if self._validation is None else self._validation.accepted,
         }
+        if self._drift is not None:
+            figures |= self._drift.row(self._plant.time)
         if judged:
             figures |= self._judge.verdict(answer.theta).row()
         self._totals = Totals()

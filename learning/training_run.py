@@ -35,6 +35,9 @@ class TrainingRun:
     `validate_every` the θ handed over is validated that often, in samples, by a greedy run of
     `validation_samples` samples, and the run ends with the best of them (`Validation`).
 
+    After `rest_after` samples, if given, the rule rests: θ stays and nothing explores, while the
+    samples go on to be counted.
+
     The configuration is completed by what the scenario states (`Configuration.for_scenario`).
     """
 
@@ -53,6 +56,7 @@ class TrainingRun:
     start: str = "naive"
     validate_every: int = 0
     validation_samples: int = 1000
+    rest_after: int | None = None
 
     def __post_init__(self) -> None:
         """Complete the configuration; raise ConfigurationError on counts that make no run."""
@@ -67,6 +71,8 @@ class TrainingRun:
         ):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.rest_after is not None and self.rest_after < 1:
+            raise ConfigurationError(f"rest_after must be at least 1, not {self.rest_after}")
         for name in ("evaluate_every", "checkpoint_every", "validate_every"):
             if getattr(self, name) % self.log_every:
                 raise ConfigurationError(

@@ -97,6 +97,15 @@ def train(
             help="Samples of each validation run; they count as plant samples.",
         ),
     ] = 1000,
+    rest_after: Annotated[
+        int | None,
+        typer.Option(
+            "--rest-after",
+            min=1,
+            max=100_000_000,
+            help="Samples after which θ stays and nothing explores; default: never.",
+        ),
+    ] = None,
     controller: Annotated[
         str, typer.Option("--controller", help="What carries θ: rti or converged.")
     ] = "rti",
@@ -166,6 +175,7 @@ def train(
             start=start,
             validate_every=validate_every,
             validation_samples=validation_samples,
+            rest_after=rest_after,
         )
         folder = open_folder(out).absolute()
         if not (resume or overwrite):

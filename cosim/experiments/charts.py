@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.evaluation.statistics import LEVEL
+from cosim.experiments import online
 from cosim.experiments.cases import BASELINES
 from cosim.experiments.records import RunResult
 from cosim.experiments.results import StudyResults
@@ -33,7 +34,10 @@ def draw(results: StudyResults, folder: Path) -> dict[str, list[str]]:
     target.mkdir(parents=True, exist_ok=True)
     drawn: dict[str, list[str]] = {}
     for scenario in results.scenarios:
-        names = [*_regret(results, scenario, target), *_curves(results, scenario, target)]
+        names = _regret(results, scenario, target)
+        if results.about.get("online") is not None:
+            names += online.draw(results, scenario, target, SUFFIXES)
+        names += _curves(results, scenario, target)
         names += _profiles(results, [scenario], f"profile-{_safe(scenario)}", target)
         drawn[scenario] = names
     known = [s for s in results.scenarios if results.optimum(s) is not None]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.experiments.online import ONLINE, online_csv
 from cosim.experiments.plan import Plan, Run
 from cosim.experiments.records import CURVE, EVALUATED, RunResult
 from cosim.experiments.results import ABOUT, SCHEMA, StudyResults
@@ -68,6 +69,7 @@ def collect(plan: Plan, out: Path, stores: Mapping[str, RunStore]) -> StudyResul
         ],
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.naive),
+        "online": None if definition.table.online is None else definition.table.online.model_dump(),
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
         "pictures": [],
@@ -85,6 +87,10 @@ def _relative(path: str, folder: Path) -> str:
 
 def _result(run: Run, store: RunStore) -> RunResult | None:
     """The run's result; None while it is not finished."""
+    if run.online is not None:
+        beside = store.online(run.online.steps, run.online.block)
+        if any(seed not in beside for seed in run.online.seeds):
+            return None
     noise = {file: store.indicators(file, steps) for file, (_, steps) in run.noise.items()}
     if any(seed not in noise[file] for file, (seeds, _) in run.noise.items() for seed in seeds):
         return None
@@ -125,6 +131,8 @@ def write(results: StudyResults, plan: Plan, stores: Mapping[str, RunStore], fig
     pictures = draw(plan, out, stores) if figures else []
     write_atomically(out / EVALUATION, evaluation_csv(results.runs))
     write_atomically(out / CURVES, curves_csv(results.runs))
+    if plan.definition.table.online is not None:
+        write_atomically(out / ONLINE, online_csv(plan, results.runs, stores))
     write_atomically(out / RUNS, to_csv(RUN_COLUMNS, run_rows(results)))
     write_atomically(out / SUMMARY, to_csv(COLUMNS, summary_rows(results)))
     aggregate = aggregate_rows(results)

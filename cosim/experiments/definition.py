@@ -170,6 +170,8 @@ class Definition:
         between = max(1, case.samples // self.table.curves.points)
         rows = -(-between // ROW)
         log_every = max(1, between // rows)
+        if (online := self.table.online) is not None:
+            log_every, rows = online.block, max(1, between // online.block)
         options = {
             "log_every": log_every,
             "evaluate_every": rows * log_every,

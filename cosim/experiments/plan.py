@@ -22,6 +22,15 @@ BLOCK = 20_000
 
 
 @dataclass(frozen=True)
+class Online:
+    """Trainings that a controller runs beside: `seeds`, the longest one's `steps`, the `block`."""
+
+    seeds: tuple[int, ...]
+    steps: int
+    block: int
+
+
+@dataclass(frozen=True)
 class Run:
     """One run: a controller, or a training and the θ that comes of it."""
 
@@ -34,6 +43,8 @@ class Run:
     """Whether a controller is run on the noise of the learning curves, too."""
     traces: tuple[TrajectoryTable, ...] = ()
     """Runs that are kept sample by sample."""
+    online: Online | None = None
+    """The noise of the trainings that a controller runs beside."""
 
     @property
     def noise(self) -> dict[str, tuple[tuple[int, ...], int]]:
@@ -50,7 +61,8 @@ class Run:
         """Plant samples of the run, validation apart."""
         trained = 0 if self.training is None else self.training.samples
         evaluated = sum(len(seeds) * steps for seeds, steps in self.noise.values())
-        return trained + evaluated + sum(trace.steps for trace in self.traces)
+        beside = 0 if self.online is None else len(self.online.seeds) * self.online.steps
+        return trained + evaluated + beside + sum(trace.steps for trace in self.traces)
 
 
 @dataclass(frozen=True)
@@ -95,7 +107,8 @@ def plan(definition: Definition) -> Plan:
         key = RunKey(scenario, case.name, seed)
         curves = training is None and _learns(definition, scenario)
         sizes, traces = definition.sizes(scenario), _traces(definition, case, scenario, seed)
-        runs.append(Run(key, case, training, facts, sizes, curves, traces))
+        online = None if training is not None else _online(definition, scenario)
+        runs.append(Run(key, case, training, facts, sizes, curves, traces, online))
     _check(definition, runs)
     provenance = {
         "versions": versions(),
@@ -117,6 +130,16 @@ def _traces(
         for table in definition.table.trajectory
         if case.name in (table.cases or [case.name]) and scenario in (table.scenarios or [scenario])
     )
+
+
+def _online(definition: Definition, scenario: str) -> Online | None:
+    """The trainings on a scenario, where what they cost is wanted."""
+    trained = [case for case in definition.cases if case.algorithm and scenario in case.scenarios]
+    if definition.table.online is None or not trained:
+        return None
+    seeds = sorted({seed for case in trained for seed in case.training_seeds})
+    steps = max(case.samples for case in trained)
+    return Online(tuple(seeds), steps, definition.table.online.block)
 
 
 def _learns(definition: Definition, scenario: str) -> bool:

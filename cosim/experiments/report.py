@@ -36,6 +36,8 @@ CAPTIONS = {
     "curves": "Learning: above what the training samples themselves cost, below the greedy policy "
     "on held-out noise. Medians over training seeds and their quartiles; a run that diverged is "
     "held where it ended. Dashed: baselines.",
+    "online": "What the runs themselves cost, exploration included: regret against the optimum on "
+    "the same noise, mean over training seeds; above, from the log of the first training seed.",
     "profile": "Performance profile: the share of runs whose regret is at most so much, with a "
     "95 % band (stratified bootstrap over runs).",
 }

@@ -12,6 +12,8 @@ from cosim.experiments.plan import BLOCK, Plan, Run
 from cosim.experiments.protocols import Progress
 from cosim.experiments.store import EVALUATION, RunStore
 from cosim.experiments.units import (
+    Accompanied,
+    Accompany,
     Advance,
     Evaluate,
     Evaluated,
@@ -106,6 +108,15 @@ class Runner:
             units[f"{name}: {trace.name}"] = Trace(
                 place, name, scenario, controller, trace.seed, trace.steps
             )
+        if run.online is not None:
+            seeds, steps, block = run.online.seeds, run.online.steps, run.online.block
+            done = self.stores[name].online(steps, block)
+            self._done[name] += steps * len(done)
+            for seed in seeds:
+                if seed not in done:
+                    units[f"{name}: online {seed}"] = Accompany(
+                        place, name, scenario, controller, seed, steps, block
+                    )
         if not units:
             self._finished.add(name)
         return units
@@ -132,6 +143,12 @@ class Runner:
             self._done[name] += trace.steps
             self._tell(self._finish(name, run))
             return None
+        if isinstance(outcome, Accompanied):
+            assert run.online is not None
+            store.accompany(run.online.steps, run.online.block, outcome.seed, outcome.costs)
+            self._done[name] += run.online.steps
+            self._tell(self._finish(name, run))
+            return None
         assert isinstance(outcome, Evaluated)
         file = what.split()[0]
         _, steps = run.noise[file]
@@ -145,6 +162,10 @@ class Runner:
         store, costs = self.stores[name], []
         if any(store.trajectory(trace) is None for trace in run.traces):
             return ""
+        if run.online is not None:
+            beside = store.online(run.online.steps, run.online.block)
+            if any(seed not in beside for seed in run.online.seeds):
+                return ""
         for file, (seeds, steps) in run.noise.items():
             found = store.indicators(file, steps)
             if any(seed not in found for seed in seeds):

@@ -1,7 +1,7 @@
 """What a study has finished, on disk: a folder for each run, readable and found again.
 
     OUT/runs/SCENARIO/CASE/SEED/   run.json  checkpoint.npz | learning.csv parameters.toml
-                                   evaluation.csv  greedy.csv
+                                   evaluation.csv  greedy.csv  online.csv
 
 Only the process that runs the study writes, so workers need no shared disk.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ RUNS = "runs"
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
 EVALUATION, GREEDY, FAILURE = "evaluation.csv", "greedy.csv", "failure.txt"
+ONLINE = "online.csv"
 INDICATORS = (
     "J",
     "economic_cost",
@@ -153,6 +154,30 @@ class RunStore:
             for seed, values in sorted(known.items())
         )
         self._write(file, csv_text(("seed", "steps", *INDICATORS), rows))
+
+    def online(self, steps: int, block: int) -> dict[int, list[float]]:
+        """Mean costs of blocks by noise seed, of runs of `steps` samples."""
+        path = self.folder / ONLINE
+        found: dict[int, list[float]] = {}
+        if not path.is_file():
+            return found
+        try:
+            for row in read_records(path, StudyError):
+                if (int(row["steps"]), int(row["block"])) == (steps, block):
+                    found.setdefault(int(row["seed"]), []).append(float(row["J"]))
+        except (StudyError, KeyError, ValueError):
+            raise StudyError(f"'{path}' is damaged; delete it to run again") from None
+        return found
+
+    def accompany(self, steps: int, block: int, seed: int, costs: Sequence[float]) -> None:
+        """Add the mean costs of a run's blocks."""
+        known = self.online(steps, block) | {seed: list(costs)}
+        rows = (
+            [str(one), str(steps), str(block), cell(cost)]
+            for one, costs in sorted(known.items())
+            for cost in costs
+        )
+        self._write(ONLINE, csv_text(("seed", "steps", "block", "J"), rows))
 
     def _trace(self, trace: TrajectoryTable) -> Path:
         return self.folder / f"trajectory-{trace.name}-{trace.seed}-{trace.steps}.csv"

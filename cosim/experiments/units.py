@@ -81,6 +81,27 @@ class Trace:
 
 
 @dataclass(frozen=True)
+class Accompany:
+    """A controller on the noise of a training, its cost in blocks of `block` samples."""
+
+    place: Place
+    key: str
+    scenario: Scenario
+    controller: str | Learnt
+    seed: int
+    steps: int
+    block: int
+
+
+@dataclass(frozen=True)
+class Accompanied:
+    """Mean cost per sample of each block; the last may be shorter."""
+
+    seed: int
+    costs: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Traced:
     """A run's trajectory as CSV."""
 
@@ -103,8 +124,8 @@ class Failure:
     trace: str
 
 
-Unit = Advance | Evaluate | Trace
-Outcome = Progress | Evaluated | Traced | Failure
+Unit = Advance | Evaluate | Trace | Accompany
+Outcome = Progress | Evaluated | Traced | Accompanied | Failure
 
 
 def perform(unit: Unit) -> Outcome:
@@ -117,6 +138,8 @@ def perform(unit: Unit) -> Outcome:
         if isinstance(unit, Trace):
             plant = reuse.plant(unit.scenario)
             return Traced(simulate(plant, controller, unit.steps, unit.seed).to_csv())
+        if isinstance(unit, Accompany):
+            return _accompany(unit, controller)
         return _evaluate(unit, controller)
     except Exception as error:
         text = " ".join(f"{error}".split()) or type(error).__name__
@@ -137,7 +160,16 @@ def _evaluate(unit: Evaluate, controller: Controller) -> Evaluated:
     return Evaluated(found, perf_counter() - begin)
 
 
-def _controller(unit: Evaluate | Trace) -> Controller:
+def _accompany(unit: Accompany, controller: Controller) -> Accompanied:
+    plant = reuse.plant(unit.scenario)
+    run = simulate(plant, controller, unit.steps, unit.seed, residuals=False)
+    cost = run.signals["stage_cost"].values + run.signals["penalty"].values
+    firsts = range(0, unit.steps, unit.block)
+    means = (float(cost[first : first + unit.block].mean()) for first in firsts)
+    return Accompanied(unit.seed, tuple(means))
+
+
+def _controller(unit: Evaluate | Trace | Accompany) -> Controller:
     trainer, wanted = unit.place.trainer, unit.controller
 
     def build() -> Controller:

@@ -25,7 +25,8 @@ from cosim.scenario import Scenario
 Array = NDArray[np.float64]
 ROWS = 64
 _TOGETHER = {
-    "cost per sample": ("J", "greedy_J"),
+    "cost per sample": ("J", "greedy_J", "reference_J"),
+    "heat transfer": ("UA2",),
     "TD error": ("td_error", "td_error_mean"),
     "smallest eigenvalue": ("smallest_eigenvalue",),
     "violating share": ("greedy_violating_share",),

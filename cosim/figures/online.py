@@ -1,0 +1,91 @@
+"""The course of regret while learning goes on, under what changes meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import EngFormatter, FuncFormatter
+from numpy.typing import NDArray
+
+from cosim.figures.labels import EndLabel, label_ends
+from cosim.figures.regret import percent
+from cosim.figures.style import REFERENCE, colors, figure, label, save
+
+Array = NDArray[np.float64]
+Signals = Mapping[str, Mapping[str, tuple[Array, Array]]]
+"""Samples and values (K,) by signal and case; one line where a signal is the same in all."""
+FLOOR = 0.1
+"""Regret in % below which the ordinate is linear."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """Regret in % of R runs in K blocks, (R, K), that end at `samples` (K,)."""
+
+    samples: Array
+    regret: Array
+
+
+def plot_online(
+    courses: Mapping[str, Course], signals: Signals, period: int, path: str | Path
+) -> Path:
+    """Draw a panel for each signal, and below the mean regret over runs so far, block by block.
+
+    The lower panel is the running mean since the start: what a case has cost until then. Vertical
+    lines stand at multiples of `period` samples. Raises FigureError as `save` does.
+    """
+    colour = colors(list(courses))
+    rows = len(signals) + 2
+    with figure(1.25 * rows + 1.2) as drawn:
+        ratios = [1.0] * len(signals) + [1.7, 1.7]
+        grid = drawn.subplots(rows, 1, sharex=True, squeeze=False, height_ratios=ratios)
+        axes_column = [axes for (axes,) in grid]
+        end = max(float(course.samples[-1]) for course in courses.values())
+        for axes in axes_column:
+            for edge in np.arange(period, end, period):
+                axes.axvline(edge, color=REFERENCE, linewidth=0.6, linestyle=(0, (1, 2)))
+        for axes, (name, lines) in zip(axes_column, signals.items(), strict=False):
+            _signal(axes, name, lines, colour)
+        blocks = {case: course.regret.mean(axis=0) for case, course in courses.items()}
+        so_far = {
+            case: np.cumsum(values) / np.arange(1, len(values) + 1)
+            for case, values in blocks.items()
+        }
+        titles = ("regret % of the block", "regret % since the start")
+        for axes, means, title in zip(axes_column[-2:], (blocks, so_far), titles, strict=True):
+            for case, values in means.items():
+                axes.plot(courses[case].samples, values, color=colour[case], linewidth=1.2)
+            _scale(axes, np.concatenate(list(means.values())))
+            axes.set_ylabel(title)
+        axes_column[-1].set_xlim(0.0, end)
+        axes_column[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes_column[-1].set_xlabel("samples of the run")
+        drawn.draw_without_rendering()
+        ends = [EndLabel(case, float(so_far[case][-1]), colour[case]) for case in courses]
+        label_ends(axes_column[-1], ends)
+    return save(drawn, path)
+
+
+def _signal(
+    axes: Axes, name: str, lines: Mapping[str, tuple[Array, Array]], colour: Mapping[str, str]
+) -> None:
+    values = [value for _, value in lines.values()]
+    common = all(np.array_equal(value, values[0], equal_nan=True) for value in values)
+    for case, (samples, value) in lines.items():
+        known = ~np.isnan(value)
+        tint = REFERENCE if common else colour[case]
+        axes.plot(samples[known], value[known], color=tint, linewidth=1.2)
+        if common:
+            break
+    axes.set_ylabel(label(name.removeprefix("theta "), ""))
+
+
+def _scale(axes: Axes, values: Array) -> None:
+    low, high = float(values.min()), float(values.max())
+    axes.set_yscale("symlog", linthresh=FLOOR, linscale=0.4)
+    axes.set_ylim(min(low, 0.0) * 1.6 - FLOOR / 4, max(high, FLOOR) * 1.6)
+    axes.yaxis.set_major_formatter(FuncFormatter(percent))

@@ -1,0 +1,33 @@
+"""What changes in a plant that drifts, for the log: the learner is not told."""
+
+from __future__ import annotations
+
+from controllers.quasi_static import DAY, Fouling, QuasiStaticPolicy
+from cosim.scenario import Scenario
+
+COLUMNS = ("UA2", "reference_J")
+
+
+class Drift:
+    """Heat transfer UA2 and quasi-static reference at a time, of a condenser that fouls.
+
+    `of` gives none for another plant, whose log has no such columns.
+    """
+
+    def __init__(self, fouling: Fouling, reference: QuasiStaticPolicy | None) -> None:
+        self._fouling, self._reference = fouling, reference
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Drift | None:
+        """What drifts in a scenario's plant, None where nothing does."""
+        fouling = Fouling.of(scenario)
+        return None if fouling is None else cls(fouling, QuasiStaticPolicy.stored(scenario))
+
+    def row(self, time: float) -> dict[str, float]:
+        """UA2 in kW/K and J* at it, by column, at a time in s; J* is NaN where it is not stored."""
+        days = time / DAY
+        present = float(self._fouling.heat_transfer(days))
+        reference = (
+            float("nan") if self._reference is None else float(self._reference.gain_at(present))
+        )
+        return dict(zip(COLUMNS, (present, reference), strict=True))

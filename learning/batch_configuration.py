@@ -22,6 +22,11 @@ class BatchQLearningConfiguration(KalmanConfiguration):
         "on Q's fit; or the projected Bellman error",
     )
     batch_size: Count = Field(500, description="samples between two updates")
+    first_batch: Count | None = Field(
+        None,
+        description="kalman: samples of the first batch, which gives noise and widths; as the "
+        "others if not given",
+    )
     buffer_size: Count = Field(1000, description="transitions that are replayed, the latest ones")
     iterations: Count = Field(1, description="replays and steps of θ per update")
     relinearisations: Count = Field(2, description="kalman: replays and steps of θ per batch")

@@ -52,8 +52,9 @@ class IteratedKalman:
         self._width = width * configuration.prior_width
         self._model = OneStepModel(scenario)
         self._errors = PredictionErrors(scenario, configuration.prediction_errors)
-        rows, n = configuration.batch_size, scenario.state_lower.size
-        self._buffer = ReplayBuffer(rows)
+        self._variance = 0.0
+        rows, n = max(self._length, configuration.batch_size), scenario.state_lower.size
+        self._buffer = ReplayBuffer(self._length)
         self._batch = {
             "states": np.zeros((rows, n)),
             "prediction_errors": np.zeros((rows, n)),
@@ -64,7 +65,6 @@ class IteratedKalman:
         self._adopt(np.ones(controller.theta.size))
         self._information: Matrix = np.eye(controller.theta.size)
         self._mean: Vector = np.zeros(controller.theta.size)
-        self._variance = 0.0
 
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
@@ -77,22 +77,34 @@ class IteratedKalman:
         batch["corrections"][row] = expected - transition.next_penalty
         self._buffer.add(transition)
         self._filled, self._last = row + 1, transition.number
-        if self._filled < self._configuration.batch_size:
+        if self._filled < self._length:
             return None
         self._filled = 0
-        return self._update()
+        first = self._variance == 0.0
+        update = self._update()
+        if first:
+            self._buffer = ReplayBuffer(self._length)
+        return update
+
+    @property
+    def _length(self) -> int:
+        """Samples of the open batch."""
+        settings = self._configuration
+        first = settings.first_batch if self._variance == 0.0 else None
+        return settings.batch_size if first is None else first
 
     def _update(self) -> Update:
         settings, update, failures = self._configuration, None, 0
+        count = self._length
         information = self._information
         for _ in range(settings.relinearisations):
             replayed = self._buffer.replay(self._controller, self._average_cost)
             failures += replayed.failures
             if not len(replayed.number):
                 break
-            td_error = self._td_error(replayed)
+            td_error = self._td_error(replayed, count)
             if self._variance == 0.0:
-                self._begin(td_error)
+                self._begin(td_error, count)
                 information = self._information
             gradient = replayed.gradient * self._step.scale
             limit = settings.innovation_clip * self._variance**0.5
@@ -112,9 +124,9 @@ class IteratedKalman:
         self._variance += share * (float(squares.mean()) - self._variance)
         return update._replace(failures=failures)
 
-    def _td_error(self, replayed: Replayed) -> Vector:
-        """δ with the next penalty's expectation in place of the penalty, (K,)."""
-        rows = self._configuration.batch_size - 1 - (self._last - replayed.number)
+    def _td_error(self, replayed: Replayed, count: int) -> Vector:
+        """δ with the next penalty's expectation in place of the penalty, (K,), in a batch of `count`."""
+        rows = count - 1 - (self._last - replayed.number)
         discount = self._average_cost.discount
         td_error: Vector = replayed.td_error + discount * self._batch["corrections"][rows]
         if not np.isfinite(td_error).all():
@@ -127,9 +139,9 @@ class IteratedKalman:
         present: Vector = (self._controller.theta - self._anchor) / self._step.scale
         return present
 
-    def _begin(self, td_error: Vector) -> None:
-        """Take the noise, the widths and c_f from the first batch."""
-        batch = self._batch
+    def _begin(self, td_error: Vector, count: int) -> None:
+        """Take the noise, the widths and c_f from the `count` samples of the first batch."""
+        batch = {name: values[:count] for name, values in self._batch.items()}
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
         start = self._controller.parameters
         start = start.replace({"c_f": batch["prediction_errors"].mean(axis=0)})
@@ -176,6 +188,7 @@ class IteratedKalman:
             float(value) for value in state["sums"]
         )
         self._filled, self._last = int(filled), int(last)
+        self._buffer = ReplayBuffer(self._length)
         buffer = {k.removeprefix("buffer_"): v for k, v in state.items() if k.startswith("buffer_")}
         self._buffer.restore(buffer)
 

@@ -108,14 +108,13 @@ class Runner:
             units[f"{name}: {trace.name}"] = Trace(
                 place, name, scenario, controller, trace.seed, trace.steps
             )
-        if run.online is not None:
-            seeds, steps, block = run.online.seeds, run.online.steps, run.online.block
-            done = self.stores[name].online(steps, block)
-            self._done[name] += steps * len(done)
-            for seed in seeds:
+        if (online := run.online) is not None:
+            done = self.stores[name].online(online.steps, online.block)
+            self._done[name] += online.steps * len(done)
+            for seed in online.seeds:
                 if seed not in done:
                     units[f"{name}: online {seed}"] = Accompany(
-                        place, name, scenario, controller, seed, steps, block
+                        place, name, scenario, controller, seed, online.steps, online.block
                     )
         if not units:
             self._finished.add(name)

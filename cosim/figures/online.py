@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -38,7 +39,7 @@ def plot_online(
     The lower panel is the running mean since the start: what a case has cost until then. Vertical
     lines stand at multiples of `period` samples. Raises FigureError as `save` does.
     """
-    colour = colors(list(courses))
+    looks = _looks(list(courses))
     rows = len(signals) + 2
     with figure(1.25 * rows + 1.2) as drawn:
         ratios = [1.0] * len(signals) + [1.7, 1.7]
@@ -49,7 +50,7 @@ def plot_online(
             for edge in np.arange(period, end, period):
                 axes.axvline(edge, color=REFERENCE, linewidth=0.6, linestyle=(0, (1, 2)))
         for axes, (name, lines) in zip(axes_column, signals.items(), strict=False):
-            _signal(axes, name, lines, colour)
+            _signal(axes, name, lines, looks)
         blocks = {case: course.regret.mean(axis=0) for case, course in courses.items()}
         so_far = {
             case: np.cumsum(values) / np.arange(1, len(values) + 1)
@@ -58,27 +59,40 @@ def plot_online(
         titles = ("regret % of the block", "regret % since the start")
         for axes, means, title in zip(axes_column[-2:], (blocks, so_far), titles, strict=True):
             for case, values in means.items():
-                axes.plot(courses[case].samples, values, color=colour[case], linewidth=1.2)
+                axes.plot(courses[case].samples, values, **looks[case])
             _scale(axes, np.concatenate(list(means.values())))
             axes.set_ylabel(title)
         axes_column[-1].set_xlim(0.0, end)
         axes_column[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
         axes_column[-1].set_xlabel("samples of the run")
         drawn.draw_without_rendering()
-        ends = [EndLabel(case, float(so_far[case][-1]), colour[case]) for case in courses]
+        ends = [EndLabel(case, float(so_far[case][-1]), looks[case]["color"]) for case in courses]
         label_ends(axes_column[-1], ends)
     return save(drawn, path)
 
 
+def _looks(cases: list[str]) -> dict[str, dict[str, Any]]:
+    """Colour of each case; one that has another's colour is dashed."""
+    found: dict[str, dict[str, Any]] = {}
+    for case, color in colors(cases).items():
+        taken = any(look["color"] == color for look in found.values())
+        dashes = (0, (4, 1.5)) if taken else "-"
+        found[case] = {"color": color, "linestyle": dashes, "linewidth": 1.2}
+    return found
+
+
 def _signal(
-    axes: Axes, name: str, lines: Mapping[str, tuple[Array, Array]], colour: Mapping[str, str]
+    axes: Axes,
+    name: str,
+    lines: Mapping[str, tuple[Array, Array]],
+    looks: Mapping[str, dict[str, Any]],
 ) -> None:
     values = [value for _, value in lines.values()]
     common = all(np.array_equal(value, values[0], equal_nan=True) for value in values)
     for case, (samples, value) in lines.items():
         known = ~np.isnan(value)
-        tint = REFERENCE if common else colour[case]
-        axes.plot(samples[known], value[known], color=tint, linewidth=1.2)
+        look = {"color": REFERENCE, "linewidth": 1.2} if common else looks[case]
+        axes.plot(samples[known], value[known], **look)
         if common:
             break
     axes.set_ylabel(label(name.removeprefix("theta "), ""))

@@ -1,0 +1,91 @@
+"""What the runs of a study cost themselves: blocks, regret by period, and the figure."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from cosim import FmuPlant, Scenario, simulate
+from cosim.errors import StudyError
+from cosim.experiments.online import tables
+from cosim.experiments.report import write_report
+from cosim.experiments.results import StudyResults
+from tests.helpers.loop import Proportional
+from tests.helpers.toy_trainer import ToyTrainer, study
+
+ONLINE = {"block": 500, "period": 1000, "signals": ["td_error"]}
+
+
+def online(**changes):
+    case = [
+        {"name": "grow", "algorithm": "grow", "samples": 1000},
+        {"controller": ["naive", "best"]},
+    ]
+    return study(online=ONLINE | changes, case=case, logs=["grow"])
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    return online().run(tmp_path_factory.mktemp("online"))
+
+
+def rows(results, case):
+    with (results.folder / "online.csv").open(newline="") as stream:
+        return [row for row in csv.DictReader(stream) if row["case"] == case]
+
+
+def test_a_controller_runs_on_the_noise_of_every_training(results):
+    scenario = Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        run = simulate(plant, Proportional(scenario), 1000, seed=1)
+    cost = (run.signals["stage_cost"].values + run.signals["penalty"].values).reshape(2, 500)
+    found = [row for row in rows(results, "best") if row["training_seed"] == "1"]
+    assert [int(row["samples"]) for row in found] == [500, 1000]
+    np.testing.assert_array_equal([float(row["J"]) for row in found], cost.mean(axis=1))
+
+
+def test_a_training_counts_with_its_own_samples(results):
+    costs = [float(row["J"]) for row in rows(results, "grow")]
+    assert costs == [7000 - 0.5 - 0, 7000 - 1.0 - 0, 7000 - 0.5 - 1, 7000 - 1.0 - 1]
+
+
+def test_the_table_pairs_each_run_with_the_optimum_on_its_noise(results):
+    ((title, header, lines),) = tables(results)
+    assert "paper" in title
+    own = np.array([float(row["J"]) for row in rows(results, "grow")]).reshape(2, 2).mean(axis=1)
+    best = np.array([float(row["J"]) for row in rows(results, "best")]).reshape(2, 2).mean(axis=1)
+    line = dict(zip(header, next(line for line in lines if line[0] == "grow"), strict=True))
+    expected = 100 * (own - best).mean() / best.mean()
+    assert float(line["regret %, mean [95 %]"].split()[0]) == pytest.approx(expected, rel=5e-3)
+    assert float(line["worst"]) == pytest.approx(100 * (own / best - 1).max(), rel=5e-3)
+    assert line["period 1"] == line["regret %, mean [95 %]"].split()[0]
+    assert "0" in next(line for line in lines if line[0] == "best")
+
+
+def test_the_report_has_table_and_figure_and_needs_no_runs(results, tmp_path):
+    page = write_report(StudyResults.load(results.folder), tmp_path).read_text("utf-8")
+    assert "own samples" in page
+    assert "alt='online-paper" in page
+
+
+def test_two_workers_give_the_bytes_of_one(results, tmp_path):
+    again = online().run(tmp_path, jobs=2)
+    content = [(folder / "online.csv").read_bytes() for folder in (results.folder, again.folder)]
+    assert content[0] == content[1]
+
+
+def test_a_run_that_goes_on_does_nothing_twice(results, monkeypatch):
+    monkeypatch.setattr(ToyTrainer, "controller", lambda *_: pytest.fail("was done"))
+    again = online().run(results.folder)
+    assert rows(again, "best")
+
+
+def test_a_study_without_it_has_no_such_table(tmp_path):
+    plain = study().run(tmp_path)
+    assert tables(plain) == []
+    assert not (tmp_path / "online.csv").exists()
+
+
+def test_a_period_is_made_of_whole_blocks():
+    with pytest.raises(StudyError, match="period: must be a multiple of block = 500"):
+        online(period=750)

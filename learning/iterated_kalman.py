@@ -125,7 +125,7 @@ class IteratedKalman:
         return update._replace(failures=failures)
 
     def _td_error(self, replayed: Replayed, count: int) -> Vector:
-        """δ with the next penalty's expectation in place of the penalty, (K,), in a batch of `count`."""
+        """δ with the next penalty's expectation in its place, (K,), in a batch of `count`."""
         rows = count - 1 - (self._last - replayed.number)
         discount = self._average_cost.discount
         td_error: Vector = replayed.td_error + discount * self._batch["corrections"][rows]

@@ -19,7 +19,7 @@ from cosim.experiments.store import RunStore, safe
 from cosim.experiments.tables import KEYS, read_numbers, to_csv
 from cosim.experiments.traces import LOGS
 from cosim.figures.online import Course, plot_online
-from cosim.files import read_records
+from cosim.text_tables import read_records
 
 Array = NDArray[np.float64]
 Costs = dict[str, dict[int, Array]]

@@ -8,6 +8,7 @@ import pytest
 from controllers.economic import tune
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.quasi_static import Fouling
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant, Scenario, simulate
 from learning.errors import ConfigurationError
@@ -29,7 +30,7 @@ SETTINGS = {
 def make_run(name, scenario="paper", **changes):
     values = {
         "algorithm": name,
-        "scenario": Scenario.load(scenario),
+        "scenario": Scenario.load(scenario) if isinstance(scenario, str) else scenario,
         "samples": 450,
         "seed": 3,
         "configuration": load_algorithm(name).Configuration.from_dict(SETTINGS[name]),
@@ -134,6 +135,22 @@ def test_identification_finds_the_fouled_condenser_and_tunes_with_it():
     expected = tune(dataclasses.replace(problem, model=fouled)).parameters
     for name in ("B_l", "b_l", "B_Vf", "b_Vf"):
         assert theta[name] == pytest.approx(expected[name], rel=1e-9)
+
+
+def test_identification_again_and_again_follows_a_parameter():
+    document = {"plant": {"parameters": {"fouling_rate": 30.0, "cleaning_period": 60.0}}}
+    scenario = Scenario.load("drifting").replace(document)
+    configuration = load_algorithm("identified").Configuration.from_dict(
+        {"back_off": False, "every": 150}
+    )
+    run = make_run("identified", scenario=scenario, configuration=configuration, start="naive")
+    rows = train(run).rows
+    law = Fouling.of(scenario).heat_transfer
+    for row in rows[3::3]:
+        # The fit is of the 150 samples before it, that is of their middle.
+        last = row["samples"] - row["samples"] % 150
+        fitted = float(row.parameters["p"][0])
+        assert fitted == pytest.approx(float(law((last - 75) / 1440)), rel=0.03)
 
 
 def test_the_policy_search_hands_over_the_mean_and_improves(scenario, problem):

@@ -1,8 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
-from cosim import FmuPlant
+from cosim import FmuPlant, Scenario
 from learning import QLearning
+from learning.errors import ConfigurationError
 from learning.learner import Learner
 from learning.protocols import Update
 from learning.training_run import TrainingRun
@@ -54,3 +57,21 @@ def test_failures_of_an_update_count_with_those_of_the_loop(plant):
     for _ in range(5):
         learner.advance()
     assert learner.interaction.failures == 10
+
+
+def test_a_rule_that_rests_neither_moves_nor_explores(plant):
+    run = dataclasses.replace(make_run(plant.scenario), rest_after=40)
+    learner = Learner(run, QLearning, plant)
+    learner.begin()
+    updates = [learner.advance()[1] for _ in range(40)]
+    assert updates[-1] is not None
+    theta, explored = learner.controller.theta.copy(), learner.interaction.explored
+    assert explored > 0
+    assert [learner.advance()[1] for _ in range(40)] == [None] * 40
+    np.testing.assert_array_equal(learner.controller.theta, theta)
+    assert learner.interaction.explored == explored
+
+
+def test_a_rest_begins_after_a_sample():
+    with pytest.raises(ConfigurationError, match="rest_after must be at least 1"):
+        dataclasses.replace(make_run(Scenario.load("paper")), rest_after=0)

@@ -144,7 +144,8 @@ class IteratedKalman:
         batch = {name: values[:count] for name, values in self._batch.items()}
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
         start = self._controller.parameters
-        start = start.replace({"c_f": batch["prediction_errors"].mean(axis=0)})
+        if self._configuration.measure_offset:
+            start = start.replace({"c_f": batch["prediction_errors"].mean(axis=0)})
         self._controller.theta = start.theta
         self._anchor = start.theta.copy()
         scale = prior_deviation(

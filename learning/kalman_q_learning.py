@@ -32,6 +32,11 @@ class KalmanConfiguration(QConfiguration):
     prior_samples: Count = Field(
         500, description="kalman: first samples, at which θ rests: they give noise and widths"
     )
+    measure_offset: bool = Field(
+        True,
+        description="kalman: c_f starts as the mean of the first prediction errors, else as in θ; a "
+        "start that has learnt its offset keeps it",
+    )
     step_every: Count = Field(50, description="kalman: samples per step of θ")
     innovation_clip: Positive = Field(
         3.0, description="kalman: innovations are cut at this many standard deviations"
@@ -126,7 +131,8 @@ class KalmanQLearning:
         if not np.isfinite(variance):
             raise DivergenceError("TD errors are not finite")
         start = self._controller.parameters
-        start = start.replace({"c_f": first["prediction_errors"].mean(axis=0)})
+        if settings.measure_offset:
+            start = start.replace({"c_f": first["prediction_errors"].mean(axis=0)})
         level = max(abs(float(start["c_lambda"])), variance**0.5)
         scale = prior_deviation(
             start,

@@ -34,8 +34,8 @@ class KalmanConfiguration(QConfiguration):
     )
     measure_offset: bool = Field(
         True,
-        description="kalman: c_f starts as the mean of the first prediction errors, else as in θ; a "
-        "start that has learnt its offset keeps it",
+        description="kalman: c_f becomes the mean of the first prediction errors; false: it "
+        "starts as it is, for a start that has learnt its offset",
     )
     step_every: Count = Field(50, description="kalman: samples per step of θ")
     innovation_clip: Positive = Field(

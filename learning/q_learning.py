@@ -43,8 +43,8 @@ OPTIONS = {
         "update_every", "gain", "gain_end", "memory", "ridge", "largest_step", "warm_up",
     ),
     ("kalman",): (
-        "prior_width", "prior_samples", "measure_offset", "step_every", "innovation_clip", "variance_memory",
-        "prediction_errors", "parameter_drift",
+        "prior_width", "prior_samples", "measure_offset", "step_every", "innovation_clip",
+        "variance_memory", "prediction_errors", "parameter_drift",
     ),
 }  # fmt: skip
 """Which hyperparameters belong to which rules."""

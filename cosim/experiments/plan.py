@@ -107,7 +107,7 @@ def plan(definition: Definition) -> Plan:
         key = RunKey(scenario, case.name, seed)
         curves = training is None and _learns(definition, scenario)
         sizes, traces = definition.sizes(scenario), _traces(definition, case, scenario, seed)
-        online = None if training is not None else _online(definition, scenario)
+        online = None if training is not None else _online(definition, case, scenario)
         runs.append(Run(key, case, training, facts, sizes, curves, traces, online))
     _check(definition, runs)
     provenance = {
@@ -132,10 +132,11 @@ def _traces(
     )
 
 
-def _online(definition: Definition, scenario: str) -> Online | None:
-    """The trainings on a scenario, where what they cost is wanted."""
+def _online(definition: Definition, controller: Case, scenario: str) -> Online | None:
+    """The trainings that a controller of the study, or the optimum, runs beside."""
     trained = [case for case in definition.cases if case.algorithm and scenario in case.scenarios]
-    if definition.table.online is None or not trained:
+    wanted = controller in definition.cases or controller.name == definition.optima.get(scenario)
+    if definition.table.online is None or not trained or not wanted:
         return None
     seeds = sorted({seed for case in trained for seed in case.training_seeds})
     steps = max(case.samples for case in trained)

@@ -3,10 +3,13 @@ import pytest
 
 from controllers.errors import QpError
 from controllers.rti import RtiNmpc
+from cosim import FmuPlant
 from learning import BatchQLearning
 from learning.batch_q_learning import RULES, gauss_newton, projected_bellman, steepest_descent
 from learning.interaction import Interaction
+from learning.learner import Learner
 from learning.starting_point import build_strategy
+from learning.training_run import TrainingRun
 
 
 @pytest.fixture
@@ -119,3 +122,19 @@ def test_an_update_counts_the_qps_that_failed_in_its_replay(linear_quadratic):
     assert bench.update().failures == 0
     controller.failing = True
     assert 0 < bench.update().failures < 40
+
+
+def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenario, problem):
+    algorithm = BatchQLearning
+    settings = {"globalisation": "none", "first_batch": 60, "batch_size": 20}
+    offsets = {}
+    for measured in (True, False):
+        configuration = algorithm.Configuration.from_dict(settings | {"measure_offset": measured})
+        run = TrainingRun("batch-q-learning", scenario, 120, 3, configuration, start="tuned")
+        with FmuPlant(scenario) as plant:
+            learner = Learner(run, algorithm, plant)
+            learner.begin()
+            updates = [learner.advance()[1] is not None for _ in range(120)]
+        assert np.flatnonzero(updates).tolist() == [59, 79, 99, 119]
+        offsets[measured] = learner.controller.parameters["c_f"]
+    assert np.abs(offsets[False]).max() < 0.1 * np.abs(offsets[True]).max()

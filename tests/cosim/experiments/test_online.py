@@ -89,3 +89,11 @@ def test_a_study_without_it_has_no_such_table(tmp_path):
 def test_a_period_is_made_of_whole_blocks():
     with pytest.raises(StudyError, match="period: must be a multiple of block = 500"):
         online(period=750)
+
+
+def test_of_the_references_only_the_optimum_runs_beside(tmp_path):
+    case = [{"name": "grow", "algorithm": "grow", "samples": 500}]
+    found = study(online=ONLINE, case=case).run(tmp_path)
+    assert rows(found, "best")
+    assert not rows(found, "naive")
+    assert found.of("naive", "paper")

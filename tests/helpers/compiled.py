@@ -20,10 +20,11 @@ FLAGS = ("-std=c99", "-O0", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", 
 
 QP = """
 #include "qp.h"
-int solve(const Qp *qp, double *v, double *nu, double *lam, double *measures) {
+int solve(const Qp *qp, double *guess, double *v, double *nu, double *lam, double *measures) {
     static QpWork work;
     QpStatus status = qp_load(qp, &work);
-    if (status == QP_SOLVED) status = qp_solve(qp, &work);
+    if (status == QP_SOLVED) status = qp_solve(qp, &work, guess);
+    if (status == QP_SOLVED) qp_remember(&work, guess);
     memcpy(v, work.v, sizeof work.v);
     memcpy(nu, work.nu, sizeof work.nu);
     memcpy(lam, work.lam, sizeof work.lam);
@@ -72,14 +73,20 @@ class CompiledQpSolver:
         self._library = library(folder, sources, f"-DQP_N={variables}", f"-DQP_ROWS={rows}")
         self._sizes = variables, variables, rows
 
-    def solve(self, qp: SoftQp) -> tuple[int, QpSolution, float, int]:
-        """Status, solution, the residual by the solver's own measure, and iterations."""
+    def solve(
+        self, qp: SoftQp, guess: np.ndarray | None = None
+    ) -> tuple[int, QpSolution, float, int]:
+        """Status, solution, the residual by the solver's own measure, and iterations.
+
+        `guess` (variables + rows,) is the working set to begin with and becomes the solution's.
+        """
+        guess = np.zeros(self._sizes[0] + self._sizes[2]) if guess is None else guess
         names = ("H", "f", "lower", "upper", "rows", "row_lower", "row_upper", "w", "W")
         arrays = [np.ascontiguousarray(getattr(qp, name), dtype=np.float64) for name in names]
         data = (ctypes.c_void_p * len(names))(*[array.ctypes.data for array in arrays])
         parts = [np.zeros(size) for size in self._sizes]
         measures = np.zeros(2)
-        status = self._library.solve(data, *map(_pointer, parts), _pointer(measures))
+        status = self._library.solve(data, *map(_pointer, (guess, *parts, measures)))
         return status, QpSolution(*parts), float(measures[0]), int(measures[1])
 
 

@@ -63,6 +63,9 @@ static void core_commit(CoreState *state) {
 
 /* Whether a state could be one that the functions above leave behind. */
 static inline int core_plausible(const CoreState *state) {
+    for (int i = 0; i < QP_LIMITS; i++)
+        if (!qp_is_mode(i, state->guess.set[i]) || !qp_is_mode(i, state->solution.next.set[i]))
+            return 0;
     return all_finite(&state->guess.x[0][0], sizeof state->guess / sizeof(double)) &&
            all_finite(&state->solution.x[0][0], sizeof state->solution / sizeof(double)) &&
            all_finite(state->action, N_U) && all_finite(state->applied, N_U) &&

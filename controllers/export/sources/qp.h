@@ -28,11 +28,16 @@
 
 enum { QP_LIMITS = QP_N + QP_ROWS, QP_ITERATIONS = 40 * QP_LIMITS, QP_ROUNDS = 4 * QP_LIMITS };
 
+/* How often a guess of the working set is mended before it is dropped. */
+enum { QP_GUESSES = 4 };
+
 /* Violations that are overlooked, relative to 1 + |limit|: on the way, and in the end. */
 #define QP_COARSE 1e-8
 #define QP_FINE 1e-12
 /* Changes of a multiplier that are zero, relative to the constraints' norms. */
 #define QP_ROUNDING 1e-11
+/* What a member of a guess must add to the working set, relative to its own square. */
+#define QP_INDEPENDENT 1e-8
 
 typedef enum { QP_SOLVED, QP_NOT_CONVEX, QP_ITERATION_LIMIT, QP_NOT_FINITE } QpStatus;
 
@@ -231,16 +236,17 @@ static int qp_most_violated(const Qp *qp, QpWork *work, double tolerance) {
     return worst;
 }
 
-/* Let member k leave, or change between `at` and `beyond` its limit. */
-static void qp_change(const Qp *qp, QpWork *work, int k) {
+/* Let member k leave, or change between `at` and `beyond` its limit; whether it could. */
+static int qp_change(const Qp *qp, QpWork *work, int k) {
     const int i = work->member[k];
+    const QpMode before = work->mode[i];
     const double w = i < QP_N ? 0.0 : qp->w[i - QP_N];
     const int leaves = work->mode[i] == QP_AT && work->step[k] < 0.0;
     qp_remove(work, k);
     if (leaves) {
         work->mode[i] = QP_OUT;
         work->mu[i] = 0.0;
-        return;
+        return 1;
     }
     work->mode[i] = work->mode[i] == QP_AT ? QP_BEYOND : QP_AT;
     work->mu[i] = w;
@@ -251,11 +257,13 @@ static void qp_change(const Qp *qp, QpWork *work, int k) {
         pivot = qp_project(qp, work, i);
     }
     qp_append(work, i, pivot);
+    return work->mode[i] != before;
 }
 
 /* Raise the multiplier of p until its constraint is met, while the set changes as it must. */
 static QpStatus qp_enter(const Qp *qp, QpWork *work, int p, double violation) {
     const int equation = work->mode[p] == QP_FIXED;
+    char held[QP_LIMITS] = {0}; /* members that could not change since the set last did */
     if (!equation) work->mode[p] = QP_AT;
     work->mu[p] = 0.0;
     for (; work->iterations < QP_ITERATIONS; work->iterations++) {
@@ -277,7 +285,7 @@ static QpStatus qp_enter(const Qp *qp, QpWork *work, int p, double violation) {
             const int i = work->member[k];
             double room = INFINITY;
             /* Steps of rounding's size would block for ever where they cannot be taken. */
-            if (work->mode[i] == QP_FIXED ||
+            if (work->mode[i] == QP_FIXED || held[i] ||
                 fabs(step[k]) * work->norm[i] <= QP_ROUNDING * work->norm[p])
                 continue;
             if (step[k] < 0.0)
@@ -305,8 +313,11 @@ static QpStatus qp_enter(const Qp *qp, QpWork *work, int p, double violation) {
         }
         if (blocking == work->count)
             work->mode[p] = QP_BEYOND;
-        else
-            qp_change(qp, work, blocking);
+        else {
+            const int i = work->member[blocking];
+            if (qp_change(qp, work, blocking)) memset(held, 0, sizeof held);
+            else held[i] = 1;
+        }
     }
     return QP_ITERATION_LIMIT;
 }
@@ -373,7 +384,55 @@ static int qp_release(QpWork *work) {
     return 0;
 }
 
-static QpStatus qp_active_set(const Qp *qp, QpWork *work) {
+/* Let every member change its mode or leave whose multiplier is none of its mode; how many there were. */
+static int qp_mend(const Qp *qp, QpWork *work) {
+    int changes = 0;
+    for (int k = work->count - 1; k >= 0; k--) { /* a change moves only what lies behind it */
+        const int i = work->member[k];
+        const double mu = work->mu[i], w = i < QP_N ? INFINITY : qp->w[i - QP_N];
+        if (work->mode[i] == QP_FIXED || (mu >= 0.0 && (work->mode[i] == QP_AT) == (mu <= w)))
+            continue;
+        work->step[k] = mu < 0.0 ? -1.0 : 1.0;
+        qp_change(qp, work, k);
+        changes++;
+    }
+    return changes;
+}
+
+/* Take a guess of the working set in and mend it; whether the multipliers are then those of an
+ * optimum of the QP with these limits alone, which is where a dual method may begin. */
+static int qp_adopt(const Qp *qp, QpWork *work, const double guess[QP_LIMITS]) {
+    const int equations = work->count;
+    for (int i = 0; i < QP_LIMITS; i++) {
+        if (guess[i] == 0.0 || work->mode[i] == QP_FIXED) continue;
+        work->side[i] = guess[i] > 0.0 ? 1.0 : -1.0;
+        if (!isfinite(qp_limit(qp, work, i))) continue;
+        work->mode[i] = fabs(guess[i]) > 1.0 ? QP_BEYOND : QP_AT;
+        const double pivot = qp_project(qp, work, i);
+        if (pivot > QP_INDEPENDENT * work->gram[i])
+            qp_append(work, i, pivot);
+        else
+            work->mode[i] = QP_OUT;
+    }
+    if (work->count == equations) return 1;
+    for (int k = 0; k < QP_GUESSES; k++, work->iterations++) {
+        qp_refine(qp, work);
+        if (qp_mend(qp, work) == 0) return 1;
+    }
+    return 0;
+}
+
+/* From the optimum without limits to that with the equations alone. */
+static QpStatus qp_begin(const Qp *qp, QpWork *work) {
+    double y[QP_N] = {0.0};
+    work->count = 0;
+    for (int i = 0; i < QP_LIMITS; i++) {
+        work->mode[i] = QP_OUT;
+        work->mu[i] = 0.0;
+        work->side[i] = 1.0;
+    }
+    for (int j = 0; j < QP_N; j++) qp_add_rows(work, -qp->f[j], j, y);
+    qp_back(work, y, work->v);
     for (int i = 0; i < QP_N; i++) {
         if (qp->lower[i] != qp->upper[i]) continue;
         const double violation = qp_violation(qp, work, i);
@@ -381,6 +440,10 @@ static QpStatus qp_active_set(const Qp *qp, QpWork *work) {
         const QpStatus status = qp_enter(qp, work, i, violation);
         if (status != QP_SOLVED) return status;
     }
+    return QP_SOLVED;
+}
+
+static QpStatus qp_active_set(const Qp *qp, QpWork *work) {
     /* At first to a tolerance above the rounding of many steps, then one step between refinements:
      * twins (a bound and a row with one limit) would otherwise take turns for ever. */
     for (int k = 0; k < 4 * QP_LIMITS; k++) {
@@ -402,21 +465,32 @@ static QpStatus qp_active_set(const Qp *qp, QpWork *work) {
     return QP_ITERATION_LIMIT;
 }
 
-/* Solve the QP whose matrices were loaded. */
-static QpStatus qp_solve(const Qp *qp, QpWork *work) {
-    double y[QP_N] = {0.0};
-    work->count = work->iterations = 0;
-    for (int i = 0; i < QP_LIMITS; i++) {
-        work->mode[i] = QP_OUT;
-        work->mu[i] = 0.0;
-        work->side[i] = 1.0;
+/* Solve the QP whose matrices were loaded, beginning with a guess of its working set: by constraint
+ * 0 where it is out, ±1 at its upper or lower limit, ±2 beyond it. The solution does not depend on
+ * the guess but for rounding. */
+static QpStatus qp_solve(const Qp *qp, QpWork *work, const double guess[QP_LIMITS]) {
+    work->iterations = 0;
+    QpStatus status = qp_begin(qp, work);
+    if (status == QP_SOLVED && qp_adopt(qp, work, guess)) {
+        status = qp_active_set(qp, work);
+    } else if (status == QP_SOLVED) {
+        status = qp_begin(qp, work);
+        if (status == QP_SOLVED) status = qp_active_set(qp, work);
     }
-    for (int j = 0; j < QP_N; j++) qp_add_rows(work, -qp->f[j], j, y);
-    qp_back(work, y, work->v);
-    const QpStatus status = qp_active_set(qp, work);
     for (int i = 0; i < QP_N; i++) work->nu[i] = work->side[i] * work->mu[i];
     for (int r = 0; r < QP_ROWS; r++) work->lam[r] = work->side[QP_N + r] * work->mu[QP_N + r];
     return status;
+}
+
+/* The working set of the solution, as a guess for a QP like it. */
+static void qp_remember(const QpWork *work, double guess[QP_LIMITS]) {
+    static const double weight[] = {0.0, 1.0, 2.0, 0.0};
+    for (int i = 0; i < QP_LIMITS; i++) guess[i] = work->side[i] * weight[work->mode[i]];
+}
+
+/* Whether `guess` is one of constraint i. */
+static inline int qp_is_mode(int i, double guess) {
+    return guess == 0.0 || fabs(guess) == 1.0 || (i >= QP_N && fabs(guess) == 2.0);
 }
 
 static double qp_clip(double value, double lower, double upper) {

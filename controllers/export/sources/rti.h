@@ -13,9 +13,11 @@
 
 enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1 };
 
-/* Where the next QP is linearised: states x_0 … x_{N−1}, actions, costates χ_1 … χ_N. */
+/* Where the next QP is linearised: states x_0 … x_{N−1}, actions, costates χ_1 … χ_N; and the
+ * working set that its solver begins with. */
 typedef struct {
     double x[HORIZON][N_X], u[HORIZON][N_U], costates[HORIZON][N_X];
+    double set[QP_LIMITS];
 } RtiGuess;
 
 /* What a sample found: predicted x_0 … x_N and u_0 … u_{N−1}, and the guess for the next sample. */
@@ -88,7 +90,7 @@ static int rti_sample(const RtiGuess *guess, const double theta[], const double 
                    prepared + PREPARED_Gamma, embedded + EMBEDDED_lower,
                    embedded + EMBEDDED_upper, w,                     W};
     QpStatus status = qp_load(&qp, &work);
-    if (status == QP_SOLVED) status = qp_solve(&qp, &work);
+    if (status == QP_SOLVED) status = qp_solve(&qp, &work, guess->set);
     if (status != QP_SOLVED) return status;
     {
         const double *arguments[READ_ARG] = {s, work.v, work.lam, prepared + PREPARED_A,
@@ -108,6 +110,7 @@ static int rti_sample(const RtiGuess *guess, const double theta[], const double 
     memcpy(solution->next.x, read + READ_next_x, sizeof solution->next.x);
     memcpy(solution->next.u, read + READ_next_u, sizeof solution->next.u);
     memcpy(solution->next.costates, read + READ_next_chi, sizeof solution->next.costates);
+    qp_remember(&work, solution->next.set);
     solution->value = read[READ_value];
     solution->residual = qp_residual(&qp, &work);
     solution->iterations = work.iterations;

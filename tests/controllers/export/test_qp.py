@@ -27,15 +27,30 @@ def solver(tmp_path_factory: pytest.TempPathFactory) -> CompiledQpSolver:
     return CompiledQpSolver(tmp_path_factory.mktemp("qp"), 20, 20)
 
 
+def _guesses(last: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Working sets to begin with, most of them wrong: of the QP before, and at random."""
+    wild = rng.choice([-2.0, -1.0, 0.0, 1.0, 2.0], size=last.size)
+    wild[:20] = np.sign(wild[:20])  # a bound is never beyond its limit
+    return {"none": np.zeros(last.size), "last": last.copy(), "wild": wild}
+
+
 def _check(solver: CompiledQpSolver, count: int, peers: tuple[type, ...], seed: int) -> Counter:
     """Solve `count` QPs; the residual is that of `QpSolution`, written independently."""
     solved: Counter = Counter()
+    rng, last = np.random.default_rng(seed), np.zeros(40)
     for k, (family, qp) in enumerate(random_qps(count, seed)):
-        status, solution, own, _ = solver.solve(qp)
-        assert status == 0, (k, family)
-        residual = solution.residuals(qp).largest
-        assert residual < RESIDUAL, (k, family)
-        assert own == pytest.approx(residual, abs=RESIDUAL / 10)
+        found = {}
+        for name, guess in _guesses(last, rng).items():
+            status, solution, own, _ = solver.solve(qp, guess)
+            assert status == 0, (k, family, name)
+            residual = solution.residuals(qp).largest
+            assert residual < RESIDUAL, (k, family, name)
+            assert own == pytest.approx(residual, abs=RESIDUAL / 10)
+            found[name], last = solution, guess
+        solution = found["none"]
+        for name, other in found.items():
+            difference = np.abs(solution.v - other.v) / (1 + np.abs(solution.v))
+            assert difference.max() < RESIDUAL, (k, family, name)
         for peer in peers:
             try:
                 backend = peer()
@@ -66,6 +81,17 @@ def test_daqp_and_proxqp_find_the_same_solution(solver: CompiledQpSolver) -> Non
 def test_a_hundred_thousand_qps_against_daqp_and_proxqp(solver: CompiledQpSolver) -> None:
     solved = _check(solver, 100_000, (DaqpBackend, ProxQpBackend), seed=3)
     print(f"solved by peers: {dict(solved)}")
+
+
+def test_a_solution_is_found_again_from_its_working_set_without_a_step(solver) -> None:
+    for family, qp in random_qps(200, seed=6):
+        if family == "integers":  # of ties, of which any may be taken
+            continue
+        guess = np.zeros(40)
+        cold = solver.solve(qp, guess)
+        warm = solver.solve(qp, guess)
+        assert warm[3] == 0
+        np.testing.assert_allclose(warm[1].v, cold[1].v, rtol=1e-9, atol=1e-9)
 
 
 def test_the_solution_does_not_depend_on_what_was_solved_before(solver) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import fmpy
 import numpy as np
 import pytest
+from fmpy import fmi2
 
 from controllers.factories import naive, tuned
 from cosim import FmuPlant, Scenario, simulate
@@ -78,6 +79,43 @@ def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
         expected = simulate(plant, tuned(scenario), SAMPLES, 5)
     for column, name in enumerate(("X2", "P2", "P100", "F200"), start=1):
         np.testing.assert_allclose(rows[:, column], expected[name], rtol=0, atol=ACTION)
+
+
+def test_another_instance_goes_on_from_its_bytes_with_the_same_bits(exported, tmp_path):
+    """The guess and the QP solver's working set are part of the state."""
+    fmpy.extract(str(exported[0]), str(tmp_path))
+    one, other = [_instance(tmp_path) for _ in range(2)]
+    states = np.random.default_rng(0).normal((25.3, 50.0), (0.5, 1.0), (12, 2))
+    for k, s in enumerate(states):
+        if k == 6:
+            other.setFMUstate(other.deSerializeFMUstate(one.serializeFMUstate(one.getFMUstate())))
+        found = [_sample(fmu, s, 60.0 * k) for fmu in ((one,) if k < 6 else (one, other))]
+        assert found[0] == found[-1]
+    one.freeInstance()
+    other.freeInstance()
+
+
+def _instance(folder):
+    description = fmpy.read_model_description(str(folder))
+    fmu = fmi2.FMU2Slave(
+        guid=description.guid,
+        unzipDirectory=str(folder),
+        modelIdentifier=description.coSimulation.modelIdentifier,
+        instanceName="test",
+    )
+    fmu.instantiate()
+    fmu.setupExperiment()
+    fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+    fmu.references = [v.valueReference for v in description.modelVariables]
+    return fmu
+
+
+def _sample(fmu, s, time):
+    """Every variable after the sample of state `s`."""
+    fmu.setReal(fmu.references[:2], list(s))
+    fmu.doStep(currentCommunicationPoint=time, communicationStepSize=60.0)
+    return fmu.getReal(fmu.references)
 
 
 def test_theta_set_in_the_fmu_is_the_controller_with_that_theta(exported):

@@ -35,18 +35,15 @@ def model_description(version: FmiVersion, token: str, model: Model = EVAPORATOR
     """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
     root = _root(version, token, model)
     _interfaces(root, version, model)
-    add_units(root, model.units)
+    _units(root, model.units)
     if any(variable.type is Type.LAW for variable in model.variables):
         _types(root, version)
-    add_categories(root)
-    ElementTree.SubElement(
-        root,
-        "DefaultExperiment",
-        startTime="0",
-        stopTime=f"{model.stop_time:g}",
-        tolerance="1e-8",
-        stepSize=f"{model.step_size:g}",
-    )
+    _categories(root)
+    experiment = {"startTime": "0", "stopTime": _number(model.stop_time), "tolerance": "1e-8"}
+    if model.sampled:
+        del experiment["tolerance"]
+    experiment["stepSize"] = _number(model.step_size)
+    ElementTree.SubElement(root, "DefaultExperiment", experiment)
     variables = ElementTree.SubElement(root, "ModelVariables")
     for variable in model.exported(version):
         (_variable2 if version == 2 else _variable3)(variables, variable, model)
@@ -112,7 +109,8 @@ def _interfaces(root: ElementTree.Element, version: FmiVersion, model: Model) ->
             "providesDirectionalDerivatives": derivatives,
             "providesAdjointDerivatives": derivatives,
         }
-    simulation = {**exchange, "canHandleVariableCommunicationStepSize": "true"}
+    any_step = "false" if model.sampled else "true"
+    simulation = {**exchange, "canHandleVariableCommunicationStepSize": any_step}
     for tag, attributes in (("ModelExchange", exchange), ("CoSimulation", simulation)):
         if tag == "ModelExchange" and not model.model_exchange:
             continue
@@ -122,14 +120,14 @@ def _interfaces(root: ElementTree.Element, version: FmiVersion, model: Model) ->
             ElementTree.SubElement(sources, "File", name="fmi2.c")
 
 
-def add_categories(root: ElementTree.Element) -> None:
+def _categories(root: ElementTree.Element) -> None:
     """Append the categories of log messages that the C sources know."""
     categories = ElementTree.SubElement(root, "LogCategories")
     for name, text in _LOG_CATEGORIES.items():
         ElementTree.SubElement(categories, "Category", name=name, description=text)
 
 
-def add_units(root: ElementTree.Element, defined: Iterable[Unit]) -> None:
+def _units(root: ElementTree.Element, defined: Iterable[Unit]) -> None:
     """Append UnitDefinitions, the same in FMI 2.0 and 3.0."""
     units = ElementTree.SubElement(root, "UnitDefinitions")
     for unit in defined:
@@ -153,12 +151,19 @@ def _types(root: ElementTree.Element, version: FmiVersion) -> None:
         ElementTree.SubElement(enumeration, "Item", name=name, value=str(value), description=text)
 
 
-def common_attributes(variable: Variable, reference: int) -> dict[str, str]:
+def _number(value: float) -> str:
+    """The shortest text that reads back to `value`, without a fraction where there is none."""
+    return repr(float(value)).removesuffix(".0")
+
+
+def _common_attributes(variable: Variable, model: Model) -> dict[str, str]:
     """The attributes that every variable has in FMI 2.0 and 3.0."""
     causality, variability, initial = _CAUSALITY[variable.kind]
+    if variable.kind is Kind.OUTPUT and model.sampled:
+        variability = "discrete"
     attributes = {
         "name": variable.name,
-        "valueReference": str(reference),
+        "valueReference": str(model.value_reference(variable.name)),
         "description": variable.description,
         "causality": causality,
         "variability": variability,
@@ -168,9 +173,9 @@ def common_attributes(variable: Variable, reference: int) -> dict[str, str]:
     return attributes
 
 
-def real_attributes(variable: Variable) -> dict[str, str]:
+def _real_attributes(variable: Variable) -> dict[str, str]:
     """Unit, range, nominal and start value of a real variable."""
-    attributes = {"unit": variable.unit}
+    attributes = {"unit": variable.unit} if variable.unit else {}
     for key in ("min", "max", "nominal", "start"):
         value = getattr(variable, key)
         if value is not None and not (key == "nominal" and value == 0.0):
@@ -187,9 +192,7 @@ def _state_of(variable: Variable) -> str:
 
 
 def _variable2(parent: ElementTree.Element, variable: Variable, model: Model) -> None:
-    scalar = ElementTree.SubElement(
-        parent, "ScalarVariable", common_attributes(variable, model.value_reference(variable.name))
-    )
+    scalar = ElementTree.SubElement(parent, "ScalarVariable", _common_attributes(variable, model))
     if variable.type is Type.BOOLEAN:
         ElementTree.SubElement(scalar, "Boolean", _boolean(variable))
     elif variable.type is Type.LAW:
@@ -199,14 +202,14 @@ def _variable2(parent: ElementTree.Element, variable: Variable, model: Model) ->
     elif variable.type in (Type.SEED, Type.SEED_HIGH):
         ElementTree.SubElement(scalar, "Integer", min=_INT32[0], max=_INT32[1], start="0")
     else:
-        attributes = real_attributes(variable)
+        attributes = _real_attributes(variable)
         if variable.kind is Kind.DERIVATIVE:
             attributes["derivative"] = str(index(_state_of(variable), model))
         ElementTree.SubElement(scalar, "Real", attributes)
 
 
 def _variable3(parent: ElementTree.Element, variable: Variable, model: Model) -> None:
-    attributes = common_attributes(variable, model.value_reference(variable.name))
+    attributes = _common_attributes(variable, model)
     if variable.type is Type.BOOLEAN:
         ElementTree.SubElement(parent, "Boolean", attributes | _boolean(variable))
     elif variable.type is Type.LAW:
@@ -216,7 +219,7 @@ def _variable3(parent: ElementTree.Element, variable: Variable, model: Model) ->
         seed = {"min": "0", "max": str(2**64 - 1), "start": "0"}
         ElementTree.SubElement(parent, "UInt64", attributes | seed)
     else:
-        attributes |= real_attributes(variable)
+        attributes |= _real_attributes(variable)
         if variable.kind is Kind.DERIVATIVE:
             attributes["derivative"] = str(model.value_reference(_state_of(variable)))
         ElementTree.SubElement(parent, "Float64", attributes)

@@ -75,13 +75,17 @@ LAWS = (
 )
 
 
+SATURATE = "an input beyond its range acts at the bound, as an actuator at its stop; false: refused"
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """A model: its name, C identifier, table of variables with their units, and interfaces.
 
     A variable's value reference is its position in the table. `stop_time` and `step_size` [s] are
     the default experiment's; `model_exchange` and `derivatives` (directional, in FMI 3.0 adjoint,
-    too) say what it offers beside co-simulation.
+    too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the multiples of
+    `step_size` alone: its outputs are discrete, and no communication step may pass over a sample.
     """
 
     name: str
@@ -94,6 +98,7 @@ class Model:
     step_size: float
     model_exchange: bool = False
     derivatives: bool = False
+    sampled: bool = False
 
     @cached_property
     def by_name(self) -> dict[str, Variable]:

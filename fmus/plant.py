@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fmus.description import build_description, model_description
-from fmus.header import c_header
-from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable
-from fmus.own import build_fmu
+from fmus.assembly import PLANT_SOURCES, assemble, sources_of
+from fmus.build import SOURCES
+from fmus.model import SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
 
-PACKAGE = Path(__file__).parent
-SHARED = PACKAGE / "sources"
-OWN = PACKAGE / "plant_sources"
-# Of the evaporator's sources what serves any plant; the rest is in OWN or generated.
+# Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (
-    "access.h", "disturbance.h", "elementary.h", "events.h", "exchange.h", "experiment.h", "grid.h",
-    "instance.h", "philox.h", "sampled.h", "seed.h", "simulation.h", "snapshot.h",
+    "disturbance.h", "elementary.h", "events.h", "model_state.h", "philox.h", "sampled.h", "seed.h",
+    "simulation.h",
 )  # fmt: skip
 
 
@@ -55,8 +49,9 @@ def plant_model(
 
     Each state x has a derivative ``der(x)`` (in C ``VR_der_x``) and a start parameter ``x_start``,
     each disturbance d a mean ``d_nominal`` and a ``d_range``; beside them are the switches
-    ``stochastic``, ``law`` (1 uniform, 2 normal), ``seed``, ``seedHigh`` (FMI 2.0) and
-    ``sampling_time`` [s], whose multiples are when the disturbances are drawn anew.
+    ``stochastic``, ``law`` (1 uniform, 2 normal), ``seed``, ``seedHigh`` (FMI 2.0),
+    ``sampling_time`` [s], whose multiples are when the disturbances are drawn anew, and
+    ``saturate``, with which an input beyond its range acts at the bound.
     """
     drawn = ["stochastic", "law", "seed", "seedHigh", "sampling_time", "time"]
     known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
@@ -112,17 +107,18 @@ def build_plant(
     draws that are a function of seed and sample; fourth-order Runge–Kutta steps of at most 1 s.
     Raises BuildError where there is no compiler or it complains.
     """
-    header = equations.encode() if isinstance(equations, str) else equations
-    sources = {name: (SHARED / name).read_bytes() for name in (*_SHARED, f"fmi{version}.c")}
-    sources |= {path.name: path.read_bytes() for path in sorted(OWN.glob("*.h"))}
-    sources["equations.h"] = header
-    sources["states.h"] = _states_header(model).encode()
-    token = _token(model, sources)
-    origin = f"from the table of {model.name}"
-    sources["variables.h"] = c_header(token, model.variables, origin).encode()
-    sources["buildDescription.xml"] = build_description(version, model).encode()
-    text = model_description(version, token, model)
-    return build_fmu(target, sources, text, every_platform=every_platform)
+    own = {name: (SOURCES / name).read_bytes() for name in _SHARED}
+    own |= {path.name: path.read_bytes() for path in sorted(PLANT_SOURCES.glob("*.h"))}
+    own["equations.h"] = equations.encode() if isinstance(equations, str) else equations
+    own["states.h"] = _states_header(model).encode()
+    return assemble(
+        model,
+        version,
+        sources_of(model, version, own),
+        target,
+        remarks=f"Disturbances are drawn every sampling_time, {model.step_size:g} s if not set.",
+        every_platform=every_platform,
+    )
 
 
 def _nominal(value: float) -> float:
@@ -163,6 +159,7 @@ def _switches(sampling_time: float) -> list[Variable]:
                  "upper 32 bits of the seed (FMI 2.0 Integers have 32)"),
         Variable("sampling_time", fixed, Type.REAL, "s", sampling_time, 0.01, 86400.0,
                  sampling_time, "the disturbances are redrawn at its multiples and held between"),
+        Variable("saturate", fixed, Type.BOOLEAN, "", 0.0, 0.0, 1.0, None, SATURATE),
     ]  # fmt: skip
 
 
@@ -197,10 +194,3 @@ static const struct {{
 
 #endif
 """
-
-
-def _token(model: Model, sources: dict[str, bytes]) -> str:
-    digest = hashlib.sha256(c_header("", model.variables).encode())
-    for name in sorted(sources):
-        digest.update(name.encode() + b"\0" + sources[name])
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"

@@ -42,8 +42,11 @@ def _kinds_text(name: str, dependencies: Iterable[str], model: Model) -> str:
 def _structure2(root: ElementTree.Element, model: Model) -> None:
     structure = ElementTree.SubElement(root, "ModelStructure")
     for _, tag, kinds, initial in _UNKNOWNS:
+        unknowns = model.names(*kinds)
+        if not unknowns:
+            continue
         group = ElementTree.SubElement(structure, tag)
-        for name in model.names(*kinds):
+        for name in unknowns:
             names = _dependencies(name, initial, model)
             ElementTree.SubElement(
                 group,

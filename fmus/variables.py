@@ -6,7 +6,7 @@ variable's value reference is its position in the table, the same in FMI 2.0 and
 
 from __future__ import annotations
 
-from fmus.model import LAWS, FmiVersion, Kind, Model, Type, Unit, Variable
+from fmus.model import LAWS, SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
 
 __all__ = [
     "BY_NAME", "DISTURBANCES", "EVAPORATOR", "LAWS", "STATES", "UNITS", "VARIABLES", "FmiVersion",
@@ -168,6 +168,7 @@ VARIABLES: tuple[Variable, ...] = (
     _output("UA2_present", "kW/K", 0.0, 1e3, 6.84,
             "present heat transfer of the condenser: UA2 while it is clean",
             "UA2 fouling_rate fouling_floor cleaning_period sampling_time time"),
+    _switch("saturate", Kind.FIXED, False, SATURATE),
 )  # fmt: skip
 
 EVAPORATOR = Model(

@@ -11,22 +11,29 @@ from cosim.simulation import spawn_seeds
 from fmus.ssp import Component, Connection, write_ssp
 
 SAMPLES = 100
+SATURATE = "saturate"
 
 
 def write_loop(controller: Path, scenario: Scenario, seed: int, target: Path) -> Path:
     """Write the SSP whose trajectory is that of `cosim simulate --seed` with this controller.
 
     The controller comes first: it acts on the state at the sample, then the plant takes the step.
+    Where the plant can, its inputs saturate, as the loop of `simulate` does it, so that a master
+    may begin before any action has come.
     Raises BuildError where the plant is not FMI 2.0, PlantError where it does not fit the scenario.
     """
     plant = scenario.plant
     plant_seed, _ = spawn_seeds(seed)
+    starts = start_values(scenario, plant_seed)
+    archive = unpack(plant.fmu)
+    if SATURATE in {variable.name for variable in archive.description.modelVariables}:
+        starts[SATURATE] = ("Boolean", 1.0)
     return write_ssp(
         target,
         "loop",
         [
             Component("controller", controller, {}),
-            Component("plant", unpack(plant.fmu).path, start_values(scenario, plant_seed)),
+            Component("plant", archive.path, starts),
         ],
         [
             *(Connection(("plant", name), ("controller", name)) for name in plant.states),

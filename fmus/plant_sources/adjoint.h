@@ -1,4 +1,4 @@
-/* Adjoint derivatives: a plant offers none. */
+/* Adjoint derivatives of a model that offers none. */
 #ifndef ADJOINT_H
 #define ADJOINT_H
 

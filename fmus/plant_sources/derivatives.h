@@ -1,4 +1,4 @@
-/* Directional derivatives: a plant offers none. */
+/* Directional derivatives of a model that offers none. */
 #ifndef DERIVATIVES_H
 #define DERIVATIVES_H
 

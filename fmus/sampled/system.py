@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from fmus.errors import BuildError
-from fmus.variables import UNITS, Kind, Type, Unit, Variable
+from fmus.model import Kind, Model, Type, Unit, Variable
+from fmus.variables import UNITS
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _INFINITE = float("inf")
 _LARGEST = sys.float_info.max
+_SAMPLES = 100
 
 
 @dataclass(frozen=True)
@@ -30,14 +32,15 @@ class Signal:
     min: float | None = None
     max: float | None = None
 
-    def variable(self, kind: Kind) -> Variable:
-        """The signal as a row of a table of variables."""
+    def variable(self, kind: Kind, uses: tuple[str, ...] = ()) -> Variable:
+        """The signal as a row of a table of variables; an output `uses` others."""
         low, high = [
             None if v in (None, -_INFINITE, _INFINITE) else v for v in (self.min, self.max)
         ]
         return Variable(
-            self.name, kind, Type.REAL, self.unit, self.start, low, high, None, self.description
-        )
+            self.name, kind, Type.REAL, self.unit, self.start, low, high, None, self.description,
+            uses,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -72,21 +75,37 @@ class SampledSystem:
 
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
-        """The table of variables; a value reference is a position in it."""
+        """The table of variables; a value reference is a position in it.
+
+        Every output follows every input at once, and every parameter.
+        """
         time = Variable(
             "time", Kind.INDEPENDENT, Type.REAL, "s", None, None, None, None, "simulation time"
         )
-        groups = (
-            (Kind.INPUT, self.inputs), (Kind.OUTPUT, self.outputs), (Kind.TUNABLE, self.parameters),
-        )  # fmt: skip
-        return (time, *(signal.variable(kind) for kind, signals in groups for signal in signals))
+        known = tuple(signal.name for signal in (*self.inputs, *self.parameters))
+        return (
+            time,
+            *(signal.variable(Kind.INPUT) for signal in self.inputs),
+            *(signal.variable(Kind.OUTPUT, known) for signal in self.outputs),
+            *(signal.variable(Kind.TUNABLE) for signal in self.parameters),
+        )
 
-    @property
-    def units(self) -> tuple[Unit, ...]:
-        """The units in use; one that `fmus.variables` does not know has no SI form."""
+    @cached_property
+    def model(self) -> Model:
+        """The table with its units; one that `fmus.variables` does not know has no SI form."""
         known = {unit.name: unit for unit in UNITS}
         names = dict.fromkeys(variable.unit for variable in self.variables)
-        return tuple(known.get(name, Unit(name)) for name in names if name)
+        return Model(
+            name=self.name,
+            identifier=self.identifier,
+            version="1.0.0",
+            description=self.description,
+            variables=self.variables,
+            units=tuple(known.get(name, Unit(name)) for name in names if name),
+            stop_time=_SAMPLES * self.sampling_time,
+            step_size=self.sampling_time,
+            sampled=True,
+        )
 
     @property
     def header(self) -> str:

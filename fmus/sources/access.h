@@ -45,6 +45,7 @@ static Status check_value(const Instance *instance, const char *function, unsign
     if (!isfinite(value))
         return report(instance, ERROR, "%s: the value of %s is not finite.", function,
                       variable->name);
+    if (variable->kind == INPUT && saturates(&instance->state)) return OK;
     if (variable->kind != STATE && !(value >= variable->min && value <= variable->max))
         return report(instance, DISCARD, "%s: %s = %.17g is outside [%g, %g]; value kept at %.17g.",
                       function, variable->name, value, variable->min, variable->max,
@@ -53,6 +54,9 @@ static Status check_value(const Instance *instance, const char *function, unsign
 }
 
 static void set_value(State *state, unsigned vr, double value) {
+    const VariableInfo *variable = &VARIABLES[vr];
+    if (variable->kind == INPUT && value < variable->min) value = variable->min;
+    if (variable->kind == INPUT && value > variable->max) value = variable->max;
     state->v[vr] = value;
     note_change(state, vr);
 }

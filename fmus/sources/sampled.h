@@ -12,6 +12,9 @@ static void note_change(State *state, unsigned vr) {
     if (VARIABLES[vr].kind == FIXED) state->model.drawn = 0;
 }
 
+/* Whether an input beyond its range acts at the bound. */
+static int saturates(const State *state) { return state->v[VR_saturate] != 0.0; }
+
 static Grid model_grid(const State *state) { return make_grid(state->v[VR_sampling_time]); }
 
 static void move_to_sample(State *state, int64_t sample) {

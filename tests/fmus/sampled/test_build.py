@@ -21,7 +21,7 @@ def test_the_model_description_is_valid(built: tuple[int, Path]) -> None:
 def test_it_is_for_co_simulation_alone_with_tunable_parameters(built: tuple[int, Path]) -> None:
     found = fmpy.read_model_description(str(built[1]))
     assert found.modelExchange is None
-    assert found.defaultExperiment.stepSize == "2.0"
+    assert float(found.defaultExperiment.stepSize) == 2.0
     variables = {v.name: v for v in found.modelVariables}
     assert (variables["u"].causality, variables["u"].unit) == ("input", "kPa")
     assert (variables["y"].causality, variables["y"].variability) == ("output", "discrete")

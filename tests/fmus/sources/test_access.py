@@ -36,6 +36,23 @@ def test_input_out_of_range_is_discarded(refused, plant, name: str, value: float
     assert plant.run(0) == before
 
 
+@pytest.mark.parametrize(
+    ("value", "acting"), [(0.0, 100.0), (99.9, 100.0), (400.1, 400.0), (1e9, 400.0), (250.0, 250.0)]
+)
+def test_a_saturating_input_acts_at_its_bound(open_fmu, version: int, value, acting) -> None:
+    saturating, plain = open_fmu(version), open_fmu(version)
+    saturating.initialise(saturate=True).set(P100=value)
+    plain.initialise().set(P100=acting)
+    assert saturating.get("P100") == [acting]
+    assert saturating.run(2) == plain.run(2)
+
+
+def test_a_saturating_plant_refuses_parameters_out_of_range_and_no_numbers(refused, plant) -> None:
+    plant.initialise(saturate=True)
+    assert refused(plant, lambda: plant.set(M=0.0))[0] == DISCARD
+    assert refused(plant, lambda: plant.set(P100=math.nan))[0] == ERROR
+
+
 @pytest.mark.parametrize("name", REAL_SETTABLE)
 def test_range_of_the_model_description_is_enforced(refused, plant, name: str) -> None:
     variable = BY_NAME[name]
@@ -83,7 +100,8 @@ def test_calculated_variable_cannot_be_set(refused, plant, kind: Kind) -> None:
 
 def test_fixed_parameter_cannot_be_set_after_initialisation(refused, plant) -> None:
     plant.initialise()
-    for name, value in {"X2_start": 26.0, "sampling_time": 6.0, "seed": 1, "law": 2}.items():
+    values = {"X2_start": 26.0, "sampling_time": 6.0, "seed": 1, "law": 2, "saturate": True}
+    for name, value in values.items():
         status, text = refused(plant, lambda n=name, v=value: plant.set(**{n: v}))
         assert status == ERROR
         assert "step mode" in text

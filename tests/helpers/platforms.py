@@ -1,0 +1,108 @@
+"""FMUs run on the platforms that this machine can run: natively, under qemu, under wine."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import fmpy
+
+from fmus.compiler import cross_compiler
+from fmus.platforms import PLATFORMS, Platform
+
+HOSTS = Path(__file__).parents[1] / "fmus" / "platforms"
+BY_NAME = {platform.tuple: platform for platform in PLATFORMS}
+NATIVE = "x86_64-linux"
+OTHERS = ("aarch64-linux", "x86_64-windows")
+ARM_LIBRARIES = Path("/usr/aarch64-linux-gnu")
+WINE = Path("/usr/lib/wine/wine64")
+STEPS = 10_000
+
+
+class NotHereError(Exception):
+    """The platform cannot be run on this machine; the message says what is missing."""
+
+
+class Importer:
+    """A C host of `tests/fmus/platforms`, compiled for each platform when it is first run there.
+
+    `headers` are the C headers of the FMU that it includes. `run` raises NotHereError where the
+    platform cannot be run, and CalledProcessError where the host ends with an error.
+    """
+
+    def __init__(self, source: str, headers: Mapping[str, bytes], folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._source, self._folder = source, folder
+        for name in (source, "importer.h"):
+            shutil.copy(HOSTS / name, folder)
+        for name, data in headers.items():
+            (folder / name).write_bytes(data)
+
+    def run(self, name: str, library: Path, *arguments: str) -> list[str]:
+        """The words that the host prints for a library on platform `name`."""
+        before, environment = _launcher(name)
+        result = subprocess.run(
+            [*before, str(self._host(name)), str(library), *arguments],
+            env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert result.returncode == 0, result.stderr
+        return result.stdout.split()
+
+    def _host(self, name: str) -> Path:
+        target = self._folder / f"{name}.exe"
+        if not target.exists():
+            libraries = [] if name.endswith("windows") else ["-ldl"]
+            c_code = Path(fmpy.__file__).parent / "c-code"
+            command = [*cross_compiler(BY_NAME[name]).command, "-std=c99", "-Wall"]
+            subprocess.run(
+                [*command, "-isystem", c_code, self._source, "-o", target.name, *libraries],
+                cwd=self._folder, check=True,
+            )  # fmt: skip
+        return target
+
+
+def library(folder: Path, platform: Platform, version: int, identifier: str) -> Path:
+    """Where an unzipped FMU has its library for a platform."""
+    return folder / "binaries" / platform.folder(f"{version}.0") / f"{identifier}{platform.suffix}"
+
+
+def unzipped(fmu: Path, folder: Path) -> Path:
+    """`folder`, with what the FMU holds."""
+    with zipfile.ZipFile(fmu) as container:
+        container.extractall(folder)
+    return folder
+
+
+def verdict(native: list[str], other: list[str]) -> str:
+    """How two runs' words compare."""
+    differing = sum(a != b for a, b in zip(native, other, strict=True))
+    return f"{differing} of {len(native)} differ" if differing else "bit-identical"
+
+
+def _launcher(name: str) -> tuple[list[str], dict[str, str] | None]:
+    """The command before a program for platform `name`, and its environment."""
+    if name == "aarch64-linux":
+        qemu = shutil.which("qemu-aarch64")
+        if qemu is None or not ARM_LIBRARIES.is_dir():
+            raise NotHereError("Debian's qemu-user and libc6-arm64-cross are not installed")
+        return [qemu, "-L", str(ARM_LIBRARIES)], None
+    if name == "x86_64-windows":
+        if not WINE.is_file():
+            raise NotHereError("Debian's wine64 is not installed")
+        return [str(WINE)], _wine()
+    return [], None
+
+
+@cache
+def _wine() -> dict[str, str]:
+    """The environment of a Windows of our own, made once a process."""
+    prefix = tempfile.mkdtemp(prefix="wine")
+    environment = os.environ | {"WINEPREFIX": prefix, "WINEDEBUG": "-all"}
+    subprocess.run([WINE, "wineboot", "-i"], env=environment, check=True, capture_output=True)
+    return environment

@@ -99,14 +99,14 @@ class Runner:
             for first in range(0, len(missing), size):
                 block = tuple(missing[first : first + size])
                 units[f"{name}: {file} {block[0]}"] = Evaluate(
-                    place, name, scenario, controller, block, steps
+                    place, name, scenario, controller, steps, block
                 )
         for trace in run.traces:
             if self.stores[name].trajectory(trace) is not None:
                 self._done[name] += trace.steps
                 continue
             units[f"{name}: {trace.name}"] = Trace(
-                place, name, scenario, controller, trace.seed, trace.steps
+                place, name, scenario, controller, trace.steps, trace.seed
             )
         if (online := run.online) is not None:
             done = self.stores[name].online(online.steps, online.block)
@@ -114,7 +114,7 @@ class Runner:
             for seed in online.seeds:
                 if seed not in done:
                     units[f"{name}: online {seed}"] = Accompany(
-                        place, name, scenario, controller, seed, online.steps, online.block
+                        place, name, scenario, controller, online.steps, seed, online.block
                     )
         if not units:
             self._finished.add(name)

@@ -54,8 +54,8 @@ class Learnt:
 
 
 @dataclass(frozen=True)
-class Evaluate:
-    """A controller, by name or learnt, on `seeds` of `steps` samples each.
+class Simulation:
+    """A controller, by name or learnt, in the closed loop for `steps` samples a seed.
 
     `key` is the same for units of one controller: a worker builds it once for all of them.
     """
@@ -64,32 +64,28 @@ class Evaluate:
     key: str
     scenario: Scenario
     controller: str | Learnt
+    steps: int
+
+
+@dataclass(frozen=True)
+class Evaluate(Simulation):
+    """Its indicators on `seeds`."""
+
     seeds: tuple[int, ...]
-    steps: int
 
 
 @dataclass(frozen=True)
-class Trace:
-    """A controller on one seed, sample by sample."""
+class Trace(Simulation):
+    """Its run on one `seed`, sample by sample."""
 
-    place: Place
-    key: str
-    scenario: Scenario
-    controller: str | Learnt
     seed: int
-    steps: int
 
 
 @dataclass(frozen=True)
-class Accompany:
-    """A controller on the noise of a training, its cost in blocks of `block` samples."""
+class Accompany(Simulation):
+    """Its cost on the noise of a training, by its `seed`, in blocks of `block` samples."""
 
-    place: Place
-    key: str
-    scenario: Scenario
-    controller: str | Learnt
     seed: int
-    steps: int
     block: int
 
 
@@ -169,7 +165,7 @@ def _accompany(unit: Accompany, controller: Controller) -> Accompanied:
     return Accompanied(unit.seed, tuple(means))
 
 
-def _controller(unit: Evaluate | Trace | Accompany) -> Controller:
+def _controller(unit: Simulation) -> Controller:
     trainer, wanted = unit.place.trainer, unit.controller
 
     def build() -> Controller:

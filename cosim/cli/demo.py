@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from cosim.cli.options import JsonOption, OutOption, SeedOption, StepsOption
+from cosim.cli.options import JsonOption, OutOption, SeedOption, StepsOption, count
 from cosim.cli.output import Output, dump, open_folder, output
 
 if TYPE_CHECKING:
@@ -28,7 +26,7 @@ RUNS = 10
 
 def demo(
     samples: Annotated[
-        int, typer.Option("--samples", min=1000, max=1_000_000, help="Plant samples of learning.")
+        int, count("--samples", least=1000, most=1_000_000, text="Plant samples of learning.")
     ] = 20_000,
     steps: StepsOption = 500,
     seed: SeedOption = 0,

@@ -17,6 +17,7 @@ from cosim.cli.options import (
     ScenarioOption,
     SchedulerOption,
     StepsOption,
+    count,
 )
 from cosim.cli.output import Output, dump, open_folder, output
 
@@ -32,9 +33,7 @@ def evaluate(
         ),
     ] = "naive",
     scenario: ScenarioOption = "paper",
-    seeds: Annotated[
-        int, typer.Option("--seeds", min=1, max=1_000_000, help="Number of seeds.")
-    ] = 10,
+    seeds: Annotated[int, count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
     first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
     steps: StepsOption = 1000,
     out: OutOption = Path("cosim-evaluation"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.options import JsonOption, OutOption, RecordOption, ScenarioOption
+from cosim.cli.options import JsonOption, OutOption, RecordOption, ScenarioOption, count
 from cosim.cli.output import Output, Progressing, dump, open_folder, output
 
 if TYPE_CHECKING:
@@ -51,16 +51,12 @@ def train(
     scenario: ScenarioOption = "paper",
     samples: Annotated[
         int | None,
-        typer.Option(
-            "--samples",
-            "-n",
-            min=1,
-            max=100_000_000,
-            help="Plant samples; default: 50 000, or what the algorithm says.",
+        count(
+            "--samples", "-n", text="Plant samples; default: 50 000, or what the algorithm says."
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, max=999_999, help="Seed of noise and exploration.")
+        int, count("--seed", least=0, most=999_999, text="Seed of noise and exploration.")
     ] = 0,
     out: OutOption = Path("cosim-train"),
     resume: Annotated[
@@ -81,29 +77,23 @@ def train(
     ] = "naive",
     validate_every: Annotated[
         int,
-        typer.Option(
+        count(
             "--validate-every",
-            min=0,
-            max=100_000_000,
-            help="Samples per validation run, which chooses among θ; 0: none.",
+            least=0,
+            text="Samples per validation run, which chooses among θ; 0: none.",
         ),
     ] = 0,
     validation_samples: Annotated[
         int,
-        typer.Option(
+        count(
             "--validation-samples",
-            min=1,
-            max=100_000_000,
-            help="Samples of each validation run; they count as plant samples.",
+            text="Samples of each validation run; they count as plant samples.",
         ),
     ] = 1000,
     rest_after: Annotated[
         int | None,
-        typer.Option(
-            "--rest-after",
-            min=1,
-            max=100_000_000,
-            help="Samples after which θ stays and nothing explores; default: never.",
+        count(
+            "--rest-after", text="Samples after which θ stays and nothing explores; default: never."
         ),
     ] = None,
     controller: Annotated[
@@ -116,28 +106,18 @@ def train(
             help="Controller whose J is J*; default: optimal, where its solution is stored.",
         ),
     ] = None,
-    log_every: Annotated[
-        int, typer.Option("--log-every", min=1, max=100_000_000, help="Samples per row.")
-    ] = 1000,
+    log_every: Annotated[int, count("--log-every", text="Samples per row.")] = 1000,
     evaluate_every: Annotated[
-        int,
-        typer.Option(
-            "--evaluate-every", min=1, max=100_000_000, help="Samples per greedy evaluation."
-        ),
+        int, count("--evaluate-every", text="Samples per greedy evaluation.")
     ] = 5000,
     checkpoint_every: Annotated[
-        int,
-        typer.Option("--checkpoint-every", min=1, max=100_000_000, help="Samples per checkpoint."),
+        int, count("--checkpoint-every", text="Samples per checkpoint.")
     ] = 5000,
     evaluation_seeds: Annotated[
-        int,
-        typer.Option(
-            "--evaluation-seeds", min=1, max=1_000_000, help="Held-out runs per evaluation."
-        ),
+        int, count("--evaluation-seeds", most=1_000_000, text="Held-out runs per evaluation.")
     ] = 4,
     evaluation_steps: Annotated[
-        int,
-        typer.Option("--evaluation-steps", min=1, max=100_000_000, help="Samples of each of them."),
+        int, count("--evaluation-steps", text="Samples of each of them.")
     ] = 500,
     explain: Annotated[
         bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")

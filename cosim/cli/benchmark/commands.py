@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.options import JsonOption, ScenarioOption
+from cosim.cli.options import JsonOption, ScenarioOption, count
 from cosim.cli.output import output
 
 app = typer.Typer(no_args_is_help=True)
@@ -28,9 +28,7 @@ def plant(
     fmu: Annotated[
         str | None, typer.Option("--fmu", help="FMU in place of the scenario's, name or path.")
     ] = None,
-    steps: Annotated[
-        int, typer.Option("--steps", min=100, max=100_000_000, help="Steps per repetition.")
-    ] = 5000,
+    steps: Annotated[int, count("--steps", least=100, text="Steps per repetition.")] = 5000,
     json: JsonOption = False,
 ) -> None:
     """Time per plant step against fmpy's convenience methods and simulate_fmu.
@@ -52,15 +50,9 @@ def evaluation(
     controllers: Annotated[
         str, typer.Option("--controllers", "-c", help="Comma-separated, as for evaluate.")
     ] = "naive",
-    seeds: Annotated[
-        int, typer.Option("--seeds", min=1, max=1_000_000, help="Number of seeds.")
-    ] = 100,
-    steps: Annotated[
-        int, typer.Option("--steps", "-n", min=1, max=100_000_000, help="Samples per run.")
-    ] = 2000,
-    jobs: Annotated[
-        int, typer.Option("--jobs", "-j", min=2, max=1024, help="Workers to compare.")
-    ] = 2,
+    seeds: Annotated[int, count("--seeds", most=1_000_000, text="Number of seeds.")] = 100,
+    steps: Annotated[int, count("--steps", "-n", text="Samples per run.")] = 2000,
+    jobs: Annotated[int, count("--jobs", "-j", least=2, most=1024, text="Workers to compare.")] = 2,
     json: JsonOption = False,
 ) -> None:
     """Time of an evaluation by several workers against one, starting them included."""
@@ -93,13 +85,10 @@ def evaluation(
 def controllers(
     scenario: ScenarioOption = "paper",
     steps: Annotated[
-        int, typer.Option("--steps", "-n", min=50, max=1_000_000, help="Samples of each run.")
+        int, count("--steps", "-n", least=50, most=1_000_000, text="Samples of each run.")
     ] = 2000,
     every: Annotated[
-        int,
-        typer.Option(
-            "--every", min=1, max=1_000_000, help="Compare every so many samples with the others."
-        ),
+        int, count("--every", most=1_000_000, text="Compare every so many samples with the others.")
     ] = 10,
     json: JsonOption = False,
 ) -> None:
@@ -130,7 +119,7 @@ def export(
         str, typer.Option("--controller", "-c", help="naive, tuned or a parameters file.")
     ] = "tuned",
     steps: Annotated[
-        int, typer.Option("--steps", "-n", min=50, max=1_000_000, help="Samples of the run.")
+        int, count("--steps", "-n", least=50, most=1_000_000, text="Samples of the run.")
     ] = 2000,
     json: JsonOption = False,
 ) -> None:
@@ -154,8 +143,7 @@ def export(
 def learning(
     scenario: ScenarioOption = "paper",
     samples: Annotated[
-        int,
-        typer.Option("--samples", "-n", min=100, max=100_000_000, help="Samples per repetition."),
+        int, count("--samples", "-n", least=100, text="Samples per repetition.")
     ] = 2000,
     against: Annotated[
         Path | None,

@@ -35,12 +35,6 @@ LOOK, WORTH, POLL = 50, 2000, 200
 """Calls after which a stored library is looked for, one is compiled, and each look at its end."""
 
 
-def mode_of(controller: object) -> str | None:
-    """Whether a controller's functions are `interpreted` or `compiled`; None where it has none."""
-    compilation = getattr(controller, "compilation", None)
-    return compilation.mode if isinstance(compilation, Compilation) else None
-
-
 class Compiler(NamedTuple):
     """A C compiler: its `path`, and what tells it from others, in one line."""
 

@@ -79,7 +79,8 @@ class Solution(Protocol):
 class Controller(Protocol):
     """A feedback law in two phases: `prepare` before the state is known, `feedback` after.
 
-    Optional attributes that are used when present: `name` (str) and `parameters` (with `.hash`).
+    Optional attributes that are used when present: `name` (str), `parameters` (with `.hash`) and
+    `compilation`, whose `mode` says how its functions are computed.
     An exception whose class has `is_solver_failure = True` makes the loop apply its fallback.
     """
 
@@ -155,6 +156,12 @@ def recover(controller: Controller, error: Exception) -> None:
     if not is_solver_failure(error):
         raise error
     controller.reset()
+
+
+def functions_of(controller: Any) -> str | None:
+    """How a controller's functions are computed, `interpreted` or `compiled`; None without any."""
+    mode = getattr(getattr(controller, "compilation", None), "mode", None)
+    return mode if isinstance(mode, str) else None
 
 
 def controller_name(controller: Any) -> str:

@@ -86,6 +86,7 @@ class Trainer:
                 parameters=(folder / "parameters.toml").read_text("utf-8"),
                 plant_samples=result.plant_samples,
                 wall_seconds=time.perf_counter() - begin,
+                functions=result.functions,
             )
 
     def policy(self, training: Training, parameters: str) -> Controller:

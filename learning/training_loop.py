@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.compilation import mode_of
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError
 from cosim.evaluation.statistics import shown
 from cosim.plant import FmuPlant
-from cosim.protocols import Controller
+from cosim.protocols import Controller, functions_of
 from learning import checkpoint
 from learning.checkpoint import Checkpoint
 from learning.definiteness import certificate
@@ -113,7 +112,7 @@ class TrainingLoop:
             self._learner.start,
             self._judge.start_J,
             self._judge.baselines,
-            mode_of(self._learner.controller),
+            functions_of(self._learner.controller),
             late_movement(self._learner.start, self._rows) if self._rows else float("nan"),
         )
 

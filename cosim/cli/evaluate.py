@@ -193,8 +193,8 @@ def _seconds(time: float) -> str:
     return f"{time:.0f}" if isfinite(time) else "not settled"
 
 
-def _step_time(timing: dict[str, float]) -> float:
-    return timing["prepare_median_us"] + timing["feedback_median_us"]
+def _step_time(timing: dict[str, Any]) -> float:
+    return float(timing["prepare_median_us"] + timing["feedback_median_us"])
 
 
 def interval(estimate: dict[str, Any], scale: float = 1.0, digits: int = 3) -> str:

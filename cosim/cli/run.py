@@ -66,7 +66,7 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
 def _summary(run: Run, trajectory: Trajectory, controller: Any, plant: Any) -> dict[str, Any]:
     from importlib.metadata import version
 
-    from controllers.compilation import mode_of
+    from cosim.protocols import functions_of
 
     parameters = getattr(controller, "parameters", None)
     return {
@@ -79,7 +79,7 @@ def _summary(run: Run, trajectory: Trajectory, controller: Any, plant: Any) -> d
         "parameters_hash": getattr(parameters, "hash", None),
         "seed": run.seed,
         **trajectory.summary(),
-        "timing": {**trajectory.timing_summary(), "functions": mode_of(controller)},
+        "timing": {**trajectory.timing_summary(), "functions": functions_of(controller)},
     }
 
 

@@ -150,14 +150,24 @@ def _thousands(samples: int) -> int:
 
 
 def write_summary(results: StudyResults) -> dict[str, Any]:
-    """Write summary.json and return what it says."""
+    """Write summary.json and return what it says; `timing` is what timing.csv says of each run."""
+    from cosim.errors import StudyError
     from cosim.experiments.summary import aggregate_rows, summary_rows
+    from cosim.experiments.tables import TIMING
+    from cosim.text_tables import read_records
     from rti_storage import write_atomically
 
     document = {
         **results.about,
         "summary": summary_rows(results),
         "aggregate": aggregate_rows(results),
+        "timing": {
+            row["run"]: {
+                "training_seconds": float(row["training_seconds"]),
+                "functions": row["functions"] or None,
+            }
+            for row in read_records(results.folder / TIMING, StudyError)
+        },
     }
     write_atomically(results.folder / "summary.json", dump(document))
     return document

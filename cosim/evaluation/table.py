@@ -219,7 +219,11 @@ def _comparison(evaluation: Evaluation, name: str, reference: str) -> dict[str, 
     }
 
 
-def _timing(evaluation: Evaluation, name: str) -> dict[str, float]:
-    """Median over seeds of each of the clock's figures."""
+def _timing(evaluation: Evaluation, name: str) -> dict[str, Any]:
+    """Median over seeds of each of the clock's figures; how the functions were computed, if any."""
     timings = [evaluation.results[name, seed].timing for seed in evaluation.seeds]
-    return {key: float(np.median([timing[key] for timing in timings])) for key in timings[0]}
+    modes = {evaluation.results[name, seed].functions for seed in evaluation.seeds} - {None}
+    return {
+        **{key: float(np.median([timing[key] for timing in timings])) for key in timings[0]},
+        "functions": " and ".join(sorted(filter(None, modes))) or None,
+    }

@@ -12,7 +12,7 @@ from cosim.evaluation import reuse
 from cosim.evaluation.provenance import EVALUATING
 from cosim.evaluation.reuse import require_code
 from cosim.kpis import displaced, indicators, settling_time
-from cosim.protocols import Controller
+from cosim.protocols import Controller, functions_of
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 
@@ -38,10 +38,14 @@ class RunUnit:
 
 @dataclass(frozen=True)
 class UnitResult:
-    """Indicators of a unit, and what the clock said: `timing` in s and µs, never in the table."""
+    """Indicators of a unit, and what the clock said: `timing` in s and µs, never in the table.
+
+    `functions` says how the controller's were computed at its end, None where it has none.
+    """
 
     indicators: dict[str, float]
     timing: dict[str, float]
+    functions: str | None = None
 
 
 def run(unit: RunUnit) -> UnitResult:
@@ -63,7 +67,7 @@ def run(unit: RunUnit) -> UnitResult:
     timing = {"wall_time_s": perf_counter() - begin}
     for name, quantiles in trajectory.timing_summary().items():
         timing |= {f"{name}_{key}": value for key, value in quantiles.items()}
-    return UnitResult(indicators(trajectory), timing)
+    return UnitResult(indicators(trajectory), timing, functions_of(controller))
 
 
 def _settling_run(unit: RunUnit, controller: Controller) -> UnitResult:
@@ -76,7 +80,11 @@ def _settling_run(unit: RunUnit, controller: Controller) -> UnitResult:
 
 def as_document(result: UnitResult) -> dict[str, Any]:
     """A result as a JSON document."""
-    return {"indicators": result.indicators, "timing": result.timing}
+    return {
+        "indicators": result.indicators,
+        "timing": result.timing,
+        "functions": result.functions,
+    }
 
 
 def from_document(document: dict[str, Any]) -> UnitResult:
@@ -84,4 +92,5 @@ def from_document(document: dict[str, Any]) -> UnitResult:
     return UnitResult(
         {str(key): float(value) for key, value in document["indicators"].items()},
         {str(key): float(value) for key, value in document["timing"].items()},
+        document.get("functions"),
     )

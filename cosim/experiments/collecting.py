@@ -147,7 +147,11 @@ def write(results: StudyResults, plan: Plan, stores: Mapping[str, RunStore], fig
 
 def _timing(stores: Mapping[str, RunStore]) -> str:
     rows: list[dict[str, Any]] = [
-        {"run": name, "training_seconds": store.progress().wall_seconds}
+        {
+            "run": name,
+            "training_seconds": store.progress().wall_seconds,
+            "functions": " and ".join(store.functions),
+        }
         for name, store in stores.items()
     ]
-    return to_csv(("run", "training_seconds"), rows)
+    return to_csv(("run", "training_seconds", "functions"), rows)

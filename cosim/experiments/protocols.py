@@ -47,7 +47,8 @@ class Progress:
 
     While it goes on, `status` is empty and `checkpoint` is what it goes on from. At its end
     `status` is `finished` or `diverged: …`, `log` the whole learning.csv, `parameters` the θ that
-    it ends with as text, and `plant_samples` all the samples that the plant gave for it.
+    it ends with as text, `plant_samples` all the samples that the plant gave for it. `functions`
+    says how the controller's were computed at the piece's end, None where that is not known.
     """
 
     samples: int
@@ -57,6 +58,7 @@ class Progress:
     parameters: str = ""
     plant_samples: int = 0
     wall_seconds: float = 0.0
+    functions: str | None = None
 
     @property
     def ended(self) -> bool:

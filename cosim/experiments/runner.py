@@ -152,6 +152,7 @@ class Runner:
         file = what.split()[0]
         _, steps = run.noise[file]
         store.evaluate(file, steps, outcome.indicators)
+        store.used(outcome.functions)
         self._done[name] += len(outcome.indicators) * steps
         self._tell(self._finish(name, run))
         return None

@@ -126,11 +126,26 @@ class RunStore:
             "status": progress.status,
             "samples": progress.samples,
             "plant_samples": progress.plant_samples,
-            "timing": {"wall_seconds": progress.wall_seconds},
+            "timing": {"wall_seconds": progress.wall_seconds, "functions": self.functions},
         }
         self._write(RUN, _json(document))
+        self.used(progress.functions)
         if progress.ended:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
+
+    @property
+    def functions(self) -> list[str]:
+        """How the functions of the run's units were computed: `compiled`, `interpreted`, both."""
+        return list(self._document().get("timing", {}).get("functions", []))
+
+    def used(self, functions: str | None) -> None:
+        """Note how a unit's functions were computed, None where that is not known."""
+        known = self.functions
+        if functions is None or functions in known:
+            return
+        document = self._document()
+        timing = document.get("timing", {}) | {"functions": sorted([*known, functions])}
+        self._write(RUN, _json(document | {"timing": timing}))
 
     def indicators(self, file: str, steps: int) -> Indicators:
         """Indicators by noise seed that a file holds of runs of `steps` samples."""

@@ -15,7 +15,7 @@ from cosim.experiments.store import INDICATORS, Indicators
 from cosim.kpis import indicators
 from cosim.lookup import import_from
 from cosim.plugins import OURS
-from cosim.protocols import Controller
+from cosim.protocols import Controller, functions_of
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 
@@ -106,10 +106,11 @@ class Traced:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Indicators by seed, and the wall time that they took."""
+    """Indicators by seed, the wall time that they took, and how functions were computed at last."""
 
     indicators: Indicators
     wall_seconds: float
+    functions: str | None = None
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def simulated(
 def _evaluate(unit: Evaluate, controller: Controller) -> Evaluated:
     begin = perf_counter()
     found = {s: simulated(unit.scenario, controller, unit.steps, s) for s in unit.seeds}
-    return Evaluated(found, perf_counter() - begin)
+    return Evaluated(found, perf_counter() - begin, functions_of(controller))
 
 
 def _accompany(unit: Accompany, controller: Controller) -> Accompanied:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -124,6 +125,32 @@ def test_a_finished_evaluation_is_read_not_run_again(paper, tmp_path, ledger):
     assert (runs, len(ledger())) == (3, 3)
     assert contents(first) == contents(again)
     assert first.timing_csv() == again.timing_csv()
+
+
+def compiled_once_it_pays(scenario):
+    """A controller whose functions are compiled after its second run."""
+    controller = Proportional(scenario)
+    controller.compilation = SimpleNamespace(mode="interpreted")
+    reset = controller.reset
+
+    def count():
+        reset()
+        if controller.resets == 3:  # the settling run may be one
+            controller.compilation.mode = "compiled"
+
+    controller.reset = count
+    return controller
+
+
+def test_timing_says_how_functions_were_computed_and_the_table_does_not(paper, tmp_path):
+    named = {"compiling": compiled_once_it_pays, "without": proportional}
+    for _ in range(2):  # the second one is read from the store
+        evaluation = evaluate(paper, named, 3, 20, folder=tmp_path / "out")
+        timing = evaluation.summary()["timing"]
+        assert timing["compiling"]["functions"] == "compiled and interpreted"
+        assert timing["without"]["functions"] is None
+    assert "compiled" not in evaluation.to_csv()
+    assert "interpreted" not in evaluation.to_csv()
 
 
 def test_more_seeds_run_only_what_is_new(paper, tmp_path, ledger):

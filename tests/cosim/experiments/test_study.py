@@ -1,13 +1,18 @@
 """The engine with a trainer that learns nothing: what is stored, resumed, repeated and counted."""
 
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from cosim import FmuPlant, simulate
+from cosim import FmuPlant, Study, simulate
+from cosim.cli.study import write_summary
 from cosim.errors import FailedRunsError, StudyError
 from cosim.experiments.results import StudyResults
 from tests.helpers.loop import Proportional
-from tests.helpers.toy_trainer import study
+from tests.helpers.toy_trainer import ToyTrainer, document, study
 
 TABLES = ("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "study.json")
 
@@ -50,6 +55,34 @@ def test_regret_is_paired_with_the_optimum_on_the_same_noise(whole):
     assert whole.regret(grown).value == pytest.approx(expected, rel=1e-12)
     assert whole.regret(best).value == 0.0
     assert whole.gap_closed(best).value == pytest.approx(1.0)
+
+
+class Compiling(ToyTrainer):
+    """Its controllers say how their functions are computed, its trainings too."""
+
+    def advance(self, training, checkpoint, seconds):
+        mode = "compiled" if checkpoint else "interpreted"
+        return replace(super().advance(training, checkpoint, seconds), functions=mode)
+
+    def controller(self, name, scenario):
+        controller = super().controller(name, scenario)
+        controller.compilation = SimpleNamespace(mode="compiled")
+        return controller
+
+
+def test_timing_says_how_functions_were_computed_and_no_table_does(whole, tmp_path):
+    modes = {}
+    for folder, made in (
+        (whole.folder, whole),
+        (tmp_path, Study.from_dict(document(), ".", trainer=Compiling()).run(tmp_path)),
+    ):
+        timing = write_summary(made)["timing"]
+        assert json.loads((folder / "summary.json").read_text())["timing"] == timing
+        modes[folder] = {run: entry["functions"] for run, entry in timing.items()}
+    assert contents(tmp_path) == contents(whole.folder)
+    assert set(modes[whole.folder].values()) == {None}
+    assert modes[tmp_path]["naive on paper"] == "compiled"
+    assert modes[tmp_path]["grow(rate=1.0) on paper, seed 0"] == "compiled and interpreted"
 
 
 def test_two_workers_give_the_bytes_of_one(whole, tmp_path):

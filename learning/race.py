@@ -61,7 +61,7 @@ class Races:
         self, scenario: Scenario, start: Parameters, samples: int, *, block: int, blocks: int
     ) -> None:
         self._penalty = KnownPenalty(scenario)
-        self._parameters = start.blocks
+        self._parameters, self._start = start.blocks, start.theta
         self.block, self.blocks = block, blocks
         self.least = 0.5 * max(certificate(start.blocks, start.theta).smallest, 0.0)
         """Least eigenvalue that the Hessians of a candidate may have."""
@@ -144,11 +144,13 @@ class Races:
         """Leave the cheapest of the incumbent and its rivals (n_θ,), each run over `blocks` blocks.
 
         In a new episode, so that no θ has to mend what another one left. A rival is given up where
-        its remaining blocks could no longer make good what it has lost.
+        its remaining blocks could no longer make good what it has lost. The start, if it lasts, is
+        left only for a θ that is cheaper by a standard error: the best of many is partly luck.
         """
         yield from self.renew(blocks, episode)
         costs = self.incumbent.costs
         patience = _patience(costs) if blocks > 1 else np.inf
+        finalists = [self.incumbent]
         for theta in rivals:
             rival = Candidate(theta)
             while len(rival.realised) < blocks:
@@ -156,7 +158,17 @@ class Races:
                 if (rival.costs - costs[: len(rival.realised)]).sum() >= patience:
                     break
             else:
-                self.incumbent = min(self.incumbent, rival, key=lambda candidate: candidate.cost)
+                finalists.append(rival)
+                self.incumbent = self._winner(finalists)
+
+    def _winner(self, finalists: list[Candidate]) -> Candidate:
+        """The cheapest; the start, where it is not dearer by a standard error."""
+        best = min(finalists, key=lambda candidate: candidate.cost)
+        for candidate in finalists:
+            start = np.array_equal(candidate.theta, self._start)
+            if start and not cheaper(best.costs - candidate.costs):
+                return candidate
+        return best
 
     def admissible(self, theta: Vector) -> Vector | None:
         """θ with definite Hessians; None where bounds cross or a slack weight is not positive."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -201,9 +202,14 @@ class TrainingLoop:
         return LogRow(figures, answer)
 
     def _trouble(self, row: LogRow) -> str | None:
-        """Why the run must stop, or None."""
+        """Why the run must stop, or None.
+
+        One evaluation above the limit may be an excursion: two in a row end the run, or the last.
+        """
         greedy, limit = row["greedy_J"], self._judge.limit
-        if greedy > limit:
+        judged = [earlier["greedy_J"] for earlier in self._rows if isfinite(earlier["greedy_J"])]
+        again = len(judged) > 1 and judged[-2] > limit
+        if greedy > limit and (again or row["samples"] == self._run.samples):
             where = f"at sample {int(row['samples'])}"
             return f"diverged: greedy J = {shown(greedy)} exceeds {shown(limit)} {where}"
         return None

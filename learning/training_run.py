@@ -29,7 +29,8 @@ class TrainingRun:
     `converged`) that learns from `samples` samples with this `seed` of noise and exploration.
     `log_every`, `evaluate_every`, `checkpoint_every` in samples; `evaluation_seeds` held-out runs
     of `evaluation_steps` samples. A greedy J that is worse than that of the naive θ and that of
-    the start by more than (`divergence` − 1) of its magnitude ends the run.
+    the start by more than (`divergence` − 1) of its magnitude, twice in a row or at the end, is
+    divergence and ends the run.
 
     `start` is where θ starts: `naive`, `tuned` or the path of a parameters file. With
     `validate_every` the θ handed over is validated that often, in samples, by a greedy run of

@@ -135,3 +135,13 @@ def test_a_theta_that_no_controller_takes_is_not_tried(scenario, start, block, v
     theta = start.theta.copy()
     theta[start.blocks.slices[block]] = value
     assert made.admissible(theta) is None
+
+
+def test_the_final_leaves_the_start_only_for_what_is_cheaper_by_a_standard_error(
+    scenario, start, rival
+):
+    lucky = np.where(np.arange(BLOCKS) == 0, -2.0, 0.25)
+    for gain, leaves in ((lucky, False), (np.full(BLOCKS, -1.0), True)):
+        plant, made = settled(scenario, start, {1.0: [100.0] * BLOCKS, 2.0: 100.0 + gain})
+        plant.drive(made.final([rival], BLOCKS, 17))
+        assert np.array_equal(made.incumbent.theta, rival if leaves else start.theta)

@@ -9,10 +9,12 @@ import sys
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-
-import filelock
+from typing import TYPE_CHECKING
 
 from cosim.errors import CosimError
+
+if TYPE_CHECKING:
+    import filelock
 
 LOCK = ".cosim.lock"
 HOLDER = ".cosim.lock.json"
@@ -25,6 +27,8 @@ def hold(folder: Path) -> None:
     The system gives the lock back when the process ends, however it ends. Raises CosimError that
     says who holds it, since when, and what to do, and OSError where the folder cannot be written.
     """
+    import filelock  # here, with some fifty modules that `cosim --help` has no use for
+
     folder = folder.resolve()
     if folder in _held:
         return

@@ -8,6 +8,8 @@ from cosim.registration import register_environments
 if TYPE_CHECKING:
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
+    from cosim.experiments.outcome import StudyOutcome as StudyOutcome
+    from cosim.experiments.outcome import study as study
     from cosim.experiments.results import StudyResults as StudyResults
     from cosim.experiments.study import Study as Study
     from cosim.plant import FmuPlant as FmuPlant
@@ -23,8 +25,10 @@ _HOMES = {
     "Scenario": "cosim.scenario",
     "Trajectory": "cosim.trajectory",
     "Study": "cosim.experiments.study",
+    "StudyOutcome": "cosim.experiments.outcome",
     "StudyResults": "cosim.experiments.results",
     "simulate": "cosim.simulation",
+    "study": "cosim.experiments.outcome",
 }
 
 __all__ = [
@@ -32,10 +36,12 @@ __all__ = [
     "FmuPlant",
     "Scenario",
     "Study",
+    "StudyOutcome",
     "StudyResults",
     "Trajectory",
     "evaluate",
     "simulate",
+    "study",
 ]
 
 

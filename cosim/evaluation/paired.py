@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from cosim.evaluation.store import Store, unit_key
 from cosim.evaluation.table import Evaluation
 from cosim.evaluation.unit import Factory, RunUnit, UnitResult, run
 from cosim.kpis import comes_to_rest
+from cosim.lookup import build_controller
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 
@@ -24,7 +26,7 @@ NAIVE, OPTIMUM = "naive", "optimal"
 
 def evaluate(
     scenario: Scenario | str | Path,
-    controllers: Mapping[str, Factory],
+    controllers: Mapping[str, Factory | str] | Sequence[str],
     seeds: int | Sequence[int],
     steps: int,
     *,
@@ -45,7 +47,8 @@ def evaluate(
 
     Parameters
     ----------
-    controllers : factory(scenario) -> Controller by name, importable where the workers run. The
+    controllers : by name a factory(scenario) -> Controller, importable where the workers run, or
+        what `cosim.lookup.build_controller` takes; or only such texts, a file by its stem. The
         one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
     seeds : the seeds, or their number S for 0 … S−1.
     steps : samples per run.
@@ -60,8 +63,9 @@ def evaluate(
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     numbers = list(range(seeds)) if isinstance(seeds, int) else list(seeds)
-    _check(controllers, numbers, steps)
-    plan = _Plan(scenario, controllers, numbers, steps, optimum)
+    factories = _factories(controllers)
+    _check(factories, numbers, steps)
+    plan = _Plan(scenario, factories, numbers, steps, optimum)
     store = Store(None if folder is None else Path(folder))
     keys = (plan.key(name, seed) for name, seed in plan.runs())
     results = {key: result for key in keys if (result := store.load(key)) is not None}
@@ -80,6 +84,21 @@ def evaluate(
     finally:
         release()
     return plan.assemble(results, command)
+
+
+def _factories(controllers: Mapping[str, Factory | str] | Sequence[str]) -> dict[str, Factory]:
+    """Factories by name; raises EvaluationError where two controllers have one name."""
+    if not isinstance(controllers, Mapping):
+        named = {Path(text).stem if text.endswith(".toml") else text: text for text in controllers}
+        if isinstance(controllers, str) or len(named) < len(controllers):
+            raise EvaluationError(
+                "controllers must be a list of different names, or a mapping that gives each one"
+            )
+        controllers = named
+    return {
+        name: partial(build_controller, item) if isinstance(item, str) else item
+        for name, item in controllers.items()
+    }
 
 
 def _check(controllers: Mapping[str, Factory], seeds: Sequence[int], steps: int) -> None:

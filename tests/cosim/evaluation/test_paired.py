@@ -238,3 +238,11 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
 def test_a_malformed_request_is_refused(paper, controllers, seeds, steps, message):
     with pytest.raises(EvaluationError, match=message):
         evaluate(paper, controllers, seeds, steps)
+
+
+def test_controllers_may_be_given_by_name(paper):
+    named = evaluate(paper, ["naive"], 1, 5)
+    assert contents(named) == contents(evaluate(paper, {"naive": naive}, 1, 5))
+    for wrong in ("naive", ["naive", "naive"]):
+        with pytest.raises(EvaluationError, match="a list of different names"):
+            evaluate(paper, wrong, 1, 5)

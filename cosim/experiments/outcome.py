@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cosim.experiments.layout import HEADER, lines
+from cosim.experiments.formatting import HEADER, lines
 from cosim.experiments.report import write_report
 from cosim.experiments.results import StudyResults
 from cosim.experiments.runner import Report

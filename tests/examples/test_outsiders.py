@@ -1,11 +1,14 @@
 """Outsiders in the benchmark's table, as their stored weights and θ."""
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cosim import Scenario, evaluate
+from cosim import Scenario, StudyResults, evaluate
 from examples.outsiders import policy
 
 FOLDER = Path(__file__).parents[2] / "examples" / "outsiders"
@@ -43,3 +46,24 @@ def test_stored_policies_run_in_the_benchmark(paper, name):
     evaluation = evaluate(paper, {name: getattr(policy, name)}, 2, 100)
     assert np.isfinite(evaluation.column(name, "J")).all()
     assert (evaluation.column(name, "failures") == 0).all()
+
+
+@pytest.mark.slow
+def test_one_command_makes_the_study_of_policies_that_are_there(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    for name in ("sac", "ppo"):
+        shutil.copy(FOLDER / f"{name}.npz", tmp_path)
+    few = ["--only", "sac,ppo", "--share", "0.01"]
+    command = [sys.executable, FOLDER / "retrain.py", "--out", tmp_path, *few]
+    subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
+    assert (tmp_path / "study" / "report.html").stat().st_size > 10_000
+    results = StudyResults.load(tmp_path / "study")
+    assert set(results.cases) >= {"naive", "tuned", "sac", "ppo"}
+    assert results.of("sac", "paper")[0].steps == 100
+
+
+def test_an_outsider_that_nobody_knows_is_named(tmp_path):
+    command = [sys.executable, FOLDER / "retrain.py", "--out", tmp_path, "--only", "dqn"]
+    result = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert result.returncode == 2
+    assert "there is no outsider 'dqn'" in result.stderr

@@ -4,7 +4,9 @@ import re
 
 import pytest
 
+from cosim.experiments.charts import shortened
 from cosim.experiments.formatting import HEADER, lines
+from cosim.experiments.outcome import StudyOutcome
 from cosim.experiments.report import write_report
 from cosim.experiments.results import StudyResults
 from cosim.experiments.summary import aggregate_rows, summary_rows
@@ -77,3 +79,15 @@ def test_an_unfinished_study_is_reported_with_what_it_has(results, tmp_path):
     part = StudyResults(tmp_path, results.about | {"runs": 99}, results.runs[:3])
     text = write_report(part).read_text("utf-8")
     assert "3 of 99 runs are finished; 96 are missing here" in text
+
+
+def test_a_start_is_told_from_the_baseline_of_its_name():
+    cases = ["q(start=naive gain=0.1)", "q(start=tuned gain=0.1)"]
+    assert list(shortened(cases).values()) == ["from naive gain=0.1", "from tuned gain=0.1"]
+
+
+def test_an_outcome_reports_itself(results):
+    outcome = StudyOutcome(results.folder, results.about, results.runs)
+    assert outcome.table("paper").splitlines()[0].startswith("| case |")
+    assert len(outcome.table("paper").splitlines()) == 2 + len(lines(results, "paper"))
+    assert outcome.report() == results.folder / "report.html"

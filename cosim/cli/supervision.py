@@ -29,8 +29,8 @@ def enter() -> None:
     """Note that this process is the command line's: one that may be watched, or that is."""
     # Taken out, so that what this command starts does not take itself for it.
     _marks.append(os.environ.pop(MARK, None))
-    if _marks[-1] is not None:
-        follow_parent()
+    if (mark := _marks[-1]) is not None:
+        follow_parent(str(Path(mark).parent))
 
 
 def finish() -> None:

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from importlib import import_module
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
 
 import loky
 
 from cosim.errors import EvaluationError
+from cosim.evaluation.cluster import cluster
 from cosim.lifetime import follow_parent
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 ROUNDS = 3
+LOOK_SECONDS = 30.0
+"""Without a finished task after which a cluster is asked whether it is still there."""
 # One thread per worker: more would only fight over the cores that the workers share.
 ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -67,8 +71,8 @@ def run_all(
             return done(key, outcome)
 
         try:
-            with _executor(jobs, scheduler) as (executor, workers):
-                _feed(executor, workers, function, waiting, count)
+            with _crew(jobs, scheduler) as crew:
+                _feed(crew, function, waiting, count)
         except BrokenProcessPool as error:
             fruitless = 0 if finished else fruitless + 1
             if fruitless == ROUNDS:
@@ -76,6 +80,19 @@ def run_all(
                     f"the workers died {ROUNDS} times without finishing one of the work "
                     f"units left ({error}); run with --jobs 1 to see why"
                 ) from None
+
+
+@dataclass(frozen=True)
+class _Crew:
+    """Who works: an executor, how many workers it has now, and whether it is still there.
+
+    `look` raises EvaluationError where it is not; `translated` says in a line what it raises.
+    """
+
+    executor: Executor
+    workers: Callable[[], int]
+    look: Callable[[], None] = lambda: None
+    translated: Callable[[], AbstractContextManager[None]] = nullcontext
 
 
 class _Queue:
@@ -99,8 +116,7 @@ class _Queue:
 
 
 def _feed(
-    executor: Executor,
-    workers: Callable[[], int],
+    crew: _Crew,
     function: Callable[[Any], Any],
     waiting: _Queue,
     done: Callable[[str, Any], Mapping[str, Any] | None],
@@ -110,15 +126,19 @@ def _feed(
     broken: BrokenProcessPool | None = None
     try:
         while given or (waiting and broken is None):
-            limit = 2 * workers() if broken is None else 0
+            limit = 2 * crew.workers() if broken is None else 0
             while waiting and len(given) < limit:
                 key, task = waiting.take()
-                given[executor.submit(function, task)] = (key, task)
-            finished, _ = wait(given, return_when=FIRST_COMPLETED)
+                with crew.translated():
+                    given[crew.executor.submit(function, task)] = (key, task)
+            finished, _ = wait(given, LOOK_SECONDS, return_when=FIRST_COMPLETED)
+            if not finished:
+                crew.look()
             for future in finished:
                 key, task = given.pop(future)
                 try:
-                    outcome = future.result()
+                    with crew.translated():
+                        outcome = future.result()
                 except BrokenProcessPool as error:
                     # Futures that finished before the pool broke still come and still count.
                     broken = error
@@ -135,44 +155,27 @@ def _feed(
 
 
 @contextmanager
-def _executor(jobs: int, scheduler: str | None) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """An executor, and a function that says how many workers it has now."""
+def _crew(jobs: int, scheduler: str | None) -> Iterator[_Crew]:
     if scheduler is not None:
-        with _cluster(scheduler) as cluster:
-            yield cluster
+        with cluster(scheduler) as there:
+            yield _Crew(there.executor, there.workers, there.look, there.translated)
         return
-    executor = loky.ProcessPoolExecutor(
-        max_workers=jobs, env=ENVIRONMENT | _inherited(), initializer=follow_parent
-    )
-    try:
-        yield executor, lambda: jobs
-    except BaseException:
-        executor.shutdown(wait=True, kill_workers=True)
-        raise
-    executor.shutdown(wait=True)
+    # The workers' temporary files, which a worker that is killed leaves to us, and we to them.
+    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
+        executor = loky.ProcessPoolExecutor(
+            max_workers=jobs,
+            env=ENVIRONMENT | _inherited() | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temporary),
+            initializer=follow_parent,
+            initargs=(temporary,),
+        )
+        try:
+            yield _Crew(executor, lambda: jobs)
+        except BaseException:
+            executor.shutdown(wait=True, kill_workers=True)
+            raise
+        executor.shutdown(wait=True)
 
 
 def _inherited() -> dict[str, str]:
     """What the user set for threads stands."""
     return {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
-
-
-@contextmanager
-def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    try:
-        dask: Any = import_module("distributed")
-    except ImportError:
-        raise EvaluationError(
-            "a Dask scheduler needs the extra 'cluster': pip install 'rti-cosim[cluster]'"
-        ) from None
-    try:
-        client = dask.Client(address, timeout="10s", set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise EvaluationError(f"no Dask scheduler answers at '{address}': {error}") from None
-    try:
-        # A cluster without workers is given something to do: one may come.
-        yield client.get_executor(pure=False), lambda: max(1, sum(client.nthreads().values()))
-    except dask.KilledWorker as error:
-        raise EvaluationError(f"workers of the cluster died again and again: {error}") from None
-    finally:
-        client.close()

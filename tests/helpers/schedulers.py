@@ -1,0 +1,128 @@
+"""Addresses at which no sound Dask cluster answers, and clusters of real processes to ruin."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+# A process that has everything but our packages.
+WITHOUT = "import sys; sys.modules.update(dict.fromkeys({names}))\n"
+MAIN = "from distributed.cli.dask_{role} import main; main()"
+PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
+OURS = PACKAGES
+
+
+@contextmanager
+def listener(answer: Callable[[socket.socket], None]) -> Iterator[str]:
+    """Address of a server on loopback that answers each connection in its own way."""
+    with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as open_ones:
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    connection, _ = server.accept()
+                    open_ones.callback(connection.close)
+                    answer(connection)
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+def silent(connection: socket.socket) -> None:
+    """Say nothing."""
+
+
+def hang_up(connection: socket.socket) -> None:
+    connection.close()
+
+
+def noise(connection: socket.socket) -> None:
+    with suppress(OSError):
+        connection.sendall(b"\xff" * 4096)
+
+
+def zeros(connection: socket.socket) -> None:
+    with suppress(OSError):
+        connection.sendall(b"\0" * 4096)
+
+
+def web(connection: socket.socket) -> None:
+    with suppress(OSError):
+        connection.sendall(b"HTTP/1.0 400 Bad request\r\n\r\n")
+        connection.close()
+
+
+def mail(connection: socket.socket) -> None:
+    with suppress(OSError):
+        connection.sendall(b"220 mail.example ESMTP\r\n")
+
+
+ANSWERS = {answer.__name__: answer for answer in (silent, hang_up, noise, zeros, web, mail)}
+
+
+@dataclass
+class Processes:
+    """A scheduler and its workers as processes."""
+
+    address: str = ""
+    scheduler: subprocess.Popen[bytes] | None = None
+    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+
+@contextmanager
+def processes(
+    *, workers: int = 1, without: tuple[str, ...] = (), role: str = "", code: Path = ROOT,
+    options: tuple[str, ...] = (),
+) -> Iterator[Processes]:  # fmt: skip
+    """A cluster; the process of `role` is `without` modules, the workers run the code in a folder.
+
+    `options` are the scheduler's.
+    """
+    cluster = Processes()
+    with tempfile.TemporaryDirectory(prefix="cosim-dask-") as folder, ExitStack() as running:
+
+        def start(which: str, *words: str, path: Path) -> subprocess.Popen[bytes]:
+            hidden = WITHOUT.format(names=without) if which == role else ""
+            process = subprocess.Popen(
+                [sys.executable, "-c", hidden + MAIN.format(role=which), *words],
+                cwd=folder,
+                env=os.environ | {"PYTHONPATH": str(path), "PYTHONWARNINGS": "ignore"},
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            running.callback(_end, process)
+            return process
+
+        note = Path(folder) / "scheduler.json"
+        where = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", *options)
+        cluster.scheduler = start("scheduler", *where, "--scheduler-file", str(note), path=ROOT)
+        cluster.address = _address(note)
+        for _ in range(workers):
+            words = (cluster.address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+            cluster.workers.append(start("worker", *words, path=code))
+        yield cluster
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
+def _address(note: Path) -> str:
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        with suppress(OSError, ValueError):
+            return str(json.loads(note.read_text())["address"])
+        time.sleep(0.05)
+    raise TimeoutError("the scheduler did not start")

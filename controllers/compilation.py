@@ -22,6 +22,7 @@ from controllers.buffered import BufferedFunction
 from controllers.code_generation import c_source
 from controllers.errors import ControllerError
 from rti_storage.cache import read_own, sweep, trusted_folder
+from rti_storage.guarded import end_guarded, start_guarded
 
 if TYPE_CHECKING:
     import filelock
@@ -106,13 +107,7 @@ class _Build:
             self._own = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
             (self._own / "functions.c").write_text(source, encoding="utf-8")
             command = [compiler.path, *FLAGS, "-o", "library", "functions.c", "-lm"]
-            self._process = subprocess.Popen(
-                command,
-                cwd=self._own,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
+            self._process = start_guarded(command, log=subprocess.DEVNULL, folder=self._own)
         except BaseException:
             self._lock.release()
             raise
@@ -140,9 +135,7 @@ class _Build:
 
     def close(self) -> None:
         """End the compiler and leave nothing behind."""
-        if self._process.poll() is None:
-            self._process.kill()
-            self._process.wait()
+        end_guarded(self._process)
         shutil.rmtree(self._own, ignore_errors=True)
         self._lock.release()
         atexit.unregister(self.close)

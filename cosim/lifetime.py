@@ -8,14 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from pathlib import Path
 from types import FrameType
-from typing import IO, TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import subprocess
 
 # Every command imports this file; processes are imported where one is started.
 
@@ -77,35 +70,3 @@ def follow_parent(temporary: str | None = None) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, name="follow-parent", daemon=True).start()
-
-
-def start_guarded(
-    command: Sequence[str],
-    *,
-    env: Mapping[str, str] | None = None,
-    log: IO[bytes] | None = None,
-) -> subprocess.Popen[bytes]:
-    """Start a command, and all that it starts, in a group that ends when this process does.
-
-    `env` is its environment, `log` takes what it prints (default: where this process prints).
-    The process returned is the guard: its exit code is the command's, and `end_guarded` ends it.
-    """
-    import subprocess  # noqa: PLC0415
-
-    from cosim import guardian  # noqa: PLC0415
-
-    return subprocess.Popen(
-        [sys.executable, "-I", str(Path(guardian.__file__)), *command],
-        stdin=subprocess.PIPE,
-        stdout=log,
-        stderr=log,
-        env=dict(env) if env is not None else None,
-    )
-
-
-def end_guarded(process: subprocess.Popen[bytes]) -> None:
-    """End a guarded command and wait until it has ended."""
-    if process.stdin is not None:
-        with suppress(OSError):
-            process.stdin.close()
-    process.wait()

@@ -1,6 +1,6 @@
 """Endurance: a long learning run on one plant; memory, time per sample and failures by tenths.
 
-    python tests/faults/endurance.py --samples 1000000
+    python tests/faults/endurance.py --samples 1000000 [--record]
 
 Exit code 1 where memory grew by more than --megabytes after the first tenth, the last tenth cost
 more than --drift times the first one's CPU time, or a sample failed to be solved.
@@ -19,6 +19,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from cosim import FmuPlant, Scenario
+from cosim.recording import TrainingRecorder
+from cosim.recording.reader import read_recording
 from learning.q_learning import QLearning
 from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun
@@ -32,9 +34,13 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
 
-def endure(samples: int, folder: Path) -> dict[str, object]:
-    """Train for `samples` samples with checkpoints; figures of each tenth of the run."""
+def endure(samples: int, folder: Path, *, record: bool = False) -> dict[str, object]:
+    """Train for `samples` samples with checkpoints; figures of each tenth of the run.
+
+    Recorded, the log has a row for each thousandth of the run.
+    """
     tenth = samples // TENTHS
+    every = tenth // 100 if record else tenth
     scenario = Scenario.load("paper")
     run = TrainingRun(
         algorithm="q-learning",
@@ -42,13 +48,15 @@ def endure(samples: int, folder: Path) -> dict[str, object]:
         samples=tenth * TENTHS,
         seed=0,
         configuration=QLearning.Configuration(),
-        log_every=tenth,
+        log_every=every,
         evaluate_every=tenth * TENTHS,
         checkpoint_every=tenth,
     )
     cpu, wall, memory, failures = [], [], [], []
 
-    def look(_: int, row: dict[str, float] | None) -> None:
+    def look(samples: int, row: dict[str, float] | None) -> None:
+        if samples % tenth:
+            return
         gc.collect()
         cpu.append(time.process_time())
         wall.append(time.perf_counter())
@@ -56,16 +64,21 @@ def endure(samples: int, folder: Path) -> dict[str, object]:
         failures.append(0 if row is None else int(row["failures"]))
 
     with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        training = TrainingLoop(run, QLearning, plant, other, out=folder)
+        recorder = TrainingRecorder(folder / "training.rrd") if record else None
+        training = TrainingLoop(run, QLearning, plant, other, out=folder, recorder=recorder)
         look(0, None)
         result = training.go(progress=look)
+    held = [row for row in result.rows if row["samples"] % tenth == 0]
+    if record:
+        recording = read_recording(folder / "training.rrd")
+        assert len(recording.samples) == len(result.rows) == 100 * TENTHS
     per_sample = [1e6 * (b - a) / tenth for a, b in pairwise(cpu)]
     per_wall = [1e6 * (b - a) / tenth for a, b in pairwise(wall)]
     return {
         "samples": run.samples,
         "status": result.status,
         "failures": failures[-1],
-        "J": [row["J"] for row in result.rows],
+        "J": [row["J"] for row in held],
         "greedy_J": result.evaluation["J"],
         "cpu_us_per_sample": per_sample,
         "wall_us_per_sample": per_wall,
@@ -79,11 +92,12 @@ def main() -> int:
     """Run, print the figures as JSON, judge them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--samples", type=int, default=1_000_000)
+    parser.add_argument("--record", action="store_true", help="write a recording, too")
     parser.add_argument("--megabytes", type=float, default=5.0)
     parser.add_argument("--drift", type=float, default=1.25)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        figures = endure(options.samples, Path(folder))
+        figures = endure(options.samples, Path(folder), record=options.record)
     print(json.dumps(figures, indent=2))
     sound = (
         figures["status"] == "finished"

@@ -1,12 +1,14 @@
 """Runs a command for as long as somebody holds the other end of standard input.
 
 A program of its own, run by its path with nothing but the standard library, so that it starts in
-some milliseconds: `python guardian.py COMMAND ARGUMENT…`. The parent keeps the pipe open; whatever
-ends the parent closes it, even a SIGKILL, and the command's whole process group ends then. Its
-temporary files go to a folder that ends with it.
+some milliseconds: `python guardian.py FOLDER COMMAND ARGUMENT…`. The parent keeps the pipe open;
+whatever ends the parent closes it, even a SIGKILL, and the command's whole process group ends then.
+Its temporary files go to a folder that ends with it. It runs in FOLDER unless that is empty; the
+FOLDER is deleted where the parent ended before it.
 """
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -44,21 +46,25 @@ def end(child: "subprocess.Popen[bytes]") -> None:
 def main() -> int:
     """Run the command of the arguments; its exit code, 128 + n where signal n ended it."""
     with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
-        return run(sys.argv[1:], temporary)
+        return run(sys.argv[2:], temporary, sys.argv[1])
 
 
-def run(command: list[str], temporary: str) -> int:
+def run(command: list[str], temporary: str, folder: str) -> int:
     """Run the command with its temporary files in a folder; its exit code."""
     child = subprocess.Popen(
         command,
+        cwd=folder or None,
         stdin=subprocess.DEVNULL,
         start_new_session=sys.platform != "win32",
         env=os.environ | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temporary),
     )
 
+    alone = threading.Event()
+
     def follow() -> None:
         while os.read(0, 4096):
             pass
+        alone.set()
         end(child)
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -71,6 +77,8 @@ def run(command: list[str], temporary: str) -> int:
     code = child.wait()
     if sys.platform != "win32":
         end(child)  # what it left behind
+    if folder and alone.is_set():
+        shutil.rmtree(folder, ignore_errors=True)
     return 128 - code if code < 0 else code
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -135,8 +136,8 @@ def compare(
     ------
     ComparisonError : a tolerance for a signal that neither run has, or a negative one.
     """
-    if not relative >= 0:
-        raise ComparisonError(f"relative (--relative) must not be negative, not {relative}")
+    if not 0 <= relative < inf:
+        raise ComparisonError(f"relative (--relative) must be finite and ≥ 0, not {relative}")
     tolerances = tolerances or {}
     known = {**a.signals, **b.signals}
     for name, value in tolerances.items():

@@ -59,7 +59,12 @@ def load(
     digest = entries.pop("digest", None)
     if digest is None or "about" not in entries or digest.tobytes() != _digest(entries):
         raise CheckpointError(f"{path}: the checkpoint is damaged (checksum); start the run anew")
-    about = json.loads(entries.pop("about").tobytes())
+    try:
+        about = json.loads(entries.pop("about").tobytes())
+        if not all(isinstance(part, dict) for part in (about, about["run"], about["state"])):
+            raise TypeError("no table")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CheckpointError(f"{path}: the checkpoint says nothing of its run ({error})") from None
     if about.get("schema") != SCHEMA:
         raise CheckpointError(
             f"{path}: schema is {about.get('schema')!r}; this version reads schema {SCHEMA}"

@@ -189,9 +189,12 @@ class Interaction:
         return {name: getattr(self, name) for name in COUNTS}, arrays
 
     def resume(self, numbers: dict[str, int], arrays: dict[str, Vector]) -> None:
-        """Take back what `state` gave; the plant must have been restored before."""
-        for name, value in numbers.items():
-            setattr(self, name, value)
+        """Take back what `state` gave; the plant must have been restored before.
+
+        Raises KeyError, TypeError or ValueError where it is not that.
+        """
+        for name in COUNTS:
+            setattr(self, name, int(numbers[name]))
         self.s, self._applied = arrays["s"], arrays["applied"]
         self._point = self._marked = None
         if "marked" in arrays:

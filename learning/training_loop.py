@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
-from cosim.errors import CapabilityError
+from cosim.errors import CapabilityError, PlantError
 from cosim.evaluation.statistics import shown
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller, functions_of
@@ -260,13 +260,30 @@ class TrainingLoop:
             raise ConfigurationError("a run without a folder cannot be resumed")
         path = self._out / "checkpoint.npz"
         found = checkpoint.load(path, self._run.identity(), but=("samples",))
-        self._require_same_beginning(path, int(found.run["samples"]))
+        try:
+            self._require_same_beginning(path, int(found.run["samples"]))
+            self._restore(found)
+        except (
+            LookupError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+            PlantError,
+        ) as e:
+            raise CheckpointError(
+                f"{path}: its content is not that of this run ({type(e).__name__}: {e}); start the "
+                "run anew"
+            ) from None
+
+    def _restore(self, found: Checkpoint) -> None:
+        """Take up a checkpoint's state; whatever does not fit raises some error."""
         learner, state, arrays = self._learner, found.state, found.arrays
         checkpoint.restore_generator(learner.rng, state["generator"])
         checkpoint.restore_generator(learner.algorithm_rng, state["algorithm_generator"])
         self._rows = [
             LogRow(
-                dict(zip(state["columns"], figures.tolist(), strict=True)),
+                dict(zip(state["columns"], map(float, figures), strict=True)),
                 learner.start.with_theta(theta),
             )
             for figures, theta in zip(arrays["rows"], arrays["row_thetas"], strict=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from collections.abc import Iterable
@@ -16,10 +17,13 @@ def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Pat
     """Write a file under a temporary name in its folder, then rename it into place.
 
     A reader never sees half a file, and what stood under the name before survives any failure.
-    Text, whole or in pieces that are written as they come, is encoded as UTF-8. Raises OSError
-    where the folder cannot be written.
+    Text, whole or in pieces that are written as they come, is encoded as UTF-8. Raises OSError,
+    which names the file, where the folder cannot be written or is full, or where something other
+    than a file has its name: a device would be no more, a folder cannot be replaced.
     """
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise FileExistsError(errno.EEXIST, "it is not a regular file", str(path))
     pieces = (data,) if isinstance(data, bytes | str) else data
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -30,8 +34,10 @@ def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Pat
             os.fsync(stream.fileno())
         make_public(Path(temporary))
         Path(temporary).replace(path)
-    except BaseException:
+    except BaseException as error:
         Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError) and not error.filename:
+            raise OSError(error.errno, error.strerror, str(path)) from None
         raise
     return path
 

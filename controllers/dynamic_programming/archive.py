@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
-import os
 from collections.abc import Callable
 from dataclasses import asdict
 from math import isfinite
@@ -25,12 +23,13 @@ from controllers.dynamic_programming.solution import Optimum
 from controllers.errors import OptimumError
 from controllers.problem import Problem
 from rti_storage import user_cache, write_atomically
-from rti_storage.cache import CACHE_VARIABLE
+from rti_storage.cache import CACHE_VARIABLE, is_closed, is_own_file, own_folder
 from rti_storage.files import read_arrays
 
 # Part of every key: raise it when the solver changes what it finds.
 VERSION = 2
 MEND = "delete it to have the policy computed anew"
+KIND = "optima"
 SHIPPED = Path(__file__).parent.parent / "optima"
 
 
@@ -83,32 +82,31 @@ def _expression(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
 
 def cache_folder() -> Path:
     """The user's folder of solved problems."""
-    return user_cache("optima")
+    return user_cache(KIND)
 
 
 def require_cache() -> Path:
-    """The user's folder, made if need be; raises OptimumError where it cannot be written."""
-    folder = cache_folder()
+    """The user's folder, made if need be; OptimumError where it is not the user's or is closed."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        reason = "" if os.access(folder, os.W_OK) else os.strerror(errno.EACCES)
+        return own_folder(KIND)
     except OSError as error:
-        reason = str(error.strerror)
-    if reason:
         raise OptimumError(
-            f"{folder}: the optimal policy cannot be kept there ({reason}); name a folder that can "
-            f"be written in the environment's {CACHE_VARIABLE}"
-        )
-    return folder
+            f"{cache_folder()}: the optimal policy cannot be kept there ({error.strerror}); name a "
+            "folder that can be written, by its user only, in the environment's "
+            f"{CACHE_VARIABLE}"
+        ) from None
 
 
 def stored(name: str) -> Path | None:
-    """File of a solved problem by its key: the package's own, else the user's, else None."""
-    for folder in (SHIPPED, cache_folder()):
-        path = folder / f"{name}.npz"
-        if path.is_file():
-            return path
-    return None
+    """File of a solved problem by its key: the package's own, else the user's, else None.
+
+    A folder that others can write is left alone.
+    """
+    path = SHIPPED / f"{name}.npz"
+    if path.is_file():
+        return path
+    path = cache_folder() / path.name
+    return path if is_closed(path.parent) and is_own_file(path) else None
 
 
 def write(path: Path, optimum: Optimum, name: str) -> Path:
@@ -226,5 +224,5 @@ def keep(name: str, make: Callable[[], Optimum]) -> Optimum:
     """
     folder = require_cache()
     optimum = make()
-    write(folder / f"{name}.npz", optimum, name)
+    write(folder / f"{name}.npz", optimum, name).chmod(0o600)
     return optimum

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from cosim.errors import EvaluationError
 from cosim.evaluation.unit import UnitResult, as_document, from_document
@@ -13,7 +14,7 @@ from rti_storage import write_atomically
 from rti_storage.documents import read_json
 
 FOLDER = ".units"
-FORMAT = 1
+FORMAT = 2
 
 
 class Store:
@@ -42,7 +43,13 @@ class Store:
     def save(self, key: str, result: UnitResult) -> None:
         """Store a result, whole or not at all."""
         if self._folder is not None:
-            write_atomically(self._folder / f"{key}.json", json.dumps(as_document(result)))
+            document = as_document(result)
+            document["sha256"] = _digest(document)
+            write_atomically(self._folder / f"{key}.json", json.dumps(document))
+
+
+def _digest(document: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
 def unit_key(facts: Mapping[str, str | int | None]) -> str:

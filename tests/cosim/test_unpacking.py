@@ -11,7 +11,7 @@ import pytest
 import fmus
 from cosim.plant import unpacking
 from cosim.plant.archive import unpack
-from rti_storage.cache import UNUSED_DAYS
+from rti_storage.cache import TAG, UNUSED_DAYS
 
 DAY = 86400
 
@@ -32,6 +32,10 @@ def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+def entries(cache):
+    return [path for path in cache.iterdir() if path.name != TAG]
+
+
 def packed(archive):
     return {name: archive.read(name) for name in archive.namelist()}
 
@@ -39,7 +43,7 @@ def packed(archive):
 def test_the_folder_holds_the_archive_and_nothing_else_is_left(cache, archive):
     folder = unpacking.place(archive, "0" * 64)
     assert contents(folder) == packed(archive)
-    assert list(cache.iterdir()) == [folder]
+    assert entries(cache) == [folder]
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
 
 
@@ -65,7 +69,7 @@ def test_a_damaged_folder_is_replaced(cache, archive, damage, tmp_path):
         (tmp_path / "elsewhere").write_bytes(data)
         library.symlink_to(tmp_path / "elsewhere")
     assert contents(unpacking.place(archive, "0" * 64)) == packed(archive)
-    assert list(cache.iterdir()) == [folder]
+    assert entries(cache) == [folder]
     assert not library.is_symlink()
 
 
@@ -78,13 +82,14 @@ def test_a_cache_that_is_deleted_in_mid_run_is_filled_again(cache):
 
 
 def test_what_nobody_used_for_long_is_deleted(cache, archive):
+    unpacking.place(archive, "1" * 64)
     old, recent = cache / ("a" * 64), cache / ("b" * 64)
     for folder, days in ((old, UNUSED_DAYS + 1), (recent, UNUSED_DAYS - 1)):
         (folder / "sources").mkdir(parents=True)
         then = folder.stat().st_mtime - days * DAY
         os.utime(folder, (then, then))
     unpacking.place(archive, "0" * 64)
-    assert {path.name[0] for path in cache.iterdir()} == {"0", "b"}
+    assert {path.name[0] for path in entries(cache)} == {"0", "1", "b"}
 
 
 def test_use_counts_even_where_nothing_is_unpacked(cache, archive):
@@ -114,7 +119,7 @@ def test_processes_that_unpack_at_once_agree(cache, archive):
     size = archive.getinfo("modelDescription.xml").file_size
     assert "".join(said).split() == [str(size)] * 80
     assert contents(cache / ("0" * 64)) == packed(archive)
-    assert len(list(cache.iterdir())) == 1
+    assert len(entries(cache)) == 1
 
 
 def test_without_a_cache_the_folder_ends_with_the_process(tmp_path):

@@ -34,21 +34,21 @@ from cosim.cli.locking import HOLDER, LOCK
 MARK = "COSIM_ORPHANS"
 COSIM = (sys.executable, "-m", "cosim")
 ROOT = Path(__file__).parents[2]
-PATIENCE = 10.0
+PATIENCE = 60.0
 """Seconds within which everything must have ended; a loaded machine's guard polls in its time."""
 STUDY = """\
 schema = 1
 name = "orphans"
 scenarios = ["paper"]
 training_seeds = { first = 0, count = 2 }
-evaluation = { seeds = 4, steps = 2000 }
+evaluation = { seeds = 4, steps = 1000 }
 curves = { points = 3, seeds = 2, steps = 200 }
 [[case]]
 controller = "tuned"
 [[case]]
 name = "q"
 algorithm = "q-learning"
-samples = 6000
+samples = 3000
 """
 
 
@@ -76,15 +76,15 @@ class Job:
 
 
 JOBS = (
-    Job("simulate --record", "simulate -n 20000 --record --out out", "out/summary.json"),
-    Job("simulate --isolate", "simulate -n 4000 --isolate --out out", "out/summary.json"),
+    Job("simulate --record", "simulate -n 6000 --record --out out", "out/summary.json"),
+    Job("simulate --isolate", "simulate -n 3000 --isolate --out out", "out/summary.json"),
     Job(
         "train",
-        "train -a q-learning -n 12000 --checkpoint-every 1000 --out out",
+        "train -a q-learning -n 4000 --checkpoint-every 1000 --out out",
         "out/summary.json",
         again="--overwrite",
     ),
-    Job("evaluate --jobs", "evaluate --seeds 8 -n 3000 --jobs 2 --out out", "out/summary.json"),
+    Job("evaluate --jobs", "evaluate --seeds 6 -n 2500 --jobs 2 --out out", "out/summary.json"),
     Job("study --jobs", "study run study.toml --jobs 2 --out out", "out/summary.json", _study),
     Job("view --png", "view recorded/run.rrd --png out.png", "out.png", _recording),
     Job("export", "export tuned --out out/policy.fmu", "out/policy.fmu"),

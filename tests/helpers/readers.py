@@ -116,7 +116,7 @@ def readers(folder: Path) -> dict[str, Reader]:
         ("recording", "run.rrd", read_recording, RecordingError, None),
         ("fmu", "plant.fmu", unpack, PlantError, None),
         ("unit", ".units/unit.json", lambda p: Store(p.parent.parent).load("unit"),
-         EvaluationError, None),
+         EvaluationError, repr),
     ]  # fmt: skip
     return {
         name: Reader(name, file, (folder / file).read_bytes(), read(folder / file), read, *rest)

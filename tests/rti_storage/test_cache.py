@@ -4,7 +4,18 @@ import stat
 import pytest
 
 from rti_storage import cache
-from rti_storage.cache import is_own_folder, read_own, sweep, trusted_folder, user_cache
+from rti_storage.cache import (
+    TAG,
+    TAGGED,
+    UNFINISHED_DAYS,
+    UNUSED_DAYS,
+    is_own_folder,
+    own_folder,
+    read_own,
+    sweep,
+    trusted_folder,
+    user_cache,
+)
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
 
@@ -83,11 +94,101 @@ def test_a_file_is_read_only_if_nobody_else_can_have_written_it(tmp_path):
         read_own(path)
 
 
-def test_what_was_not_used_for_long_is_swept(tmp_path):
-    for name in ("old", "new"):
-        (tmp_path / name).write_text(name)
-        (tmp_path / f"{name} folder").mkdir()
-    for name in ("old", "old folder"):
-        os.utime(tmp_path / name, (0, 0))
-    sweep(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"new", "new folder"}
+def test_a_fifo_in_place_of_a_file_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(OSError, match="this user alone"):
+        read_own(tmp_path / "fifo")
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o775, 0o757])
+def test_a_cache_that_others_can_replace_is_not_used(tmp_path, monkeypatch, mode):
+    above = tmp_path / "above"
+    above.mkdir()
+    monkeypatch.setenv("COSIM_CACHE", str(above / "cache"))
+    assert trusted_folder("compiled") == above / "cache" / "compiled"
+    above.chmod(mode)
+    assert above not in trusted_folder("compiled").parents
+    with pytest.raises(PermissionError, match="other users can replace it"):
+        own_folder("compiled")
+
+
+def test_a_folder_for_temporary_files_of_all_is_none_that_others_can_replace(tmp_path, monkeypatch):
+    (tmp_path / "above").mkdir()
+    (tmp_path / "above").chmod(0o1777)
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "above" / "cache"))
+    assert own_folder("compiled").parent.parent == tmp_path / "above"
+
+
+def aged(path, days):
+    then = path.lstat().st_mtime - days * 86400
+    os.utime(path, (then, then), follow_symlinks=False)
+
+
+HASH = "0123456789abcdef" * 4
+OWN = [HASH, HASH[:16] + ".npz", HASH[:32] + "." + HASH, HASH[:32] + ".lock"]
+WORDS = ["plant.fmu", "results", ".git", "thesis.tex"]
+FOREIGN = [*WORDS, "0123", HASH + "0", HASH.upper(), "zz" * 32]
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_what_was_not_used_for_long_is_swept(name):
+    folder = own_folder("fmus")
+    for kind in ("old", "new"):
+        (folder / name.replace("0", {"old": "0", "new": "1"}[kind], 1)).mkdir()
+    aged(folder / name, UNUSED_DAYS + 1)
+    aged(folder / name.replace("0", "1", 1), UNUSED_DAYS - 1)
+    sweep(folder)
+    assert {path.name for path in folder.iterdir()} == {TAG, name.replace("0", "1", 1)}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+def test_what_is_not_ours_is_never_swept(tmp_path, name, kind):
+    folder = own_folder("fmus")
+    path = folder / name
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "kept").touch()
+    if kind == "link":
+        path.symlink_to(tmp_path / "elsewhere")
+    else:
+        path.touch() if kind == "file" else path.mkdir()
+    aged(path, 10 * UNUSED_DAYS)
+    sweep(folder)
+    assert path.is_symlink() or path.exists()
+    assert (tmp_path / "elsewhere" / "kept").exists()
+
+
+def test_a_link_of_our_name_is_swept_and_not_followed(tmp_path):
+    folder = own_folder("fmus")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "kept").touch()
+    (folder / HASH).symlink_to(tmp_path / "elsewhere")
+    aged(folder / HASH, UNUSED_DAYS + 1)
+    sweep(folder)
+    assert not (folder / HASH).is_symlink()
+    assert (tmp_path / "elsewhere" / "kept").exists()
+
+
+@pytest.mark.parametrize("mark", ["none", "another", "a link"])
+def test_a_folder_without_our_mark_is_never_swept(own_cache, tmp_path, mark):
+    (own_cache / "fmus").mkdir(parents=True)
+    old = own_cache / "fmus" / HASH
+    old.mkdir()
+    aged(old, 10 * UNUSED_DAYS)
+    folder = own_folder("fmus")
+    if mark == "another":
+        (folder / TAG).write_text("another")
+    elif mark == "a link":
+        (tmp_path / "tag").write_text(TAGGED)
+        (folder / TAG).symlink_to(tmp_path / "tag")
+    sweep(folder)
+    assert old.exists()
+
+
+def test_what_a_killed_process_left_unfinished_is_swept_sooner():
+    folder = own_folder("fmus")
+    for name, days in ((".partial-old", UNFINISHED_DAYS + 1), (".partial-new", 0)):
+        (folder / name).mkdir()
+        aged(folder / name, days)
+    sweep(folder)
+    assert {path.name for path in folder.iterdir()} == {TAG, ".partial-new"}

@@ -28,7 +28,7 @@ FOLDER = (
     "import subprocess, sys, time\n"
     "from pathlib import Path\n"
     "from rti_storage.guarded import start_guarded\n"
-    "start_guarded([sys.executable, '-c', {program!r}], folder=Path({folder!r}))\n"
+    "process = start_guarded([sys.executable, '-c', {program!r}], folder=Path({folder!r}))\n"
     "print('started', flush=True)\n"
     "time.sleep(600)\n"
 )

@@ -1,3 +1,4 @@
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -103,10 +104,11 @@ def test_content_changed_by_hand_is_refused(stored):
 
 
 def test_the_packages_own_is_preferred_to_the_users(optimum, tmp_path, monkeypatch):
-    for folder in ("shipped", "cache"):
-        archive.write(tmp_path / folder / "abc.npz", optimum, "abc")
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    archive.keep("abc", lambda: optimum)
+    assert archive.stored("abc") == tmp_path / "optima" / "abc.npz"
+    archive.write(tmp_path / "shipped" / "abc.npz", optimum, "abc")
     monkeypatch.setattr(archive, "SHIPPED", tmp_path / "shipped")
-    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path / "cache")
     assert archive.stored("abc") == tmp_path / "shipped" / "abc.npz"
 
 
@@ -116,7 +118,7 @@ def test_another_problems_file_is_refused(stored):
 
 
 def test_what_is_solved_once_is_read_the_next_time(optimum, tmp_path, monkeypatch):
-    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     calls = []
 
     def make():
@@ -135,6 +137,24 @@ def test_a_cache_that_cannot_be_written_is_refused_before_the_work(tmp_path, mon
     with pytest.raises(OptimumError, match=r"cannot be kept there .*COSIM_CACHE"):
         archive.obtain("abc", SCALAR.problem, lambda: calls.append(1))
     assert not calls
+
+
+OPENED = {
+    "folder open to others": lambda path: path.parent.chmod(0o777),
+    "cache open to others": lambda path: path.parent.parent.chmod(0o777),
+    "file open to others": lambda path: path.chmod(0o666),
+    "link": lambda path: path.rename(path.with_name("b")) and path.symlink_to("b"),
+    "second name": lambda path: path.with_name("b").hardlink_to(path),
+}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
+@pytest.mark.parametrize("how", OPENED)
+def test_what_others_may_have_written_is_not_read(optimum, tmp_path, monkeypatch, how):
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
+    archive.keep("abc", lambda: optimum)
+    OPENED[how](tmp_path / "cache" / "optima" / "abc.npz")
+    assert archive.stored("abc") is None
 
 
 def changed_key(problem=PROBLEM, law=LAW, parameters=P, settings=None):

@@ -34,13 +34,17 @@ def test_table_shows_value_and_bounds(cosim):
     assert "6224.9" in out
 
 
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+
+
 def test_without_a_certificate_it_is_a_reference(cosim, tmp_path, monkeypatch):
     plant = PlantProblem.from_scenario(Scenario.load("paper"))
     key = archive.key(plant, Settings())
     known = archive.read(archive.SHIPPED / f"{key}.npz", key, plant.problem)
     monkeypatch.setattr(archive, "SHIPPED", tmp_path / "none")
-    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
-    archive.write(tmp_path / f"{key}.npz", replace(known, certificate=None), key)
+    archive.keep(key, lambda: replace(known, certificate=None))
     code, out, err = cosim("optimum", "--scenario", "paper")
     assert code == 0
     assert "reference of paper" in out
@@ -48,7 +52,7 @@ def test_without_a_certificate_it_is_a_reference(cosim, tmp_path, monkeypatch):
     figures = known.certificate.figures
     apart = (replace(figures[0], value=6300.0, lower=6300.0, upper=6300.0), *figures[1:])
     apart = replace(known, certificate=Certificate(apart))
-    archive.write(tmp_path / f"{key}.npz", apart, key)
+    archive.keep(key, lambda: apart)
     code, out, _ = cosim("optimum", "--scenario", "paper", "--json")
     document = json.loads(out)
     assert document["kind"] == "reference"
@@ -79,9 +83,9 @@ def test_unknown_criterion_is_refused(cosim):
 
 
 def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):
-    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
+    folder = archive.require_cache()
     for shipped in archive.SHIPPED.glob("*.npz"):
-        (tmp_path / shipped.name).write_bytes(b"damaged")
+        (folder / shipped.name).write_bytes(b"damaged")
     monkeypatch.setattr(archive, "SHIPPED", tmp_path / "none")
     code, out, err = cosim("optimum", "--scenario", "paper")
     assert (code, out) == (2, "")
@@ -100,7 +104,6 @@ def test_a_cache_that_cannot_be_written_is_refused_before_the_work(cosim, tmp_pa
 
 @pytest.mark.slow
 def test_solving_anew_ends_in_the_optimum_that_is_shipped(cosim, tmp_path, monkeypatch):
-    monkeypatch.setattr(archive, "cache_folder", lambda: tmp_path)
     code, out, _ = cosim("optimum", "--scenario", "paper", "--recompute", "--json")
     assert code == 0
     assert json.loads(out)["J"] == pytest.approx(6337.8, rel=3e-5)

@@ -108,6 +108,8 @@ def _check(controllers: Mapping[str, Factory], seeds: Sequence[int], steps: int)
         raise EvaluationError("no seed to evaluate on; give at least one")
     if len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise EvaluationError("seeds must be distinct and not negative")
+    if max(seeds) >= 1 << 64:
+        raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
     if steps < 1:
         raise EvaluationError(f"steps must be at least 1, not {steps}")
 
@@ -153,7 +155,7 @@ class _Plan:
                 "controller_hash": controller_hash(controller),
                 "parameters_hash": self._parameters[name],
             }
-            self._units[name] = RunUnit(session, name, factory, scenario, None, steps, code)
+            self._units[name] = RunUnit(session, name, factory, scenario, None, steps, code, fmu)
 
     def runs(self) -> Iterator[tuple[str, int | None]]:
         """Controller and seed of every unit; without a seed it is the settling run."""

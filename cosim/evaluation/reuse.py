@@ -8,6 +8,7 @@ from collections.abc import Callable
 from cosim.errors import CosimError
 from cosim.evaluation.provenance import code_hash
 from cosim.plant import FmuPlant
+from cosim.plant.archive import unpack
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 
@@ -51,4 +52,15 @@ def require_code(code: str, packages: tuple[str, ...], error: type[CosimError]) 
         raise error(
             f"a worker runs other code ({here}) than the work was given out with ({code}); install "
             "the same version of rti-cosim everywhere"
+        )
+
+
+def require_fmu(scenario: Scenario, sha256: str, error: type[CosimError]) -> None:
+    """Raise `error` where a scenario's FMU is another one than where the work was given out."""
+    found = unpack(scenario.plant.fmu)
+    if found.sha256 != sha256:
+        raise error(
+            f"FMU '{found.path}' was replaced, or is another one on this worker (SHA-256 "
+            f"{found.sha256[:16]}…, not {sha256[:16]}…); what is finished is stored: put the FMU "
+            "back, or begin anew with it"
         )

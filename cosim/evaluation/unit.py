@@ -10,7 +10,7 @@ from typing import Any
 from cosim.errors import EvaluationError
 from cosim.evaluation import reuse
 from cosim.evaluation.provenance import EVALUATING
-from cosim.evaluation.reuse import require_code
+from cosim.evaluation.reuse import require_code, require_fmu
 from cosim.kpis import displaced, indicators, settling_time
 from cosim.protocols import Controller, functions_of
 from cosim.scenario import Scenario
@@ -24,7 +24,7 @@ class RunUnit:
     """What a worker needs to know; `seed` None is the settling run without disturbances.
 
     `session` tells evaluations apart, so that a worker keeps its controllers within one; `code`
-    is the hash of the code that the evaluation was started with.
+    and `fmu` are the hashes of code and FMU that the evaluation was started with.
     """
 
     session: str
@@ -34,6 +34,7 @@ class RunUnit:
     seed: int | None
     steps: int
     code: str
+    fmu: str
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,11 @@ class UnitResult:
 def run(unit: RunUnit) -> UnitResult:
     """Run a unit; the result depends on nothing but the unit, so any worker may do it.
 
-    Raises EvaluationError if this worker has other code than the evaluation was started with, and
-    whatever plant and controller raise.
+    Raises EvaluationError if this worker has other code or another FMU than the evaluation was
+    started with, and whatever plant and controller raise.
     """
     require_code(unit.code, EVALUATING, EvaluationError)
+    require_fmu(unit.scenario, unit.fmu, EvaluationError)
     controller = reuse.controller(
         f"{unit.session} {unit.controller}", lambda: unit.factory(unit.scenario)
     )

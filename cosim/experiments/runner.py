@@ -53,7 +53,10 @@ class Runner:
         self._plan, self._report = plan, report
         folders = (str(definition.folder), str(Path.cwd()))
         self._place = Place(
-            definition.trainer, tuple(dict.fromkeys(folders)), plan.provenance["code_hash"]
+            definition.trainer,
+            tuple(dict.fromkeys(folders)),
+            plan.provenance["code_hash"],
+            {run.facts["scenario"]: run.facts["fmu"] for run in plan.runs},
         )
         self._runs = {str(run.key): run for run in plan.runs}
         self.stores = {name: RunStore(out, run.key, run.facts) for name, run in self._runs.items()}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import traceback
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
 from cosim.errors import StudyError
 from cosim.evaluation import reuse
-from cosim.evaluation.reuse import require_code
+from cosim.evaluation.reuse import require_code, require_fmu
 from cosim.experiments.protocols import Progress, Trainer, Training
 from cosim.experiments.store import INDICATORS, Indicators
 from cosim.kpis import indicators
@@ -22,17 +23,21 @@ from cosim.simulation import simulate
 
 @dataclass(frozen=True)
 class Place:
-    """What every unit needs: who trains, where foreign modules are, and the code's hash."""
+    """What every unit needs: who trains, where foreign modules are, the hash of the code, and those
+    of the FMUs by their scenario's.
+    """
 
     trainer: Trainer
     folders: tuple[str, ...]
     code: str
+    fmus: Mapping[str, str]
 
-    def enter(self) -> None:
-        """Let foreign modules be imported; raises StudyError where the code is another."""
+    def enter(self, scenario: Scenario) -> None:
+        """Let foreign modules be imported; raises StudyError where code or FMU are others."""
         for folder in self.folders:
             import_from(Path(folder))
         require_code(self.code, OURS, StudyError)
+        require_fmu(scenario, self.fmus[scenario.hash], StudyError)
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ Outcome = Progress | Evaluated | Traced | Accompanied | Failure
 def perform(unit: Unit) -> Outcome:
     """Do a unit; what it gives depends on nothing but the unit. Any error becomes a Failure."""
     try:
-        unit.place.enter()
+        unit.place.enter(unit.training.scenario if isinstance(unit, Advance) else unit.scenario)
         if isinstance(unit, Advance):
             return unit.place.trainer.advance(unit.training, unit.checkpoint, unit.seconds)
         controller = _controller(unit)

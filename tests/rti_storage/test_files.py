@@ -15,9 +15,10 @@ def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path):
 
 def test_what_stood_there_survives_a_failure(tmp_path, monkeypatch):
     path = write_atomically(tmp_path / "file", "old")
-    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(5, "disk full")))
+    with pytest.raises(OSError, match="disk full") as caught:
         write_atomically(path, "new")
+    assert caught.value.filename == str(path)
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
@@ -75,3 +76,21 @@ def test_python_objects_are_refused_not_executed(tmp_path):
 def test_a_missing_file_is_no_damage(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_arrays(tmp_path / "missing.npz")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="kinds of files of POSIX")
+@pytest.mark.parametrize("kind", ["folder", "fifo", "link to a folder", "device"])
+def test_what_is_no_regular_file_is_never_replaced(tmp_path, kind):
+    path = tmp_path / "there"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(tmp_path if kind == "link to a folder" else os.devnull)
+    before = path.lstat()
+    with pytest.raises(OSError, match="not a regular file") as caught:
+        write_atomically(path, "new")
+    assert caught.value.filename == str(path)
+    assert (path.lstat().st_mode, path.lstat().st_ino) == (before.st_mode, before.st_ino)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["there"]

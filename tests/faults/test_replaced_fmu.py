@@ -1,0 +1,100 @@
+"""An FMU replaced during a run: the run keeps to the old one or says so; none mixes two."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import fmus
+from controllers.factories import naive
+from cosim import FmuPlant, Scenario, evaluate, simulate
+from cosim.errors import EvaluationError, PlantError, StudyError
+from cosim.evaluation.provenance import code_hash
+from cosim.experiments.units import Place
+from cosim.plugins import OURS
+from tests.helpers.loop import Proportional
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    """`paper` with an FMU of its own."""
+    path = tmp_path / "plant.fmu"
+    shutil.copy(fmus.path("evaporator"), path)
+    return Scenario.load("paper").replace({"plant": {"fmu": str(path)}})
+
+
+def replacing(scenario, how):
+    """Put something else in the place of the scenario's FMU."""
+    path = Path(scenario.plant.fmu)
+    if how == "another FMU":
+        shutil.copy(fmus.path("evaporator_fmi3"), path)
+    elif how == "no FMU":
+        path.write_bytes(b"no FMU")
+    else:
+        path.unlink()
+
+
+HOW = ["another FMU", "no FMU", "nothing"]
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_a_plant_keeps_to_what_it_was_made_from(scenario, how):
+    with FmuPlant(scenario) as plant:
+        whole = simulate(plant, naive(scenario), 40, 0).to_csv()
+    with FmuPlant(scenario) as plant:
+        digest = plant.fmu_sha256
+
+        class Replacing(Proportional):
+            def prepare(self):
+                if self.left == 20:
+                    replacing(scenario, how)
+                self.left -= 1
+                policy.prepare()
+
+            def feedback(self, s, a=None):
+                return policy.feedback(s, a)
+
+            def reset(self):
+                policy.reset()
+
+        policy, controller = naive(scenario), Replacing(scenario)
+        controller.left = 40
+        assert simulate(plant, controller, 40, 0).to_csv() == whole
+        assert plant.fmu_sha256 == digest
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_an_evaluation_ends_in_a_line_and_goes_on_with_the_fmu_of_before(scenario, tmp_path, how):
+    runs = []
+
+    def counting(described):
+        controller = Proportional(described)
+        reset = controller.reset
+
+        def note():
+            runs.append(1)
+            if len(runs) == 3:
+                replacing(scenario, how)
+            reset()
+
+        controller.reset = note
+        return controller
+
+    with pytest.raises((EvaluationError, PlantError)) as caught:
+        evaluate(scenario, {"p": counting}, 6, 20, folder=tmp_path / "out")
+    assert str(scenario.plant.fmu) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    shutil.copy(fmus.path("evaporator"), scenario.plant.fmu)
+    again = evaluate(scenario, {"p": Proportional}, 6, 20).to_csv()
+    assert again == evaluate(scenario, {"p": Proportional}, 6, 20).to_csv()
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_a_unit_of_a_study_ends_in_a_line(scenario, how):
+    with FmuPlant(scenario) as plant:
+        known = {scenario.hash: plant.fmu_sha256}
+    place = Place(None, (), code_hash(OURS), known)
+    place.enter(scenario)
+    replacing(scenario, how)
+    with pytest.raises((StudyError, PlantError), match=r"plant\.fmu"):
+        place.enter(scenario)

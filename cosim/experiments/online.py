@@ -20,6 +20,7 @@ from cosim.experiments.tables import KEYS, read_numbers, to_csv
 from cosim.experiments.traces import LOGS
 from cosim.figures.online import Course, plot_online
 from cosim.text_tables import read_records
+from cosim.validation import suggestion
 
 Array = NDArray[np.float64]
 Costs = dict[str, dict[int, Array]]
@@ -123,13 +124,19 @@ def draw(results: StudyResults, scenario: str, target: Path, suffixes: Iterable[
     if not courses:
         return []
     signals: dict[str, dict[str, tuple[Array, Array]]] = {}
+    columns: list[str] = []
     for case in courses:
         path = results.folder / LOGS / f"{safe(scenario)}-{safe(case)}.csv"
         if path.is_file():
             log = read_numbers(path)
+            columns = list(log)
             for name in settings.signals:
                 if name in log:
                     signals.setdefault(name, {})[case] = (log["samples"], log[name])
+    if columns and (unknown := [name for name in settings.signals if name not in signals]):
+        raise StudyError(
+            f"online.signals: no log has a column '{unknown[0]}'{suggestion(unknown[0], columns)}"
+        )
     name = f"online-{safe(scenario)}"
     for suffix in suffixes:
         plot_online(courses, signals, settings.period, target / f"{name}.{suffix}")

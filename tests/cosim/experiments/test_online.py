@@ -68,6 +68,13 @@ def test_the_report_has_table_and_figure_and_needs_no_runs(results, tmp_path):
     assert "alt='online-paper" in page
 
 
+def test_a_signal_that_no_log_has_is_named(results, tmp_path):
+    about = dict(results.about) | {"online": ONLINE | {"signals": ["td_eror"]}}
+    damaged = StudyResults(results.folder, about, results.runs)
+    with pytest.raises(StudyError, match=r"no log has a column 'td_eror'.*'td_error'"):
+        write_report(damaged, tmp_path)
+
+
 def test_two_workers_give_the_bytes_of_one(results, tmp_path):
     again = online().run(tmp_path, jobs=2)
     content = [(folder / "online.csv").read_bytes() for folder in (results.folder, again.folder)]

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -22,7 +23,7 @@ from controllers.buffered import BufferedFunction
 from controllers.code_generation import c_source
 from controllers.errors import ControllerError
 from rti_storage.cache import read_own, sweep, trusted_folder
-from rti_storage.guarded import end_guarded, start_guarded
+from rti_storage.guarded import end_guarded, exit_code, start_guarded
 
 if TYPE_CHECKING:
     import filelock
@@ -32,6 +33,8 @@ KIND = "compiled"
 SWITCH = "COSIM_COMPILE"
 CHOICES = ("auto", "never", "now")
 INTERPRETED, COMPILED = "interpreted", "compiled"
+WAIT = 0.01
+"""Seconds between two looks at a compiler that is waited for."""
 LOOK, WORTH, POLL = 50, 2000, 200
 """Calls after which a stored library is looked for, one is compiled, and each look at its end."""
 
@@ -115,12 +118,19 @@ class _Build:
 
     def done(self, *, wait: bool = False) -> bool:
         """Whether the compiler has ended."""
-        return (self._process.wait() if wait else self._process.poll()) is not None
+        while (ended := self._ended()) is None and wait:
+            time.sleep(WAIT)
+        return ended is not None
+
+    def _ended(self) -> int | None:
+        """The compiler's exit code, None while it works; the guard's where that was ended."""
+        code = exit_code(self._own)
+        return self._process.poll() if code is None else code
 
     def publish(self) -> Path | None:
         """Put the library in its place, whole; None where the compiler failed."""
         try:
-            if self._process.returncode:
+            if self._ended():
                 return None
             made = self._own / "library"
             made.chmod(0o700)

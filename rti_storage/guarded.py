@@ -22,8 +22,9 @@ def start_guarded(
     """Start a command, and all that it starts, in a group that ends when this process does.
 
     `env` is its environment, `log` takes what it prints (default: where this process prints).
-    With `folder` it runs there, and the folder is deleted with this process. The process returned
-    is the guard: its exit code is the command's, and `end_guarded` ends it.
+    The process returned is the guard: its exit code is the command's, and `end_guarded` ends it.
+    With `folder` the command runs there, its exit code is `exit_code(folder)`, and the guard waits
+    to delete the folder, by `end_guarded` or with this process.
     """
     return subprocess.Popen(
         [sys.executable, "-I", guardian.__file__, str(folder or ""), *command],
@@ -40,3 +41,11 @@ def end_guarded(process: subprocess.Popen[bytes]) -> None:
         with suppress(OSError):
             process.stdin.close()
     process.wait()
+
+
+def exit_code(folder: Path) -> int | None:
+    """Exit code of the guarded command that ran in a folder, None where it has not ended."""
+    try:
+        return int((folder / guardian.EXIT_CODE).read_text())
+    except FileNotFoundError:
+        return None

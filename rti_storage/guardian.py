@@ -3,8 +3,8 @@
 A program of its own, run by its path with nothing but the standard library, so that it starts in
 some milliseconds: `python guardian.py FOLDER COMMAND ARGUMENT…`. The parent keeps the pipe open;
 whatever ends the parent closes it, even a SIGKILL, and the command's whole process group ends then.
-Its temporary files go to a folder that ends with it. It runs in FOLDER unless that is empty; the
-FOLDER is deleted where the parent ended before it.
+Its temporary files go to a folder that ends with it. It runs in FOLDER unless that is empty; then
+its exit code is written to FOLDER/exit-code, and FOLDER deleted once the parent lets go.
 """
 
 import os
@@ -15,8 +15,11 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 from types import FrameType
 
+EXIT_CODE = "exit-code"
 PATIENCE = 2.0
 """Seconds that a process group has to end by itself."""
 
@@ -41,6 +44,13 @@ def end(child: "subprocess.Popen[bytes]") -> None:
             except ProcessLookupError:
                 return
             time.sleep(0.02)
+
+
+def tell(folder: Path, code: int) -> None:
+    """Leave the exit code in the folder, whole."""
+    with suppress(OSError):
+        (folder / ".exit-code").write_text(str(code))
+        (folder / ".exit-code").replace(folder / EXIT_CODE)
 
 
 def main() -> int:
@@ -77,7 +87,10 @@ def run(command: list[str], temporary: str, folder: str) -> int:
     code = child.wait()
     if sys.platform != "win32":
         end(child)  # what it left behind
-    if folder and alone.is_set():
+    if folder:
+        tell(Path(folder), code)
+        # Whoever is killed before he takes what was made leaves the folder to us.
+        alone.wait()
         shutil.rmtree(folder, ignore_errors=True)
     return 128 - code if code < 0 else code
 

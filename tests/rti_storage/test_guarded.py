@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from rti_storage.guarded import end_guarded, start_guarded
+from rti_storage.guarded import end_guarded, exit_code, start_guarded
 from tests.helpers.processes import eventually, running
 
 SLEEPER = (
@@ -83,9 +83,26 @@ def test_the_folder_of_a_guarded_command_ends_with_the_parent(mark, tmp_path):
     assert eventually(lambda: not running(mark) and not own.exists())
 
 
-def test_a_guarded_command_runs_in_its_folder_and_leaves_it_to_a_parent_that_lives(tmp_path):
-    script = "import pathlib; pathlib.Path('made').touch()"
-    guard = start_guarded([sys.executable, "-c", script], folder=tmp_path)
-    assert guard.wait() == 0
+@pytest.mark.parametrize("code", [0, 3])
+def test_a_guarded_command_in_a_folder_leaves_what_it_made_until_the_parent_lets_go(tmp_path, code):
+    own = tmp_path / "own"
+    own.mkdir()
+    script = f"import pathlib; pathlib.Path('made').touch(); raise SystemExit({code})"
+    guard = start_guarded([sys.executable, "-c", script], folder=own)
+    assert eventually(lambda: exit_code(own) is not None)
+    assert exit_code(own) == code
+    assert (own / "made").exists()
+    assert guard.poll() is None
     end_guarded(guard)
-    assert [path.name for path in tmp_path.iterdir()] == ["made"]
+    assert not own.exists()
+
+
+def test_what_was_made_and_not_taken_ends_with_the_parent(tmp_path):
+    own = tmp_path / "own"
+    own.mkdir()
+    script = FOLDER.format(program="pass", folder=str(own))
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as parent:
+        parent.stdout.readline()
+        assert eventually(lambda: exit_code(own) == 0)
+        parent.kill()
+    assert eventually(lambda: not own.exists())

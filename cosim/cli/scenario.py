@@ -66,7 +66,8 @@ def init(
         str | None, typer.Option("--cost", help="Output that is the stage cost.")
     ] = None,
     sampling_time: Annotated[
-        float | None, typer.Option("--sampling-time", min=1e-9, help="Sampling time in s.")
+        float | None,
+        typer.Option("--sampling-time", min=1e-9, max=1e12, help="Sampling time in s."),
     ] = None,
     state: Annotated[
         str, typer.Option("--state", help="Where to look for the steady state: numbers.")

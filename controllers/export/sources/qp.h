@@ -10,9 +10,12 @@
  * is met. A full step raises the dual function strictly, so no working set comes twice.
  *
  * With H = U Uᵀ, U upper triangular, and m_i = U⁻¹ a_i, the working set's matrix is S = M Mᵀ + C, C
- * the compliances 1/2W of the rows beyond their limits; it is kept as L D Lᵀ. The last word is
- * iterative refinement with the QP's own data. The including file defines QP_N (variables) and
- * QP_ROWS. Only sqrt is taken from libm, so every platform with IEEE doubles has the same bits.
+ * the compliances 1/2W of the rows beyond their limits; it is kept as L D Lᵀ. A guess of the working
+ * set, say that of a QP like it, is mended until its multipliers are such as a full step leaves, or
+ * dropped after a few rounds. The last word is iterative refinement with the QP's own data.
+ *
+ * The including file defines QP_N (variables) and QP_ROWS. Only sqrt is taken from libm, so every
+ * platform with IEEE doubles has the same bits.
  */
 #ifndef QP_H
 #define QP_H
@@ -311,12 +314,13 @@ static QpStatus qp_enter(const Qp *qp, QpWork *work, int p, double violation) {
             qp_append(work, p, pivot);
             return QP_SOLVED;
         }
-        if (blocking == work->count)
+        if (blocking == work->count) {
             work->mode[p] = QP_BEYOND;
-        else {
+        } else {
             const int i = work->member[blocking];
-            if (qp_change(qp, work, blocking)) memset(held, 0, sizeof held);
-            else held[i] = 1;
+            const int changed = qp_change(qp, work, blocking);
+            if (changed) memset(held, 0, sizeof held);
+            held[i] = (char)!changed;
         }
     }
     return QP_ITERATION_LIMIT;

@@ -69,14 +69,14 @@ x86-64. `python -m pytest -m slow tests/fmus/platforms tests/integration/test_ex
 holds the files to this."""
 
 
-def _compared(runs: dict[str, list[str] | NotHereError]) -> dict[str, str]:
-    """A verdict for each platform, macOS too."""
+def _compared(runs: dict[str, list[str] | NotHereError], otherwise: str) -> dict[str, str]:
+    """A verdict for each platform; `otherwise` for those that were not tried."""
     native = runs[NATIVE]
     found = {}
     for platform in PLATFORMS:
         run = runs.get(platform.tuple)
         if run is None:
-            found[platform.tuple] = "not run: symbols and load commands checked"
+            found[platform.tuple] = otherwise
         elif isinstance(run, NotHereError) or isinstance(native, NotHereError):
             found[platform.tuple] = f"not run: {run}"
         elif platform.tuple == NATIVE:
@@ -108,7 +108,8 @@ def _plants(folder: Path) -> str:
         name = fmus.NAMES[version - 2]
         root = unzipped(fmus.path(name), folder / name)
         for law in LAWS:
-            found[version, law] = _compared(_runs(importer, root, version, MODEL_IDENTIFIER, law))
+            runs = _runs(importer, root, version, MODEL_IDENTIFIER, law)
+            found[version, law] = _compared(runs, "not run: symbols and load commands checked")
     rows = [
         (p.tuple, NATURE.get(p.tuple, "–"), law, found[2, law][p.tuple], found[3, law][p.tuple])
         for p in PLATFORMS
@@ -139,7 +140,7 @@ def _exported(folder: Path, controllers: dict[FmiVersion, tuple[Path, dict[str, 
         importer = Importer("controller_host.c", headers, folder / f"host{version}")
         root = unzipped(path, folder / path.stem)
         runs = _runs(importer, root, version, IDENTIFIER)
-        found[version] = _compared(runs)
+        found[version] = _compared(runs, "not run")
     rows = [
         (p.tuple, NATURE.get(p.tuple, "–"), found[2][p.tuple], found[3][p.tuple]) for p in PLATFORMS
     ]

@@ -175,7 +175,9 @@ def trial(job: Job, folder: Path, delay: float, number: signal.Signals) -> dict[
     # Not `communicate`: what survives the parent would hold its pipe.
     code = process.wait(PATIENCE)
     ended = survive(folder, began)
-    said = process.stderr.read().decode() if process.stderr else ""
+    assert process.stderr is not None
+    with process.stderr as stream:
+        said = stream.read().decode()
     what = f"{job.name}, {number.name} at {delay:.2f} s"
     assert "Traceback" not in said, f"{what}:\n{said}"
     if running:

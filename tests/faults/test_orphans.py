@@ -19,7 +19,7 @@ def held(trials, seed, *names):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("job", ["train", "evaluate --jobs", "view --png"])
+@pytest.mark.parametrize("job", ["evaluate --jobs"])
 def test_a_killed_parent_leaves_nothing(monkeypatch, job):
     monkeypatch.delenv("COSIM_COMPILE", raising=False)
     assert held(1, 5, job)[job]["trials"] == 1

@@ -23,7 +23,7 @@ from rti_storage import write_atomically
 
 WORK = ".work"
 """Folder within the folder: what long studies have finished."""
-LARGEST = 1_000_000
+LARGEST = 4_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
 SUFFIXES = (".csv", ".toml", ".md", ".svg", ".png")
 HEAD = """\

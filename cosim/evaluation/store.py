@@ -34,7 +34,10 @@ class Store:
         if self._folder is None or not (path := self._folder / f"{key}.json").is_file():
             return None
         try:
-            return from_document(read_json(path, f"'{path}'", EvaluationError))
+            document = read_json(path, f"'{path}'", EvaluationError)
+            if document.pop("sha256", None) != _digest(document):
+                raise ValueError
+            return from_document(document)
         except (EvaluationError, ValueError, KeyError, TypeError, AttributeError):
             raise EvaluationError(
                 f"the finished work unit '{path}' is damaged; delete it to compute it again"

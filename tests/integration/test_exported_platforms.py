@@ -84,11 +84,7 @@ def run(exported, system, tmp_path_factory):
     return runner
 
 
-# Seen on 2026-11-21: the hashes differ from about sample 37 on. The cause is not known.
-DIFFERS = {"aarch64-linux": pytest.mark.xfail(reason="ARM64 is not bit-identical")}
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=DIFFERS.get(n, ())) for n in OTHERS])
+@pytest.mark.parametrize("name", OTHERS)
 def test_ten_thousand_samples_are_bit_identical_to_the_native_ones(run, name: str) -> None:
     """States at random, so that working sets come and go and some QPs need many steps."""
     native, other = run(NATIVE), run(name)

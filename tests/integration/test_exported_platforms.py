@@ -59,7 +59,10 @@ def test_it_holds_a_library_for_each_platform(exported) -> None:
         held = {name for name in container.namelist() if name.startswith("binaries/")}
     expected = {library(Path(), p, version, IDENTIFIER).as_posix() for p in PLATFORMS}
     assert held == expected
-    assert len(information(path).platforms) == len(PLATFORMS)
+    found = information(path).platforms
+    assert found.pop("c-code") == ()
+    assert found.keys() == {p.folder(f"{version}.0") for p in PLATFORMS}
+    assert all(p.tuple in found[p.folder(f"{version}.0")] for p in PLATFORMS)
     assert fmpy.read_model_description(str(path)).fmiVersion == f"{version}.0"
 
 

@@ -26,6 +26,7 @@ def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_pat
         "demo.csv",
         "demo.rrd",
         "learning.csv",
+        "learning.png",
         "parameters.toml",
         "summary.json",
     }

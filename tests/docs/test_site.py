@@ -34,7 +34,8 @@ def test_the_site_builds_without_a_warning(build):
 
 @pytest.mark.slow
 def test_the_reference_shows_nothing_private(build):
-    for page in (build[0] / "reference").glob("*/index.html"):
+    for package in ("controllers", "cosim", "fmus", "learning"):
+        page = build[0] / "reference" / package / "index.html"
         anchors = re.findall(r'<h\d id="([^"]+)"', page.read_text())
         assert len(anchors) > 10
         assert [name for name in anchors if re.search(r"(^|\.)_", name)] == []

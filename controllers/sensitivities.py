@@ -23,6 +23,8 @@ from controllers.qp.stagewise import LEAST_CONTROLS, StageMatrices, kkt_solve_by
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Matrix = NDArray[np.float64]
+SOLUTION = ("xi", "t", "chi", "v", "lam")
+"""First inputs of the sensitivities: three in the read-out's order, so that one copy moves them."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,8 @@ def sensitivities(
         gradient[blocks.slices["p"]] = _parameter_gradient(
             problem, blocks, symbols.theta, y, x, u, (M, guess) if exact else None
         )
-    inputs = {**y.named(), "x": x, "u": u, "theta": symbols.theta, **extra}
+    solution = {name: getattr(y, name) for name in SOLUTION}
+    inputs = {**solution, "x": x, "u": u, "theta": symbols.theta, **extra}
     value = stacked("value_gradient", inputs, {"gradient": gradient})
 
     A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
@@ -183,18 +186,17 @@ def _direction(
 
 
 def adjoint_directions(
-    qp: SoftQp, stages: StageMatrices, solution: QpSolution
+    qp: SoftQp, solution: QpSolution, n_actions: int, stages: Callable[[], StageMatrices]
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Solutions dv, dt, dλ of the KKT system for unit right-hand sides in u_0, a row an action.
 
     The KKT matrix of the active set is symmetric, so these rows of its inverse are all that dπ/dθ
-    and dπ/ds need. `stages` are those of the condensed `qp`; long horizons are solved by them.
+    and dπ/ds need. `stages` gives those of the condensed `qp`; long horizons are solved by them.
     """
-    n_actions = stages.B.shape[2]
     active, seeds = solution.active(qp), np.eye(n_actions, qp.f.size)
     solved = None
     if qp.f.size >= LEAST_CONTROLS:
-        solved = kkt_solve_by_stages(stages, qp.W, active, seeds)
+        solved = kkt_solve_by_stages(stages(), qp.W, active, seeds)
     dv, dlam = solved or kkt_solve(qp, active, seeds, np.zeros((n_actions, qp.w.size)))
     violated, dt = active[2], np.zeros_like(dlam)
     if violated.any():

@@ -105,10 +105,14 @@ class ThetaBlocks:
             for block, end in zip(self.blocks, ends, strict=True)
         }
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Length of θ."""
         return sum(block.size for block in self.blocks)
+
+    @cached_property
+    def _by_name(self) -> dict[str, ThetaBlock]:
+        return {block.name: block for block in self.blocks}
 
     @cached_property
     def scale(self) -> Vector:
@@ -142,10 +146,9 @@ class ThetaBlocks:
 
     def block(self, name: str) -> ThetaBlock:
         """Block of this name; raises ParameterError where there is none."""
-        for block in self.blocks:
-            if block.name == name:
-                return block
-        raise ParameterError(f"θ has no block '{name}'; it has {', '.join(self.slices)}")
+        if name not in self._by_name:
+            raise ParameterError(f"θ has no block '{name}'; it has {', '.join(self.slices)}")
+        return self._by_name[name]
 
     @classmethod
     def of(

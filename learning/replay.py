@@ -15,6 +15,9 @@ from learning.protocols import LearnableController, LearnableSolution, Transitio
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+POINT = tuple(f"point_{name}" for name in LinearisationPoint._fields)
+NEXT_POINT = tuple(f"next_{name}" for name in POINT)
+COLUMNS = ("number", "s", "a", "explored", "cost", "next_s", *POINT, *NEXT_POINT)
 
 
 @dataclass(frozen=True)
@@ -58,23 +61,17 @@ class ReplayBuffer:
         """Keep a transition in place of the oldest one."""
         point, next_point = transition.point, transition.next_point
         assert point is not None and next_point is not None
-        row: dict[str, Any] = {
-            "number": np.int64(transition.number),
-            "s": transition.s,
-            "a": transition.a,
-            "explored": np.bool_(transition.explored),
-            "cost": np.float64(transition.cost),
-            "next_s": transition.next_s,
-        }
-        row |= {f"point_{key}": value for key, value in point._asdict().items()}
-        row |= {f"next_point_{key}": value for key, value in next_point._asdict().items()}
+        row = (
+            *(transition.number, transition.s, transition.a, transition.explored),
+            *(transition.cost, transition.next_s, *point, *next_point),
+        )
         if not self._columns:
+            kept = zip(COLUMNS, map(np.asarray, row), strict=True)
             self._columns = {
-                name: np.empty((self._capacity, *value.shape), dtype=value.dtype)
-                for name, value in row.items()
+                name: np.empty((self._capacity, *value.shape), value.dtype) for name, value in kept
             }
         position = self._added % self._capacity
-        for name, value in row.items():
+        for name, value in zip(COLUMNS, row, strict=True):
             self._columns[name][position] = value
         self._added += 1
 
@@ -91,20 +88,24 @@ class ReplayBuffer:
         gradient, next_gradient = np.zeros((count, size)), np.zeros((count, size))
         at: int | None = None
         value: LearnableSolution | None = None
-        for k, row in enumerate(order):
-            number, s = int(columns["number"][row]), columns["s"][row]
+        # Plain numbers: reading them one by one out of arrays costs as much as a gradient.
+        numbers, explored, cost = (
+            columns[n][order].tolist() for n in ("number", "explored", "cost")
+        )
+        points, next_points = ([columns[name] for name in names] for names in (POINT, NEXT_POINT))
+        for k, row in enumerate(order.tolist()):
             try:
-                if at != number:
-                    controller.prepare_at(_point(columns, "point", row))
+                if at != numbers[k]:
+                    controller.prepare_at(LinearisationPoint(*(part[row] for part in points)))
                     value = None
-                if columns["explored"][row]:
-                    value = controller.feedback(s, columns["a"][row])
+                if explored[k]:
+                    value = controller.feedback(columns["s"][row], columns["a"][row])
                 elif value is None:
-                    value = controller.feedback(s)
+                    value = controller.feedback(columns["s"][row])
                 q[k], gradient[k] = value.value, value.value_gradient
-                controller.prepare_at(_point(columns, "next_point", row))
-                at, value = number + 1, controller.feedback(columns["next_s"][row])
-                target[k] = average_cost.target(float(columns["cost"][row]), value.value)
+                controller.prepare_at(LinearisationPoint(*(part[row] for part in next_points)))
+                at, value = numbers[k] + 1, controller.feedback(columns["next_s"][row])
+                target[k] = average_cost.target(cost[k], value.value)
                 next_gradient[k] = value.value_gradient
             except QpError:
                 at = None
@@ -126,9 +127,3 @@ class ReplayBuffer:
         """Take back what `state` gave."""
         self._added = int(state["added"])
         self._columns = {name: values for name, values in state.items() if name != "added"}
-
-
-def _point(columns: dict[str, NDArray[Any]], prefix: str, row: np.intp) -> LinearisationPoint:
-    return LinearisationPoint(
-        *(columns[f"{prefix}_{name}"][row] for name in LinearisationPoint._fields)
-    )

@@ -20,6 +20,8 @@ class Linear:
 
     def __call__(self, sample: int) -> Vector:
         """Value at a sample, in the shape of `start`."""
+        if self.end is self.start:
+            return self.start
         share = min(sample / self.samples, 1.0) if self.samples > 0 else 1.0
         return self.start + share * (self.end - self.start)
 

@@ -32,7 +32,7 @@ def kkt_solve(
     bound = held.any()
     H = qp.H
     if bound:
-        H, equal, outside = H[np.ix_(free, free)], equal[:, free], outside[:, free]
+        H, equal, outside = H[free][:, free], equal[:, free], outside[:, free]
     size, count = len(H), len(equal)
     # Column-major, as LAPACK wants it.
     kkt = np.zeros((size + count, size + count), order="F")

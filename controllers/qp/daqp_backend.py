@@ -37,6 +37,7 @@ class DaqpBackend:
         self._model: Any = None
         self._factorised = 0
         self._limits: Matrix | None = None
+        self._failed = False
 
     def load(self, qp: SoftQp) -> None:
         """Factorise H and transform the rows; the first call allocates the workspace.
@@ -61,6 +62,7 @@ class DaqpBackend:
             self._parts = (self._lower[:n], self._upper[:n], self._lower[n:], self._upper[n:])
             self._free = np.repeat(np.array([0, SOFT], dtype=np.int32), [n, rows])
             self._sense = self._free.copy()
+            self._bounds_sense = self._sense[:n]
             self._model = daqp.Model()
             self._model.settings = SETTINGS
             self._write_limits(qp)
@@ -70,16 +72,16 @@ class DaqpBackend:
             )
             self._weights(qp)
         else:
-            if self._written != qp.w.tobytes() + qp.W.tobytes():
+            if self._weighed[0] is not qp.w or self._weighed[1] is not qp.W:
                 self._weights(qp)
-            # The limits go along, since an update is refused while those of a failed QP stand.
-            self._write_limits(qp)
+            if self._failed:  # an update is refused while the limits of a failed QP stand
+                self._write_limits(qp)
             self._factorised = self._model.update(
                 H=H, A=A, bupper=self._upper, blower=self._lower, sense=self._free
             )
 
     def _weights(self, qp: SoftQp) -> None:
-        self._written = qp.w.tobytes() + qp.W.tobytes()
+        self._weighed = (qp.w, qp.W)
         unused = np.ones(qp.f.size)
         linear, compliance = np.r_[unused, qp.w], np.r_[unused, 0.5 / qp.W]
         self._model.soft_weights(rho_l=compliance, rho_u=compliance, w_l=linear, w_u=linear)
@@ -92,12 +94,12 @@ class DaqpBackend:
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the vectors of `qp`; raises QpError where DAQP does not."""
         n, flag = qp.f.size, self._factorised
+        self._failed = True
         # Not by BLAS, which would start threads for a long horizon's product.
         T = None if self._limits is None else self._limits[:n]
         if flag >= 0:
             self._write_limits(qp)
-            self._sense[:] = self._free
-            self._sense[:n][qp.lower == qp.upper] = FIXED
+            np.multiply(qp.lower == qp.upper, FIXED, out=self._bounds_sense)
             flag = self._model.update(
                 f=qp.f if T is None else np.einsum("ij,i->j", T, qp.f),
                 bupper=self._upper,
@@ -111,5 +113,6 @@ class DaqpBackend:
             raise QpError(f"DAQP did not solve the QP: {status}", status=status, qp=qp.copy())
         if T is not None:
             v = np.einsum("ij,j->i", T, v)
+        self._failed = False
         multipliers = info["lam"]
         return QpSolution(v, multipliers[:n], multipliers[n:])

@@ -208,7 +208,7 @@ class QpSolution(NamedTuple):
         Zero means that the linear independence constraint qualification fails.
         """
         held, at_limit, _ = self.active(qp)
-        gradients = qp.rows[np.ix_(at_limit, ~held)]
+        gradients = qp.rows[at_limit][:, ~held]
         if gradients.shape[0] == 0:
             return np.inf
         if gradients.shape[0] > gradients.shape[1]:

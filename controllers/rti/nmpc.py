@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from math import isfinite
 
 import numpy as np
@@ -73,10 +73,21 @@ class RtiNmpc:
         self._qp, self._stages = qp_in_memory(problem, self._prepare, self._embed)
         if self._riccati is not None:
             self._qp.factor = partial(limits_of, self._riccati)
-        self._action_lower, self._action_upper = self._qp.lower.copy(), self._qp.upper.copy()
+        self._weigh(problem.penalty_linear, problem.penalty_quadratic)
+        self._action_lower, self._action_upper = (
+            self._qp.lower[:m].copy(),
+            self._qp.upper[:m].copy(),
+        )
+        self._first_lower, self._first_upper = self._qp.lower[:m], self._qp.upper[:m]
+        self._enforced = False
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
         self._u = self._prepare.inputs["u"].reshape(horizon, m)
         self._costates = np.zeros((horizon, n))
+        # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
+        start, end = (self._prepare.positions[name] for name in ("x", "u"))
+        self._point = self._prepare.arguments[start.start : end.stop]
+        self._next_point = self._readout.span("next_x", "next_u")
+        self._next_costates = self._readout.slices["next_chi"]
         self._value = self._readout.slices["value"].start
         self._constant = 0.0
         self.parameters = parameters
@@ -105,22 +116,19 @@ class RtiNmpc:
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
         current = getattr(self, "_parameters", parameters)
-        if parameters.blocks != current.blocks:
+        if parameters.blocks is not current.blocks and parameters.blocks != current.blocks:
             raise ParameterError(
                 "θ has other blocks than the controller was built with: "
                 f"{', '.join(parameters.blocks.slices)}; build a new controller for it"
             )
         parameters.require_well_posed()
-        problem, horizon = self.problem, self.problem.horizon
+        problem = self.problem
         self._parameters = parameters
         self._hessian.set_parameters(parameters)
+        self._blocks: tuple[Vector, Vector] | None = None  # that are kept; Gauss–Newton's stay
         self._prepare.inputs["theta"][:] = parameters.theta
-        discounts = np.repeat(problem.discount ** np.arange(1, horizon + 1), problem.n_states)
-        learned = "w_sigma" in parameters.blocks
-        w = parameters["w_sigma"] if learned else problem.penalty_linear
-        W = parameters["W_sigma"] if learned else problem.penalty_quadratic
-        self._qp.w = discounts * np.tile(w, horizon)
-        self._qp.W = discounts * np.tile(W, horizon)
+        if "w_sigma" in parameters.blocks:
+            self._weigh(parameters["w_sigma"], parameters["W_sigma"])
         self._stages.state_lower[:] = parameters["x_l"] - problem.reference_state
         self._stages.state_upper[:] = parameters["x_u"] - problem.reference_state
         self._prepared: Prepared | None = None
@@ -152,8 +160,9 @@ class RtiNmpc:
         linearised, needs no state beyond the predicted x_N.
         """
         if self._pending is not None:
-            shifted, self._pending = self._pending.shifted, None
-            self._x[:], self._u[:], self._costates[:] = shifted
+            stack, self._pending = self._pending.stack, None
+            self._point[:] = stack[self._next_point]
+            self._costates.reshape(-1)[:] = stack[self._next_costates]
             self._prepared = None
         if self._prepared is None:
             self._linearise()
@@ -167,7 +176,7 @@ class RtiNmpc:
         targets = (self._x, self._u, self._costates)
         arrays = [np.asarray(values, dtype=np.float64) for values in point]
         for name, target, array in zip(point._fields, targets, arrays, strict=True):
-            if array.shape != target.shape or not _is_finite(array.reshape(-1)):
+            if array.shape != target.shape or not isfinite(sum(array.reshape(-1).tolist())):
                 raise ControllerError(
                     f"linearisation point: {name} must be finite with shape {target.shape}, "
                     f"not {array.shape}"
@@ -177,13 +186,19 @@ class RtiNmpc:
         self._pending = None
         self._linearise()
 
+    def _weigh(self, w: Vector, W: Vector) -> None:
+        """Give the slack of the predicted stages its weights (n,), discounted."""
+        problem, horizon = self.problem, self.problem.horizon
+        discounts = np.repeat(problem.discount ** np.arange(1, horizon + 1), problem.n_states)
+        self._qp.w, self._qp.W = discounts * np.tile(w, horizon), discounts * np.tile(W, horizon)
+
     def _linearise(self) -> None:
         prepare = self._prepare
         self.compilation.count()
         self._prepared = None
         self._constant = self._hessian.fill(self._x, self._u, self._costates)
         prepare()
-        if not _is_finite(prepare.stack):
+        if not prepare.finite():
             raise QpError(
                 "the QP is not finite: the model has no finite value or derivative at the point of "
                 "linearisation",
@@ -191,12 +206,14 @@ class RtiNmpc:
                 qp=self._qp.copy(),
             )
         self._backend.load(self._qp)
+        if self._blocks is None or self._hessian.spectrum is not None:
+            self._blocks = prepare.inputs["L"].copy(), prepare.inputs["L_N"].copy()
         self._prepared = Prepared(
             point=LinearisationPoint(self._x.copy(), self._u.copy(), self._costates.copy()),
             parameters=self._parameters,
             stack=prepare.stack.copy(),
-            L=prepare.inputs["L"].copy(),
-            L_N=prepare.inputs["L_N"].copy(),
+            L=self._blocks[0],
+            L_N=self._blocks[1],
             w=self._qp.w,
             W=self._qp.W,
             spectrum=self._hessian.spectrum,
@@ -223,20 +240,24 @@ class RtiNmpc:
         return solution
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
-        s = _vector("state", s, self.problem.n_states)
+        problem = self.problem
+        s = _vector("state", s, problem.n_states)
         if self._prepared is None:
             self.prepare()
-        prepared, qp, m = self._prepared, self._qp, self.problem.n_actions
+        prepared, qp = self._prepared, self._qp
         assert prepared is not None
-        self._stages.initial[:] = s - self.problem.reference_state
+        np.subtract(s, problem.reference_state, out=self._stages.initial)
         self._embed.inputs["s"][:] = s
         self._embed()
-        if a is None:
-            qp.lower[:m], qp.upper[:m] = self._action_lower[:m], self._action_upper[:m]
-        else:
-            qp.lower[:m] = _vector("action", a, m) - self.problem.reference_action
-            qp.upper[:m] = qp.lower[:m]
-        if not (_is_finite(self._embed.stack) and _is_finite(qp.lower[:m])):
+        known = self._embed.finite()
+        if a is not None:
+            enforced = _vector("action", a, problem.n_actions) - problem.reference_action
+            self._first_lower[:] = self._first_upper[:] = enforced
+            known = known and all(map(isfinite, enforced.tolist()))
+        elif self._enforced:
+            self._first_lower[:], self._first_upper[:] = self._action_lower, self._action_upper
+        self._enforced = a is not None
+        if not known:
             raise QpError(
                 f"the QP is not finite: state {s}, action {a!r}",
                 status="state or action not finite",
@@ -245,7 +266,7 @@ class RtiNmpc:
         multipliers = self._backend.solve(qp)
         if a is not None:
             multipliers = multipliers_at_kink(
-                qp, multipliers, self._action_lower[:m], self._action_upper[:m]
+                qp, multipliers, self._action_lower, self._action_upper
             )
         inputs = self._readout.inputs
         inputs["s"][:], inputs["constant"][0] = s, self._constant
@@ -253,7 +274,7 @@ class RtiNmpc:
         self._readout()
         stack = self._readout.stack.copy()
         return RtiSolution(
-            action=multipliers.v[:m] + self.problem.reference_action,
+            action=multipliers.v[: problem.n_actions] + problem.reference_action,
             value=float(stack[self._value]),
             multipliers=multipliers,
             prepared=prepared,
@@ -276,23 +297,6 @@ class RtiNmpc:
     def policy(self, s: ArrayLike) -> Vector:
         """π(s) of the prepared QP, (m,)."""
         return self._solve(s, None).action
-
-
-def _is_finite(values: Vector) -> bool:
-    """Whether all entries are finite: 0ᵀx takes a third of the time of NumPy's isfinite.
-
-    By `vdot`, which does not warn of the 0·∞ that is looked for: `errstate` around `dot` costs more
-    than the product.
-    Not where BLAS would start threads for it, which wait for each other on a busy machine.
-    """
-    if values.size > 8192:
-        return bool(np.isfinite(values).all())
-    return isfinite(np.vdot(values, _zeros(values.size)))
-
-
-@cache
-def _zeros(size: int) -> Vector:
-    return np.zeros(size)
 
 
 def _vector(kind: str, values: ArrayLike, size: int) -> Vector:

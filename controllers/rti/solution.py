@@ -211,12 +211,13 @@ class RtiSolution:
                 "the action was enforced, so this solution is Q(s, a) and has no policy; "
                 "call feedback(s) without an action"
             )
-        dv, dt, dlam = adjoint_directions(self.qp, self._stages, self.multipliers)
+        m = self.action.size
+        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m, self._stages)
         function = self.prepared.functions.policy
         self._write_solution(function)
-        inputs = function.inputs
+        inputs, preparation = function.inputs, self.prepared.functions.preparation
         for name in ("A", "B"):
-            inputs[name][:] = self.prepared.stack[self.prepared.functions.preparation.slices[name]]
+            inputs[name][:] = self.prepared.stack[preparation.slices[name]]
         inputs["L"][:], inputs["L_N"][:] = self.prepared.L, self.prepared.L_N
         inputs["dv"][:], inputs["dt"][:] = dv.reshape(-1), dt.reshape(-1)
         inputs["dlam"][:] = dlam.reshape(-1)
@@ -226,13 +227,11 @@ class RtiSolution:
             )
             inputs["dM"][:] = moved.reshape(-1)
         function()
-        m = self.action.size
         return (
             function.part("policy").reshape(m, -1).copy(),
             function.part("state").reshape(m, -1).copy(),
         )
 
-    @property
     def _stages(self) -> StageMatrices:
         prepared = self.prepared
         n, m = self.costates.shape[1], self.action.size
@@ -247,8 +246,8 @@ class RtiSolution:
     def _write_solution(self, function: StackedFunction) -> None:
         """Give a read-out function the solution and the point of linearisation."""
         inputs, point = function.inputs, self.prepared.point
-        for name in ("xi", "t", "chi"):
-            inputs[name][:] = self.stack[self.prepared.functions.readout.slices[name]]
+        read = self.prepared.functions.readout.slices["chi"].stop  # xi, t and chi begin both
+        function.arguments[:read] = self.stack[:read]
         inputs["v"][:], inputs["lam"][:] = self.multipliers.v, self.multipliers.lam
         inputs["x"][:], inputs["u"][:] = point.x.reshape(-1), point.u.reshape(-1)
         inputs["theta"][:] = self.prepared.parameters.theta

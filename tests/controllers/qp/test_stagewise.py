@@ -28,7 +28,7 @@ def test_it_agrees_with_the_condensed_system(horizon, hessian, rng):
         kinds += [mask.any() for mask in active]
         seeds = rng.normal(size=(2, qp.f.size))
         dense = kkt_solve(qp, active, seeds, np.zeros((2, qp.w.size)))
-        banded = kkt_solve_by_stages(solution._stages, qp.W, active, seeds)
+        banded = kkt_solve_by_stages(solution._stages(), qp.W, active, seeds)
         for ours, theirs in zip(banded, dense, strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11 * np.abs(theirs).max())
     if horizon == 12:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cosim.evaluation.statistics import Estimate, regret
 from cosim.evaluation.statistics import mean as mean_of
-from cosim.figures.pareto import draw_pareto
+from cosim.figures.pareto import FRONT, draw_pareto
 from cosim.figures.regret import FLOOR, percent
 from cosim.figures.style import REFERENCE, colors, figure, plain
 
@@ -48,6 +48,9 @@ def evaluation_figure(
         points = {name: (c.mean_violation, c.economic_cost) for name, c in controllers.items()}
         draw_pareto(right, points, color)
         _violation_axis(right, np.concatenate([c.mean_violation for c in controllers.values()]))
+        named = [line for line in right.lines if line.get_label() == FRONT]
+        if named:
+            right.legend(handles=named, loc="best")
         drawn.suptitle(plain(title), fontsize=8.5)
     return drawn
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 Array = NDArray[np.float64]
 
@@ -49,23 +50,16 @@ def label_ends(axes: Axes, labels: Sequence[EndLabel], size: float = 6.5) -> Non
             ha="left",
             annotation_clip=False,
             arrowprops={"arrowstyle": "-", "color": item.color, "linewidth": 0.5, "shrinkB": 0.0,
-                        "shrinkA": 0.5},
+                        "shrinkA": 0.5, "relpos": (0.0, 0.5)},
         )  # fmt: skip
 
 
 def spread(positions: Array, gap: float) -> Array:
-    """Descending positions in [0, 1], moved as little as need be to be `gap` apart."""
-    placed: Array = positions.astype(np.float64)
-    for _ in range(200):
-        moved = False
-        for i in range(len(placed) - 1):
-            overlap = gap - (placed[i] - placed[i + 1])
-            if overlap > 1e-9:
-                placed[i] += overlap / 2
-                placed[i + 1] -= overlap / 2
-                moved = True
-        if not moved:
-            break
-    # Those that were pushed out come back in as one, if they fit.
-    placed += max(-placed[-1], 0.0) or -max(placed[0] - 1.0, 0.0)
-    return placed
+    """Descending positions (K,) in [0, 1], moved as little as need be to be `gap` apart.
+
+    They minimise the sum of the squared moves, within [0, 1]: an isotonic regression of
+    `positions[i] + i·gap`, clipped. Where K gaps do not fit, the lowest is at 0.
+    """
+    steps = gap * np.arange(len(positions))
+    placed: Array = isotonic_regression(positions + steps, increasing=False).x
+    return np.clip(placed, steps[-1], max(1.0, steps[-1])) - steps

@@ -15,6 +15,7 @@ from cosim.figures.style import REFERENCE, colors, figure, plain, save
 Array = NDArray[np.float64]
 XLABEL = "mean violation per sample, in the states' units"
 YLABEL = "economic cost per sample"
+FRONT = "no other is better in both"
 
 
 def plot_pareto(
@@ -48,7 +49,10 @@ def draw_pareto(
     means = {name: (float(np.mean(v)), float(np.mean(c))) for name, (v, c) in points.items()}
     front = nondominated(np.array(list(means.values())))
     best = sorted(mean for mean, keep in zip(means.values(), front, strict=True) if keep)
-    axes.plot(*np.array(best).T, color=REFERENCE, linewidth=0.9, linestyle=(0, (4, 2)))
+    if len(best) > 1:
+        axes.plot(
+            *np.array(best).T, color=REFERENCE, linewidth=0.9, linestyle=(0, (4, 2)), label=FRONT
+        )
     for name, (violation, cost) in points.items():
         axes.plot(violation, cost, ".", color=color[name], markersize=3, alpha=0.35, mew=0)
         axes.errorbar(

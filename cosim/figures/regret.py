@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,15 +109,20 @@ def plot_profiles(panels: Mapping[str, Mapping[str, Profile]], path: str | Path)
             axes.set_xlabel("regret % at most")
             axes.tick_params(labelbottom=True)
         for axes, profiles in zip(grid, panels.values(), strict=False):
-            _name(axes, list(profiles))
+            _name(axes, profiles)
     return save(drawn, path)
 
 
-def _name(axes: Axes, names: Sequence[str]) -> None:
-    """Names in their curves' colours, in the corner that curves which end at 1 leave free."""
-    colors = list(zip(SERIES, names, strict=False))
-    for row, (color, name) in enumerate(reversed(colors)):
+def _name(axes: Axes, profiles: Mapping[str, Profile]) -> None:
+    """Names in their curves' colours, in the emptier of the two corners that curves leave free."""
+    shares = np.array([profile.share for profile in profiles.values()])
+    half = shares.shape[1] // 2
+    low = shares[:, half:].min() >= 1.0 - shares[:, :half].max()
+    for row, (color, name) in enumerate(zip(SERIES, profiles, strict=False)):
+        y = 0.03 + 0.1 * (len(profiles) - 1 - row) if low else 0.97 - 0.1 * row
         axes.text(
-            0.98, 0.03 + 0.1 * row, plain(name), color=color, fontsize=6.5, ha="right",
-            transform=axes.transAxes,
+            0.98 if low else 0.03, y, plain(name), color=color, fontsize=6.5,
+            ha="right" if low else "left", va="bottom" if low else "top",
+            transform=axes.transAxes, zorder=6,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
         )  # fmt: skip

@@ -136,17 +136,17 @@ def label(name: str, unit: str) -> str:
 
 
 def limit(axes: Axes, value: float, text: str = "") -> None:
-    """Draw a bound across the axes, named at its right end."""
+    """Draw a bound across the axes, named right of them: within, the data would hide it."""
     axes.axhline(value, color=BOUND, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3)
     if text:
         axes.annotate(
             text,
             (1.0, value),
             xycoords=("axes fraction", "data"),
-            xytext=(-2, 2),
+            xytext=(3, 0),
             textcoords="offset points",
-            ha="right",
-            va="bottom",
+            ha="left",
+            va="center",
             fontsize=6.5,
             color=BOUND,
         )

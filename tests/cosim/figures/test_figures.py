@@ -77,6 +77,9 @@ def test_a_bound_is_named_whether_it_is_drawn_or_too_far_away(trajectory, paper)
     said = {name: [text.get_text() for text in axis.texts] for name, axis in axes.items()}
     assert said["$X_{2}$ [%]"] == ["≥ 25", "bound ≤ 100"]
     assert said["$F_{200}$ [kg/min]"] == ["bound ≥ 100, ≤ 400"]
+    bound = axes["$X_{2}$ [%]"].texts[0]
+    assert bound.xy == (1.0, 25.0)
+    assert bound.get_ha() == "left", "beside the axes, where no curve hides it"
 
 
 def test_runs_side_by_side_have_the_same_axes(trajectory, paper):
@@ -198,3 +201,5 @@ def test_labels_at_line_ends_do_not_overlap_and_stay_within_the_axes(rng):
     assert np.diff(placed).max() <= -0.1 + 1e-6
     assert placed[0] <= 1.0 + 1e-9
     assert spread(np.array([0.9, 0.1]), 0.1).tolist() == [0.9, 0.1], "what is apart stays"
+    crowded = spread(np.array([0.95, 0.02, 0.01, 0.0]), 0.1)
+    assert crowded == pytest.approx([0.95, 0.2, 0.1, 0.0]), "a crowd below moves nothing above"

@@ -1,6 +1,6 @@
 """kill -9 at random moments of training, evaluation, recording and results update.
 
-    python tests/faults/kill.py --trials 60
+    python -m tests.faults.kill --trials 60
 
 Every trial: start the command, kill its whole process group after a random share of the time that
 it takes, look at all files that are there (each must be absent, or whole and right), run it again
@@ -11,16 +11,12 @@ differs.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import os
-import random
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -34,10 +30,8 @@ from cosim import Scenario
 from cosim.errors import RecordingError
 from cosim.recording.reader import read_recording
 from learning.checkpoint import load as load_checkpoint
+from tests.helpers.campaigns import Trial, finish, main, start, trials
 
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
-COSIM = (sys.executable, "-m", "cosim")
 STUDY = """\
 schema = 1
 name = "runs"
@@ -169,85 +163,39 @@ JOBS = (
 )
 
 
-def start(job: Job, folder: Path) -> subprocess.Popen[bytes]:
-    """Start a job in a process group of its own."""
-    return subprocess.Popen(
-        [*COSIM, *job.words(folder)],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder.parent / "code")},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
-
-
-def finish(process: subprocess.Popen[bytes], what: str) -> None:
-    """Wait for a job; raises AssertionError with its last words where it failed."""
-    _, said = process.communicate()
-    assert process.returncode == 0, f"{what}: exit code {process.returncode}\n{said.decode()}"
-
-
-def trial(job: Job, reference: Path, folder: Path, delay: float) -> Counter[str]:
+def trial(one: Trial[Job]) -> Counter[str]:
     """Kill a job once, look, finish it, compare; what was seen."""
-    job.begin(folder)
-    process = start(job, folder)
-    time.sleep(delay)
+    job, folder, what = one.job, one.folder, f"{one.job.name} after a kill at {one.delay:.2f} s"
+    process = start(job.words(folder), folder, group=True)
+    time.sleep(one.delay)
     running = process.poll() is None
     if running:
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
-    seen = Counter({"trials": 1, "killed": int(running)}) + job.inspect(folder, reference)
-    finish(start(job, folder), f"{job.name} after a kill at {delay:.2f} s")
+    seen = Counter({"trials": 1, "killed": int(running)}) + job.inspect(folder, one.reference)
+    finish(start(job.words(folder), folder), what)
     for name in job.results:
-        same = (folder / name).read_bytes() == (reference / name).read_bytes()
-        assert same, f"{job.name} after a kill at {delay:.2f} s: {name} differs"
+        same = (folder / name).read_bytes() == (one.reference / name).read_bytes()
+        assert same, f"{what}: {name} differs"
     seen["equal to the byte afterwards"] += 1
     return seen
 
 
 def campaign(
-    trials: int, seed: int, names: tuple[str, ...] = (), seconds: float = float("inf")
+    count: int, seed: int, names: tuple[str, ...] = (), seconds: float = float("inf")
 ) -> dict[str, dict[str, int]]:
     """Run trials in turn over the jobs, for a time; what was seen, by job."""
-    end = time.monotonic() + seconds
-    draw = random.Random(seed)
     jobs = [job for job in JOBS if not names or job.name in names]
     seen: dict[str, Counter[str]] = {job.name: Counter() for job in jobs}
-    with tempfile.TemporaryDirectory(prefix="cosim-kill-") as top:
-        # A copy: work that goes on in the checkout must not change the program under the trials.
-        for package in PACKAGES:
-            shutil.copytree(ROOT / package, Path(top) / "code" / package)
-        references, durations = {}, {}
-        for number in range(trials):
-            if time.monotonic() > end:
-                break
-            job = jobs[number % len(jobs)]
-            if job.name not in references:
-                folder = references[job.name] = Path(top) / f"reference {job.name}"
-                folder.mkdir()
-                job.begin(folder)
-                began = time.perf_counter()
-                finish(start(job, folder), job.name)
-                durations[job.name] = time.perf_counter() - began
-            folder = Path(top) / str(number)
-            folder.mkdir()
-            delay = draw.uniform(0.1, 1.0) * durations[job.name]
-            seen[job.name] += trial(job, references[job.name], folder, delay)
-            print(f"trial {number + 1}: {job.name}, kill at {delay:.2f} s", file=sys.stderr)
-            shutil.rmtree(folder)
+
+    def whole(job: Job, folder: Path) -> None:
+        finish(start(job.words(folder), folder), job.name)
+
+    for one in trials(jobs, count, seed, whole, seconds=seconds):
+        seen[one.job.name] += trial(one)
+        print(f"trial {one.number + 1}: {one.job.name}, kill at {one.delay:.2f} s", file=sys.stderr)
     return {name: dict(counter) for name, counter in seen.items()}
 
 
-def main() -> None:
-    """Run the campaign and print what was seen."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--trials", type=int, default=60)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after")
-    options = parser.parse_args()
-    seen = campaign(options.trials, options.seed, seconds=options.seconds)
-    print(json.dumps(seen, indent=1, ensure_ascii=False))
-
-
 if __name__ == "__main__":
-    main()
+    main(__doc__, JOBS, campaign, 60)

@@ -1,6 +1,6 @@
 """Kills only the parent of commands that start others, at random moments, and looks for survivors.
 
-    python tests/faults/orphans.py --trials 70
+    python -m tests.faults.orphans --trials 70
 
 Every trial: start the command in a folder of its own for results, cache and temporary files, end
 its first process alone (SIGKILL or SIGTERM, in turn) after a random share of the command's own
@@ -12,15 +12,8 @@ as JSON, in seconds for what took time; ends in an AssertionError where somethin
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import random
-import shutil
 import signal
-import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -30,10 +23,9 @@ from pathlib import Path
 import filelock
 
 from cosim.cli.locking import HOLDER, LOCK
+from tests.helpers.campaigns import Trial, finish, main, start, trials
 
 MARK = "COSIM_ORPHANS"
-COSIM = (sys.executable, "-m", "cosim")
-ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
 """Seconds within which everything must have ended; a loaded machine's guard polls in its time."""
 STUDY = """\
@@ -57,7 +49,7 @@ def _nothing(folder: Path) -> None:
 
 
 def _recording(folder: Path) -> None:
-    run(["simulate", "-n", "300", "--record", "--out", "recorded"], folder)
+    whole(["simulate", "-n", "300", "--record", "--out", "recorded"], folder)
 
 
 def _study(folder: Path) -> None:
@@ -92,29 +84,15 @@ JOBS = (
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """One in which all that a command leaves is in the folder, and its processes are known."""
+    """What makes a command leave all that it leaves in the folder, and its processes known."""
     own = {"TMPDIR": folder / "temporary", "COSIM_CACHE": folder / "cache", MARK: folder}
-    return os.environ | {name: str(value) for name, value in own.items()}
+    own["TMPDIR"].mkdir(exist_ok=True)
+    return {name: str(value) for name, value in own.items()}
 
 
-def start(words: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    """Start a command in a folder."""
-    (folder / "temporary").mkdir(exist_ok=True)
-    return subprocess.Popen(
-        [*COSIM, *words],
-        cwd=folder,
-        env=environment(folder) | {"PYTHONPATH": str(ROOT)},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
-
-
-def run(words: list[str], folder: Path) -> None:
+def whole(words: list[str], folder: Path) -> None:
     """Run a command to its end; raises AssertionError with its last words where it failed."""
-    process = start(words, folder)
-    _, said = process.communicate()
-    assert process.returncode == 0, f"{words}: exit code {process.returncode}\n{said.decode()}"
+    finish(start(words, folder, environment(folder)), " ".join(words))
 
 
 def family(folder: Path) -> dict[int, str]:
@@ -162,11 +140,11 @@ def leftovers(folder: Path, numbers: set[int]) -> list[str]:
     return found
 
 
-def trial(job: Job, folder: Path, delay: float, number: signal.Signals) -> dict[str, float]:
+def trial(one: Trial[Job], number: signal.Signals) -> dict[str, float]:
     """Kill a job's first process once, look, and run it again; what was seen."""
-    job.begin(folder)
-    process = start(job.words.split(), folder)
-    time.sleep(delay)
+    job, folder = one.job, one.folder
+    process = start(job.words.split(), folder, environment(folder))
+    time.sleep(one.delay)
     members = family(folder)
     running = process.poll() is None
     began = time.monotonic()
@@ -178,7 +156,7 @@ def trial(job: Job, folder: Path, delay: float, number: signal.Signals) -> dict[
     assert process.stderr is not None
     with process.stderr as stream:
         said = stream.read().decode()
-    what = f"{job.name}, {number.name} at {delay:.2f} s"
+    what = f"{job.name}, {number.name} at {one.delay:.2f} s"
     assert "Traceback" not in said, f"{what}:\n{said}"
     if running:
         # A signal before Python has begun to handle it ends the process as the system does.
@@ -186,61 +164,38 @@ def trial(job: Job, folder: Path, delay: float, number: signal.Signals) -> dict[
         assert code in expected, f"{what}: exit code {code}\n{said}"
     left = leftovers(folder, set(members))
     assert not left, f"{what} left {left}"
-    resumed = [*job.words.split(), *(job.again.split() if (folder / "out").exists() else [])]
-    run(resumed, folder)
+    whole([*job.words.split(), *(job.again.split() if (folder / "out").exists() else [])], folder)
     assert (folder / job.result).is_file()
     locks = [path for path in folder.rglob("*") if path.name in {LOCK, HOLDER}]
     assert not locks, f"{what}, then run again, left {locks}"
+    print(f"trial {one.number + 1}: {what}, all ended after {ended:.2f} s", file=sys.stderr)
     return {"killed": running, "others": max(0, len(members) - 1), "seconds": ended}
 
 
-def campaign(trials: int, seed: int, names: tuple[str, ...] = ()) -> dict[str, dict[str, float]]:
-    """Run trials in turn over the jobs; what was seen, by job."""
-    draw = random.Random(seed)
+def campaign(
+    count: int, seed: int, names: tuple[str, ...] = (), seconds: float = float("inf")
+) -> dict[str, dict[str, float]]:
+    """Run trials in turn over the jobs, for a time; what was seen, by job."""
     jobs = [job for job in JOBS if not names or job.name in names]
     counts: dict[str, Counter[str]] = {job.name: Counter() for job in jobs}
     slowest = dict.fromkeys(counts, 0.0)
-    durations: dict[str, float] = {}
-    with tempfile.TemporaryDirectory(prefix="cosim-orphans-") as top:
-        for number in range(trials):
-            job = jobs[number % len(jobs)]
-            folder = Path(top) / str(number)
-            folder.mkdir()
-            if job.name not in durations:
-                job.begin(folder)
-                began = time.monotonic()
-                run(job.words.split(), folder)
-                durations[job.name] = time.monotonic() - began
-                assert not (left := leftovers(folder, set())), f"{job.name} left {left}"
-                shutil.rmtree(folder)
-                folder.mkdir()
-            # The first tenth is Python's start.
-            delay = draw.uniform(0.1, 1.0) * durations[job.name]
-            kind = (signal.SIGKILL, signal.SIGTERM)[number // len(jobs) % 2]
-            seen = trial(job, folder, delay, kind)
-            counts[job.name]["trials"] += 1
-            counts[job.name]["killed while running"] += int(seen["killed"])
-            counts[job.name]["with others running"] += int(seen["others"] > 0)
-            slowest[job.name] = max(slowest[job.name], seen["seconds"])
-            words = f"trial {number + 1}: {job.name}, {kind.name} at {delay:.2f} s"
-            print(f"{words}, all ended after {seen['seconds']:.2f} s", file=sys.stderr)
-            shutil.rmtree(folder)
+
+    def undisturbed(job: Job, folder: Path) -> None:
+        whole(job.words.split(), folder)
+        assert not (left := leftovers(folder, set())), f"{job.name} left {left}"
+
+    for one in trials(jobs, count, seed, undisturbed, seconds=seconds):
+        kind = (signal.SIGKILL, signal.SIGTERM)[one.number // len(jobs) % 2]
+        name, seen = one.job.name, trial(one, kind)
+        counts[name]["trials"] += 1
+        counts[name]["killed while running"] += int(seen["killed"])
+        counts[name]["with others running"] += int(seen["others"] > 0)
+        slowest[name] = max(slowest[name], seen["seconds"])
     return {
         name: {**counter, "seconds until all had ended, at most": round(slowest[name], 2)}
         for name, counter in counts.items()
     }
 
 
-def main() -> None:
-    """Run the campaign and print what was seen."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--trials", type=int, default=70)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", action="append", default=[], choices=[job.name for job in JOBS])
-    options = parser.parse_args()
-    seen = campaign(options.trials, options.seed, tuple(options.only))
-    print(json.dumps(seen, indent=1, ensure_ascii=False))
-
-
 if __name__ == "__main__":
-    main()
+    main(__doc__, JOBS, campaign, 70)

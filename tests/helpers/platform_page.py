@@ -9,31 +9,23 @@ import sys
 import tempfile
 from pathlib import Path
 
-import fmus
-from controllers.factories import tuned
-from cosim import FmuPlant, Scenario
-from cosim.cli.controller_fmu import IDENTIFIER, rti_controller, sampled_controller, write_fmu
 from cosim.text_tables import markdown_table
-from fmus.build import HEADER, SOURCES
 from fmus.checks import check
-from fmus.description import MODEL_IDENTIFIER
 from fmus.platforms import PLATFORMS
-from fmus.sampled.build import sampled_sources
 from fmus.variables import FmiVersion
 from tests.helpers.platforms import (
-    BY_NAME,
+    LAWS,
     NATIVE,
     STEPS,
-    Importer,
+    VERSIONS,
+    Hosted,
     NotHereError,
-    library,
-    unzipped,
+    hosted_controller,
+    hosted_plant,
     verdict,
 )
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "platforms.md"
-LAWS = ("none", "uniform", "normal", "drifting")
-VERSIONS: tuple[FmiVersion, ...] = (2, 3)
 NATURE = {"x86_64-linux": "natively", "aarch64-linux": "qemu-user", "x86_64-windows": "wine64"}
 
 
@@ -41,18 +33,19 @@ def main(target: Path) -> None:
     """Write the page."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        controllers = _controllers(folder)
+        plants = {version: hosted_plant(version, folder) for version in VERSIONS}
+        controllers = {version: hosted_controller(version, folder) for version in VERSIONS}
         text = "\n\n".join(
             [
                 HEAD,
                 "## The plant, by platform, law and FMI version",
-                _plants(folder),
+                _plants(plants),
                 "## The controller, by platform and FMI version",
-                _exported(folder, controllers),
+                _exported(controllers),
                 "## Importers of the plant's FMU",
-                _importers([fmus.path(name) for name in fmus.NAMES]),
+                _importers(plants),
                 "## Importers of the controller's FMU",
-                _importers([path for path, _ in controllers.values()]),
+                _importers(controllers),
             ]
         )
     target.write_text(text + "\n", encoding="utf-8")
@@ -86,12 +79,11 @@ def _compared(runs: dict[str, list[str] | NotHereError], otherwise: str) -> dict
     return found
 
 
-def _runs(importer: Importer, root: Path, version: int, identifier: str, *arguments: str):
+def _runs(hosted: Hosted, *arguments: str) -> dict[str, list[str] | NotHereError]:
     runs: dict[str, list[str] | NotHereError] = {}
     for name in NATURE:
         try:
-            file = library(root, BY_NAME[name], version, identifier)
-            runs[name] = importer.run(name, file, str(version), *arguments, str(STEPS))
+            runs[name] = hosted.run(name, *arguments)
         except NotHereError as error:
             runs[name] = error
     return runs
@@ -101,15 +93,12 @@ def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return markdown_table(header, rows).replace("---:", "---").rstrip()
 
 
-def _plants(folder: Path) -> str:
-    importer = Importer("host.c", {HEADER: (SOURCES / HEADER).read_bytes()}, folder / "host")
-    found = {}
-    for version in VERSIONS:
-        name = fmus.NAMES[version - 2]
-        root = unzipped(fmus.path(name), folder / name)
-        for law in LAWS:
-            runs = _runs(importer, root, version, MODEL_IDENTIFIER, law)
-            found[version, law] = _compared(runs, "not run: symbols and load commands checked")
+def _plants(plants: dict[FmiVersion, Hosted]) -> str:
+    found = {
+        (version, law): _compared(_runs(plant, law), "not run: symbols and load commands checked")
+        for version, plant in plants.items()
+        for law in LAWS
+    }
     rows = [
         (p.tuple, NATURE.get(p.tuple, "–"), law, found[2, law][p.tuple], found[3, law][p.tuple])
         for p in PLATFORMS
@@ -118,37 +107,16 @@ def _plants(folder: Path) -> str:
     return _table(("platform", "run by", "law", "FMI 2.0", "FMI 3.0"), rows)
 
 
-def _controllers(folder: Path) -> dict[FmiVersion, tuple[Path, dict[str, bytes]]]:
-    """The tuned controller's FMUs for all platforms, and their sources."""
-    scenario = Scenario.load("paper")
-    with FmuPlant(scenario) as plant:
-        system = sampled_controller(tuned(scenario), scenario, plant.units)
-    controller = rti_controller("tuned", scenario)
-    return {
-        v: (
-            write_fmu(system, controller, scenario, folder / f"controller{v}.fmu", v, True),
-            sampled_sources(system, v),
-        )
-        for v in VERSIONS
-    }
-
-
-def _exported(folder: Path, controllers: dict[FmiVersion, tuple[Path, dict[str, bytes]]]) -> str:
-    found = {}
-    for version, (path, sources) in controllers.items():
-        headers = {name: sources[name] for name in ("variables.h", "system.h")}
-        importer = Importer("controller_host.c", headers, folder / f"host{version}")
-        root = unzipped(path, folder / path.stem)
-        runs = _runs(importer, root, version, IDENTIFIER)
-        found[version] = _compared(runs, "not run")
+def _exported(controllers: dict[FmiVersion, Hosted]) -> str:
+    found = {version: _compared(_runs(one), "not run") for version, one in controllers.items()}
     rows = [
         (p.tuple, NATURE.get(p.tuple, "–"), found[2][p.tuple], found[3][p.tuple]) for p in PLATFORMS
     ]
     return _table(("platform", "run by", "FMI 2.0", "FMI 3.0"), rows)
 
 
-def _importers(files: list[Path]) -> str:
-    findings = [check(path) for path in files]
+def _importers(hosted: dict[FmiVersion, Hosted]) -> str:
+    findings = [check(one.fmu) for one in hosted.values()]
     rows = [
         (both[0].tool, both[0].subject, *(f"{f.status}: {f.detail}" for f in both))
         for both in zip(*findings, strict=True)

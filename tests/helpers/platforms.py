@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import subprocess
 import tempfile
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import fmpy
+import pytest
 
+import fmus
+from controllers.factories import tuned
+from cosim import FmuPlant, Scenario
+from cosim.cli.controller_fmu import IDENTIFIER, rti_controller, sampled_controller, write_fmu
+from fmus.build import HEADER, SOURCES
 from fmus.compiler import cross_compiler
+from fmus.description import MODEL_IDENTIFIER
 from fmus.platforms import PLATFORMS, Platform
+from fmus.sampled import SampledSystem
+from fmus.sampled.build import sampled_sources
+from fmus.variables import FmiVersion
 
 HOSTS = Path(__file__).parents[1] / "fmus" / "platforms"
 BY_NAME = {platform.tuple: platform for platform in PLATFORMS}
@@ -23,6 +35,15 @@ OTHERS = ("aarch64-linux", "x86_64-windows")
 ARM_LIBRARIES = Path("/usr/aarch64-linux-gnu")
 WINE = Path("/usr/lib/wine/wine64")
 STEPS = 10_000
+VERSIONS: tuple[FmiVersion, ...] = (2, 3)
+LAWS = ("none", "uniform", "normal", "drifting")
+MARKS = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        importlib.util.find_spec("ziglang") is None, reason="the extra 'cross' is not installed"
+    ),
+]
+"""Of the tests that build or run other platforms' binaries."""
 # A host draws the inputs that it gives: with fused multiply-adds, which clang makes for ARM64 by
 # default and not for x86-64, they would be other inputs there.
 FLAGS = ("-std=c99", "-Wall", "-ffp-contract=off")
@@ -80,6 +101,54 @@ def unzipped(fmu: Path, folder: Path) -> Path:
     with zipfile.ZipFile(fmu) as container:
         container.extractall(folder)
     return folder
+
+
+@dataclass(frozen=True)
+class Hosted:
+    """An FMU for all platforms, unzipped in `root`, and the host that steps it."""
+
+    fmu: Path
+    root: Path
+    importer: Importer
+    version: FmiVersion
+    identifier: str
+
+    def run(self, name: str, *arguments: str) -> list[str]:
+        """What the host prints of `STEPS` steps on platform `name`; see `Importer.run`."""
+        file = library(self.root, BY_NAME[name], self.version, self.identifier)
+        return self.importer.run(name, file, str(self.version), *arguments, str(STEPS))
+
+    def run_or_skip(self, name: str, *arguments: str) -> list[str]:
+        """The same in a test, skipped where the platform cannot be run."""
+        try:
+            return self.run(name, *arguments)
+        except NotHereError as error:
+            pytest.skip(str(error))
+
+
+def hosted_plant(version: FmiVersion, folder: Path) -> Hosted:
+    """The shipped plant."""
+    fmu = fmus.path(fmus.NAMES[version - 2])
+    importer = Importer("host.c", {HEADER: (SOURCES / HEADER).read_bytes()}, folder / "host")
+    return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, MODEL_IDENTIFIER)
+
+
+def hosted_controller(version: FmiVersion, folder: Path) -> Hosted:
+    """The tuned controller, exported for all platforms."""
+    scenario, system = Scenario.load("paper"), _tuned()
+    target = folder / f"controller{version}.fmu"
+    fmu = write_fmu(system, rti_controller("tuned", scenario), scenario, target, version, True)
+    sources = sampled_sources(system, version)
+    headers = {name: sources[name] for name in ("variables.h", "system.h")}
+    importer = Importer("controller_host.c", headers, folder / f"host{version}")
+    return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, IDENTIFIER)
+
+
+@cache
+def _tuned() -> SampledSystem:
+    scenario = Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        return sampled_controller(tuned(scenario), scenario, plant.units)
 
 
 def verdict(native: list[str], other: list[str]) -> str:

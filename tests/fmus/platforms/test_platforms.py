@@ -2,52 +2,33 @@
 
 from __future__ import annotations
 
-import importlib.util
 from functools import cache
-from pathlib import Path
 
 import pytest
 
-import fmus
-from fmus.build import HEADER, SOURCES
-from fmus.description import MODEL_IDENTIFIER
 from tests.helpers.platforms import (
-    BY_NAME,
+    LAWS,
+    MARKS,
     NATIVE,
     OTHERS,
     STEPS,
-    Importer,
-    NotHereError,
-    library,
-    unzipped,
+    VERSIONS,
+    hosted_plant,
     verdict,
 )
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        importlib.util.find_spec("ziglang") is None, reason="the extra 'cross' is not installed"
-    ),
-]
-LAWS = ["none", "uniform", "normal", "drifting"]
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory):
     """Lines that the host prints on a platform; skipped where it cannot be run."""
     folder = tmp_path_factory.mktemp("platforms")
-    importer = Importer("host.c", {HEADER: (SOURCES / HEADER).read_bytes()}, folder / "host")
-    for name in fmus.NAMES:
-        unzipped(fmus.path(name), folder / name)
+    plants = {version: hosted_plant(version, folder) for version in VERSIONS}
 
     @cache
     def runner(name: str, version: int, law: str) -> list[str]:
-        root: Path = folder / fmus.NAMES[version - 2]
-        file = library(root, BY_NAME[name], version, MODEL_IDENTIFIER)
-        try:
-            return importer.run(name, file, str(version), law, str(STEPS))
-        except NotHereError as error:
-            pytest.skip(str(error))
+        return plants[version].run_or_skip(name, law)
 
     return runner
 

@@ -4,51 +4,35 @@ import numpy as np
 import pytest
 
 from controllers.errors import ControllerError
-from cosim import FmuPlant, Scenario
+from cosim import FmuPlant
 from learning import checkpoint
 from learning.errors import LearningError
 from learning.q_learning import QLearning
 from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun
+from tests.helpers.training import make_run, train
 
-RUN = TrainingRun(
-    algorithm="q-learning",
-    scenario=Scenario.load("paper"),
-    samples=40,
-    seed=0,
-    configuration=QLearning.Configuration(),
-    log_every=20,
-    evaluate_every=40,
-    checkpoint_every=20,
-    evaluation_seeds=1,
-    evaluation_steps=10,
-)
+RUN = make_run()
 
 
 @pytest.fixture(scope="module")
-def plants():
-    with FmuPlant(RUN.scenario) as plant, FmuPlant(RUN.scenario) as other:
-        yield plant, other
-
-
-@pytest.fixture(scope="module")
-def good(plants, tmp_path_factory):
+def good(tmp_path_factory):
     folder = tmp_path_factory.mktemp("good")
-    TrainingLoop(RUN, QLearning, *plants, out=folder).go()
+    train(RUN, folder)
     return checkpoint.load(folder / "checkpoint.npz")
 
 
 @pytest.fixture(scope="module")
-def resume(plants, tmp_path_factory):
+def resume(tmp_path_factory):
     """Take up a checkpoint with a content and a checksum that fits it, always in one loop."""
     folder = tmp_path_factory.mktemp("resumed")
-    loop = TrainingLoop(RUN, QLearning, *plants, out=folder)
+    with FmuPlant(RUN.scenario) as plant, FmuPlant(RUN.scenario) as other:
+        loop = TrainingLoop(RUN, QLearning, plant, other, out=folder)
 
-    def attempt(content):
-        checkpoint.save(folder / "checkpoint.npz", content)
-        loop._resume()
+        def attempt(content):
+            checkpoint.save(folder / "checkpoint.npz", content)
+            loop._resume()
 
-    return attempt
+        yield attempt
 
 
 ENTRIES = ("plant", "rows", "row_thetas", "theta")

@@ -19,11 +19,9 @@ from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.cli import locking
 from cosim.errors import RecordingError
 from cosim.recording.reader import read_recording
-from learning.q_learning import QLearning
-from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun
 from tests.faults.kill import JOBS, campaign
 from tests.helpers.tank import build_tank, write_scenario
+from tests.helpers.training import make_run, train
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2
 COSIM = (sys.executable, "-m", "cosim")
@@ -259,21 +257,8 @@ def test_an_evaluation_says_how_many_samples_failed(unreliable):
 
 def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, monkeypatch):
     monkeypatch.setattr("controllers.rti.nmpc.make_backend", lambda name: unreliable())
-    scenario = Scenario.load("paper")
-    run = TrainingRun(
-        algorithm="q-learning",
-        scenario=scenario,
-        samples=2000,
-        seed=0,
-        configuration=QLearning.Configuration(),
-        log_every=1000,
-        evaluate_every=2000,
-        checkpoint_every=2000,
-        evaluation_seeds=1,
-        evaluation_steps=1,
-    )
-    with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        result = TrainingLoop(run, QLearning, plant, other).go()
+    every = {"log_every": 1000, "evaluate_every": 2000, "checkpoint_every": 2000}
+    result = train(make_run(samples=2000, evaluation_steps=1, **every))
     assert result.status == "finished"
     failures = result.rows[-1]["failures"]
     # One-sample evaluations may fail too, and are not counted among the samples.

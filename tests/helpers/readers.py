@@ -23,9 +23,7 @@ from fmus import path as shipped
 from learning.checkpoint import Checkpoint
 from learning.checkpoint import load as load_checkpoint
 from learning.errors import CheckpointError
-from learning.q_learning import QLearning
-from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun
+from tests.helpers.training import make_run, train
 
 
 @dataclass(frozen=True)
@@ -72,24 +70,6 @@ def _run(folder: Path) -> None:
     run.write_csv(folder / "trajectory.csv")
 
 
-def _train(folder: Path) -> None:
-    scenario = Scenario.load("paper")
-    run = TrainingRun(
-        algorithm="q-learning",
-        scenario=scenario,
-        samples=40,
-        seed=0,
-        configuration=QLearning.Configuration(),
-        log_every=20,
-        evaluate_every=40,
-        checkpoint_every=20,
-        evaluation_seeds=1,
-        evaluation_steps=10,
-    )
-    with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        TrainingLoop(run, QLearning, plant, other, out=folder).go()
-
-
 def _seal(checkpoint: Checkpoint) -> str:
     digest = hashlib.sha256(repr((checkpoint.run, checkpoint.state)).encode())
     for name in sorted(checkpoint.arrays):
@@ -102,7 +82,7 @@ def readers(folder: Path) -> dict[str, Reader]:
     scenario = Scenario.load("paper")
     problem = Problem.from_scenario(scenario)
     _run(folder)
-    _train(folder)
+    train(make_run(), folder)
     (folder / "scenario.toml").write_text(scenario.to_toml())
     (folder / "plant.fmu").write_bytes(shipped().read_bytes())
     Parameters.naive(problem).save(folder / "theta.toml")

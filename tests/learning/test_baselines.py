@@ -16,8 +16,8 @@ from learning.log import to_csv
 from learning.policy_search import Coordinates
 from learning.prediction_errors import OneStepModel
 from learning.registry import load_algorithm
-from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun
+from tests.helpers import training
+from tests.helpers.training import killed_and_resumed, train
 
 SETTINGS = {
     "backoff": {},
@@ -28,30 +28,9 @@ SETTINGS = {
 
 
 def make_run(name, scenario="paper", **changes):
-    values = {
-        "algorithm": name,
-        "scenario": Scenario.load(scenario) if isinstance(scenario, str) else scenario,
-        "samples": 450,
-        "seed": 3,
-        "configuration": load_algorithm(name).Configuration.from_dict(SETTINGS[name]),
-        "start": "tuned",
-        "log_every": 50,
-        "evaluate_every": 450,
-        "checkpoint_every": 50,
-        "evaluation_seeds": 1,
-        "evaluation_steps": 20,
-    }
-    return TrainingRun(**{**values, **changes})
-
-
-def train(run, out=None, *, resume=False, progress=None):
-    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
-        loop = TrainingLoop(run, load_algorithm(run.algorithm), plant, other, out=out)
-        return loop.go(resume=resume, progress=progress)
-
-
-class Killed(BaseException):
-    """Stands for a kill."""
+    values = {"samples": 450, "seed": 3, "start": "tuned", "evaluation_steps": 20}
+    every = {"log_every": 50, "evaluate_every": 450, "checkpoint_every": 50}
+    return training.make_run(name, scenario, SETTINGS[name], **{**values, **every, **changes})
 
 
 @pytest.mark.parametrize(
@@ -67,13 +46,7 @@ def test_a_baseline_resumed_after_a_kill_ends_in_the_same_digits(name, tmp_path)
     run = make_run(name)
     whole = train(run)
 
-    def die(done, row):
-        if done == 250:
-            raise Killed
-
-    with pytest.raises(Killed):
-        train(run, tmp_path, progress=die)
-    resumed = train(run, tmp_path, resume=True)
+    resumed = killed_and_resumed(run, tmp_path, 250)
     assert to_csv(resumed.rows) == to_csv(whole.rows)
     assert whole.plant_samples == 450
     assert whole.status == "finished"

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from controllers.quasi_static import QuasiStaticPolicy
-from cosim import FmuPlant, Scenario
+from cosim import Scenario
 from learning.drift import Drift
 from learning.log import COLUMNS
-from learning.registry import load_algorithm
-from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun
+from tests.helpers.training import make_run, train
 
 
 @pytest.fixture(scope="module")
@@ -32,22 +30,10 @@ def test_a_plant_that_stays_as_it_is_has_none():
 
 @pytest.mark.parametrize(("name", "more"), [("paper", []), ("drifting", ["UA2", "reference_J"])])
 def test_the_log_shows_it_at_the_end_of_each_row(name, more):
-    scenario, algorithm = Scenario.load(name), load_algorithm("offset-free")
-    run = TrainingRun(
-        algorithm="offset-free",
-        scenario=scenario,
-        samples=60,
-        seed=0,
-        configuration=algorithm.Configuration.from_dict({"back_off": False}),
-        log_every=30,
-        evaluate_every=60,
-        checkpoint_every=60,
-        evaluation_seeds=1,
-        evaluation_steps=5,
-    )
-    with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        rows = TrainingLoop(run, algorithm, plant, other).go().rows
+    every = {"log_every": 30, "evaluate_every": 60, "checkpoint_every": 60}
+    run = make_run("offset-free", name, {"back_off": False}, samples=60, **every)
+    rows = train(run).rows
     assert list(rows[0]) == [*COLUMNS, *more]
     if more:
-        drift = Drift.of(scenario)
+        drift = Drift.of(run.scenario)
         assert [row["UA2"] for row in rows] == [drift.row(t)["UA2"] for t in (1800.0, 3600.0)]

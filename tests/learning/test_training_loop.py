@@ -17,8 +17,9 @@ from learning.log import LogRow, to_csv
 from learning.protocols import Update
 from learning.q_learning import StepwiseQLearning
 from learning.registry import load_algorithm
-from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun, late_movement
+from learning.training_run import late_movement
+from tests.helpers import training
+from tests.helpers.training import killed_and_resumed, train
 
 SETTINGS = {
     "q-learning": {"rule": "gauss-newton", "warm_up": 20},
@@ -34,45 +35,16 @@ def alone(name):
 
 
 def make_run(scenario, name, **changes):
-    algorithm = load_algorithm(name)
-    values = {
-        "algorithm": name,
-        "scenario": scenario,
-        "samples": 450,
-        "seed": 3,
-        "configuration": algorithm.Configuration.from_dict(SETTINGS[name]),
-        "log_every": 50,
-        "evaluate_every": 100,
-        "checkpoint_every": 100,
-        "evaluation_seeds": 1,
-        "evaluation_steps": 20,
-    }
-    return TrainingRun(**{**values, **changes}), algorithm
-
-
-def train(run, algorithm, out=None, *, resume=False, progress=None):
-    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
-        return TrainingLoop(run, algorithm, plant, other, out=out).go(
-            resume=resume, progress=progress
-        )
-
-
-class Killed(BaseException):
-    """Stands for a kill: nothing after it runs."""
+    values = {"samples": 450, "seed": 3, "evaluation_steps": 20}
+    every = {"log_every": 50, "evaluate_every": 100, "checkpoint_every": 100}
+    return training.make_run(name, scenario, SETTINGS[name], **{**values, **every, **changes})
 
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, name, tmp_path):
-    run, algorithm = make_run(scenario, name)
-    whole = train(run, algorithm)
-
-    def die(done, row):
-        if done == 350:
-            raise Killed
-
-    with pytest.raises(Killed):
-        train(run, algorithm, tmp_path, progress=die)
-    resumed = train(run, algorithm, tmp_path, resume=True)
+    run = make_run(scenario, name)
+    whole = train(run)
+    resumed = killed_and_resumed(run, tmp_path, 350)
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
     assert to_csv(resumed.rows) == to_csv(whole.rows)
     assert resumed.evaluation == whole.evaluation
@@ -87,16 +59,16 @@ def train_start(run):
 
 
 def test_another_runs_checkpoint_is_refused(scenario, tmp_path):
-    run, algorithm = make_run(scenario, "q-learning", samples=100)
-    train(run, algorithm, tmp_path)
-    other, _ = make_run(scenario, "q-learning", samples=100, seed=4)
+    run = make_run(scenario, "q-learning", samples=100)
+    train(run, tmp_path)
+    other = make_run(scenario, "q-learning", samples=100, seed=4)
     with pytest.raises(CheckpointError, match="seed is 3 there and 4 here"):
-        train(other, algorithm, tmp_path, resume=True)
+        train(other, tmp_path, resume=True)
 
 
 def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(scenario):
-    run, algorithm = make_run(scenario, "q-learning")
-    result = train(run, algorithm)
+    run = make_run(scenario, "q-learning")
+    result = train(run)
     assert [row["samples"] for row in result.rows] == list(range(50, 451, 50))
     evaluated = [row["samples"] for row in result.rows if not np.isnan(row["greedy_J"])]
     assert evaluated == [100, 200, 300, 400, 450]
@@ -105,27 +77,25 @@ def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(
 
 
 def test_the_log_keeps_the_least_certificate_of_all_updates(scenario):
-    run, algorithm = make_run(scenario, "q-learning")
+    run = make_run(scenario, "q-learning")
     seen = []
 
-    class Watched(algorithm):
+    class Watched(load_algorithm("q-learning")):
         def observe(self, sample):
             update = super().observe(sample)
             if update is not None:
                 seen.append((sample.number, update.smallest_eigenvalue))
             return update
 
-    for row in train(run, Watched).rows:
+    for row in train(run, rule=Watched).rows:
         part = [v for number, v in seen if row["samples"] - 50 <= number < row["samples"]]
         if part:
             assert row["smallest_eigenvalue"] == min(part)
 
 
 def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
-    run, algorithm = make_run(
-        scenario, "actor-critic", divergence=1e-3, configuration=alone("actor-critic")
-    )
-    result = train(run, algorithm, tmp_path)
+    run = make_run(scenario, "actor-critic", divergence=1e-3, configuration=alone("actor-critic"))
+    result = train(run, tmp_path)
     assert result.status.startswith("diverged: greedy J")
     assert "at sample 200" in result.status, "the second evaluation in a row"
     last = result.rows[-1]
@@ -137,13 +107,13 @@ def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
 
 
 def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
-    run, _ = make_run(scenario, "q-learning")
+    run = make_run(scenario, "q-learning")
 
     class Broken(StepwiseQLearning):
         def _recursive(self, number, td_error, gradient):
             return super()._recursive(number, float("nan") if number > 200 else td_error, gradient)
 
-    result = train(run, Broken)
+    result = train(run, rule=Broken)
     assert result.status.startswith("diverged: TD errors or gradients are not finite")
     assert result.rows[-1]["samples"] == 220, "the row of the sample at which it broke"
     assert result.rows[-1]["greedy_J"] == result.evaluation["J"]
@@ -164,8 +134,8 @@ class Reporting(StepwiseQLearning):
 
 
 def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tmp_path):
-    run, _ = make_run(scenario, "q-learning", samples=200)
-    result = train(run, Reporting, tmp_path)
+    run = make_run(scenario, "q-learning", samples=200)
+    result = train(run, tmp_path, rule=Reporting)
     stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
     assert 25.0 < result.parameters["x_l"][0] < 26.0
     assert np.array_equal(stored.theta, result.parameters.theta)
@@ -177,23 +147,16 @@ def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tm
 
 def test_the_runs_seed_reaches_the_algorithm(scenario):
     ends = [
-        train(make_run(scenario, "q-learning", samples=50, seed=seed)[0], Reporting).parameters
+        train(make_run(scenario, "q-learning", samples=50, seed=seed), rule=Reporting).parameters
         for seed in (3, 3, 4)
     ]
     assert ends[0].hash == ends[1].hash != ends[2].hash
 
 
 def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):
-    run, _ = make_run(scenario, "q-learning", samples=300)
-    whole = train(run, Reporting)
-
-    def die(done, row):
-        if done == 250:
-            raise Killed
-
-    with pytest.raises(Killed):
-        train(run, Reporting, tmp_path, progress=die)
-    resumed = train(run, Reporting, tmp_path, resume=True)
+    run = make_run(scenario, "q-learning", samples=300)
+    whole = train(run, rule=Reporting)
+    resumed = killed_and_resumed(run, tmp_path, 250, Reporting)
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
 
 
@@ -206,10 +169,10 @@ def constant_run(scenario, samples, **changes):
 
 
 def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
-    run, algorithm = constant_run(scenario, 400)
-    whole = train(run, algorithm)
-    train(constant_run(scenario, 200)[0], algorithm, tmp_path)
-    more = train(run, algorithm, tmp_path, resume=True)
+    run = constant_run(scenario, 400)
+    whole = train(run)
+    train(constant_run(scenario, 200), tmp_path)
+    more = train(run, tmp_path, resume=True)
     assert to_csv(more.rows) == to_csv(whole.rows)
     assert np.array_equal(more.parameters.theta, whole.parameters.theta)
 
@@ -223,11 +186,11 @@ def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
     ],
 )
 def test_a_run_that_began_otherwise_is_given_no_more_samples(scenario, tmp_path, first, message):
-    run, algorithm = first(scenario)
-    train(run, algorithm, tmp_path)
+    run = first(scenario)
+    train(run, tmp_path)
     longer = dataclasses.replace(run, samples=400)
     with pytest.raises(CheckpointError, match=message):
-        train(longer, algorithm, tmp_path, resume=True)
+        train(longer, tmp_path, resume=True)
 
 
 class Worsening(load_algorithm("q-learning")):
@@ -249,9 +212,9 @@ class Worsening(load_algorithm("q-learning")):
 def test_validation_keeps_a_good_start_and_counts_its_samples(scenario, problem, tmp_path):
     start = Parameters.naive(problem).replace({"x_l": [27.5, 40.0]}).save(tmp_path / "start.toml")
     changes = {"samples": 200, "start": str(start), "validate_every": 50, "validation_samples": 60}
-    run, _ = make_run(scenario, "q-learning", **changes)
-    result = train(run, Worsening)
-    lost = train(dataclasses.replace(run, validate_every=0), Worsening)
+    run = make_run(scenario, "q-learning", **changes)
+    result = train(run, rule=Worsening)
+    lost = train(dataclasses.replace(run, validate_every=0), rule=Worsening)
     assert result.parameters["x_l"].tolist() == [27.5, 40.0]
     assert lost.parameters["x_l"][0] < 20.0 and lost.plant_samples == 200
     assert result.plant_samples == 200 + 5 * 60 and result.validated == 5 * 60
@@ -261,39 +224,30 @@ def test_validation_keeps_a_good_start_and_counts_its_samples(scenario, problem,
 
 
 def test_validation_resumes_to_the_same_digits(scenario, tmp_path):
-    run, algorithm = make_run(
-        scenario, "q-learning", samples=300, validate_every=50, validation_samples=40
-    )
-    whole = train(run, algorithm)
-
-    def die(done, row):
-        if done == 250:
-            raise Killed
-
-    with pytest.raises(Killed):
-        train(run, algorithm, tmp_path, progress=die)
-    resumed = train(run, algorithm, tmp_path, resume=True)
+    run = make_run(scenario, "q-learning", samples=300, validate_every=50, validation_samples=40)
+    whole = train(run)
+    resumed = killed_and_resumed(run, tmp_path, 250)
     assert to_csv(resumed.rows) == to_csv(whole.rows)
     assert resumed.rows[-1]["accepted"] >= 1
 
 
 def test_scenarios_that_differ_in_open_points_train_differently(scenario):
-    run, algorithm = make_run(scenario, "q-learning", samples=60)
-    theta = {train(run, algorithm).parameters.hash}
+    run = make_run(scenario, "q-learning", samples=60)
+    theta = {train(run).parameters.hash}
     for stated in (
         {"exploration": {"kind": "additive", "probability": 0.1, "standard_deviation": [3.0, 3.0]}},
         {"controller": {"value_offset": "stage-cost"}},
     ):
         other = dataclasses.replace(run, scenario=scenario.replace(stated))
-        theta.add(train(other, algorithm).parameters.hash)
+        theta.add(train(other).parameters.hash)
     assert len(theta) == 3
 
 
 def test_the_log_counts_flags_of_the_policies(scenario, monkeypatch):
-    run, algorithm = make_run(scenario, "q-learning", samples=100)
+    run = make_run(scenario, "q-learning", samples=100)
     monkeypatch.setattr(RtiSolution, "weakly_active", True)
     monkeypatch.setattr(RtiSolution, "licq", False)
-    rows = train(run, algorithm).rows
+    rows = train(run).rows
     assert [row["weakly_active"] for row in rows] == [5, 10]
     assert [row["licq_failed"] for row in rows] == [5, 10]
 

@@ -1,0 +1,69 @@
+"""Short trainings, whole, and killed and resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim import FmuPlant, Scenario
+from learning.protocols import Algorithm
+from learning.registry import load_algorithm
+from learning.training_loop import Progress, TrainingLoop
+from learning.training_run import TrainingResult, TrainingRun
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing after it runs."""
+
+
+def make_run(
+    algorithm: str = "q-learning",
+    scenario: str | Scenario = "paper",
+    settings: Mapping[str, Any] = {},
+    **changes: Any,
+) -> TrainingRun:
+    """Forty samples, judged by one held-out run of ten, with a checkpoint in the middle."""
+    values = {
+        "samples": 40,
+        "seed": 0,
+        "configuration": load_algorithm(algorithm).Configuration.from_dict(settings),
+        "log_every": 20,
+        "evaluate_every": 40,
+        "checkpoint_every": 20,
+        "evaluation_seeds": 1,
+        "evaluation_steps": 10,
+    }
+    loaded = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+    return TrainingRun(algorithm=algorithm, scenario=loaded, **{**values, **changes})
+
+
+def train(
+    run: TrainingRun,
+    out: Path | None = None,
+    *,
+    rule: type[Algorithm] | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> TrainingResult:
+    """Train to the end, by another rule than the run's where one is given."""
+    rule = rule or load_algorithm(run.algorithm)
+    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
+        loop = TrainingLoop(run, rule, plant, other, out=out)
+        return loop.go(resume=resume, progress=progress)
+
+
+def killed_and_resumed(
+    run: TrainingRun, out: Path, at: int, rule: type[Algorithm] | None = None
+) -> TrainingResult:
+    """The result of a run that was killed when it had done `at` samples, and resumed."""
+
+    def die(done: int, row: object) -> None:
+        if done == at:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(run, out, rule=rule, progress=die)
+    return train(run, out, rule=rule, resume=True)

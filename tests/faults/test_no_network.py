@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.drawing import skip_without_driver
+
 pytestmark = pytest.mark.slow
 SCRIPT = Path(__file__).parents[1] / "helpers" / "no_network.py"
 COMMANDS = {
@@ -47,8 +49,7 @@ def test_a_command_needs_no_network_and_asks_for_no_name(tmp_path, name):
     if name == "view":
         without_network(tmp_path, *command, *COMMANDS["simulate"])
     found = without_network(tmp_path, *command, *COMMANDS[name])
-    if "no graphics driver" in found["stderr"]:
-        pytest.skip("no graphics driver")
+    skip_without_driver(found["stderr"])
     assert found["returncode"] == 0, found["stderr"]
     assert found["queries"] == []
     assert not list((tmp_path / "home").rglob("analytics*"))

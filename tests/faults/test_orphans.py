@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from tests.faults.orphans import JOBS, campaign
+from tests.helpers.drawing import skip_without_driver
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 
@@ -13,8 +14,7 @@ def held(trials, seed, *names):
     try:
         return campaign(trials, seed, names)
     except AssertionError as error:
-        if "no graphics driver" in str(error):
-            pytest.skip("no graphics driver")
+        skip_without_driver(str(error))
         raise
 
 

@@ -2,6 +2,8 @@ import json
 
 import pytest
 
+from tests.helpers.drawing import skip_without_driver
+
 
 @pytest.fixture
 def recording(cosim):
@@ -35,7 +37,6 @@ def test_without_a_display_the_message_says_how_to_draw(cosim, recording, monkey
 @pytest.mark.slow
 def test_png_draws_the_recording(cosim, recording, tmp_path):
     code, _, err = cosim("view", recording, "--png", "run.png", "--at", 600)
-    if "no graphics driver" in err:
-        pytest.skip(err)
+    skip_without_driver(err)
     assert code == 0
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")

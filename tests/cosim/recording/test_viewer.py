@@ -12,6 +12,7 @@ from cosim.errors import RecordingError
 from cosim.recording import open_viewer, render, viewer
 from tests.cosim.recording.test_run_recorder import recorded
 from tests.helpers.blocks import random_block
+from tests.helpers.drawing import skip_without_driver
 
 slow = pytest.mark.slow
 
@@ -28,8 +29,7 @@ def drawn(recording, png, **options):
     try:
         render(recording, png, **options)
     except RecordingError as error:
-        if "no graphics driver" in str(error):
-            pytest.skip(str(error))
+        skip_without_driver(str(error))
         raise
     return imread(png)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from itertools import islice
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -207,12 +208,14 @@ class TrainingLoop:
         One evaluation above the limit may be an excursion: two in a row end the run, or the last.
         """
         greedy, limit = row["greedy_J"], self._judge.limit
-        judged = [earlier["greedy_J"] for earlier in self._rows if isfinite(earlier["greedy_J"])]
-        again = len(judged) > 1 and judged[-2] > limit
-        if greedy > limit and (again or row["samples"] == self._run.samples):
-            where = f"at sample {int(row['samples'])}"
-            return f"diverged: greedy J = {shown(greedy)} exceeds {shown(limit)} {where}"
-        return None
+        if not greedy > limit:
+            return None
+        earlier = (last["greedy_J"] for last in islice(reversed(self._rows), 1, None))
+        before = next((judged for judged in earlier if isfinite(judged)), limit)
+        if before <= limit and row["samples"] < self._run.samples:
+            return None
+        where = f"at sample {int(row['samples'])}"
+        return f"diverged: greedy J = {shown(greedy)} exceeds {shown(limit)} {where}"
 
     def _record(self, row: LogRow) -> None:
         assert self._recorder is not None

@@ -16,7 +16,6 @@ from cosim.experiments.protocols import Progress, Training
 from cosim.lookup import GROUP as CONTROLLERS
 from cosim.lookup import build_controller as controller_by_name
 from cosim.lookup import import_from_here
-from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from learning.errors import ConfigurationError
@@ -24,11 +23,10 @@ from learning.log import COLUMNS, LogRow, to_csv
 from learning.optimum import stored_optimum
 from learning.registry import GROUP as ALGORITHMS
 from learning.registry import load_algorithm
-from learning.starting_point import build_controller, starting_parameters
-from learning.training_loop import TrainingLoop
-from learning.training_run import TrainingRun
+from learning.starting_point import build_controller
+from learning.training_loop import CHECKPOINT, training_loop
+from learning.training_run import TrainingRun, prepare
 
-CHECKPOINT = "checkpoint.npz"
 SEQUENCES = (list, tuple, set, frozenset)
 
 
@@ -67,10 +65,9 @@ class Trainer:
             folder = Path(name)
             if checkpoint:
                 (folder / CHECKPOINT).write_bytes(checkpoint)
-            with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
-                learner = TrainingLoop(run, load_algorithm(run.algorithm), plant, other, out=folder)
+            with training_loop(run, out=folder) as loop:
                 try:
-                    result = learner.go(resume=bool(checkpoint), progress=hand_over)
+                    result = loop.go(resume=bool(checkpoint), progress=hand_over)
                 except _HandOver:
                     return Progress(
                         reached,
@@ -82,7 +79,7 @@ class Trainer:
             return Progress(
                 samples,
                 result.status,
-                log=to_csv(_with_start(run, result.rows)),
+                log=to_csv(_with_start(result.start, result.rows)),
                 parameters=(folder / "parameters.toml").read_text("utf-8"),
                 plant_samples=result.plant_samples,
                 wall_seconds=time.perf_counter() - begin,
@@ -96,8 +93,7 @@ class Trainer:
             path = Path(name, "parameters.toml")
             path.write_text(parameters, "utf-8")
             theta = Parameters.load(path, problem)
-        found = build_controller(training.nmpc, training.scenario, theta)
-        return found
+        return build_controller(training.nmpc, training.scenario, theta)
 
     def controller(self, name: str, scenario: Scenario) -> Controller:
         """A controller by name, parameters file or `module:factory`; ControllerLookupError."""
@@ -117,35 +113,29 @@ class Trainer:
         return source_hashes(target)
 
 
-def _with_start(run: TrainingRun, rows: list[LogRow]) -> list[LogRow]:
+def _with_start(start: Parameters, rows: list[LogRow]) -> list[LogRow]:
     """The log with a first row of θ at the start, from which its increments are counted."""
-    problem = Problem.from_scenario(run.scenario)
-    start = starting_parameters(problem, run.configuration, run.start)
     figures = dict.fromkeys(rows[0] if rows else COLUMNS, float("nan")) | {"samples": 0.0}
     return [LogRow(figures, start), *rows]
 
 
 def _run(training: Training) -> TrainingRun:
-    import_from_here()
-    algorithm = load_algorithm(training.algorithm)
-    try:
-        return TrainingRun(
-            algorithm=training.algorithm,
-            scenario=training.scenario,
-            samples=training.samples,
-            seed=training.seed,
-            configuration=algorithm.Configuration.from_dict(dict(training.settings)),
-            controller=training.nmpc,
-            start=training.start,
-            log_every=training.log_every,
-            evaluate_every=training.evaluate_every,
-            checkpoint_every=training.checkpoint_every,
-            evaluation_seeds=training.evaluation_seeds,
-            evaluation_steps=training.evaluation_steps,
-            **training.options,
-        )
-    except TypeError as error:
-        raise ConfigurationError(f"training: {error}") from None
+    options = {
+        "seed": training.seed,
+        "controller": training.nmpc,
+        "start": training.start,
+        "log_every": training.log_every,
+        "evaluate_every": training.evaluate_every,
+        "checkpoint_every": training.checkpoint_every,
+        "evaluation_seeds": training.evaluation_seeds,
+        "evaluation_steps": training.evaluation_steps,
+    }
+    if twice := sorted(options.keys() & training.options):
+        raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
+    options |= training.options
+    return prepare(
+        training.algorithm, training.scenario, training.samples, training.settings, options
+    )
 
 
 def _is_sequence(annotation: Any) -> bool:

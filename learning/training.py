@@ -17,36 +17,29 @@ from controllers.parameters import Parameters
 from cosim.evaluation.statistics import shown
 from cosim.figures.style import save
 from cosim.figures.training import training_figure
-from cosim.lookup import build_controller, import_from_here
-from cosim.plant import FmuPlant
+from cosim.lookup import build_controller
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.log import to_csv
 from learning.optimum import stored_optimum
 from learning.protocols import LearnableController
-from learning.registry import load_algorithm
 from learning.starting_point import build_controller as build_learnt
-from learning.training_loop import Progress, TrainingLoop
-from learning.training_run import TrainingRecorder, TrainingResult, TrainingRun
+from learning.training_loop import Progress, training_loop
+from learning.training_run import TrainingRecorder, TrainingResult, TrainingRun, prepare
 from rti_storage import write_atomically
 
 Array = NDArray[np.float64]
 FIGURE = "learning.png"
-SAMPLES = 50_000
 
 
 @dataclass(frozen=True)
 class Training:
-    """A training that has ended: its `run`, the `result`, and how long it took, `wall_seconds`.
-
-    `without_checkpoint` says why it left no checkpoint, if it left none.
-    """
+    """A training that has ended: its `run`, the `result`, and how long it took, `wall_seconds`."""
 
     run: TrainingRun
     result: TrainingResult
     wall_seconds: float = field(compare=False)
-    without_checkpoint: str | None = None
 
     @property
     def parameters(self) -> Parameters:
@@ -193,42 +186,13 @@ def train(
     progress : called with the samples done and the last row of the log.
     options : further fields of `TrainingRun`, `evaluate_every=1000` say.
     """
-    run = prepare(
-        algorithm,
-        Scenario.load(scenario) if not isinstance(scenario, Scenario) else scenario,
-        samples,
-        settings,
-        seed=seed,
-        start=str(start),
-        **options,
-    )
+    if not isinstance(scenario, Scenario):
+        scenario = Scenario.load(scenario)
+    fields = {"seed": seed, "start": str(start), **options}
+    run = prepare(algorithm, scenario, samples, settings, fields)
     return carry_out(
         run, out=out, resume=resume, optimum=optimum, recorder=recorder, progress=progress
     )
-
-
-def prepare(
-    algorithm: str,
-    scenario: Scenario,
-    samples: int | None,
-    settings: Mapping[str, Any] | Configuration | None,
-    **options: Any,
-) -> TrainingRun:
-    """The run that `train` would carry out, checked; raises as `train` does."""
-    import_from_here()
-    found = load_algorithm(algorithm)
-    if not isinstance(settings, Configuration):
-        settings = found.Configuration.from_dict(dict(settings or {}))
-    try:
-        return TrainingRun(
-            algorithm=algorithm,
-            scenario=scenario,
-            samples=getattr(found, "budget", SAMPLES) if samples is None else samples,
-            configuration=settings,
-            **options,
-        )
-    except TypeError as error:
-        raise ConfigurationError(f"train: {error}") from None
 
 
 def carry_out(
@@ -243,15 +207,8 @@ def carry_out(
     """Train as `run` says; the other arguments and the errors are those of `train`."""
     begin = time.perf_counter()
     optimum = optimum or stored_optimum(run.scenario)
-    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
-        loop = TrainingLoop(
-            run,
-            load_algorithm(run.algorithm),
-            plant,
-            evaluation_plant,
-            optimum=build_controller(optimum, run.scenario) if optimum else None,
-            out=None if out is None else Path(out),
-            recorder=recorder,
-        )
+    yardstick = build_controller(optimum, run.scenario) if optimum else None
+    folder = None if out is None else Path(out)
+    with training_loop(run, optimum=yardstick, out=folder, recorder=recorder) as loop:
         result = loop.go(resume=resume, progress=progress)
-    return Training(run, result, time.perf_counter() - begin, loop.without_checkpoint)
+    return Training(run, result, time.perf_counter() - begin)

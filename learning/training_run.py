@@ -11,14 +11,20 @@ from typing import Any, Protocol
 import numpy as np
 
 from controllers.parameters import Parameters
+from cosim.lookup import import_from_here
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.log import LogRow
+from learning.registry import load_algorithm
 
 PLANT, EXPLORATION, ALGORITHM, VALIDATION = range(4)
 """Children of the run's seed sequence, by what they are for."""
+
+
+SAMPLES = 50_000
+"""Of a run where neither user nor algorithm says how many."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,33 @@ class TrainingRun:
         return np.random.SeedSequence(self.seed).spawn(purpose + 1)[purpose]
 
 
+def prepare(
+    algorithm: str,
+    scenario: Scenario,
+    samples: int | None,
+    settings: Mapping[str, Any] | Configuration | None,
+    options: Mapping[str, Any],
+) -> TrainingRun:
+    """The run of an algorithm by name, checked; `options` are the other fields of `TrainingRun`.
+
+    Raises AlgorithmLookupError; ConfigurationError on settings or options that make no run.
+    """
+    import_from_here()
+    found = load_algorithm(algorithm)
+    if not isinstance(settings, Configuration):
+        settings = found.Configuration.from_dict(dict(settings or {}))
+    try:
+        return TrainingRun(
+            algorithm=algorithm,
+            scenario=scenario,
+            samples=getattr(found, "budget", SAMPLES) if samples is None else samples,
+            configuration=settings,
+            **options,
+        )
+    except TypeError as error:
+        raise ConfigurationError(f"training: {error}") from None
+
+
 class TrainingRecorder(Protocol):
     """Takes a training run row by row; `cosim.recording.TrainingRecorder` is one."""
 
@@ -118,7 +151,8 @@ class TrainingResult:
     and validation, `validated` those of the latter; `functions` says whether the controller's were
     `interpreted` or `compiled` at the end; `late_movement` how far θ still went in the last fifth
     of the run, as a share of its way from the start; `start` is θ there and `start_J` its
-    greedy J, `baselines` that of `naive` and `optimal` on the same noise.
+    greedy J, `baselines` that of `naive` and `optimal` on the same noise. `without_checkpoint` says
+    why it left no checkpoint, if it was to leave one.
     """
 
     parameters: Parameters
@@ -132,6 +166,7 @@ class TrainingResult:
     baselines: Mapping[str, float]
     functions: str | None = None
     late_movement: float = float("nan")
+    without_checkpoint: str | None = None
 
 
 def late_movement(start: Parameters, rows: Sequence[LogRow]) -> float:

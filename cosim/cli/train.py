@@ -133,7 +133,7 @@ def train(
         from cosim.lookup import import_from_here
         from cosim.scenario import Scenario
         from learning.registry import load_algorithm
-        from learning.training import prepare
+        from learning.training_run import prepare
 
         import_from_here()
         found = load_algorithm(algorithm)
@@ -145,17 +145,19 @@ def train(
             Scenario.load(scenario),
             samples,
             found.Configuration.from_assignments(assignments or []),
-            seed=seed,
-            controller=controller,
-            log_every=log_every,
-            evaluate_every=evaluate_every,
-            checkpoint_every=checkpoint_every,
-            evaluation_seeds=evaluation_seeds,
-            evaluation_steps=evaluation_steps,
-            start=start,
-            validate_every=validate_every,
-            validation_samples=validation_samples,
-            rest_after=rest_after,
+            {
+                "seed": seed,
+                "controller": controller,
+                "log_every": log_every,
+                "evaluate_every": evaluate_every,
+                "checkpoint_every": checkpoint_every,
+                "evaluation_seeds": evaluation_seeds,
+                "evaluation_steps": evaluation_steps,
+                "start": start,
+                "validate_every": validate_every,
+                "validation_samples": validation_samples,
+                "rest_after": rest_after,
+            },
         )
         folder = open_folder(out).absolute()
         if not (resume or overwrite):
@@ -208,8 +210,8 @@ def _execute(
             recorder=recorder,
             progress=_remark(progress),
         )
-    if training.without_checkpoint:
-        output.note(f"left no checkpoint, --resume is not possible: {training.without_checkpoint}")
+    if reason := training.result.without_checkpoint:
+        output.note(f"left no checkpoint, --resume is not possible: {reason}")
     return training
 
 

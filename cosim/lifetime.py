@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import sys
 import threading
@@ -46,11 +45,10 @@ def ignore_sigterm() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
-def follow_parent(temporary: str | None = None) -> None:
+def follow_parent() -> None:
     """End this worker process, without further ado, as soon as the process that started it ends.
 
-    To be called once in a worker, whose work is lost with its parent anyway. `temporary` is a
-    folder of the parent's that it can then no longer delete.
+    To be called once in a worker, whose work is lost with its parent anyway.
     """
     from multiprocessing import parent_process  # noqa: PLC0415
     from multiprocessing.connection import wait  # noqa: PLC0415
@@ -65,8 +63,6 @@ def follow_parent(temporary: str | None = None) -> None:
         else:
             while os.getppid() == number:
                 time.sleep(POLL)
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
         os._exit(1)
 
     threading.Thread(target=watch, name="follow-parent", daemon=True).start()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tempfile
 import uuid
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from fmus.errors import BuildError
 from fmus.header import c_header
 from fmus.model import FmiVersion
 from fmus.own import binaries, compilers
+from rti_storage.temporary import temporary_folder
 
 PACKAGE = Path(__file__).parent
 SOURCES = PACKAGE / "sources"
@@ -115,8 +115,8 @@ def differences(built: Path, shipped: Path) -> list[str]:
 
 def compare_with_shipped() -> dict[str, list[str]]:
     """Build anew for every platform; file name → `differences` from the shipped file."""
-    with tempfile.TemporaryDirectory() as folder:
-        built = build(Path(folder), every_platform=True)
+    with temporary_folder("cosim-") as folder:
+        built = build(folder, every_platform=True)
         return {path.name: differences(path, PACKAGE / path.name) for path in built}
 
 

@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ import fmpy
 
 from fmus.errors import BuildError
 from fmus.platforms import Platform, present
+from rti_storage.temporary import temporary_folder
 
 # No path, date or identification may enter the binary; no fused multiply-add may change a result.
 COMPILER_FLAGS = (
@@ -68,9 +68,9 @@ class Compiler:
         """
         headers = Path(fmpy.__file__).parent / "c-code"
         file = name + self.platform.suffix
-        with tempfile.TemporaryDirectory() as folder:
+        with temporary_folder("cosim-") as folder:
             for path, data in sources.items():
-                (Path(folder) / path).write_bytes(data)
+                (folder / path).write_bytes(data)
             units = sorted(path for path in sources if path.endswith(".c"))
             command = [
                 *self.command, *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
@@ -81,7 +81,7 @@ class Compiler:
             )
             if result.returncode != 0 or result.stderr:
                 raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
-            return (Path(folder) / file).read_bytes()
+            return (folder / file).read_bytes()
 
 
 def local_compiler() -> Compiler:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Mapping
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from controllers.parameters import Parameters
@@ -26,6 +24,7 @@ from learning.registry import load_algorithm
 from learning.starting_point import build_controller
 from learning.training_loop import CHECKPOINT, training_loop
 from learning.training_run import TrainingRun, prepare
+from rti_storage.temporary import temporary_folder
 
 SEQUENCES = (list, tuple, set, frozenset)
 
@@ -61,8 +60,7 @@ class Trainer:
             if at_checkpoint and late and (folder / CHECKPOINT).is_file():
                 raise _HandOver
 
-        with tempfile.TemporaryDirectory(prefix="cosim-training-") as name:
-            folder = Path(name)
+        with temporary_folder("cosim-training-") as folder:
             if checkpoint:
                 (folder / CHECKPOINT).write_bytes(checkpoint)
             with training_loop(run, out=folder) as loop:
@@ -89,8 +87,8 @@ class Trainer:
     def policy(self, training: Training, parameters: str) -> Controller:
         """The greedy controller of a training's θ."""
         problem = Problem.from_scenario(training.scenario)
-        with tempfile.TemporaryDirectory(prefix="cosim-theta-") as name:
-            path = Path(name, "parameters.toml")
+        with temporary_folder("cosim-theta-") as folder:
+            path = folder / "parameters.toml"
             path.write_text(parameters, "utf-8")
             theta = Parameters.load(path, problem)
         return build_controller(training.nmpc, training.scenario, theta)

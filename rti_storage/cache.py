@@ -8,13 +8,14 @@ import os
 import re
 import shutil
 import stat
-import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
 import platformdirs
+
+from rti_storage.temporary import delete_temporary_folder, new_temporary_folder
 
 CACHE_VARIABLE = "COSIM_CACHE"
 UNUSED_DAYS = 30
@@ -75,8 +76,8 @@ def trusted_folder(kind: str) -> Path:
     try:
         return own_folder(kind)
     except OSError:
-        _temporary[folder] = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))
-    atexit.register(shutil.rmtree, _temporary[folder], ignore_errors=True)
+        _temporary[folder] = new_temporary_folder(f"cosim-{kind}-")
+    atexit.register(delete_temporary_folder, _temporary[folder])
     return _temporary[folder]
 
 

@@ -48,11 +48,10 @@ def check(
     2 where a stored table is missing or damaged. Writes nothing.
     """
     with output(json) as out_:
-        import tempfile
-
         from cosim.experiments.check import differences, load_tolerances
         from cosim.experiments.results import StudyResults
         from cosim.experiments.stored import chosen, stored_results, stored_studies
+        from rti_storage.temporary import temporary_folder
 
         folder = folder or (Path("results") if Path("results").is_dir() else stored_results())
         tolerances, studies = load_tolerances(folder), stored_studies(folder)
@@ -60,10 +59,10 @@ def check(
         for name in quick:
             StudyResults.load(folder / name)
         found: dict[str, list[str]] = {}
-        with tempfile.TemporaryDirectory(prefix="cosim-results-") as work:
+        with temporary_folder("cosim-results-") as work:
             for name in quick:
-                execute(folder / f"{name}.toml", Path(work, name), out_, jobs=jobs, figures=False)
-                found[name] = differences(name, folder / name, Path(work, name), tolerances)
+                execute(folder / f"{name}.toml", work / name, out_, jobs=jobs, figures=False)
+                found[name] = differences(name, folder / name, work / name, tolerances)
         rows = [(name, _verdict(found.get(name))) for name in studies]
         out_.table("stored studies", ("study", "verdict"), rows)
         for lines in found.values():

@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -29,8 +28,8 @@ def enter() -> None:
     """Note that this process is the command line's: one that may be watched, or that is."""
     # Taken out, so that what this command starts does not take itself for it.
     _marks.append(os.environ.pop(MARK, None))
-    if (mark := _marks[-1]) is not None:
-        follow_parent(str(Path(mark).parent))
+    if _marks[-1] is not None:
+        follow_parent()
 
 
 def finish() -> None:
@@ -50,11 +49,13 @@ def watch(fmu: Path, stdout: int | None) -> None:
     """
     if not _marks or _marks[-1] is not None:
         return
+    from rti_storage.temporary import temporary_folder  # here: few commands watch another
+
     flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
     command = [sys.executable, *flags, "-m", "cosim", *sys.argv[1:]]
     folders = release()  # for the process that does the work
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
-        mark = Path(temporary) / "finished"
+    with temporary_folder("cosim-") as temporary:
+        mark = temporary / "finished"
         child = subprocess.Popen(command, stdout=stdout, env=os.environ | {MARK: str(mark)})
         code = _outcome(child)
         finished = mark.exists()

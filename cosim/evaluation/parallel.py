@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
@@ -18,6 +17,7 @@ import loky
 from cosim.errors import EvaluationError
 from cosim.evaluation.cluster import cluster
 from cosim.lifetime import follow_parent
+from rti_storage.temporary import temporary_folder
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
@@ -160,13 +160,14 @@ def _crew(jobs: int, scheduler: str | None) -> Iterator[_Crew]:
         with cluster(scheduler) as there:
             yield _Crew(there.executor, there.workers, there.look, there.translated)
         return
-    # The workers' temporary files, which a worker that is killed leaves to us, and we to them.
-    with tempfile.TemporaryDirectory(prefix="cosim-", ignore_cleanup_errors=True) as temporary:
+    # The workers' temporary files, which a worker that is killed leaves to us.
+    with temporary_folder("cosim-") as temporary:
         executor = loky.ProcessPoolExecutor(
             max_workers=jobs,
-            env=ENVIRONMENT | _inherited() | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temporary),
+            env=ENVIRONMENT
+            | _inherited()
+            | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)),
             initializer=follow_parent,
-            initargs=(temporary,),
         )
         try:
             yield _Crew(executor, lambda: jobs)

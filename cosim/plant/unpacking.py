@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 import zipfile
 from contextlib import suppress
 from pathlib import Path
 
 from rti_storage.cache import sweep, trusted_folder
+from rti_storage.temporary import temporary_folder
 
 _CHUNK = 1 << 20
 
@@ -28,12 +28,9 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     folder = cache / sha256
     if _holds(folder, archive):
         return folder
-    partial = Path(tempfile.mkdtemp(prefix=".partial-", dir=cache))
-    try:
+    with temporary_folder(".partial-", cache) as partial:
         archive.extractall(partial)
         _publish(partial, folder, archive)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     sweep(cache)
     return folder
 

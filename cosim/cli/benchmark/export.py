@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +14,7 @@ from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_f
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 from fmus.sampled import SampledInstance
+from rti_storage.temporary import temporary_folder
 
 TARGET = 30.0
 WARM_UP = 20
@@ -32,9 +31,9 @@ def measure(
     """
     python = rti_controller(controller, scenario)
     python.compilation.finish()
-    with build_plant(scenario) as plant, tempfile.TemporaryDirectory() as folder:
+    with build_plant(scenario) as plant, temporary_folder("cosim-") as folder:
         system = sampled_controller(python, scenario, plant.units)
-        path = write_fmu(system, python, scenario, Path(folder) / "controller.fmu", 2, False)
+        path = write_fmu(system, python, scenario, folder / "controller.fmu", 2, False)
         fmu = SampledInstance(path, scenario.plant.states, scenario.plant.actions)
         try:
             seconds, differences = _run(plant, python, fmu, steps, progress)

@@ -15,6 +15,7 @@ from learning.critic import AdvantageRegression, lstdv
 from learning.exploration import Strategy
 from learning.fit import policy_gradient_fit
 from learning.globalised import GlobalisedLearning, Rule
+from learning.globalised_configuration import GlobalisedConfiguration
 from learning.kalman_q_learning import KalmanConfiguration, KalmanQLearning
 from learning.protocols import LearnableController, Transition, Update
 from learning.schedule import Geometric
@@ -22,7 +23,7 @@ from learning.schedule import Geometric
 Vector = NDArray[np.float64]
 
 
-class ActorCriticConfiguration(Configuration):
+class ActorCriticConfiguration(GlobalisedConfiguration):
     """Hyperparameters of the actor-critic."""
 
     batch_size: Count = Field(1000, description="samples per step of θ, all at one θ")
@@ -177,7 +178,9 @@ class ActorCritic(GlobalisedLearning):
         shared = (samples, self._strategy, self._rng)
         self._made += 1
         if settings.q_learning_first and settings.globalised and self._made % 2:
-            common = {name: getattr(settings, name) for name in Configuration.model_fields}
+            common = {
+                name: getattr(settings, name) for name in GlobalisedConfiguration.model_fields
+            }
             q = KalmanConfiguration(**common)
             return KalmanQLearning(self._controller, self._scenario, q, *shared, width=width)
         return PolicyGradient(self._controller, self._scenario, settings, *shared, width=width)

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from learning.configuration import Count, Positive
-from learning.kalman_q_learning import KalmanConfiguration
-from learning.q_configuration import FinalGain, Gain
+from learning.q_configuration import FinalGain, Gain, QConfiguration
 
 
-class BatchQLearningConfiguration(KalmanConfiguration):
+class BatchQLearningConfiguration(QConfiguration):
     """Hyperparameters of batch Q-learning."""
+
+    OPTIONS: ClassVar[Mapping[tuple[str, ...], tuple[str, ...]]] = {
+        ("kalman",): (
+            "prior_width", "measure_offset", "innovation_clip", "variance_memory",
+            "prediction_errors", "first_batch", "relinearisations",
+        ),
+        ("first-order", "gauss-newton", "lstdq"): (
+            "gain", "gain_end", "ridge", "buffer_size", "iterations", "radius", "radius_minimum",
+        ),
+    }  # fmt: skip
 
     gain: Gain = 0.5
     gain_end: FinalGain = 0.05

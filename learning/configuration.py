@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from controllers.model import Model
 from cosim.scenario import Scenario
@@ -82,20 +82,6 @@ class Configuration(BaseModel):
         None, description="the same at the end, approached linearly"
     )
 
-    globalisation: Literal["validated", "none"] | None = Field(
-        None,
-        description="validated: phases of learning and line searches, in which a θ must beat the "
-        "incumbent on the same noise; none: the rule alone; if not given, as the rule recommends",
-    )
-    phase: Count = Field(2500, description="validated: samples of learning between validations")
-    block: Count = Field(100, description="validated: samples of a block of a race")
-    blocks: Count = Field(8, description="validated: blocks of a race that is not decided before")
-
-    @property
-    def globalised(self) -> bool:
-        """Whether validation decides what is kept."""
-        return self.globalisation != "none"
-
     @classmethod
     def from_assignments(cls, assignments: Iterable[str]) -> Self:
         """Build from `name=value` texts, values as in TOML (a bare word is a string).
@@ -150,12 +136,25 @@ class Configuration(BaseModel):
         """Names of the model parameters that θ has."""
         return self.model_parameters
 
+    def without_part(self) -> Mapping[str, str]:
+        """The hyperparameters that act nowhere here, each with the words for where that is."""
+        return {}
+
+    @model_validator(mode="after")
+    def _refuse_what_has_no_part(self) -> Self:
+        for name, where in self.without_part().items():
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(f"{name}: has no part in {where}; leave it out")
+        return self
+
     def depends_on_samples(self) -> list[str]:
         """Names of what changes over the run, so that a longer run would not begin as this one."""
+        without = self.without_part()
         return [
             name
             for name in type(self).model_fields
-            if (end := getattr(self, f"{name}_end", None)) is not None
+            if name not in without
+            and (end := getattr(self, f"{name}_end", None)) is not None
             and end != getattr(self, name)
         ]
 

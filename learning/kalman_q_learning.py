@@ -10,7 +10,7 @@ from pydantic import Field
 
 from cosim.scenario import Scenario
 from learning.average_cost import AverageCost
-from learning.configuration import Configuration, Count, NonNegative, Positive
+from learning.configuration import Configuration, Count, NonNegative
 from learning.constrained_step import ConstrainedStep
 from learning.errors import DivergenceError
 from learning.exploration import Strategy
@@ -24,29 +24,12 @@ Vector = NDArray[np.float64]
 
 
 class KalmanConfiguration(QConfiguration):
-    """Hyperparameters of the Kalman form, none of them in units of a plant."""
+    """Hyperparameters of the Kalman form online, none of them in units of a plant."""
 
-    prior_width: Positive = Field(
-        0.3, description="kalman: how far θ may be from its start, as a share of the start's cost"
-    )
     prior_samples: Count = Field(
         500, description="kalman: first samples, at which θ rests: they give noise and widths"
     )
-    measure_offset: bool = Field(
-        True,
-        description="kalman: c_f becomes the mean of the first prediction errors; false: it "
-        "starts as it is, for a start that has learnt its offset",
-    )
     step_every: Count = Field(50, description="kalman: samples per step of θ")
-    innovation_clip: Positive = Field(
-        3.0, description="kalman: innovations are cut at this many standard deviations"
-    )
-    variance_memory: Positive = Field(
-        2000.0, description="kalman: samples over which the innovations' variance is taken"
-    )
-    prediction_errors: Count = Field(
-        1000, description="kalman: prediction errors over which the next penalty is expected"
-    )
     parameter_drift: NonNegative = Field(
         0.0,
         description="kalman: variance that each sample adds to θ, in units of the prior's, so that "

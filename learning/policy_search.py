@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from cmaes import CMA
@@ -15,28 +15,21 @@ from cosim.scenario import Scenario
 from learning.configuration import Configuration, Count, Positive
 from learning.definiteness import HESSIANS, certificate
 from learning.exploration import Strategy
+from learning.greedy_configuration import GreedyConfiguration
 from learning.protocols import LearnableController, Transition, Update
 
 Vector = NDArray[np.float64]
 
 
-class PolicySearchConfiguration(Configuration):
-    """Settings of the policy search; it explores θ, not actions."""
+class PolicySearchConfiguration(GreedyConfiguration):
+    """Settings of the policy search."""
 
-    exploration: Literal["none"] = Field(
-        "none", description="none: it is θ that is tried, not actions"
-    )
     population: Count = Field(13, description="candidates of a generation")
     episode: Count = Field(500, description="plant samples that judge a candidate")
     spread: Positive = Field(0.5, description="σ at the start, in the coordinates of the search")
     width: Positive = Field(
         0.02, description="unit of states and actions, as a share of the width of their bounds"
     )
-
-    def for_scenario(self, scenario: Scenario) -> Self:
-        """Copy with what the scenario states of c_lambda's start; its exploration has no part."""
-        own = {name: getattr(self, name) for name in type(self).model_fields if "explor" in name}
-        return super().for_scenario(scenario).model_copy(update=own)
 
 
 class Coordinates:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,24 +15,17 @@ from learning.back_off_search import BackOffSearch
 from learning.configuration import Configuration, Share
 from learning.definiteness import certificate
 from learning.exploration import Strategy
+from learning.greedy_configuration import GreedyConfiguration
 from learning.protocols import LearnableController, Transition, Update
 
 Vector = NDArray[np.float64]
 
 
-class PractitionerConfiguration(Configuration):
-    """Settings of a baseline that a practitioner would use; it does not explore actions."""
+class PractitionerConfiguration(GreedyConfiguration):
+    """Settings of a baseline that a practitioner would use."""
 
-    exploration: Literal["none"] = Field(
-        "none", description="none: it is θ that is tried, not actions"
-    )
     back_off: bool = Field(True, description="search the back-off of the active bounds")
     estimation_share: Share = Field(0.25, description="share of the samples for the estimate")
-
-    def for_scenario(self, scenario: Scenario) -> Self:
-        """Copy with what the scenario states of c_lambda's start; its exploration has no part."""
-        own = {name: getattr(self, name) for name in type(self).model_fields if "explor" in name}
-        return super().for_scenario(scenario).model_copy(update=own)
 
     def depends_on_samples(self) -> list[str]:
         """The shares of the samples that each stage has."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ClassVar, Literal, Self
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from controllers.errors import QpError
 from cosim.scenario import Scenario
@@ -37,17 +37,6 @@ AS_PRINTED: dict[str, Any] = {
 """Hyperparameters of the rule as the paper prints it (paper.tex, Simulations)."""
 ONE_SAMPLE = {"td": td_step, "fit": td_fit}
 """The rules that step on one sample; `gauss-newton` steps on all that it remembers."""
-OPTIONS = {
-    ("td", "fit"): ("step_size", "line_search"),
-    ("gauss-newton",): (
-        "update_every", "gain", "gain_end", "memory", "ridge", "largest_step", "warm_up",
-    ),
-    ("kalman",): (
-        "prior_width", "prior_samples", "measure_offset", "step_every", "innovation_clip",
-        "variance_memory", "prediction_errors", "parameter_drift",
-    ),
-}  # fmt: skip
-"""Which hyperparameters belong to which rules."""
 
 
 class QLearningConfiguration(KalmanConfiguration):
@@ -55,6 +44,17 @@ class QLearningConfiguration(KalmanConfiguration):
 
     `AS_PRINTED` has those of the paper's rule.
     """
+
+    OPTIONS: ClassVar[Mapping[tuple[str, ...], tuple[str, ...]]] = {
+        ("td", "fit"): ("step_size", "line_search"),
+        ("gauss-newton",): (
+            "update_every", "gain", "gain_end", "memory", "ridge", "largest_step", "warm_up",
+        ),
+        ("kalman",): (
+            "prior_width", "prior_samples", "measure_offset", "step_every", "innovation_clip",
+            "variance_memory", "prediction_errors", "parameter_drift",
+        ),
+    }  # fmt: skip
 
     rule: Literal["kalman", "gauss-newton", "td", "fit"] = Field(
         "kalman",
@@ -81,16 +81,6 @@ class QLearningConfiguration(KalmanConfiguration):
         if self.globalisation is None:
             return self.rule == "kalman"
         return self.globalisation == "validated"
-
-    @model_validator(mode="after")
-    def _options_belong_to_the_rule(self) -> Self:
-        for rules, names in OPTIONS.items():
-            if self.rule in rules:
-                continue
-            for name in names:
-                if getattr(self, name) != type(self).model_fields[name].default:
-                    raise ValueError(f"{name}: has no part in the rule {self.rule}; leave it out")
-        return self
 
 
 class QLearning(GlobalisedLearning):

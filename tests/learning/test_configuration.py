@@ -2,6 +2,7 @@ import pytest
 
 from learning import ActorCritic, BatchQLearning, QLearning
 from learning.errors import ConfigurationError
+from learning.registry import load_algorithm
 
 CLASSES = (QLearning, BatchQLearning, ActorCritic)
 
@@ -42,6 +43,39 @@ def test_an_option_of_another_rule_is_refused_and_its_default_is_not():
     with pytest.raises(ConfigurationError, match="memory: has no part in the rule fit"):
         QLearning.Configuration.from_dict({"rule": "fit", "memory": 10.0})
     QLearning.Configuration.from_dict({"rule": "fit", "memory": 4000.0})
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "assignment", "message"),
+    [
+        ("batch-q-learning", "radius=2.0", "radius: has no part in the rule kalman"),
+        ("batch-q-learning", "parameter_drift=0.1", "no hyperparameter 'parameter_drift'"),
+        ("actor-critic", "globalisation=none blocks=4", "blocks: has no part in a rule that is"),
+        ("backoff", "exploration_share=0.1", "exploration_share: has no part in a rule that tries"),
+        ("policy-search", "definiteness=cholesky", "definiteness: has no part in a rule that"),
+        ("identified", "globalisation=none", "no hyperparameter 'globalisation'"),
+    ],
+)
+def test_what_acts_nowhere_is_refused(algorithm, assignment, message):
+    with pytest.raises(ConfigurationError, match=message):
+        load_algorithm(algorithm).Configuration.from_assignments(assignment.split())
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "schedules"),
+    [
+        ("q-learning", {}, ["globalisation"]),
+        ("q-learning", {"globalisation": "none"}, []),
+        ("q-learning", {"rule": "gauss-newton"}, ["gain"]),
+        ("batch-q-learning", {"rule": "lstdq", "gain_end": 0.5}, ["globalisation"]),
+        ("actor-critic", {"globalisation": "none"}, ["radius"]),
+        ("policy-search", {}, []),
+        ("backoff", {}, ["samples (shared out among the stages)"]),
+    ],
+)
+def test_only_what_a_rule_reads_depends_on_the_samples(algorithm, settings, schedules):
+    configuration = load_algorithm(algorithm).Configuration.from_dict(settings)
+    assert configuration.depends_on_samples() == schedules
 
 
 @pytest.mark.parametrize("cls", CLASSES)

@@ -9,7 +9,7 @@ from learning.training_run import TrainingRun
 ALGORITHMS = ("q-learning", "batch-q-learning", "actor-critic")
 SETTINGS = {
     "q-learning": {"prior_samples": 40, "step_every": 20},
-    "batch-q-learning": {"batch_size": 40, "buffer_size": 80},
+    "batch-q-learning": {"batch_size": 40},
     "actor-critic": {"batch_size": 60},
 }
 

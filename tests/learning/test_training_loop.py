@@ -23,7 +23,7 @@ from tests.helpers.training import killed_and_resumed, train
 
 SETTINGS = {
     "q-learning": {"rule": "gauss-newton", "warm_up": 20},
-    "batch-q-learning": {"batch_size": 50, "buffer_size": 100},
+    "batch-q-learning": {"batch_size": 50},
     "actor-critic": {"batch_size": 80},
 }
 

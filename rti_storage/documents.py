@@ -24,7 +24,11 @@ def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str
 
 def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
     """Document of a JSON file, an object; raises `error` as `read_toml` does."""
-    text = _text(path, origin, error)
+    return parse_json(_text(path, origin, error), origin, error)
+
+
+def parse_json(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
+    """Document of a JSON text; raises `error` where it is no object, or nested beyond `DEEPEST`."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as cause:

@@ -13,9 +13,10 @@ from cosim.errors import EvaluationError
 from cosim.evaluation.parallel import run_all
 from cosim.evaluation.provenance import code_hash, controller_hash, parameters_hash, versions
 from cosim.evaluation.reuse import release
+from cosim.evaluation.runs import Runs
 from cosim.evaluation.store import Store, unit_key
 from cosim.evaluation.table import Evaluation
-from cosim.evaluation.unit import Factory, RunUnit, UnitResult, run
+from cosim.evaluation.unit import BLOCK, SETTLING, Factory, RunUnit, UnitResult, run
 from cosim.kpis import comes_to_rest
 from cosim.lookup import build_controller
 from cosim.plant import FmuPlant
@@ -67,23 +68,21 @@ def evaluate(
     _check(factories, numbers, steps)
     plan = _Plan(scenario, factories, numbers, steps, optimum)
     store = Store(None if folder is None else Path(folder))
-    keys = (plan.key(name, seed) for name, seed in plan.runs())
-    results = {key: result for key in keys if (result := store.load(key)) is not None}
+    for key, result in store.load(plan.keys):
+        plan.take(key, result)
     report = progress or (lambda _: None)
-    report(len(results))
+    report(plan.known)
 
     def done(key: str, result: UnitResult) -> None:
         store.save(key, result)
-        results[key] = result
-        report(len(results))
+        plan.take(key, result)
+        report(plan.known)
 
-    missing = (plan.unit(name, seed) for name, seed in plan.runs())
-    tasks = ((key, unit) for key, unit in missing if key not in results)
     try:
-        run_all(run, tasks, done, jobs=jobs, scheduler=scheduler)
+        run_all(run, plan.missing(), done, jobs=jobs, scheduler=scheduler)
     finally:
         release()
-    return plan.assemble(results, command)
+    return plan.assemble(command)
 
 
 def _factories(controllers: Mapping[str, Factory | str] | Sequence[str]) -> dict[str, Factory]:
@@ -115,7 +114,7 @@ def _check(controllers: Mapping[str, Factory], seeds: Sequence[int], steps: int)
 
 
 class _Plan:
-    """The units under their keys. Building each controller here finds every mistake at once."""
+    """What is wanted and what is known of it. Building each controller here finds every mistake."""
 
     def __init__(
         self,
@@ -144,50 +143,57 @@ class _Plan:
         }
         self._parameters: dict[str, str] = {}
         self._units: dict[str, RunUnit] = {}
-        self._of_controller: dict[str, dict[str, Any]] = {}
+        self._runs: dict[str, Runs] = {}
+        self._settling = {} if self._rests else dict.fromkeys(self._names, float("nan"))
+        self.keys: dict[str, str] = {}
+        """Names of the controllers by what their units are stored under."""
+        self.known = 0
+        """Number of runs that are known."""
         session = secrets.token_hex(8)
         for name, factory in every.items():
             controller = factory(scenario)
             self._parameters[name] = parameters_hash(controller)
-            self._of_controller[name] = self._facts | {
-                "scenario": None,
-                "controller": name,
-                "controller_hash": controller_hash(controller),
-                "parameters_hash": self._parameters[name],
-            }
-            self._units[name] = RunUnit(session, name, factory, scenario, None, steps, code, fmu)
+            key = unit_key(
+                self._facts
+                | {
+                    "scenario": None,
+                    "controller": name,
+                    "controller_hash": controller_hash(controller),
+                    "parameters_hash": self._parameters[name],
+                }
+            )
+            self.keys[key] = name
+            self._runs[name] = Runs(self._seeds)
+            self._units[name] = RunUnit(
+                session, name, factory, scenario, SETTLING, steps, code, fmu
+            )
 
-    def runs(self) -> Iterator[tuple[str, int | None]]:
-        """Controller and seed of every unit; without a seed it is the settling run."""
-        for name in self._units:
-            if name in self._names and self._rests:
-                yield name, None
-            yield from ((name, seed) for seed in self._seeds)
+    def missing(self) -> Iterator[tuple[str, RunUnit]]:
+        """Units of what is not known, each under its controller's key, made when asked for."""
+        for key, name in self.keys.items():
+            unit = self._units[name]
+            if name in self._names and name not in self._settling:
+                yield key, unit
+            seeds, size = self._runs[name].missing(), -(-BLOCK // unit.steps)
+            for first in range(0, len(seeds), size):
+                yield key, replace(unit, seeds=tuple(seeds[first : first + size]))
 
-    def key(self, name: str, seed: int | None) -> str:
-        """Key of a unit, made when it is asked for: a million of them take half a gigabyte."""
-        return unit_key(self._of_controller[name] | {"seed": seed})
+    def take(self, key: str, result: UnitResult) -> None:
+        """Take up what a unit gave, now or before."""
+        name = self.keys[key]
+        if result.seeds != SETTLING:
+            self.known += self._runs[name].add(result)
+        elif name not in self._settling:
+            (self._settling[name],) = result.indicators["settling_time"]
+            self.known += 1
 
-    def unit(self, name: str, seed: int | None) -> tuple[str, RunUnit]:
-        """A unit under its key."""
-        return self.key(name, seed), replace(self._units[name], seed=seed)
-
-    def assemble(self, results: Mapping[str, UnitResult], command: str) -> Evaluation:
+    def assemble(self, command: str) -> Evaluation:
         names = self._names
         return Evaluation(
             controllers=names,
             seeds=self._seeds,
-            results={
-                (name, seed): results[self.key(name, seed)]
-                for name, seed in self.runs()
-                if seed is not None
-            },
-            settling={
-                name: results[self.key(name, None)].indicators["settling_time"]
-                if self._rests
-                else float("nan")
-                for name in names
-            },
+            results=self._runs,
+            settling={name: self._settling[name] for name in names},
             parameters={name: self._parameters[name] for name in names},
             facts=self._facts | {"command": command},
             reference=NAIVE if NAIVE in names else names[0],

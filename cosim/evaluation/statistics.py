@@ -23,6 +23,10 @@ Interval = tuple[float, float] | None
 
 LEVEL = 0.95
 RESAMPLES = 9999
+RESAMPLED = 10_000
+"""Most seeds that are resampled; with more of them Student's interval stands alone."""
+AT_ONCE = RESAMPLES * 1000
+"""Most values that are drawn at once."""
 TD_WINDOW = 10_000
 """Samples over which a TD error is averaged (paper.tex, fig. nmpc_learn)."""
 
@@ -36,8 +40,9 @@ def undefined() -> Interval:
 class Estimate:
     """A value with its 95 % intervals, (low, high): `t` is Student's, `bootstrap` over seeds.
 
-    The intervals are None where one seed, or none of the two methods, can say anything. The
-    bootstrap, which takes much longer, is drawn by `resample` when it is first asked for.
+    The intervals are None where one seed, or none of the two methods, can say anything, and the
+    bootstrap's for more than `RESAMPLED` seeds, where the two no longer differ. The bootstrap takes
+    much longer, and is drawn by `resample` when it is first asked for.
     """
 
     value: float
@@ -97,6 +102,27 @@ def gain(cost: Array, reference: Array) -> Estimate:
 def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
     """(J_naive − J)/(J_naive − J*), as a ratio of means; all (S,)."""
     return ratio(naive - cost, naive - optimum)
+
+
+def regrets(cost: Array, optimum: Array) -> Array:
+    """`regret` of each seed by itself, (S,)."""
+    return _each(cost - optimum, np.abs(optimum))
+
+
+def gains(cost: Array, reference: Array) -> Array:
+    """`gain` of each seed by itself, (S,)."""
+    return _each(reference - cost, np.abs(reference))
+
+
+def gaps_closed(cost: Array, naive: Array, optimum: Array) -> Array:
+    """`gap_closed` of each seed by itself, (S,)."""
+    return _each(naive - cost, naive - optimum)
+
+
+def _each(numerator: Array, denominator: Array) -> Array:
+    """Quotients, NaN where the denominator is zero."""
+    there = denominator != 0
+    return np.where(there, numerator / np.where(there, denominator, 1.0), np.nan)
 
 
 def interquartile_mean(values: Array, axis: int = -1) -> Any:
@@ -200,7 +226,7 @@ def _t_interval(residuals: Array, value: float) -> tuple[float, float] | None:
 def _bootstrap(samples: Sequence[Array], statistic: Any) -> tuple[float, float] | None:
     """BCa interval of paired samples, None where there are fewer than two."""
     seeds = len(samples[0])
-    if seeds < 2:
+    if not 2 <= seeds <= RESAMPLED:
         return None
     value = float(statistic(*samples, axis=-1))
     jackknife = [statistic(*(np.delete(x, s) for x in samples), axis=-1) for s in range(seeds)]
@@ -220,6 +246,7 @@ def _resampled(
         paired=paired,
         vectorized=True,
         n_resamples=RESAMPLES,
+        batch=max(1, AT_ONCE // max(map(len, samples))),
         confidence_level=LEVEL,
         method=method,
         rng=np.random.default_rng(0),

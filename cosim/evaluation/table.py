@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,11 +12,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import gain, gap_closed, mean, regret
-from cosim.evaluation.unit import UnitResult
+from cosim.evaluation.runs import Runs
+from cosim.evaluation.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.figures.evaluation import Costs, evaluation_figure
 from cosim.figures.style import save
-from cosim.text_tables import cell, csv_text
+from cosim.text_tables import cell, csv_pieces
 from rti_storage import write_atomically
 
 Array = NDArray[np.float64]
@@ -43,6 +43,14 @@ PROVENANCE = (
     "parameters_hash",
     "command",
 )
+INDICATORS = (
+    "economic_cost",
+    "mean_violation",
+    "violating_share",
+    "J",
+    "input_effort",
+    "failures",
+)
 DRAWN = ("J", "economic_cost", "mean_violation")
 FIGURE = "evaluation.png"
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
@@ -54,7 +62,7 @@ COLUMNS = (*TEXT, "seed", "steps", *NUMBERS, "failures", *PROVENANCE)
 class Evaluation:
     """Indicators of controllers × seeds on common random numbers.
 
-    `results` maps (controller, seed) to a unit's result; `settling` a controller to its settling
+    `results` holds each controller's runs; `settling` a controller to its settling
     time in s, NaN where permanent disturbances let nothing settle; `facts` are the columns that do
     not vary, `parameters` each controller's hash. `reference` is the controller that gains are
     measured against, `naive` the one that the gap is measured from, `optimum` the one that gives
@@ -63,7 +71,7 @@ class Evaluation:
 
     controllers: Sequence[str]
     seeds: Sequence[int]
-    results: Mapping[tuple[str, int], UnitResult]
+    results: Mapping[str, Runs]
     settling: Mapping[str, float]
     parameters: Mapping[str, str]
     facts: Mapping[str, Any]
@@ -80,36 +88,38 @@ class Evaluation:
 
     def column(self, controller: str, name: str) -> Array:
         """An indicator of a controller over the seeds, (S,)."""
-        return np.array([self.results[controller, seed].indicators[name] for seed in self.seeds])
+        return self.results[controller].column(name)
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
         """The rows, by controller as given, then by seed; NaN where an indicator is undefined."""
-        return [
-            {
+        return list(self._rows())
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        for controller in self.controllers:
+            constant = {
                 "controller": controller,
-                "seed": seed,
                 "settling_time": self.settling[controller],
                 "parameters_hash": self.parameters[controller],
                 **self.facts,
-                **self.results[controller, seed].indicators,
-                **self._relative(controller, seed),
             }
-            for controller in self.controllers
-            for seed in self.seeds
-        ]
+            columns = {name: self.column(controller, name) for name in INDICATORS}
+            columns |= self._relative(controller)
+            for row, seed in enumerate(self.seeds):
+                figures = {name: float(values[row]) for name, values in columns.items()}
+                yield {**constant, "seed": seed, **figures}
 
-    def _relative(self, controller: str, seed: int) -> dict[str, float]:
+    def _relative(self, controller: str) -> dict[str, Array]:
+        """Each seed's own regret, gap closed and gain in J, (S,) each."""
+
         def cost(name: str | None) -> Array:
-            if name is None:
-                return np.array([np.nan])
-            return np.array([self.results[name, seed].indicators["J"]])
+            return np.full(len(self.seeds), np.nan) if name is None else self.column(name, "J")
 
         own, optimum = cost(controller), cost(self.optimum)
         return {
-            "regret": regret(own, optimum).value,
-            "gap_closed": gap_closed(own, cost(self.naive), optimum).value,
-            "gain_in_J": gain(own, cost(self.reference)).value,
+            "regret": regrets(own, optimum),
+            "gap_closed": gaps_closed(own, cost(self.naive), optimum),
+            "gain_in_J": gains(own, cost(self.reference)),
         }
 
     def summary(self) -> dict[str, Any]:
@@ -118,19 +128,29 @@ class Evaluation:
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
-        return csv_text(
-            COLUMNS, ([_cell(name, row[name]) for name in COLUMNS] for row in self.rows)
+        return "".join(self._csv())
+
+    def _csv(self) -> Iterator[str]:
+        return csv_pieces(
+            COLUMNS, ([_cell(name, row[name]) for name in COLUMNS] for row in self._rows())
         )
 
     def timing_csv(self) -> str:
         """What the clock said, one row per controller and seed."""
+        return "".join(self._timing_csv())
+
+    def _timing_csv(self) -> Iterator[str]:
         names = list(next(iter(self.results.values())).timing)
         rows = (
-            [controller, str(seed), *(f"{result.timing[name]:.6g}" for name in names)]
-            for (controller, seed), result in self.results.items()
-            if controller in self.controllers
+            [controller, str(seed), *(f"{value:.6g}" for value in values)]
+            for controller in self.controllers
+            for seed, *values in zip(
+                self.seeds,
+                *(self.results[controller].timing[name] for name in names),
+                strict=True,
+            )
         )
-        return csv_text(["controller", "seed", *names], rows)
+        return csv_pieces(["controller", "seed", *names], rows)
 
     def figure(self) -> Figure:
         """Regret (J where J* is not known) with its intervals; economic cost against violation."""
@@ -147,9 +167,9 @@ class Evaluation:
 
     def write(self, folder: Path) -> None:
         """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""
-        write_atomically(folder / "evaluation.csv", self.to_csv())
+        write_atomically(folder / "evaluation.csv", self._csv())
         self.plot(folder / FIGURE)
-        write_atomically(folder / "timing.csv", self.timing_csv())
+        write_atomically(folder / "timing.csv", self._timing_csv())
 
 
 def _cell(name: str, value: Any) -> str:
@@ -221,9 +241,8 @@ def _comparison(evaluation: Evaluation, name: str, reference: str) -> dict[str, 
 
 def _timing(evaluation: Evaluation, name: str) -> dict[str, Any]:
     """Median over seeds of each of the clock's figures; how the functions were computed, if any."""
-    timings = [evaluation.results[name, seed].timing for seed in evaluation.seeds]
-    modes = {evaluation.results[name, seed].functions for seed in evaluation.seeds} - {None}
+    runs = evaluation.results[name]
     return {
-        **{key: float(np.median([timing[key] for timing in timings])) for key in timings[0]},
-        "functions": " and ".join(sorted(filter(None, modes))) or None,
+        **{key: float(np.median(values)) for key, values in runs.timing.items()},
+        "functions": " and ".join(sorted(runs.functions)) or None,
     }

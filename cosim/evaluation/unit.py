@@ -1,4 +1,4 @@
-"""The work unit: one controller on one seed, run wherever a worker is free."""
+"""The work unit: one controller on a seed or several, run wherever a worker is free."""
 
 from __future__ import annotations
 
@@ -19,9 +19,15 @@ from cosim.simulation import simulate
 Factory = Callable[[Scenario], Controller]
 
 
+BLOCK = 100
+"""Samples of a unit, at least: giving one out costs about as much as twenty of them."""
+SETTLING = (None,)
+"""The seeds of the settling run, which has no disturbances."""
+
+
 @dataclass(frozen=True)
 class RunUnit:
-    """What a worker needs to know; `seed` None is the settling run without disturbances.
+    """What a worker needs to know: a controller and the `seeds` of its runs.
 
     `session` tells evaluations apart, so that a worker keeps its controllers within one; `code`
     and `fmu` are the hashes of code and FMU that the evaluation was started with.
@@ -31,7 +37,7 @@ class RunUnit:
     controller: str
     factory: Factory
     scenario: Scenario
-    seed: int | None
+    seeds: tuple[int | None, ...]
     steps: int
     code: str
     fmu: str
@@ -39,14 +45,15 @@ class RunUnit:
 
 @dataclass(frozen=True)
 class UnitResult:
-    """Indicators of a unit, and what the clock said: `timing` in s and µs, never in the table.
+    """Indicators by name, a value for each seed, and what the clock said, in s and µs.
 
-    `functions` says how the controller's were computed at its end, None where it has none.
+    `functions` says how the controller's were computed at the ends of the runs.
     """
 
-    indicators: dict[str, float]
-    timing: dict[str, float]
-    functions: str | None = None
+    seeds: tuple[int | None, ...]
+    indicators: dict[str, list[float]]
+    timing: dict[str, list[float]]
+    functions: tuple[str, ...] = ()
 
 
 def run(unit: RunUnit) -> UnitResult:
@@ -60,39 +67,61 @@ def run(unit: RunUnit) -> UnitResult:
     controller = reuse.controller(
         f"{unit.session} {unit.controller}", lambda: unit.factory(unit.scenario)
     )
-    if unit.seed is None:
-        return _settling_run(unit, controller)
-    begin = perf_counter()
-    trajectory = simulate(
-        reuse.plant(unit.scenario), controller, unit.steps, unit.seed, residuals=False
-    )
-    timing = {"wall_time_s": perf_counter() - begin}
-    for name, quantiles in trajectory.timing_summary().items():
-        timing |= {f"{name}_{key}": value for key, value in quantiles.items()}
-    return UnitResult(indicators(trajectory), timing, functions_of(controller))
+    found: dict[str, list[float]] = {}
+    timing: dict[str, list[float]] = {}
+    functions: dict[str, None] = {}
+    for seed in unit.seeds:
+        if seed is None:
+            found["settling_time"] = [_settling_run(unit, controller)]
+            continue
+        begin = perf_counter()
+        trajectory = simulate(
+            reuse.plant(unit.scenario), controller, unit.steps, seed, residuals=False
+        )
+        clock = {"wall_time_s": perf_counter() - begin}
+        for name, quantiles in trajectory.timing_summary().items():
+            clock |= {f"{name}_{key}": value for key, value in quantiles.items()}
+        for values, figures in ((found, indicators(trajectory)), (timing, clock)):
+            for name, value in figures.items():
+                values.setdefault(name, []).append(value)
+        if (computed := functions_of(controller)) is not None:
+            functions[computed] = None
+    return UnitResult(unit.seeds, found, timing, tuple(functions))
 
 
-def _settling_run(unit: RunUnit, controller: Controller) -> UnitResult:
+def _settling_run(unit: RunUnit, controller: Controller) -> float:
     scenario = displaced(unit.scenario)
     if scenario is None:
-        return UnitResult({"settling_time": float("nan")}, {})
+        return float("nan")
     trajectory = simulate(reuse.plant(scenario), controller, unit.steps, 0, residuals=False)
-    return UnitResult({"settling_time": settling_time(trajectory)}, {})
+    return settling_time(trajectory)
 
 
 def as_document(result: UnitResult) -> dict[str, Any]:
     """A result as a JSON document."""
     return {
+        "seeds": list(result.seeds),
         "indicators": result.indicators,
         "timing": result.timing,
-        "functions": result.functions,
+        "functions": list(result.functions),
     }
 
 
 def from_document(document: dict[str, Any]) -> UnitResult:
     """Read back what `as_document` gave; raises KeyError, TypeError or ValueError."""
+    seeds = tuple(None if seed is None else int(seed) for seed in document["seeds"])
+    if seeds != SETTLING and (None in seeds or not all(0 <= s < 1 << 64 for s in seeds if s)):
+        raise ValueError("no seeds")
+
+    def columns(name: str) -> dict[str, list[float]]:
+        found = {str(key): [float(v) for v in values] for key, values in document[name].items()}
+        if any(len(values) != len(seeds) for values in found.values()):
+            raise ValueError("not a value for each seed")
+        return found
+
     return UnitResult(
-        {str(key): float(value) for key, value in document["indicators"].items()},
-        {str(key): float(value) for key, value in document["timing"].items()},
-        document.get("functions"),
+        seeds,
+        columns("indicators"),
+        columns("timing"),
+        tuple(str(word) for word in document["functions"]),
     )

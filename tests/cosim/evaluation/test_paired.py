@@ -14,10 +14,17 @@ from controllers.factories import naive
 from cosim import FmuPlant, evaluate, simulate
 from cosim.errors import EvaluationError
 from cosim.evaluation.parallel import run_all
+from cosim.evaluation.store import FILE
 from tests.helpers.loop import Proportional, hold, proportional
 from tests.helpers.workers import LEDGER, die, mortal, noting
 
 BOTH = {"proportional": proportional, "hold": hold}
+
+
+def lines(folder):
+    """Whole lines of a folder's finished units."""
+    path = folder / FILE
+    return path.read_bytes().splitlines(keepends=True) if path.exists() else []
 
 
 def contents(evaluation):
@@ -81,7 +88,7 @@ def test_the_optimum_need_not_be_named_for_the_regret(paper):
 def test_each_row_has_the_regret_of_its_seed(paper):
     evaluation = evaluate(paper, BOTH, 2, 40, optimum=hold)
     for row in evaluation.rows:
-        optimum = evaluation.results["hold", row["seed"]].indicators["J"]
+        optimum = evaluation.column("hold", "J")[row["seed"]]
         assert row["regret"] == pytest.approx((row["J"] - optimum) / optimum, abs=1e-15)
 
 
@@ -185,9 +192,8 @@ def test_an_evaluation_draws_itself_to_the_same_bytes(paper, tmp_path):
 
 def test_a_damaged_unit_is_named(paper, tmp_path):
     evaluate(paper, {"hold": hold}, 1, 5, folder=tmp_path)
-    for path in (tmp_path / ".units").iterdir():
-        path.write_text("{")
-    with pytest.raises(EvaluationError, match=r"finished work unit '.*\.units.*' is damaged"):
+    (tmp_path / FILE).write_text("{\n")
+    with pytest.raises(EvaluationError, match=r"line 1 of the finished work units '.*' is damaged"):
         evaluate(paper, {"hold": hold}, 1, 5, folder=tmp_path)
 
 
@@ -210,16 +216,17 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     out = tmp_path / "out"
     with subprocess.Popen(command(out), env=environment, stderr=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 60
-        while len(list(out.glob(".units/*.json"))) < 2:
+        while len(lines(out)) < 2:
             assert process.poll() is None, "the run ended before it could be killed"
             assert time.monotonic() < deadline
             time.sleep(0.01)
         process.send_signal(signal.SIGKILL)
-    kept = {path: path.stat().st_mtime_ns for path in out.glob(".units/*.json")}
+    kept = lines(out)
     assert 2 <= len(kept) < 7
     assert not (out / "evaluation.csv").exists()
     subprocess.run(command(out), env=environment, check=True, capture_output=True)
-    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert lines(out)[: len(kept)] == kept
+    assert len(lines(out)) == 12, "six of the controller, six of the optimum"
     subprocess.run(command(tmp_path / "whole"), env=environment, check=True, capture_output=True)
     whole = tmp_path / "whole" / "evaluation.csv"
     assert (out / "evaluation.csv").read_bytes() == whole.read_bytes()

@@ -112,7 +112,10 @@ def _scale(axes: Axes, values: Array, levels: Mapping[str, float], floor: float 
         axes.set_ylim(low - margin, high + margin)
         return
     axes.set_yscale("symlog", linthresh=floor, linscale=0.4)
-    axes.set_ylim(-floor if low < 0 else max(low / 1.5, 0.0), max(high, floor) * 1.6)
+    # Room below zero, where what equals J* is a line of its own.
+    axes.set_ylim(
+        low / 1.5 if low > floor else min(1.6 * low, -0.3 * floor), max(high, floor) * 1.6
+    )
     axes.yaxis.set_major_formatter(FuncFormatter(percent))
 
 

@@ -55,7 +55,8 @@ def training_figure(
     ]
     if _measured(log, "greedy_violating_share"):
         panels.append(("greedy: violating samples %", lambda a: _violation(a, log)))
-    if _measured(log, "td_error"):
+    # A single one says nothing of a course.
+    if _measured(log, "td_error", 2):
         panels.append(("TD error (r.m.s.)", lambda a: _td_error(a, log)))
     if moved := _most_moved(theta):
         panels.append(("change of θ, by its scale", lambda a: _change(a, log, moved)))
@@ -79,8 +80,8 @@ def training_figure(
     return drawn
 
 
-def _measured(log: Mapping[str, Array], name: str) -> bool:
-    return name in log and bool(np.isfinite(log[name]).any())
+def _measured(log: Mapping[str, Array], name: str, least: int = 1) -> bool:
+    return name in log and int(np.isfinite(log[name]).sum()) >= least
 
 
 def _known(log: Mapping[str, Array], name: str) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import torch
 from policy import action, observation
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.utils import set_random_seed
@@ -68,6 +69,7 @@ def main():
     parser.add_argument("--out", type=Path, default=Path(__file__).parent)
     arguments = parser.parse_args()
     set_random_seed(arguments.seed)
+    torch.set_num_threads(1)  # the networks are too small to share, and sums keep their order
     scenario = Scenario.load(arguments.scenario)
     env = Normalised(gymnasium.make("cosim/Evaporator-v0", scenario=scenario), scenario)
     settings = {"gamma": scenario.discount, "seed": arguments.seed, "device": "cpu", "verbose": 1}

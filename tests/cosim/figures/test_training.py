@@ -57,3 +57,8 @@ def test_what_was_not_measured_has_no_panel(tmp_path):
     figure = training_figure(log, still, {}, title="$t")
     assert list(panels(figure)) == ["J per sample"]
     assert save(figure, tmp_path / "a.png").stat().st_size > 5000
+
+
+def test_a_single_td_error_is_no_course():
+    log = LOG | {"td_error": np.array([9.0, np.nan, np.nan, np.nan])}
+    assert "TD error (r.m.s.)" not in panels(training_figure(log, THETA, BASELINES, title="t"))

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ModelError
 from controllers.model import Model
 from controllers.penalty import StatePenalty
+from controllers.units import Units
 
 Vector = NDArray[np.float64]
 
@@ -146,6 +147,17 @@ class Problem:
         """Penalty of a state by the true bounds."""
         return StatePenalty(
             self.state_lower, self.state_upper, self.penalty_linear, self.penalty_quadratic
+        )
+
+    @cached_property
+    def units(self) -> Units:
+        """Orders of magnitude of states, actions and cost."""
+        return Units.of(
+            self.model,
+            np.concatenate([self.state_lower, self.action_lower]),
+            np.concatenate([self.state_upper, self.action_upper]),
+            np.concatenate([self.reference_state, self.reference_action]),
+            self.reference_cost,
         )
 
     def value_level(self, discount: float | None = None) -> float:

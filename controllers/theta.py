@@ -30,7 +30,9 @@ class ThetaBlock:
 
     `kind` says which of these it is. A symmetric matrix is packed as its upper triangle row by row,
     each entry once. `scale` is the typical size of a change worth making, in the block's own units,
-    `meaning` a few words, and `labels` name the entries where they have names of their own.
+    `meaning` a few words, and `labels` name the entries where they have names of their own. `least`
+    are the smallest values that entries may have where there are such, and `unit` (d, d) are those
+    in which a matrix has no unit, ones if not given.
     """
 
     name: str
@@ -39,6 +41,8 @@ class ThetaBlock:
     scale: tuple[float, ...]
     meaning: str = ""
     labels: tuple[str, ...] = ()
+    least: tuple[float, ...] = ()
+    unit: tuple[tuple[float, ...], ...] = ()
 
     @property
     def size(self) -> int:
@@ -58,6 +62,13 @@ class ThetaBlock:
             "vector": (self.dimension,),
             "symmetric": (self.dimension, self.dimension),
         }[self.kind]
+
+    @cached_property
+    def packed_unit(self) -> Vector:
+        """Unit of each packed entry, ones where none is given."""
+        if not self.unit:
+            return np.ones(self.size)
+        return np.array(self.unit)[upper_triangle(self.dimension)]
 
     def pack(self, value: ArrayLike) -> Vector:
         """Flatten an unpacked value; raises ParameterError on a wrong shape, NaN or asymmetry."""
@@ -162,32 +173,54 @@ class ThetaBlocks:
 
         `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
         predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
-        Raises ModelError on a parameter that the model lacks.
+        Scales are shares of the problem's `Units`, ρ those of states and actions, κ that of cost:
+        κ/ρ_iρ_j for a Hessian, 0.1 κ/ρ for a gradient, ρ/100 for a bound, κ/ρ and 1000 κ/ρ² for the
+        slack weights. Raises ModelError on a parameter that the model lacks.
         """
-        n, m = problem.n_states, problem.n_actions
+        units = problem.units
+        kappa, states = units.cost, units.state
+        both = np.concatenate([states, units.action])
 
-        def symmetric(name: str, dimension: int, scale: float, meaning: str) -> ThetaBlock:
-            size = dimension * (dimension + 1) // 2
-            return ThetaBlock(name, "symmetric", dimension, (scale,) * size, meaning)
+        def symmetric(name: str, sizes: Vector, meaning: str) -> ThetaBlock:
+            unit = kappa / np.outer(sizes, sizes)
+            scale = tuple(unit[upper_triangle(sizes.size)].tolist())
+            rows = tuple(tuple(row) for row in unit.tolist())
+            return ThetaBlock(name, "symmetric", sizes.size, scale, meaning, unit=rows)
 
-        def vector(name: str, dimension: int, scale: float, meaning: str) -> ThetaBlock:
-            return ThetaBlock(name, "vector", dimension, (scale,) * dimension, meaning)
+        def vector(
+            name: str, scale: Vector, meaning: str, least: tuple[float, ...] = ()
+        ) -> ThetaBlock:
+            entries = tuple(scale.tolist())
+            return ThetaBlock(name, "vector", scale.size, entries, meaning, least=least)
 
         blocks = [
-            symmetric("B_lambda", n, 1.0, "initial cost, quadratic"),
-            vector("b_lambda", n, 10.0, "initial cost, linear"),
-            ThetaBlock("c_lambda", "scalar", 1, (1e3,), "initial cost, constant"),
-            symmetric("B_Vf", n, 1.0, "terminal cost, quadratic"),
-            vector("b_Vf", n, 10.0, "terminal cost, linear"),
-            symmetric("B_l", n + m, 1.0, "stage cost, quadratic"),
-            vector("b_l", n + m, 10.0, "stage cost, linear"),
-            vector("c_f", n, 0.1, "model offset"),
-            vector("x_l", n, 1.0, "lower state bound"),
-            vector("x_u", n, 1.0, "upper state bound"),
+            symmetric("B_lambda", states, "initial cost, quadratic"),
+            vector("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
+            ThetaBlock("c_lambda", "scalar", 1, (0.1 * kappa,), "initial cost, constant"),
+            symmetric("B_Vf", states, "terminal cost, quadratic"),
+            vector("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
+            symmetric("B_l", both, "stage cost, quadratic"),
+            vector("b_l", 0.1 * kappa / both, "stage cost, linear"),
+            vector("c_f", 0.001 * states, "model offset"),
+            vector("x_l", 0.01 * states, "lower state bound"),
+            vector("x_u", 0.01 * states, "upper state bound"),
         ]
         if slack_weights:
-            blocks.append(vector("w_sigma", n, 100.0, "slack of stages 1…N, linear weight"))
-            blocks.append(vector("W_sigma", n, 1e3, "slack of stages 1…N, quadratic weight"))
+            quadratic = kappa / states**2
+            blocks += [
+                vector(
+                    "w_sigma",
+                    kappa / states,
+                    "slack of stages 1…N, linear weight",
+                    tuple(units.exact().tolist()),
+                ),
+                vector(
+                    "W_sigma",
+                    1e3 * quadratic,
+                    "slack of stages 1…N, quadratic weight",
+                    tuple(quadratic.tolist()),
+                ),
+            ]
         if model_parameters:
             indices = problem.model.parameter_indices(model_parameters)
             scale = tuple(0.1 * abs(problem.model.parameters[i].nominal) for i in indices)

@@ -48,13 +48,20 @@ class Configuration(BaseModel):
         "discounted",
         description="c_lambda at the start: ℓ_s (paper) or ℓ_s/(1−γ), unless the scenario says",
     )
-    slack_linear_weight: Positive = Field(
-        100.0, description="w_sigma at the start, extended θ; exact relaxation needs more than 60.3"
+    slack_linear_weight: Positive | None = Field(
+        None,
+        description="w_sigma at the start, extended θ; if not given, of the problem's scale: the "
+        "power of ten above the dearest multiplier of a state bound (`controllers.units`)",
     )
-    slack_linear_minimum: Positive = Field(
-        61.0, description="lower limit of w_sigma, just above the exactness threshold"
+    slack_linear_minimum: Positive | None = Field(
+        None,
+        description="lower limit of w_sigma; if not given, just above what exactness asks for",
     )
-    slack_quadratic_weight: Positive = Field(1e3, description="W_sigma at the start, extended θ")
+    slack_quadratic_weight: Positive | None = Field(
+        None,
+        description="W_sigma at the start, extended θ; if not given, what makes it as large as the "
+        "linear part at a thousandth of the bounds' width",
+    )
     model_parameters: tuple[str, ...] = Field(
         (), description="parameters of the controller's model that θ has, in its block p"
     )
@@ -62,7 +69,8 @@ class Configuration(BaseModel):
         "lmi", description="how B_l and B_Vf are kept positive definite"
     )
     smallest_eigenvalue: Positive = Field(
-        1e-3, description="least eigenvalue that B_l and B_Vf may have"
+        1e-3,
+        description="least eigenvalue that B_l and B_Vf may have, in the problem's own units",
     )
     exploration: Literal["additive", "literal", "perturbed-cost", "none"] = Field(
         "additive",

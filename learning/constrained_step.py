@@ -47,7 +47,9 @@ class ConstrainedStep:
             self.blocks,
             least_eigenvalue(configuration, controller.parameters),
         )
-        self._weight_minimum = configuration.slack_linear_minimum
+        self._least = {block.name: np.array(block.least) for block in blocks if block.least}
+        if (chosen := configuration.slack_linear_minimum) is not None and "w_sigma" in blocks:
+            self._least["w_sigma"] = np.full(blocks.block("w_sigma").size, chosen)
 
     def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
         """The new θ that a fit leads to, and its certificate; the controller stays as it is.
@@ -96,10 +98,10 @@ class ConstrainedStep:
 
     def _admissible(self, theta: Vector) -> Vector:
         """Keep learned slack weights above what exactness (linear) and convexity ask for."""
-        if "w_sigma" not in self.blocks:
+        if not self._least:
             return theta
         theta = theta.copy()
-        for name, minimum in (("w_sigma", self._weight_minimum), ("W_sigma", 1.0)):
+        for name, minimum in self._least.items():
             where = self.blocks.slices[name]
             theta[where] = np.maximum(theta[where], minimum)
         return theta

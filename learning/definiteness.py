@@ -2,6 +2,7 @@
 
 A learning rule proposes a step (`learning.fit.Fit`); an enforcement turns it into one after which
 ∇²ℓ_θ = 2 B_l and ∇²V^f_θ = 2 B_Vf satisfy B ⪰ εI (paper.tex, eq. q_pd_constr and pg_pd_constr).
+B counts in the units of its block, in which it has none: B_ij ρ_i ρ_j / κ.
 """
 
 from __future__ import annotations
@@ -57,8 +58,9 @@ def certificate(
 
 
 def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
-    """Symmetric block `name` of θ."""
-    return blocks.block(name).unpack(theta[blocks.slices[name]])
+    """Symmetric block `name` of θ, in its own unit."""
+    block = blocks.block(name)
+    return block.unpack(theta[blocks.slices[name]] / block.packed_unit)
 
 
 class LinearMatrixInequality:
@@ -95,8 +97,9 @@ class LinearMatrixInequality:
             block, where = blocks.block(name), blocks.slices[name]
             order, weight = self._rows[name]
             shifted = matrix_of(blocks, theta, name) - self._smallest * np.eye(block.dimension)
+            scale = blocks.scale[where] / block.packed_unit
             rows = np.zeros((block.size, size))
-            rows[np.arange(block.size), where.start + order] = -weight * blocks.scale[where][order]
+            rows[np.arange(block.size), where.start + order] = -weight * scale[order]
             matrices.append(rows)
             offsets.append(weight * block.pack(shifted)[order])
             cones.append(sdp.semidefinite(block.dimension))
@@ -158,14 +161,15 @@ class CholeskyParametrisation:
                     f"θ block {name} does not have all eigenvalues above {self._smallest}; "
                     "choose a smaller smallest_eigenvalue or start from another θ"
                 ) from error
-            inner = solve_triangular(factor, block.unpack(step[where]), lower=True)
+            unit = block.packed_unit
+            inner = solve_triangular(factor, block.unpack(step[where] / unit), lower=True)
             inner = solve_triangular(factor, inner.T, lower=True)
             inner /= max(1.0, float(np.linalg.norm(inner, 2)))
             lower = np.tril(inner)
             np.fill_diagonal(lower, np.diag(inner) / 2)
             moved = factor + factor @ lower
             matrix = moved @ moved.T + self._smallest * np.eye(block.dimension)
-            result[where] = block.pack((matrix + matrix.T) / 2)
+            result[where] = unit * block.pack((matrix + matrix.T) / 2)
         return result, certificate(blocks, result, corrected=corrected)
 
 
@@ -179,7 +183,8 @@ def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vec
             # Rounding of the product must not take the last digits back.
             values = np.maximum(values, smallest * (1 + 1e-9))
             matrix = (vectors * values) @ vectors.T
-            theta[blocks.slices[name]] = blocks.block(name).pack((matrix + matrix.T) / 2)
+            block = blocks.block(name)
+            theta[blocks.slices[name]] = block.packed_unit * block.pack((matrix + matrix.T) / 2)
     return theta
 
 

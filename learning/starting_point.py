@@ -40,10 +40,10 @@ def starting_parameters(
     offset = _value_offset(problem, configuration)
     naive = Parameters.naive(problem, blocks, value_offset=offset)
     if start == "naive":
-        return naive.replace(_slack_weights(problem, configuration))
+        return naive.replace(_slack_weights(blocks, configuration))
     if start == "tuned":
         tuned = tune(problem, blocks, value_offset=offset).parameters
-        return tuned.replace(_slack_weights(problem, configuration))
+        return tuned.replace(_slack_weights(blocks, configuration))
     return _extended(problem, configuration, start)
 
 
@@ -53,14 +53,18 @@ def _value_offset(problem: Problem, configuration: Configuration) -> float | Non
     return problem.value_level(chosen) if configuration.value_offset == "discounted" else None
 
 
-def _slack_weights(problem: Problem, configuration: Configuration) -> dict[str, Vector]:
-    """The configured slack weights by block, none for the paper's θ."""
-    if configuration.parametrisation != "extended":
-        return {}
-    ones = np.ones(problem.n_states)
+def _slack_weights(blocks: ThetaBlocks, configuration: Configuration) -> dict[str, Vector]:
+    """The slack weights at the start by block, none for the paper's θ."""
+    chosen = {
+        "w_sigma": configuration.slack_linear_weight,
+        "W_sigma": configuration.slack_quadratic_weight,
+    }
     return {
-        "w_sigma": configuration.slack_linear_weight * ones,
-        "W_sigma": configuration.slack_quadratic_weight * ones,
+        name: blocks.scale[blocks.slices[name]]
+        if weight is None
+        else np.full(blocks.block(name).size, weight)
+        for name, weight in chosen.items()
+        if name in blocks
     }
 
 
@@ -84,7 +88,7 @@ def _extended(problem: Problem, configuration: Configuration, path: str) -> Para
     )
     values: dict[str, ArrayLike] = {block.name: found[block.name] for block in found.blocks}
     if not learned:
-        values |= _slack_weights(problem, configuration)
+        values |= _slack_weights(blocks, configuration)
     if more:
         chosen = problem.model.parameter_indices(more)
         nominal = problem.model.nominal_parameters[chosen]

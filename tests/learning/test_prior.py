@@ -4,6 +4,7 @@ import pytest
 from controllers.parameters import Parameters
 from controllers.theta import ThetaBlocks
 from learning.prior import prior_deviation
+from tests.helpers.other_units import factors
 
 
 def parameters(problem, rng):
@@ -20,34 +21,10 @@ def parameters(problem, rng):
     )
 
 
-def rescaling(blocks, state, action, cost):
-    """By what each entry of θ is multiplied when x, u and the cost are counted in other units."""
-    both = np.concatenate([state, action])
-
-    def quadratic(units):
-        return (cost / np.outer(units, units))[np.triu_indices(units.size)]
-
-    factors = {
-        "B_lambda": quadratic(state),
-        "b_lambda": cost / state,
-        "c_lambda": [cost],
-        "B_Vf": quadratic(state),
-        "b_Vf": cost / state,
-        "B_l": quadratic(both),
-        "b_l": cost / both,
-        "c_f": state,
-        "x_l": state,
-        "x_u": state,
-        "w_sigma": cost / state,
-        "W_sigma": cost / state**2,
-    }
-    return np.concatenate([factors[block.name] for block in blocks])
-
-
 def test_other_units_of_states_inputs_and_cost_give_the_same_prior(problem, rng):
     start = parameters(problem, rng)
     state, action, cost = np.array([10.0, 0.1]), np.array([1e-3, 7.0]), 50.0
-    factor = rescaling(start.blocks, state, action, cost)
+    factor = factors(start.blocks, state, action, cost)
     moved, erred, explored = np.array([1.5, 2.0]), np.array([1.0, 0.1]), np.array([10.0, 10.0])
     width = prior_deviation(start, moved, erred, explored, 6e5, 0.3)
     other = prior_deviation(

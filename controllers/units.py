@@ -1,0 +1,114 @@
+"""A problem's own units: what makes a change of θ large or small, however the plant is counted.
+
+They are orders of magnitude, powers of ten, of what every problem has: the widths of its states'
+bounds, the ranges of its inputs, the multipliers of the bounds that are active at its reference.
+The same problem in other decimal units has the same θ but for these units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import lsq_linear
+
+from controllers.model import Model
+
+Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+ACTIVE = 1e-6
+"""Share of a bound's width within which the reference counts as at the bound."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units `state` ρ_x (n,) and `action` ρ_u (m,), of cost κ, and `dearest` max_i μ_i ρ_i.
+
+    μ are the multipliers of the state bounds at the reference; κ is the power of ten above
+    `dearest`, so that the slack weights κ/ρ_x are exact. Where no bound is active `dearest` is 0
+    and κ that of the economic cost's curvature, max_i |∂²ℓ/∂w_i²| ρ_i², or of the cost itself.
+    """
+
+    state: Vector
+    action: Vector
+    cost: float
+    dearest: float
+
+    @classmethod
+    def of(
+        cls, model: Model, lower: Vector, upper: Vector, reference: Vector, cost: float
+    ) -> Units:
+        """Units of a nominal model at a reference w_s = (x_s, u_s) with this cost ℓ_s.
+
+        `lower`, `upper` and `reference` are (n+m,).
+        """
+        n = len(model.states)
+        widths = upper - lower
+        both = np.array([10.0**power for power in np.rint(_power(widths))])
+        gradient, curvature, rates = _derivatives(model, reference)
+        near = ACTIVE * widths
+        below, above = reference <= lower + near, reference >= upper - near
+        multipliers = _multipliers(gradient * both, rates * both, below, above)
+        dearest = float(multipliers[:n].max())
+        sizes = (
+            dearest,
+            float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max()),
+            abs(cost),
+        )
+        # What rounding leaves of a zero is none.
+        least = np.finfo(np.float64).eps ** 0.5 * max(sizes)
+        unit = next((_above(size) for size in sizes if size > least), 1.0)
+        return cls(both[:n], both[n:], unit, dearest if dearest > least else 0.0)
+
+    def exact(self) -> Vector:
+        """Slack weights just above the multipliers, to two digits, (n,): the least exact ones.
+
+        Where no bound is active any positive ones are: a thousandth of κ/ρ_x.
+        """
+        if not self.dearest:
+            return 1e-3 * self.cost / self.state
+        digit = 10.0 ** (np.floor(_power(self.dearest)) - 1)
+        exact: Vector = (np.floor(self.dearest / digit) + 1) * digit / self.state
+        return exact
+
+
+def _derivatives(model: Model, reference: Vector) -> tuple[Vector, Vector, Vector]:
+    """∂ℓ/∂w (n+m,), ∂²ℓ/∂w_i² (n+m,) and ∂(x')/∂w (n, n+m) at the reference."""
+    x, u, d, p = model.symbols()
+    w = ca.vertcat(x, u)
+    hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
+    rates = ca.jacobian(model.ode(x, u, d, p), w)
+    function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
+    n = len(model.states)
+    disturbance, parameters = model.nominal_disturbance, model.nominal_parameters
+    values = function(reference[:n], reference[n:], disturbance, parameters)
+    first, second, jacobian = (value.full() for value in values)
+    return first.reshape(-1), second.reshape(-1), jacobian
+
+
+def _multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
+    """|μ| (n+m,) of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs."""
+    active = np.flatnonzero(below | above)
+    found = np.zeros(gradient.size)
+    signs = np.where(below, -1.0, 1.0)
+    columns = np.hstack([rates.T, np.diag(signs)[:, active]])
+    if not active.size or not (np.isfinite(columns).all() and np.isfinite(gradient).all()):
+        return found
+    free = np.full(len(rates), -np.inf)
+    least = np.concatenate([free, np.zeros(active.size)])
+    solved = lsq_linear(columns, -gradient, (least, np.inf), method="bvls")
+    found[active] = solved.x[len(rates) :]
+    return found
+
+
+def _power(size: ArrayLike) -> Vector:
+    """log10 of positive sizes, kept where products of the units are finite."""
+    power: Vector = np.clip(np.log10(size), -50.0, 50.0)
+    return power
+
+
+def _above(size: float) -> float:
+    """Power of ten above a positive size."""
+    return float(10.0 ** (np.floor(_power(size)) + 1))

@@ -1,0 +1,103 @@
+"""The rules in other units of states, inputs and cost: the same policy, sample by sample."""
+
+import numpy as np
+import pytest
+
+from controllers.problem import Problem
+from controllers.rti import RtiNmpc
+from learning import ActorCritic, BatchQLearning, QLearning
+from learning.configuration import Configuration
+from learning.constrained_step import ConstrainedStep, least_eigenvalue
+from learning.fit import Fit
+from learning.interaction import Interaction
+from learning.starting_point import build_strategy, starting_parameters
+from tests.helpers.carrier import Carrier
+from tests.helpers.other_units import (
+    ACTION,
+    COST,
+    STATE,
+    NoisyModel,
+    factors,
+    problems,
+    recounted,
+)
+
+SAMPLES = 240
+SETTINGS = {
+    QLearning: {"prior_samples": 100, "step_every": 20},
+    BatchQLearning: {"first_batch": 100, "batch_size": 50},
+    ActorCritic: {"batch_size": 100},
+}
+
+
+def starts(scenario, configuration):
+    """θ in both countings, with the slack weights that each problem is given of itself.
+
+    The naive B = I counts in the plant's units, as in the paper; here it is recounted.
+    """
+    own, other = (starting_parameters(problem, configuration) for problem in problems(scenario))
+    recounting = factors(own.blocks)
+    for name in ("w_sigma", "W_sigma", "c_lambda"):
+        where = own.blocks.slices[name]
+        assert other.theta[where] == pytest.approx(recounting[where] * own.theta[where], rel=1e-12)
+    flat = own.replace({"x_l": own["x_l"] + 0.5, "B_l": np.diag([1.0, 1.0, 3e-3, 3e-3])})
+    return flat, other.with_theta(recounting * flat.theta)
+
+
+def learnt(scenario, cls, start, units):
+    """θ and actions of a run of the rule alone."""
+    configuration = cls.Configuration.from_dict({"globalisation": "none", **SETTINGS[cls]})
+    controller = RtiNmpc(Problem.from_scenario(scenario), start)
+    strategy = build_strategy(configuration, scenario, SAMPLES)
+    rule = cls(controller, scenario, configuration, SAMPLES, strategy, np.random.default_rng(0))
+    plant = NoisyModel(scenario, *units)
+    loop = Interaction(plant, controller, rule, strategy, np.random.default_rng(1))
+    loop.start(3)
+    actions, corrected = [], 0
+    for _ in range(SAMPLES):
+        sample, _ = loop.next()
+        actions.append(sample.policy.action)
+        if (update := rule.observe(sample)) is not None:
+            corrected += update.corrected
+            loop.renew()
+    return controller.parameters, np.array(actions), corrected
+
+
+@pytest.mark.parametrize("cls", SETTINGS)
+def test_a_rule_learns_the_same_policy_in_other_units(scenario, cls):
+    own_start, other_start = starts(scenario, cls.Configuration())
+    own, actions, corrected = learnt(scenario, cls, own_start, (1.0, 1.0, 1.0))
+    other, recounted_actions, other_corrected = learnt(
+        recounted(scenario), cls, other_start, (STATE, ACTION, COST)
+    )
+    assert np.abs(own.theta - own_start.theta).max() > 0, "the rule must have learnt"
+    assert recounted_actions / ACTION == pytest.approx(actions, rel=1e-6)
+    way = (own.theta - own_start.theta) / own.blocks.scale
+    other_way = (other.theta - other_start.theta) / other.blocks.scale
+    assert other_way == pytest.approx(way, abs=1e-5 * np.abs(way).max())
+    assert corrected == other_corrected
+
+
+@pytest.mark.parametrize("kind", ["lmi", "projection", "cholesky"])
+def test_definiteness_and_the_least_slack_weights_are_the_same_in_other_units(scenario, kind, rng):
+    configuration = Configuration(definiteness=kind)
+    own, other = (Carrier(start) for start in starts(scenario, configuration))
+    steps = [ConstrainedStep(carrier, configuration) for carrier in (own, other)]
+    assert least_eigenvalue(configuration, own.parameters) == pytest.approx(
+        least_eigenvalue(configuration, other.parameters)
+    )
+    corrected = 0
+    for _ in range(10):
+        root = rng.normal(size=(own.theta.size, own.theta.size))
+        metric = root @ root.T + np.eye(own.theta.size)
+        target = 3.0 * rng.normal(size=own.theta.size)
+        fit = Fit(metric @ target, target, lambda metric=metric: metric)
+        updates = [step.take(fit, 0.0) for step in steps]
+        corrected += updates[0].corrected
+        assert updates[0].smallest_eigenvalue == pytest.approx(
+            updates[1].smallest_eigenvalue, rel=1e-6
+        )
+        moved = factors(own.parameters.blocks) * own.theta
+        error = (other.theta - moved) / other.parameters.blocks.scale
+        assert np.abs(error).max() < 1e-6
+    assert corrected > 5, "the test must meet corrected steps"

@@ -155,6 +155,7 @@ class IteratedKalman:
             self._configuration.deviation(self._scenario),
             max(abs(float(start["c_lambda"])), self._variance**0.5),
             self._width,
+            offset=self._configuration.measure_offset,
         )
         self._adopt(scale)
 

@@ -124,6 +124,7 @@ class KalmanQLearning:
             settings.deviation(self._scenario),
             level,
             self._width,
+            offset=settings.measure_offset,
         )
         self._adopt(scale)
         self._regression = self._filter(max(variance, np.finfo(np.float64).tiny))

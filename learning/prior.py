@@ -32,6 +32,8 @@ def prior_deviation(
     action_deviation: Vector,
     level: float,
     width: float,
+    *,
+    offset: bool = True,
 ) -> Vector:
     """Standard deviation of each entry of θ about its start, (n_θ,).
 
@@ -40,8 +42,9 @@ def prior_deviation(
     κ = max_i B_ii σ_i², the dearest typical move, or a share of the gradient that is there. λ_θ,
     which the policy does not feel, is as wide as V^f_θ or as its own start. Bounds get
     2·width/0.3 deviations of e, or of a slow state's movement; c_f little, since the mean of e says
-    what it must be; slack weights `width` of themselves. `state_deviation` and `error_deviation`
-    (n,), `action_deviation` (m,) are σ of s, e and the exploration, `level` the size of c_lambda.
+    what it must be, and none at all without `offset`; slack weights `width` of themselves.
+    `state_deviation` and `error_deviation` (n,), `action_deviation` (m,) are σ of s, e and the
+    exploration, `level` the size of c_lambda.
     """
     move = np.concatenate([np.maximum(state_deviation, error_deviation), action_deviation])
     stage, terminal = _root_diagonal(start["B_l"]), _root_diagonal(start["B_Vf"])
@@ -56,7 +59,7 @@ def prior_deviation(
         "b_Vf": width * np.maximum(terminal * dearest, GRADIENT * np.abs(start["b_Vf"])),
         "B_l": width * _packed(stage),
         "b_l": width * np.maximum(stage * dearest, GRADIENT * np.abs(start["b_l"])),
-        "c_f": OFFSET * error_deviation,
+        "c_f": OFFSET * error_deviation if offset else np.zeros_like(error_deviation),
         "x_l": bound,
         "x_u": bound,
     }

@@ -14,10 +14,10 @@ from learning.constrained_step import ConstrainedStep
 from learning.critic import AdvantageRegression, lstdv
 from learning.exploration import Strategy
 from learning.fit import policy_gradient_fit
-from learning.globalised import GlobalisedLearning, Rule
+from learning.globalised import GlobalisedLearning
 from learning.globalised_configuration import GlobalisedConfiguration
 from learning.kalman_q_learning import KalmanConfiguration, KalmanQLearning
-from learning.protocols import LearnableController, Transition, Update
+from learning.protocols import LearnableController, Rule, Transition, Update
 from learning.schedule import Geometric
 
 Vector = NDArray[np.float64]

@@ -16,9 +16,9 @@ from learning.configuration import Configuration
 from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
 from learning.fit import Fit, damped, least_squares
-from learning.globalised import GlobalisedLearning, Rule
+from learning.globalised import GlobalisedLearning
 from learning.iterated_kalman import IteratedKalman
-from learning.protocols import LearnableController, Transition, Update
+from learning.protocols import LearnableController, Rule, Transition, Update
 from learning.replay import ReplayBuffer, Replayed
 
 Vector = NDArray[np.float64]

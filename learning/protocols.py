@@ -105,7 +105,28 @@ class Update(NamedTuple):
     rewind: bool = False
 
 
-class Algorithm(Protocol):
+class Rule(Protocol):
+    """What learns from transitions: an algorithm, or what one has inside."""
+
+    @property
+    def needs_action_value(self) -> bool:
+        """Whether `Transition.action_value` must be solved for where the sample explored."""
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether `Transition.point` and `Transition.next_point` must be kept."""
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Take one sample; move θ and say so, or return None."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that must survive a checkpoint but θ."""
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+
+
+class Algorithm(Rule, Protocol):
     """A learning rule. Register its class in the entry-point group `cosim.algorithms`.
 
     `Configuration` is the class of its hyperparameters. The loop constructs it with a controller
@@ -129,14 +150,6 @@ class Algorithm(Protocol):
 
     Configuration: ClassVar[type[Configuration]]
 
-    @property
-    def needs_action_value(self) -> bool:
-        """Whether `Transition.action_value` must be solved for where the sample explored."""
-
-    @property
-    def needs_points(self) -> bool:
-        """Whether `Transition.point` and `Transition.next_point` must be kept."""
-
     def __init__(
         self,
         controller: LearnableController,
@@ -146,12 +159,3 @@ class Algorithm(Protocol):
         strategy: Strategy,
         rng: np.random.Generator,
     ) -> None: ...
-
-    def observe(self, sample: Transition) -> Update | None:
-        """Take one sample; move θ and say so, or return None."""
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """All that must survive a checkpoint but θ."""
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""

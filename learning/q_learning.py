@@ -16,9 +16,9 @@ from learning.configuration import Configuration, Count, Positive
 from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
 from learning.fit import Fit, least_squares, line_search, td_fit, td_step
-from learning.globalised import GlobalisedLearning, Rule
+from learning.globalised import GlobalisedLearning
 from learning.kalman_q_learning import KalmanConfiguration, KalmanQLearning
-from learning.protocols import LearnableController, Transition, Update
+from learning.protocols import LearnableController, Rule, Transition, Update
 
 Vector = NDArray[np.float64]
 

@@ -7,8 +7,9 @@ from controllers.errors import ControllerError
 from cosim import FmuPlant
 from learning import checkpoint
 from learning.errors import LearningError
+from learning.learner import Learner
 from learning.q_learning import QLearning
-from learning.training_loop import TrainingLoop
+from learning.run_state import RunState
 from tests.helpers.training import make_run, train
 
 RUN = make_run()
@@ -23,14 +24,14 @@ def good(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def resume(tmp_path_factory):
-    """Take up a checkpoint with a content and a checksum that fits it, always in one loop."""
-    folder = tmp_path_factory.mktemp("resumed")
-    with FmuPlant(RUN.scenario) as plant, FmuPlant(RUN.scenario) as other:
-        loop = TrainingLoop(RUN, QLearning, plant, other, out=folder)
+    """Take up a checkpoint with a content and a checksum that fits it, always in one run."""
+    path = tmp_path_factory.mktemp("resumed") / "checkpoint.npz"
+    with FmuPlant(RUN.scenario) as plant:
+        state = RunState(RUN, Learner(RUN, QLearning, plant), plant, None)
 
         def attempt(content):
-            checkpoint.save(folder / "checkpoint.npz", content)
-            loop._resume()
+            checkpoint.save(path, content)
+            state.load(path)
 
         yield attempt
 

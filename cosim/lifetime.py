@@ -23,6 +23,10 @@ class Terminated(BaseException):
     """SIGTERM was received; raised so that a command unwinds as it does on Ctrl-C."""
 
 
+class Interrupted(BaseException):
+    """Ctrl-C was pressed, and the command has unwound; its arguments say how it goes on."""
+
+
 def unwind_on_sigterm() -> None:
     """Let SIGTERM raise `Terminated` in this process's main thread, until that has unwound.
 

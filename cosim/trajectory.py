@@ -22,6 +22,7 @@ from rti_storage import write_atomically
 Array = NDArray[np.float64]
 STATUS = "status"
 SOLVED = "solved"
+QUANTILES = {"median_us": 0.5, "p95_us": 0.95, "p99_us": 0.99, "max_us": 1.0}
 FALLBACK = "fallback"
 
 
@@ -129,13 +130,9 @@ class Trajectory:
     def timing_summary(self) -> dict[str, dict[str, float]]:
         """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
         return {
-            name: {
-                "median_us": float(np.median(values)) * 1e6,
-                "p95_us": float(np.quantile(values, 0.95)) * 1e6,
-                "p99_us": float(np.quantile(values, 0.99)) * 1e6,
-                "max_us": float(np.max(values)) * 1e6,
-            }
+            name: dict(zip(QUANTILES, map(float, quantiles), strict=True))
             for name, values in self.timing.items()
+            for quantiles in [1e6 * np.quantile(values, list(QUANTILES.values()))]
         }
 
     def to_csv(self) -> str:

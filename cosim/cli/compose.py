@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 
 from cosim.lookup import import_from, import_from_here
 
+LONG = 200
+"""Stages of a horizon from which building a controller takes seconds."""
+
 if TYPE_CHECKING:
     from cosim.cli.output import Output
     from cosim.plant import FmuPlant
@@ -37,8 +40,13 @@ def build_plant(scenario: Scenario, output: Output | None = None) -> FmuPlant:
 
 
 def announce(scenario: Scenario, output: Output) -> None:
-    """Say which native code is about to run, unless it is the package's own, and watch it."""
+    """Say which native code is about to run, unless it is the package's own, and watch it.
+
+    Say, too, what a long horizon means for whoever waits.
+    """
     announce_fmu(scenario.plant.fmu, output)
+    if (stages := scenario.controller.horizon) > LONG:
+        output.note(f"horizon {stages}: building the controller takes up to a minute, once")
 
 
 def announce_fmu(name: str, output: Output) -> None:

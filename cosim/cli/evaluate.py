@@ -19,7 +19,7 @@ from cosim.cli.options import (
     StepsOption,
     count,
 )
-from cosim.cli.output import Output, dump, open_folder, output
+from cosim.cli.output import Output, again, dump, open_folder, output, resumable
 
 
 def evaluate(
@@ -66,7 +66,8 @@ def evaluate(
         optimum = None if yardstick is None else partial(build_controller, yardstick)
         extra = seeds if yardstick is not None and yardstick not in named else 0
         units = len(named) * (seeds + comes_to_rest(task)) + extra
-        with out_.progress(f"{', '.join(named)} on {task.name}", units) as progress:
+        label = f"{', '.join(named)} on {task.name}"
+        with resumable(again), out_.progress(label, units) as progress:
             evaluation = run(
                 task,
                 {name: partial(build_controller, spec) for name, spec in named.items()},

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Annotated, Any
 
 import typer
+from typer import Context
+from typer.core import TyperGroup
 
 from cosim.cli import (
     benchmark,
@@ -26,10 +30,34 @@ from cosim.cli import (
     view,
 )
 from cosim.cli.streams import open_streams
-from cosim.lifetime import Terminated, ignore_sigterm, unwind_on_sigterm
+from cosim.errors import CosimError
+from cosim.lifetime import Interrupted, Terminated, ignore_sigterm, unwind_on_sigterm
+
+
+class _Commands(TyperGroup):
+    """The commands, none of which takes an empty word."""
+
+    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
+        """Refuse empty words: as a path, one would mean the working directory."""
+        for before, word in pairwise(["", *args]):
+            name, equals, value = word.partition("=")
+            if not word or (name.startswith("--") and equals and not value):
+                name = name or (before if before.startswith("-") else "")
+                what = f"the value of '{name}'" if name else "an argument"
+                raise CosimError(f"{what} is empty: give one, or leave it out")
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Context) -> Any:
+        """Let Ctrl-C through, which Typer would end without a word."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise Interrupted(*getattr(error, "__notes__", [])) from None
+
 
 app = typer.Typer(
     name="cosim",
+    cls=_Commands,
     help="Co-simulate an FMU plant with learning-based MPC, and benchmark what it learns.",
     no_args_is_help=True,
     add_completion=False,
@@ -125,13 +153,11 @@ def _run() -> None:
         _fail(f"{name}{error.strerror or error}")
     except MemoryError as error:
         _fail(f"not enough memory ({error}); ask for fewer samples")
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
-    except Terminated:
+    except Interrupted as error:
+        _end("interrupted", error.args, EXIT_INTERRUPTED)
+    except Terminated as error:
         ignore_sigterm()
-        print("terminated", file=sys.stderr)
-        sys.exit(EXIT_TERMINATED)
+        _end("terminated", getattr(error, "__notes__", ()), EXIT_TERMINATED)
     except Exception as error:
         _report(error)
 
@@ -143,6 +169,11 @@ def _known_errors() -> list[type[Exception]]:
 def _fail(message: str) -> None:
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(EXIT_BAD_INPUT)
+
+
+def _end(word: str, notes: Sequence[str], code: int) -> None:
+    print("; ".join([word, *notes]), file=sys.stderr)
+    sys.exit(code)
 
 
 def _report(error: Exception) -> None:

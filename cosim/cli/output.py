@@ -6,12 +6,13 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from cosim.errors import CosimError
+from cosim.lifetime import Terminated
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -146,6 +147,22 @@ def output(as_json: bool) -> Iterator[Output]:
         os.dup2(result._stdout, 1)
         os.close(result._stdout)
         result._stdout = -1
+
+
+@contextmanager
+def resumable(how: Callable[[], str]) -> Iterator[None]:
+    """Where the block is interrupted or terminated, say `how` to go on, if that is not empty."""
+    try:
+        yield
+    except (KeyboardInterrupt, Terminated) as error:
+        if words := how():
+            error.add_note(words)
+        raise
+
+
+def again() -> str:
+    """How a command goes on that finds again what it has finished."""
+    return "what is finished is kept: the same command goes on from there"
 
 
 def _release() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli.options import JobsOption, JsonOption, OutOption, SchedulerOption
-from cosim.cli.output import Output, dump, open_folder, output
+from cosim.cli.output import Output, again, dump, open_folder, output, resumable
 
 if TYPE_CHECKING:
     from cosim.experiments.results import StudyResults
@@ -61,7 +61,7 @@ def execute(
         _announce(scenario, out_)
     planned = study.plan()
     label, total = f"{study.name}, thousands of samples", _thousands(planned.samples)
-    with out_.progress(label, total) as bar:
+    with resumable(again), out_.progress(label, total) as bar:
 
         def report(state: State, line: str) -> None:
             failed = f", {state.failed} failed" if state.failed else ""

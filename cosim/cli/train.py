@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli.options import JsonOption, OutOption, RecordOption, ScenarioOption, count
-from cosim.cli.output import Output, Progressing, dump, open_folder, output
+from cosim.cli.output import Output, Progressing, dump, open_folder, output, resumable
 
 if TYPE_CHECKING:
     from learning.log import LogRow
@@ -201,7 +201,13 @@ def _execute(
 
         recorder = TrainingRecorder(folder / "training.rrd")
     announce(run.scenario, output)
-    with output.progress(run.algorithm, run.samples) as progress:
+    checkpoint = folder / "checkpoint.npz"
+
+    def how() -> str:
+        there = f"the same command with --resume goes on from {checkpoint}"
+        return there if checkpoint.is_file() else ""
+
+    with resumable(how), output.progress(run.algorithm, run.samples) as progress:
         training = carry_out(
             run,
             out=folder,

@@ -1,0 +1,134 @@
+"""Ctrl-C and SIGTERM end every command with one line that says how it goes on."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from cosim.cli import main, output
+from cosim.lifetime import Terminated
+from tests.helpers.processes import eventually
+
+AGAIN = "; what is finished is kept: the same command goes on from there"
+STUDY = """\
+schema = 1
+name = "long"
+scenarios = ["paper"]
+evaluation = { seeds = 4000, steps = 1000 }
+[[case]]
+controller = "naive"
+"""
+COMMANDS = {
+    "simulate": ("simulate -n 5000000", "", ".cosim.lock"),
+    "evaluate": ("evaluate --seeds 9999 -n 1000 --jobs 1", AGAIN, ".units.jsonl"),
+    "evaluate --jobs": ("evaluate --seeds 9999 -n 1000 --jobs 2", AGAIN, ".units.jsonl"),
+    "study": ("study run study.toml --jobs 2", AGAIN, "runs"),
+    "train": (
+        "train -a q-learning -n 9999999 --checkpoint-every 1000 --log-every 100",
+        "; the same command with --resume goes on from {out}/checkpoint.npz",
+        "checkpoint.npz",
+    ),
+}
+# What a shell's background starts is born deaf to Ctrl-C.
+HEARING = (
+    "import runpy, signal\n"
+    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "runpy.run_module('cosim', run_name='__main__')\n"
+)
+ENDS = {"SIGINT": ("interrupted", 130), "SIGTERM": ("terminated", 143)}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("number", ENDS)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_interrupted_command_says_how_it_goes_on(tmp_path, command, number):
+    (tmp_path / "study.toml").write_text(STUDY)
+    words, how, file = COMMANDS[command]
+    word, code = ENDS[number]
+    with subprocess.Popen(
+        [sys.executable, "-c", HEARING, *words.split(), "--out", "out"],
+        cwd=tmp_path,
+        env=os.environ | {"COSIM_COMPILE": "never"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert eventually((tmp_path / "out" / file).exists, 120)
+        if number == "SIGINT":  # as a terminal does, to all in the foreground
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.terminate()
+        _, said = process.communicate(timeout=120)
+    out = (tmp_path / "out").resolve()
+    assert (process.returncode, said) == (code, f"{word}{how.format(out=out)}\n")
+
+
+def interrupted(error, how):
+    with pytest.raises(type(error)) as caught, output.resumable(lambda: how):
+        raise error
+    return getattr(caught.value, "__notes__", [])
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), Terminated()])
+def test_only_a_way_that_there_is_is_named(error):
+    assert interrupted(error, "") == []
+    assert interrupted(error, "so") == ["so"]
+
+
+def test_an_error_is_no_interruption():
+    assert interrupted(ValueError(), "so") == []
+
+
+@pytest.mark.parametrize("command", ["simulate", "evaluate", "train -a q-learning", "demo"])
+@pytest.mark.parametrize("form", ["-o|", "--out|", "--out="])
+def test_an_empty_folder_is_refused(monkeypatch, capsys, command, form, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    name = form.partition("|")[0].partition("=")[0]
+    assert refused(monkeypatch, capsys, [*command.split(), *form.split("|")]) == (
+        f"error: the value of '{name}' is empty: give one, or leave it out\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "export tuned -o ",
+        "study run study.toml --out ",
+        "study report ",
+        "results update --results ",
+        "compare a ",
+        "compare a b --record ",
+        "view ",
+        "view run.rrd --png ",
+        "scenario draft --out ",
+        "tuning -o ",
+        "reproduce --out ",
+        "simulate -s ",
+        "simulate -c ",
+        "evaluate --scheduler ",
+        "fmu info ",
+        "fmu check ",
+        "fmu build --out ",
+        "optimum -s ",
+        "",
+    ],
+)
+def test_an_empty_word_is_refused_by_every_command(monkeypatch, capsys, words, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert "is empty: give one, or leave it out" in refused(monkeypatch, capsys, words.split(" "))
+    assert list(tmp_path.iterdir()) == []
+
+
+def refused(monkeypatch, capsys, words):
+    monkeypatch.setattr(sys, "argv", ["cosim", *words])
+    with pytest.raises(SystemExit) as caught:
+        main._run()
+    assert caught.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    return captured.err

@@ -8,7 +8,6 @@ from itertools import pairwise
 from typing import Annotated, Any
 
 import typer
-from typer import Context
 from typer.core import TyperGroup
 
 from cosim.cli import (
@@ -37,7 +36,7 @@ from cosim.lifetime import Interrupted, Terminated, ignore_sigterm, unwind_on_si
 class _Commands(TyperGroup):
     """The commands, none of which takes an empty word."""
 
-    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse empty words: as a path, one would mean the working directory."""
         for before, word in pairwise(["", *args]):
             name, equals, value = word.partition("=")
@@ -47,7 +46,7 @@ class _Commands(TyperGroup):
                 raise CosimError(f"{what} is empty: give one, or leave it out")
         return super().parse_args(ctx, args)
 
-    def invoke(self, ctx: Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         """Let Ctrl-C through, which Typer would end without a word."""
         try:
             return super().invoke(ctx)

@@ -4,10 +4,11 @@ import os
 import signal
 import subprocess
 import sys
+from importlib import import_module
 
 import pytest
 
-from cosim.cli import main, output
+from cosim.cli import output
 from cosim.lifetime import Terminated
 from tests.helpers.processes import eventually
 
@@ -127,7 +128,7 @@ def test_an_empty_word_is_refused_by_every_command(monkeypatch, capsys, words, t
 def refused(monkeypatch, capsys, words):
     monkeypatch.setattr(sys, "argv", ["cosim", *words])
     with pytest.raises(SystemExit) as caught:
-        main._run()
+        import_module("cosim.cli.main")._run()
     assert caught.value.code == 2
     captured = capsys.readouterr()
     assert captured.out == ""

@@ -82,7 +82,7 @@ JOBS = (
     Job("study --jobs", "study run study.toml --jobs 2 --out out", "out/summary.json", _study),
     Job("study --jobs 1", "study run study.toml --jobs 1 --out out", "out/summary.json", _study),
     Job("view --png", "view recorded/run.rrd --png out.png", "out.png", _recording),
-    Job("export", "export tuned --out out/policy.fmu", "out/policy.fmu"),
+    Job("export", "export tuned --out policy.fmu", "policy.fmu"),
 )
 
 

@@ -19,7 +19,7 @@ from typing import Any
 from cosim.errors import StudyError
 from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Progress
-from cosim.text_tables import cell, csv_text, read_records
+from cosim.text_tables import cell, csv_pieces, csv_text, read_records
 from rti_storage import write_atomically
 from rti_storage.documents import read_json
 
@@ -74,6 +74,7 @@ class RunStore:
     def __init__(self, out: Path, key: RunKey, facts: Mapping[str, Any]) -> None:
         self.folder = out / key.folder
         self._facts = json.loads(json.dumps(facts))
+        self._known: dict[tuple[str, int], Indicators] = {}
         (self.folder / FAILURE).unlink(missing_ok=True)
         if not self._belongs():
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -148,7 +149,12 @@ class RunStore:
         self._write(RUN, _json(document | {"timing": timing}))
 
     def indicators(self, file: str, steps: int) -> Indicators:
-        """Indicators by noise seed that a file holds of runs of `steps` samples."""
+        """Indicators by noise seed that a file holds of runs of `steps` samples, read once."""
+        if (file, steps) not in self._known:
+            self._known[file, steps] = self._read_indicators(file, steps)
+        return self._known[file, steps]
+
+    def _read_indicators(self, file: str, steps: int) -> Indicators:
         path = self.folder / file
         if not path.is_file():
             return {}
@@ -163,12 +169,13 @@ class RunStore:
 
     def evaluate(self, file: str, steps: int, fresh: Indicators) -> None:
         """Add indicators to a file."""
-        known = self.indicators(file, steps) | fresh
+        known = self.indicators(file, steps)
+        known.update(fresh)
         rows = (
             [str(seed), str(steps), *(cell(values[name]) for name in INDICATORS)]
             for seed, values in sorted(known.items())
         )
-        self._write(file, csv_text(("seed", "steps", *INDICATORS), rows))
+        write_atomically(self.folder / file, csv_pieces(("seed", "steps", *INDICATORS), rows))
 
     def online(self, steps: int, block: int) -> dict[int, list[float]]:
         """Mean costs of blocks by noise seed, of runs of `steps` samples."""

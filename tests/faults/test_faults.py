@@ -80,6 +80,17 @@ def test_a_short_endurance_run_fails_nowhere_and_does_not_grow():
     assert seen["growth_mb"] < 5
 
 
+@pytest.mark.slow
+def test_many_units_of_evaluation_take_little_memory_and_one_file():
+    script = Path(__file__).with_name("endurance.py")
+    words = [sys.executable, str(script), "--units", "3000", "--jobs", "2"]
+    seen = json.loads(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
+    assert seen["status"] == "finished"
+    assert seen["files"] == 4, "units, table, timing, figure"
+    assert seen["megabytes_on_disk"] < 4
+    assert seen["growth_mb"] < 5
+
+
 # Disks -----------------------------------------------------------------------------------------
 
 

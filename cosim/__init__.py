@@ -1,8 +1,8 @@
 """Co-simulation of an FMU plant with a controller: scenarios, closed loop, records, results."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from cosim.lazy import on_first_use
 from cosim.registration import register_environments
 
 if TYPE_CHECKING:
@@ -18,18 +18,21 @@ if TYPE_CHECKING:
     from cosim.trajectory import Trajectory as Trajectory
 
 # Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
-_HOMES = {
-    "Evaluation": "cosim.evaluation",
-    "evaluate": "cosim.evaluation",
-    "FmuPlant": "cosim.plant",
-    "Scenario": "cosim.scenario",
-    "Trajectory": "cosim.trajectory",
-    "Study": "cosim.experiments.study",
-    "StudyOutcome": "cosim.experiments.outcome",
-    "StudyResults": "cosim.experiments.results",
-    "simulate": "cosim.simulation",
-    "study": "cosim.experiments.outcome",
-}
+__getattr__, __dir__ = on_first_use(
+    __name__,
+    {
+        "Evaluation": "cosim.evaluation",
+        "evaluate": "cosim.evaluation",
+        "FmuPlant": "cosim.plant",
+        "Scenario": "cosim.scenario",
+        "Trajectory": "cosim.trajectory",
+        "Study": "cosim.experiments.study",
+        "StudyOutcome": "cosim.experiments.outcome",
+        "StudyResults": "cosim.experiments.results",
+        "simulate": "cosim.simulation",
+        "study": "cosim.experiments.outcome",
+    },
+)
 
 __all__ = [
     "Evaluation",
@@ -43,16 +46,6 @@ __all__ = [
     "simulate",
     "study",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'cosim' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
 
 
 register_environments()

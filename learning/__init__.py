@@ -1,8 +1,8 @@
 """Reinforcement learning rules that tune an NMPC from plant data."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from cosim.lazy import on_first_use
 from learning.actor_critic import ActorCritic
 from learning.batch_q_learning import BatchQLearning
 from learning.q_learning import QLearning
@@ -11,17 +11,10 @@ if TYPE_CHECKING:
     from learning.training import Training as Training
     from learning.training import train as train
 
-# Imported on first use: a worker that trains has no use for what draws.
-_HOMES = {"Training": "learning.training", "train": "learning.training"}
+# Imported on first use: a rule alone needs neither plant nor statistics.
+__getattr__, __dir__ = on_first_use(
+    __name__,
+    {"Training": "learning.training", "train": "learning.training"},
+)
 
 __all__ = ["ActorCritic", "BatchQLearning", "QLearning", "Training", "train"]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'learning' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

@@ -1,7 +1,8 @@
 """Rerun recordings: of runs, of training and of comparisons; the only importer of rerun."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from cosim.lazy import on_first_use
 
 if TYPE_CHECKING:
     from cosim.recording.overlay import record_comparison as record_comparison
@@ -16,17 +17,20 @@ if TYPE_CHECKING:
 
 # Imported on first use: a recorded run must not pay, in time and 80 MB, for the statistics and
 # colours of training's recordings.
-_HOMES = {
-    "Recording": "reader",
-    "RerunRecorder": "run_recorder",
-    "TrainingRecorder": "training_recorder",
-    "open_viewer": "viewer",
-    "read_recording": "reader",
-    "read_signals": "reader",
-    "record_comparison": "overlay",
-    "render": "viewer",
-    "summarise": "reader",
-}
+__getattr__, __dir__ = on_first_use(
+    __name__,
+    {
+        "Recording": "cosim.recording.reader",
+        "RerunRecorder": "cosim.recording.run_recorder",
+        "TrainingRecorder": "cosim.recording.training_recorder",
+        "open_viewer": "cosim.recording.viewer",
+        "read_recording": "cosim.recording.reader",
+        "read_signals": "cosim.recording.reader",
+        "record_comparison": "cosim.recording.overlay",
+        "render": "cosim.recording.viewer",
+        "summarise": "cosim.recording.reader",
+    },
+)
 
 __all__ = [
     "Recording",
@@ -39,13 +43,3 @@ __all__ = [
     "render",
     "summarise",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'cosim.recording' has no attribute '{name}'")
-    return getattr(import_module(f"cosim.recording.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

@@ -7,16 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from cosim.evaluation.statistics import shown
-from cosim.figures.style import save
-from cosim.figures.training import training_figure
 from cosim.lookup import build_controller
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
@@ -28,6 +25,9 @@ from learning.starting_point import build_controller as build_learnt
 from learning.training_loop import Progress, training_loop
 from learning.training_run import TrainingRecorder, TrainingResult, TrainingRun, prepare
 from rti_storage import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 FIGURE = "learning.png"
@@ -79,6 +79,8 @@ class Training:
 
     def figure(self) -> Figure:
         """Cost, violations, TD error and θ over the samples; LearningError without a log."""
+        from cosim.figures.training import training_figure  # noqa: PLC0415 - matplotlib
+
         if not self.result.rows:
             raise ConfigurationError("this training's log has no row: there is nothing to draw")
         blocks, run = self.parameters.blocks, self.run
@@ -95,6 +97,8 @@ class Training:
 
     def plot(self, path: str | Path) -> Path:
         """Draw `figure` to a PNG or SVG file; raises FigureError where it cannot be written."""
+        from cosim.figures.style import save  # noqa: PLC0415 - matplotlib
+
         return save(self.figure(), path)
 
     def save(self, folder: str | Path) -> Path:

@@ -6,18 +6,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cosim.evaluation.runs import Runs
 from cosim.evaluation.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
-from cosim.figures.evaluation import Costs, evaluation_figure
-from cosim.figures.style import save
 from cosim.text_tables import cell, csv_pieces
 from rti_storage import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -154,6 +154,8 @@ class Evaluation:
 
     def figure(self) -> Figure:
         """Regret (J where J* is not known) with its intervals; economic cost against violation."""
+        from cosim.figures.evaluation import Costs, evaluation_figure  # noqa: PLC0415 - matplotlib
+
         return evaluation_figure(
             {name: Costs(*(self.column(name, key) for key in DRAWN)) for name in self.controllers},
             title=f"{self.facts['scenario']}, {self.facts['steps']} samples × {len(self.seeds)} "
@@ -163,6 +165,8 @@ class Evaluation:
 
     def plot(self, path: str | Path) -> Path:
         """Draw `figure` to a PNG or SVG file; raises FigureError where it cannot be written."""
+        from cosim.figures.style import save  # noqa: PLC0415 - matplotlib
+
         return save(self.figure(), path)
 
     def write(self, folder: Path) -> None:

@@ -36,12 +36,12 @@ def demo(
     """Let a controller whose model is wrong learn from its plant, and compare it.
 
     The condenser of the evaporator is fouled and no controller is told. Writes demo.csv,
-    before-after.png, demo.rrd, learning.csv, learning.png, parameters.toml and summary.json.
+    before-after.png, demo.rrd, summary.json, and of the training learning.csv, learning.png,
+    parameters.toml and scenario.toml.
     """
     with output(json) as out_:
         from cosim.figures import plot_overlay
         from cosim.scenario import Scenario
-        from learning.log import to_csv
         from rti_storage import write_atomically
 
         scenario = Scenario.load(SCENARIO)
@@ -55,11 +55,9 @@ def demo(
         _show(rows, scenario, steps, out_)
         shown = {name: runs[name][0] for name in ("naive", LEARNT, OPTIMAL)}
         plot_overlay(shown, folder / "before-after.png")
-        learnt.plot(folder / "learning.png")
+        learnt.save(folder)
         _record(folder / "demo.rrd", shown, learnt, rows)
         write_atomically(folder / "demo.csv", _csv(rows))
-        write_atomically(folder / "learning.csv", to_csv(learnt.result.rows))
-        learnt.result.parameters.save(folder / "parameters.toml")
         summary: dict[str, Any] = {
             "scenario": scenario.name,
             "steps": steps,
@@ -111,12 +109,8 @@ def _remark(scenario: Scenario, progress: Any) -> Callable[[int, LogRow], None]:
 
 def _controllers(scenario: Scenario, trained: Mapping[str, Training]) -> dict[str, Controller]:
     from cosim.lookup import build_controller
-    from learning.starting_point import build_controller as build_learnt
 
-    learnt: dict[str, Controller] = {
-        name: build_learnt("rti", scenario, each.result.parameters)
-        for name, each in trained.items()
-    }
+    learnt: dict[str, Controller] = {name: one.controller() for name, one in trained.items()}
     return {
         "naive": build_controller("naive", scenario),
         **learnt,
@@ -206,19 +200,13 @@ def _csv(rows: list[dict[str, Any]]) -> str:
 def _record(
     path: Path, runs: Mapping[str, Trajectory], learnt: Training, rows: list[dict[str, Any]]
 ) -> None:
-    import numpy as np
-
     from cosim.recording.showcase import TrainingHistory, record_showcase
 
-    log, blocks = learnt.result.rows, learnt.result.parameters.blocks
-    theta = np.array([row.parameters.theta for row in log])
+    log, blocks = learnt.log(), learnt.parameters.blocks
     history = TrainingHistory(
-        samples=np.array([row["samples"] for row in log]),
-        curves={
-            "regret %": 100 * np.array([row["regret"] for row in log]),
-            "J of the training samples": np.array([row["J"] for row in log]),
-        },
-        theta={name: (theta - theta[0])[:, where] for name, where in blocks.slices.items()},
+        samples=log["samples"],
+        curves={"regret %": 100 * log["regret"], "J of the training samples": log["J"]},
+        theta=learnt.theta(),
         labels={name: tuple(blocks.labels[where]) for name, where in blocks.slices.items()},
     )
     lines = [

@@ -41,13 +41,6 @@ def load_run(path: str | Path) -> RunSignals:
 def _bounds(path: Path) -> dict[str, tuple[float, float]]:
     """Bounds of states and actions by name; none where no readable scenario lies beside a run."""
     try:
-        scenario = Scenario.load(path) if path.is_file() else None
+        return Scenario.load(path).limits if path.is_file() else {}
     except ScenarioError:
         return {}
-    if scenario is None:
-        return {}
-    names = [*scenario.plant.states, *scenario.plant.actions]
-    lower = [*scenario.state_lower, *scenario.action_lower]
-    upper = [*scenario.state_upper, *scenario.action_upper]
-    pairs = zip(map(float, lower), map(float, upper), strict=True)
-    return dict(zip(names, pairs, strict=True))

@@ -26,21 +26,15 @@ def overlay_figure(runs: Mapping[str, Trajectory]) -> Figure:
     first = next(iter(runs.values()))
     scenario, plant = first.scenario, first.scenario.plant
     scale, unit = time_unit(first.time)
-    names = [*plant.states, *plant.actions]
-    lower = dict(zip(names, [*scenario.state_lower, *scenario.action_lower], strict=True))
-    upper = dict(zip(names, [*scenario.state_upper, *scenario.action_upper], strict=True))
     color = colors(list(runs))
-    with figure(1.2 * len(names) + 0.6) as drawn:
-        rows = drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, name in zip(rows, names, strict=True):
+    with figure(1.2 * len(scenario.limits) + 0.6) as drawn:
+        rows = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (name, (lower, upper)) in zip(rows, scenario.limits.items(), strict=True):
             for controller, run in runs.items():
                 time, values = run.time / scale, run[name]
                 held = "steps-post" if name in plant.actions else "default"
                 axes.plot(time, values, color=color[controller], linewidth=1.1, drawstyle=held)
-                for bound, outside in (
-                    (lower[name], values < lower[name]),
-                    (upper[name], values > upper[name]),
-                ):
+                for bound, outside in ((lower, values < lower), (upper, values > upper)):
                     axes.fill_between(
                         time,
                         values,
@@ -51,7 +45,7 @@ def overlay_figure(runs: Mapping[str, Trajectory]) -> Figure:
                         linewidth=0,
                         interpolate=True,
                     )
-            limits(axes, lower[name], upper[name])
+            limits(axes, lower, upper)
             axes.set_ylabel(label(name, first.signals[name].unit))
         rows[-1].set_xlabel(f"time [{unit}]")
         rows[-1].set_xlim(first.time[0] / scale, (first.time[-1] + scenario.sampling_time) / scale)

@@ -49,10 +49,7 @@ def record_showcase(
     scenario, plant = first.scenario, first.scenario.plant
     stream = Stream(path, f"before and after learning on {scenario.name}")
     stream.static("about", rr.TextDocument(drawable(about), media_type=rr.MediaType.MARKDOWN))
-    lower = [*scenario.state_lower, *scenario.action_lower]
-    upper = [*scenario.state_upper, *scenario.action_upper]
-    limits = zip([*plant.states, *plant.actions], lower, upper, strict=True)
-    bounds = {name: (low, high) for name, low, high in limits}
+    bounds = scenario.limits
     names = [*bounds, "penalty"]
     steps = max(len(run.time) for run in runs.values())
     overlaid = {}

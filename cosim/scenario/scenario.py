@@ -185,6 +185,14 @@ class Scenario(Table):
         return _frozen(self.bounds.action_upper)
 
     @cached_property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """Lower and upper bound of each state and action by name."""
+        names, bounds = (*self.plant.states, *self.plant.actions), self.bounds
+        lower = (*bounds.state_lower, *bounds.action_lower)
+        upper = (*bounds.state_upper, *bounds.action_upper)
+        return dict(zip(names, zip(lower, upper, strict=True), strict=True))
+
+    @cached_property
     def penalty_linear(self) -> NDArray[np.float64]:
         """Linear weights b of the violation, (n,)."""
         return _frozen(self.penalty.linear)

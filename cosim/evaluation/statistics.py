@@ -104,9 +104,14 @@ def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
     return ratio(naive - cost, naive - optimum)
 
 
-def regrets(cost: Array, optimum: Array) -> Array:
+def regrets(cost: Array, optimum: Array | float) -> Array:
     """`regret` of each seed by itself, (S,)."""
     return _each(cost - optimum, np.abs(optimum))
+
+
+def regret_terms(cost: Array, optimum: Array) -> Array:
+    """What each seed, or block of a run, adds to `regret`, which is their mean: (S,)."""
+    return (cost - optimum) / abs(np.mean(optimum))
 
 
 def gains(cost: Array, reference: Array) -> Array:
@@ -119,7 +124,7 @@ def gaps_closed(cost: Array, naive: Array, optimum: Array) -> Array:
     return _each(naive - cost, naive - optimum)
 
 
-def _each(numerator: Array, denominator: Array) -> Array:
+def _each(numerator: Array, denominator: Array | float) -> Array:
     """Quotients, NaN where the denominator is zero."""
     there = denominator != 0
     return np.where(there, numerator / np.where(there, denominator, 1.0), np.nan)

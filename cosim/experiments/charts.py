@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import LEVEL
+from cosim.evaluation.statistics import LEVEL, regrets
 from cosim.experiments import online
 from cosim.experiments.cases import BASELINES
 from cosim.experiments.records import RunResult
 from cosim.experiments.results import StudyResults
 from cosim.experiments.summary import summary_rows
 from cosim.figures.curves import LearningCurve, chunks, plot_curves
-from cosim.figures.regret import FLOOR, Dots, Profile, plot_profiles, plot_regret
+from cosim.figures.regret import FINE, Dots, Profile, plot_profiles, plot_regret
 
 Array = NDArray[np.float64]
 
@@ -92,10 +92,10 @@ def _curves(results: StudyResults, scenario: str, target: Path) -> list[str]:
     """Figures of the learning curves: relative to J* in %, where it is known."""
     optimum = results.optimum(scenario)
     known = optimum is not None and np.isfinite(optimum.greedy_J)
-    best = optimum.greedy_J if optimum is not None and known else 0.0
+    best = optimum.greedy_J if optimum is not None and known else float("nan")
 
     def relative(cost: Array) -> Array:
-        return 100 * (cost - best) / abs(best) if known else cost
+        return 100 * regrets(cost, best) if known else cost
 
     everything = list(panels(results, scenario).items())
     levels = {
@@ -118,7 +118,7 @@ def _curves(results: StudyResults, scenario: str, target: Path) -> list[str]:
                 levels,
                 target / f"{name}.{suffix}",
                 ylabel="regret %" if known else "J",
-                floor=0.1 if known else None,
+                relative=known,
             )
         names.append(name)
     return names
@@ -216,8 +216,8 @@ def _profiles(
         return []
     finite = np.concatenate([r for cases in shown.values() for s in cases.values() for r in s])
     finite = finite[np.isfinite(finite)]
-    top = max(float(finite.max(initial=1.0)), 10 * FLOOR)
-    axis = np.geomspace(FLOOR, 1.3 * top, 200)
+    top = max(float(finite.max(initial=1.0)), 10 * FINE)
+    axis = np.geomspace(FINE, 1.3 * top, 200)
     drawn = {
         title: {case: _profile(strata, axis) for case, strata in cases.items()}
         for title, cases in shown.items()

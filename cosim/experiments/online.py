@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
-from cosim.evaluation.statistics import regret, shown
+from cosim.evaluation.statistics import regret, regret_terms, regrets, shown
 from cosim.experiments.document import OnlineTable
 from cosim.experiments.plan import Plan, Run
 from cosim.experiments.records import RunResult
@@ -52,7 +52,7 @@ def _blocks(run: Run, result: RunResult, store: RunStore) -> list[tuple[int, Arr
     if run.online is None:
         return []
     steps, block = run.online.steps, run.online.block
-    found = store.online(steps, block).items()
+    found = store.online(run.online).items()
     return [
         (seed, np.minimum(block * np.arange(1, len(costs) + 1), steps), np.array(costs))
         for seed, costs in found
@@ -82,7 +82,7 @@ def _table(results: StudyResults, scenario: str) -> tuple[str, tuple[str, ...], 
         own = np.array([runs[seed] for seed in seeds])
         optimum = np.array([best[seed] for seed in seeds])
         found = regret(own.mean(axis=1), optimum.mean(axis=1))
-        single = (own.mean(axis=1) / optimum.mean(axis=1) - 1) * np.sign(optimum.mean(axis=1))
+        single = regrets(own.mean(axis=1), optimum.mean(axis=1))
         cut = [slice(i * each, (i + 1) * each) for i in range(periods)]
         parts = [regret(own[:, c].mean(axis=1), optimum[:, c].mean(axis=1)) for c in cut]
         by_period = [shown(part.value, None, 100, 3) for part in parts]
@@ -117,7 +117,7 @@ def draw(results: StudyResults, scenario: str, target: Path, suffixes: Iterable[
         if runs is best:
             continue
         seeds = [s for s in runs if s in best and len(runs[s]) == len(best[s])]
-        values = [100 * (runs[s] - best[s]) / abs(best[s].mean()) for s in seeds]
+        values = [100 * regret_terms(runs[s], best[s]) for s in seeds]
         if values:
             samples = settings.block * np.arange(1, len(values[0]) + 1, dtype=np.float64)
             courses[case] = Course(samples, np.array(values))

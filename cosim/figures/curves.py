@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import EngFormatter, FuncFormatter
+from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from cosim.figures.labels import EndLabel, label_ends
-from cosim.figures.regret import percent
+from cosim.figures.regret import cost_axis
 from cosim.figures.style import REFERENCE, SERIES, WIDTH, figure, plain, save
 
 Array = NDArray[np.float64]
@@ -47,23 +47,24 @@ def plot_curves(
     path: str | Path,
     *,
     ylabel: str,
-    floor: float | None,
+    relative: bool,
 ) -> Path:
     """Draw a column for each panel: above what training cost, below the greedy policy.
 
     Lines are medians over runs, bands their quartiles. `levels` are drawn across all panels, by
-    name. With `floor` the ordinate is logarithmic above it and linear below; without it linear.
+    name. The ordinate is `cost_axis`.
     Raises FigureError as `save` does.
     """
     columns = len(panels)
     everything = [quartiles(v) for p in panels.values() for c in p.values() for v in c.both]
     reached = np.concatenate([np.ravel(middle) for middle, *_ in everything])
+    shown = np.concatenate([reached[np.isfinite(reached)], list(levels.values())])
     with figure(4.6, max(WIDTH * columns / 2, 4.6)) as drawn:
         grid = drawn.subplots(2, columns, sharex="col", sharey="row", squeeze=False)
         for row, axes_row in enumerate(grid):
             for axes, (title, curves) in zip(axes_row, panels.items(), strict=True):
                 _panel(axes, curves, "training" if row == 0 else "greedy")
-                _scale(axes, reached, levels, floor)
+                cost_axis(axes, shown, relative=relative)
                 axes.xaxis.set_major_formatter(EngFormatter(sep=""))
                 axes.set_xlim(0.0, max(float(c.samples[-1]) for c in curves.values()))
                 if row == 0:
@@ -102,21 +103,6 @@ def quartiles(values: Array) -> tuple[Array, Array, Array]:
     found[:, known] = np.nanquantile(values[:, known], (0.5, 0.25, 0.75), axis=0)
     middle, low, high = found
     return middle, low, high
-
-
-def _scale(axes: Axes, values: Array, levels: Mapping[str, float], floor: float | None) -> None:
-    found = np.concatenate([values[np.isfinite(values)], list(levels.values())])
-    low, high = float(found.min()), float(found.max())
-    if floor is None:
-        margin = 0.05 * (high - low) or 1.0
-        axes.set_ylim(low - margin, high + margin)
-        return
-    axes.set_yscale("symlog", linthresh=floor, linscale=0.4)
-    # Room below zero, where what equals J* is a line of its own.
-    axes.set_ylim(
-        low / 1.5 if low > floor else min(1.6 * low, -0.3 * floor), max(high, floor) * 1.6
-    )
-    axes.yaxis.set_major_formatter(FuncFormatter(percent))
 
 
 def _ends(curves: Mapping[str, LearningCurve], kind: str) -> list[EndLabel]:

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import Estimate, regret
+from cosim.evaluation.statistics import Estimate, regret, regret_terms
 from cosim.evaluation.statistics import mean as mean_of
 from cosim.figures.pareto import FRONT, draw_pareto
-from cosim.figures.regret import FLOOR, percent
+from cosim.figures.regret import percent, regret_axis
 from cosim.figures.style import REFERENCE, colors, figure, plain
 
 Array = NDArray[np.float64]
@@ -73,10 +73,7 @@ def _rows(
     values = np.concatenate(everything)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1)
-        axes.set_xscale("symlog", linthresh=10 * FLOOR, linscale=0.6)
-        least = min(1.6 * float(values.min()), -2 * FLOOR)
-        axes.set_xlim(least, max(1.6 * float(values.max()), FLOOR))
-        axes.xaxis.set_major_formatter(FuncFormatter(percent))
+        regret_axis(axes, "x", np.append(values, 0.0))
         axes.set_xlabel("regret %, 95 % interval")
         return
     if float(values.min()) > 0 and float(values.max()) > DECADE * float(values.min()):
@@ -99,6 +96,5 @@ def _shown(cost: Array, optimal: Array | None) -> tuple[Array, Estimate]:
     if optimal is None:
         return cost, mean_of(cost)
     found = regret(cost, optimal)
-    scale = 100.0 / abs(float(np.mean(optimal)))
     interval = None if found.t is None else (100 * found.t[0], 100 * found.t[1])
-    return scale * (cost - optimal), Estimate(100 * found.value, interval)
+    return 100 * regret_terms(cost, optimal), Estimate(100 * found.value, interval)

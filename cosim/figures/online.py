@@ -9,18 +9,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import EngFormatter, FuncFormatter
+from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from cosim.figures.labels import EndLabel, label_ends
-from cosim.figures.regret import percent
+from cosim.figures.regret import regret_axis
 from cosim.figures.style import REFERENCE, colors, figure, label, save
 
 Array = NDArray[np.float64]
 Signals = Mapping[str, Mapping[str, tuple[Array, Array]]]
 """Samples and values (K,) by signal and case; one line where a signal is the same in all."""
-FLOOR = 0.1
-"""Regret in % below which the ordinate is linear."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ def plot_online(
         for axes, means, title in zip(axes_column[-2:], (blocks, so_far), titles, strict=True):
             for case, values in means.items():
                 axes.plot(courses[case].samples, values, **looks[case])
-            _scale(axes, np.concatenate(list(means.values())))
+            regret_axis(axes, "y", np.concatenate([[0.0], *means.values()]))
             axes.set_ylabel(title)
         axes_column[-1].set_xlim(0.0, end)
         axes_column[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -96,10 +94,3 @@ def _signal(
         if common:
             break
     axes.set_ylabel(label(name.removeprefix("theta "), ""))
-
-
-def _scale(axes: Axes, values: Array) -> None:
-    low, high = float(values.min()), float(values.max())
-    axes.set_yscale("symlog", linthresh=FLOOR, linscale=0.4)
-    axes.set_ylim(min(low, 0.0) * 1.6 - FLOOR / 4, max(high, FLOOR) * 1.6)
-    axes.yaxis.set_major_formatter(FuncFormatter(percent))

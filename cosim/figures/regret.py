@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 from cosim.figures.style import SERIES, WIDTH, figure, plain, save
 
 Array = NDArray[np.float64]
-FLOOR = 0.01
-"""Regret in % below which the axis is linear."""
+FLOOR = 0.1
+"""Regret in % below which an axis is linear."""
+FINE = 0.01
+"""The same where finished runs are told apart."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Dots:
 def plot_regret(cases: Mapping[str, Dots], path: str | Path) -> Path:
     """Draw a row for each case: its runs, their interquartile mean and its 95 % interval.
 
-    A run that diverged is a cross; the axis is logarithmic above `FLOOR`. Raises FigureError.
+    A run that diverged is a cross; the axis is logarithmic above `FINE`. Raises FigureError.
     """
     groups = list(dict.fromkeys(dots.group for dots in cases.values()))
     color = {group: SERIES[i % len(SERIES)] for i, group in enumerate(groups)}
@@ -55,10 +58,8 @@ def plot_regret(cases: Mapping[str, Dots], path: str | Path) -> Path:
         axes.set_yticks(range(len(cases)), [plain(name) for name in cases])
         axes.set_ylim(len(cases) - 0.4, -0.6)
         axes.grid(axis="y", visible=False)
-        axes.set_xscale("symlog", linthresh=FLOOR, linscale=0.5)
         finite = np.concatenate([d.values[np.isfinite(d.values)] for d in cases.values()])
-        axes.set_xlim(min(0.0, float(finite.min()) * 1.3), max(float(finite.max()) * 1.6, FLOOR))
-        axes.xaxis.set_major_formatter(FuncFormatter(percent))
+        regret_axis(axes, "x", np.append(finite, 0.0), FINE)
         axes.set_xlabel("regret % of runs (crosses diverged); interquartile mean, 95 % interval")
     return save(drawn, path)
 
@@ -66,6 +67,33 @@ def plot_regret(cases: Mapping[str, Dots], path: str | Path) -> Path:
 def _jitter(count: int) -> Array:
     """Dots of a row are spread a little, the same way each time."""
     return np.linspace(-0.18, 0.18, count) if count > 1 else np.zeros(count)
+
+
+def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: float = FLOOR) -> None:
+    """Scale an axis for regrets in %: logarithmic above `floor`, for they span decades.
+
+    Below it is linear, with room below zero where values come near it: there J* is a line.
+    """
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, floor)
+    lowest = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
+    scale, limits, axis = (
+        (axes.set_xscale, axes.set_xlim, axes.xaxis)
+        if which == "x"
+        else (axes.set_yscale, axes.set_ylim, axes.yaxis)
+    )
+    scale("symlog", linthresh=floor, linscale=0.5)
+    limits(lowest, 1.6 * max(high, floor))
+    axis.set_major_formatter(FuncFormatter(percent))
+
+
+def cost_axis(axes: Axes, values: Array, *, relative: bool) -> None:
+    """Scale the ordinate for costs: `regret_axis` where they are `relative`, else linear."""
+    if relative:
+        regret_axis(axes, "y", values)
+        return
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+    margin = 0.05 * (high - low) or 1.0
+    axes.set_ylim(low - margin, high + margin)
 
 
 def percent(value: float, _: object = None) -> str:

@@ -11,14 +11,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
 
+from cosim.evaluation.statistics import regrets
 from cosim.figures.labels import EndLabel, label_ends
-from cosim.figures.regret import percent
+from cosim.figures.regret import cost_axis, percent
 from cosim.figures.style import REFERENCE, SERIES, figure, plain, symbol
 
 Array = NDArray[np.float64]
 GREEDY, TRAINING = SERIES[0], SERIES[1]
-FLOOR = 0.1
-"""Regret in % below which the axis is linear."""
 DECADES = 30.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""
 POINTS = 30
@@ -98,7 +97,7 @@ def _cost(
 ) -> list[EndLabel]:
     def shown(cost: Array | float) -> Array:
         values = np.asarray(cost, dtype=np.float64)
-        return values if best is None else 100 * (values - best) / abs(best)
+        return values if best is None else 100 * regrets(values, best)
 
     labels, everything = [], [shown(level) for level in baselines.values()]
     for name, color, text in (("J", TRAINING, "training"), ("greedy_J", GREEDY, "greedy")):
@@ -109,29 +108,15 @@ def _cost(
             continue
         marker = "o" if name == "greedy_J" else ""
         values = shown(cost)
-        axes.plot(
-            samples, values, marker=marker, color=color, markersize=3, linewidth=1.2, clip_on=False
-        )
+        axes.plot(samples, values, marker=marker, color=color, **_LINE)
         labels.append(EndLabel(text, float(values[-1]), color))
         everything.append(values)
     for name, level in baselines.items():
         axes.axhline(float(shown(level)), color=REFERENCE, linewidth=0.8, linestyle=(0, (4, 2)))
         labels.append(EndLabel(plain(name), float(shown(level)), REFERENCE))
-    _span(axes, np.concatenate([np.ravel(values) for values in everything]), best is not None)
+    values = np.concatenate([np.ravel(values) for values in everything])
+    cost_axis(axes, values, relative=best is not None)
     return labels
-
-
-def _span(axes: Axes, values: Array, relative: bool) -> None:
-    """Regret: logarithmic above `FLOOR`, for it spans decades; a cost: linear."""
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
-    if not relative:
-        margin = 0.05 * (high - low) or 1.0
-        axes.set_ylim(low - margin, high + margin)
-        return
-    axes.set_yscale("symlog", linthresh=FLOOR, linscale=0.5)
-    # Room below zero, where J* is a line of its own.
-    axes.set_ylim(min(1.6 * low, -0.3 * FLOOR), 1.6 * max(high, FLOOR))
-    axes.yaxis.set_major_formatter(FuncFormatter(percent))
 
 
 def _violation(axes: Axes, log: Mapping[str, Array]) -> list[EndLabel]:

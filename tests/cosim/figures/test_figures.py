@@ -122,9 +122,11 @@ def figures(rng, paper):
             {"naive": cloud[:, 0], "$mine": cloud[:, 0] + 1}, 25.0, "X2", "%", path
         ),
         "curves": lambda path: plot_curves(
-            {"$one": curves, "two": curves}, {"naive": 3.0}, path, ylabel="regret %", floor=0.1
+            {"$one": curves, "two": curves}, {"naive": 3.0}, path, ylabel="regret %", relative=True
         ),
-        "curves of J": lambda path: plot_curves({"one": curves}, {}, path, ylabel="J", floor=None),
+        "curves of J": lambda path: plot_curves(
+            {"one": curves}, {}, path, ylabel="J", relative=False
+        ),
         "regret": lambda path: plot_regret(dots, path),
         "profiles": lambda path: plot_profiles({"a": {"$x": profile}, "b": {"y": profile}}, path),
         "parameters": lambda path: plot_parameters_and_td_error(

@@ -87,10 +87,8 @@ def _relative(path: str, folder: Path) -> str:
 
 def _result(run: Run, store: RunStore) -> RunResult | None:
     """The run's result; None while it is not finished."""
-    if run.online is not None:
-        beside = store.online(run.online.steps, run.online.block)
-        if any(seed not in beside for seed in run.online.seeds):
-            return None
+    if store.missing_online(run.online):
+        return None
     noise = {file: store.indicators(file, steps) for file, (_, steps) in run.noise.items()}
     if any(seed not in noise[file] for file, (seeds, _) in run.noise.items() for seed in seeds):
         return None

@@ -12,22 +12,13 @@ from cosim.experiments.cases import Case
 from cosim.experiments.definition import HELD_OUT, Definition, Sizes
 from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Training
-from cosim.experiments.store import EVALUATION, GREEDY, RunKey
+from cosim.experiments.store import EVALUATION, GREEDY, Online, RunKey
 from cosim.plant import FmuPlant
 from cosim.plugins import OURS
 from cosim.validation import suggestion
 
 BLOCK = 20_000
 """Samples of an evaluation unit, about: a few seconds of work."""
-
-
-@dataclass(frozen=True)
-class Online:
-    """Trainings that a controller runs beside: `seeds`, the longest one's `steps`, the `block`."""
-
-    seeds: tuple[int, ...]
-    steps: int
-    block: int
 
 
 @dataclass(frozen=True)

@@ -93,10 +93,10 @@ class Runner:
         if run.training is not None:
             controller = Learnt(run.training, progress.parameters)
         units: dict[str, Unit] = {}
+        store = self.stores[name]
         place, scenario = self._place, self._plan.definition.scenarios[run.key.scenario]
         for file, (seeds, steps) in run.noise.items():
-            known = self.stores[name].indicators(file, steps)
-            missing = [seed for seed in seeds if seed not in known]
+            missing = store.missing(file, seeds, steps)
             self._done[name] += (len(seeds) - len(missing)) * steps
             size = max(1, BLOCK // steps)
             for first in range(0, len(missing), size):
@@ -105,20 +105,19 @@ class Runner:
                     place, name, scenario, controller, steps, block
                 )
         for trace in run.traces:
-            if self.stores[name].trajectory(trace) is not None:
+            if store.trajectory(trace) is not None:
                 self._done[name] += trace.steps
                 continue
             units[f"{name}: {trace.name}"] = Trace(
                 place, name, scenario, controller, trace.steps, trace.seed
             )
         if (online := run.online) is not None:
-            done = self.stores[name].online(online.steps, online.block)
-            self._done[name] += online.steps * len(done)
-            for seed in online.seeds:
-                if seed not in done:
-                    units[f"{name}: online {seed}"] = Accompany(
-                        place, name, scenario, controller, online.steps, seed, online.block
-                    )
+            beside = store.missing_online(online)
+            self._done[name] += online.steps * (len(online.seeds) - len(beside))
+            for seed in beside:
+                units[f"{name}: online {seed}"] = Accompany(
+                    place, name, scenario, controller, online.steps, seed, online.block
+                )
         if not units:
             self._finished.add(name)
         return units
@@ -147,7 +146,7 @@ class Runner:
             return None
         if isinstance(outcome, Accompanied):
             assert run.online is not None
-            store.accompany(run.online.steps, run.online.block, outcome.seed, outcome.costs)
+            store.accompany(run.online, outcome.seed, outcome.costs)
             self._done[name] += run.online.steps
             self._tell(self._finish(name, run))
             return None
@@ -162,22 +161,18 @@ class Runner:
 
     def _finish(self, name: str, run: Run) -> str:
         """A line for a run whose last evaluation just came, else nothing."""
-        store, costs = self.stores[name], []
+        store = self.stores[name]
         if any(store.trajectory(trace) is None for trace in run.traces):
             return ""
-        if run.online is not None:
-            beside = store.online(run.online.steps, run.online.block)
-            if any(seed not in beside for seed in run.online.seeds):
-                return ""
-        for file, (seeds, steps) in run.noise.items():
-            found = store.indicators(file, steps)
-            if any(seed not in found for seed in seeds):
-                return ""
-            if file == EVALUATION:
-                costs = [found[seed]["J"] for seed in seeds]
+        if store.missing_online(run.online):
+            return ""
+        if any(store.missing(file, seeds, steps) for file, (seeds, steps) in run.noise.items()):
+            return ""
+        seeds, steps = run.noise[EVALUATION]
+        found = store.indicators(EVALUATION, steps)
         self._finished.add(name)
         status = store.progress().status.partition(":")[0]
-        cost = sum(costs) / len(costs)
+        cost = sum(found[seed]["J"] for seed in seeds) / len(seeds)
         return f"{name}: J {cost:.6g}{f', {status}' if status else ''}"
 
     def _tell(self, line: str) -> None:

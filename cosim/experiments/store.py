@@ -60,6 +60,15 @@ class RunKey:
         return f"{self.case} on {self.scenario}{seed}"
 
 
+@dataclass(frozen=True)
+class Online:
+    """Trainings that a controller runs beside: `seeds`, the longest one's `steps`, the `block`."""
+
+    seeds: tuple[int, ...]
+    steps: int
+    block: int
+
+
 def safe(name: str) -> str:
     """A folder's name on any system."""
     return re.sub(r"[^\w.+=()\[\]-]", "_", name)
@@ -76,14 +85,12 @@ class RunStore:
         self._facts = json.loads(json.dumps(facts))
         self._known: dict[tuple[str, int], Indicators] = {}
         (self.folder / FAILURE).unlink(missing_ok=True)
-        if not self._belongs():
+        self._about = self._document()
+        if self._about.get("facts") != self._facts:
             shutil.rmtree(self.folder, ignore_errors=True)
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._write(RUN, _json({"facts": self._facts, "status": ""}))
-
-    def _belongs(self) -> bool:
-        found = self._document().get("facts")
-        return found is not None and bool(found == self._facts)
+            self._about = {"facts": self._facts}
+            self._note(status="")
 
     def _document(self) -> dict[str, Any]:
         path = self.folder / RUN
@@ -96,7 +103,7 @@ class RunStore:
 
     def progress(self) -> Progress:
         """Where the run's training stands."""
-        document = self._document()
+        document = self._about
         if status := document.get("status", ""):
             return Progress(
                 int(document["samples"]),
@@ -122,31 +129,35 @@ class RunStore:
             self._write(PARAMETERS, progress.parameters)
         else:
             self._write(CHECKPOINT, progress.checkpoint)
-        document = {
-            "facts": self._facts,
-            "status": progress.status,
-            "samples": progress.samples,
-            "plant_samples": progress.plant_samples,
-            "timing": {"wall_seconds": progress.wall_seconds, "functions": self.functions},
-        }
-        self._write(RUN, _json(document))
-        self.used(progress.functions)
+        self._note(
+            status=progress.status,
+            samples=progress.samples,
+            plant_samples=progress.plant_samples,
+            timing={
+                "wall_seconds": progress.wall_seconds,
+                "functions": self._with(progress.functions),
+            },
+        )
         if progress.ended:
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
     @property
     def functions(self) -> list[str]:
         """How the functions of the run's units were computed: `compiled`, `interpreted`, both."""
-        return list(self._document().get("timing", {}).get("functions", []))
+        return list(self._about.get("timing", {}).get("functions", []))
 
     def used(self, functions: str | None) -> None:
         """Note how a unit's functions were computed, None where that is not known."""
-        known = self.functions
-        if functions is None or functions in known:
-            return
-        document = self._document()
-        timing = document.get("timing", {}) | {"functions": sorted([*known, functions])}
-        self._write(RUN, _json(document | {"timing": timing}))
+        if functions is not None and functions not in self.functions:
+            timing = self._about.get("timing", {}) | {"functions": self._with(functions)}
+            self._note(timing=timing)
+
+    def _with(self, functions: str | None) -> list[str]:
+        return sorted({*self.functions, *([] if functions is None else [functions])})
+
+    def _note(self, **changes: Any) -> None:
+        self._about = self._about | changes
+        self._write(RUN, json.dumps(self._about, indent=1, sort_keys=True) + "\n")
 
     def indicators(self, file: str, steps: int) -> Indicators:
         """Indicators by noise seed that a file holds of runs of `steps` samples, read once."""
@@ -167,6 +178,11 @@ class RunStore:
         except (StudyError, KeyError, ValueError):
             raise StudyError(f"'{path}' is damaged; delete it to evaluate again") from None
 
+    def missing(self, file: str, seeds: Sequence[int], steps: int) -> list[int]:
+        """Noise seeds without indicators in a file."""
+        known = self.indicators(file, steps)
+        return [seed for seed in seeds if seed not in known]
+
     def evaluate(self, file: str, steps: int, fresh: Indicators) -> None:
         """Add indicators to a file."""
         known = self.indicators(file, steps)
@@ -177,25 +193,32 @@ class RunStore:
         )
         write_atomically(self.folder / file, csv_pieces(("seed", "steps", *INDICATORS), rows))
 
-    def online(self, steps: int, block: int) -> dict[int, list[float]]:
-        """Mean costs of blocks by noise seed, of runs of `steps` samples."""
+    def online(self, online: Online) -> dict[int, list[float]]:
+        """Mean costs of blocks by training seed."""
         path = self.folder / ONLINE
         found: dict[int, list[float]] = {}
         if not path.is_file():
             return found
         try:
             for row in read_records(path, StudyError):
-                if (int(row["steps"]), int(row["block"])) == (steps, block):
+                if (int(row["steps"]), int(row["block"])) == (online.steps, online.block):
                     found.setdefault(int(row["seed"]), []).append(float(row["J"]))
         except (StudyError, KeyError, ValueError):
             raise StudyError(f"'{path}' is damaged; delete it to run again") from None
         return found
 
-    def accompany(self, steps: int, block: int, seed: int, costs: Sequence[float]) -> None:
+    def missing_online(self, online: Online | None) -> list[int]:
+        """Seeds of trainings that the controller has not run beside yet."""
+        if online is None:
+            return []
+        known = self.online(online)
+        return [seed for seed in online.seeds if seed not in known]
+
+    def accompany(self, online: Online, seed: int, costs: Sequence[float]) -> None:
         """Add the mean costs of a run's blocks."""
-        known = self.online(steps, block) | {seed: list(costs)}
+        known = self.online(online) | {seed: list(costs)}
         rows = (
-            [str(one), str(steps), str(block), cell(cost)]
+            [str(one), str(online.steps), str(online.block), cell(cost)]
             for one, costs in sorted(known.items())
             for cost in costs
         )
@@ -227,7 +250,3 @@ class RunStore:
 
     def _write(self, name: str, content: str | bytes) -> None:
         write_atomically(self.folder / name, content)
-
-
-def _json(document: Mapping[str, Any]) -> str:
-    return json.dumps(document, indent=1, sort_keys=True) + "\n"

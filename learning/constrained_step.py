@@ -110,11 +110,8 @@ class ConstrainedStep:
 def least_eigenvalue(configuration: Configuration, start: Parameters) -> float:
     """ε of B ⪰ εI for a run that begins at `start`."""
     own = certificate(start.blocks, start.theta).smallest
-    return (
-        min(configuration.smallest_eigenvalue, own / 2)
-        if own > 0
-        else (configuration.smallest_eigenvalue)
-    )
+    chosen = configuration.smallest_eigenvalue
+    return min(chosen, own / 2) if own > 0 else chosen
 
 
 def rescaled(blocks: ThetaBlocks, scale: Vector) -> ThetaBlocks:

@@ -4,48 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import QpError
 from controllers.rti.solution import LinearisationPoint
-from cosim.protocols import Step, recover
-from cosim.scenario import Scenario
+from cosim.protocols import recover
 from learning.exploration import Strategy
-from learning.protocols import Algorithm, LearnableController, LearnableSolution, Transition
+from learning.protocols import (
+    Algorithm,
+    ContinuablePlant,
+    LearnableController,
+    LearnableSolution,
+    Transition,
+)
 
 Vector = NDArray[np.float64]
 CHECKED_EVERY = 10
 """The flags of a solution cost as much as a feedback; of this many samples one pays for them."""
 COUNTS = ("number", "failures", "explored", "saturated", "weakly_active", "licq_failed")
-
-
-class ContinuablePlant(Protocol):
-    """A plant whose state goes through a checkpoint; `FmuPlant` is one."""
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario that the plant realises."""
-
-    def reset(self, seed: int) -> Vector:
-        """Start an episode."""
-
-    def step(self, a: Vector) -> Step:
-        """Hold an action for one sample."""
-
-    def snapshot(self) -> Any:
-        """The plant as it is, its noise to come included."""
-
-    def restore(self, snapshot: Any) -> Any:
-        """Put a snapshot back."""
-
-    def serialise(self, snapshot: Any) -> bytes:
-        """A snapshot as bytes."""
-
-    def deserialise(self, content: bytes) -> Any:
-        """The snapshot of these bytes."""
 
 
 class Interaction:

@@ -16,7 +16,7 @@ from learning.errors import DivergenceError
 from learning.fit import Fit
 from learning.kalman import OUTLIER
 from learning.prediction_errors import OneStepModel, PredictionErrors
-from learning.prior import prior_deviation
+from learning.prior import measured_prior
 from learning.protocols import LearnableController, Transition, Update
 from learning.replay import ReplayBuffer, Replayed
 
@@ -112,8 +112,7 @@ class IteratedKalman:
             information = self._information + gradient.T @ gradient / self._variance
             slope = gradient.T @ innovation / self._variance
             slope -= self._information @ (self._present - self._mean)
-            minimiser = cho_solve(cho_factor(information), slope)
-            fit = Fit(slope, minimiser, _constant(information))
+            fit = _newton(information, slope)
             size = float(np.sqrt(np.mean(td_error**2)))
             update = self._step.take(self._average_cost.take(fit), size)
         if update is None:
@@ -143,20 +142,17 @@ class IteratedKalman:
         """Take the noise, the widths and c_f from the `count` samples of the first batch."""
         batch = {name: values[:count] for name, values in self._batch.items()}
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
-        start = self._controller.parameters
-        if self._configuration.measure_offset:
-            start = start.replace({"c_f": batch["prediction_errors"].mean(axis=0)})
+        start, scale = measured_prior(
+            self._controller.parameters,
+            batch["states"],
+            batch["prediction_errors"],
+            self._configuration.deviation(self._scenario),
+            self._variance**0.5,
+            self._width,
+            measure_offset=self._configuration.measure_offset,
+        )
         self._controller.theta = start.theta
         self._anchor = start.theta.copy()
-        scale = prior_deviation(
-            start,
-            batch["states"].std(axis=0),
-            batch["prediction_errors"].std(axis=0),
-            self._configuration.deviation(self._scenario),
-            max(abs(float(start["c_lambda"])), self._variance**0.5),
-            self._width,
-            offset=self._configuration.measure_offset,
-        )
         self._adopt(scale)
 
     def _adopt(self, scale: Vector) -> None:
@@ -195,5 +191,6 @@ class IteratedKalman:
         self._buffer.restore(buffer)
 
 
-def _constant(matrix: Matrix) -> Any:
-    return lambda: matrix
+def _newton(information: Matrix, slope: Vector) -> Fit:
+    """Step Λ⁻¹b in the metric Λ."""
+    return Fit(slope, cho_solve(cho_factor(information), slope), lambda: information)

@@ -16,7 +16,7 @@ from learning.errors import DivergenceError
 from learning.exploration import Strategy
 from learning.kalman import KalmanRegression
 from learning.prediction_errors import OneStepModel, PredictionErrors
-from learning.prior import prior_deviation
+from learning.prior import measured_prior
 from learning.protocols import LearnableController, Transition, Update
 from learning.q_configuration import QConfiguration
 
@@ -113,18 +113,14 @@ class KalmanQLearning:
         variance = float(np.mean(first["td_errors"] ** 2))
         if not np.isfinite(variance):
             raise DivergenceError("TD errors are not finite")
-        start = self._controller.parameters
-        if settings.measure_offset:
-            start = start.replace({"c_f": first["prediction_errors"].mean(axis=0)})
-        level = max(abs(float(start["c_lambda"])), variance**0.5)
-        scale = prior_deviation(
-            start,
-            first["states"].std(axis=0),
-            first["prediction_errors"].std(axis=0),
+        start, scale = measured_prior(
+            self._controller.parameters,
+            first["states"],
+            first["prediction_errors"],
             settings.deviation(self._scenario),
-            level,
+            variance**0.5,
             self._width,
-            offset=settings.measure_offset,
+            measure_offset=settings.measure_offset,
         )
         self._adopt(scale)
         self._regression = self._filter(max(variance, np.finfo(np.float64).tiny))

@@ -7,8 +7,8 @@ import numpy as np
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from cosim.simulation import spawn_seeds
-from learning.interaction import ContinuablePlant, Interaction
-from learning.protocols import Algorithm, Update
+from learning.interaction import Interaction
+from learning.protocols import Algorithm, ContinuablePlant, Update
 from learning.starting_point import build_controller, build_strategy, starting_parameters
 from learning.training_run import ALGORITHM, TrainingRun
 

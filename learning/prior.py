@@ -71,6 +71,36 @@ def prior_deviation(
     return np.maximum(deviation, floor)
 
 
+def measured_prior(
+    start: Parameters,
+    states: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    action_deviation: Vector,
+    noise: float,
+    width: float,
+    *,
+    measure_offset: bool,
+) -> tuple[Parameters, Vector]:
+    """Mean and deviation (n_θ,) of the prior by the first samples' states and errors e, (K, n).
+
+    The mean is the start, with `measure_offset` c_f at the mean of e; else c_f stays as it is.
+    `noise` is the standard deviation of the TD errors, which c_lambda's level is not below.
+    """
+    if measure_offset:
+        start = start.replace({"c_f": errors.mean(axis=0)})
+    level = max(abs(float(start["c_lambda"])), noise)
+    deviation = prior_deviation(
+        start,
+        states.std(axis=0),
+        errors.std(axis=0),
+        action_deviation,
+        level,
+        width,
+        offset=measure_offset,
+    )
+    return start, deviation
+
+
 def _root_diagonal(matrix: NDArray[np.float64]) -> Vector:
     root: Vector = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     return root

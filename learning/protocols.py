@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from controllers.rti.solution import LinearisationPoint
-from cosim.protocols import Controller, Solution
+from cosim.protocols import Controller, Solution, Step
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
 from learning.exploration import Strategy
@@ -56,6 +56,32 @@ class LearnableController(Controller, Protocol):
 
     def feedback(self, s: Vector, a: Vector | None = None) -> LearnableSolution:
         """Solve for V and π, or with the first action fixed for Q."""
+
+
+class ContinuablePlant(Protocol):
+    """A plant whose state goes through a checkpoint; `FmuPlant` is one."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario that the plant realises."""
+
+    def reset(self, seed: int) -> Vector:
+        """Start an episode."""
+
+    def step(self, a: Vector) -> Step:
+        """Hold an action for one sample."""
+
+    def snapshot(self) -> Any:
+        """The plant as it is, its noise to come included."""
+
+    def restore(self, snapshot: Any) -> Any:
+        """Put a snapshot back."""
+
+    def serialise(self, snapshot: Any) -> bytes:
+        """A snapshot as bytes."""
+
+    def deserialise(self, content: bytes) -> Any:
+        """The snapshot of these bytes."""
 
 
 class Transition(NamedTuple):

@@ -96,8 +96,8 @@ class TrainingLoop:
             state.load(self._out / CHECKPOINT)
         if self._recorder is not None:
             self._recorder.start(self._run, learner.start)
-            for row in state.rows:
-                self._record(row)
+        for row in state.rows:
+            self._record(row)
         try:
             status = self._loop(progress)
         finally:
@@ -171,8 +171,7 @@ class TrainingLoop:
 
     def _append(self, row: LogRow) -> None:
         self._state.rows.append(row)
-        if self._recorder is not None:
-            self._record(row)
+        self._record(row)
 
     def _row(self, number: int, *, judged: bool) -> LogRow:
         """A line of the log: what happened since the last one, with an evaluation if `judged`."""
@@ -221,8 +220,9 @@ class TrainingLoop:
         return f"diverged: greedy J = {shown(greedy)} exceeds {shown(limit)} {where}"
 
     def _record(self, row: LogRow) -> None:
-        assert self._recorder is not None
-        self._recorder.record(row, row.parameters, self._judge.controller(row.parameters.theta))
+        if self._recorder is not None:
+            controller = self._judge.controller(row.parameters.theta)
+            self._recorder.record(row, row.parameters, controller)
 
     def _checkpoint(self) -> None:
         """Write the state to disk and start the solver afresh, as a resumed run will."""

@@ -17,7 +17,8 @@ from controllers import (
     compilation,
 )
 from controllers.buffered import BufferedFunction
-from controllers.compilation import Compilation, description, find, find_compiler
+from controllers.compilation import Compilation, description
+from controllers.shared_library import find, find_compiler
 from cosim.scenario import Scenario
 from cosim.scenario.loading import presets
 from rti_storage.cache import TAG

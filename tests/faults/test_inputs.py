@@ -233,6 +233,8 @@ def test_a_bad_number_is_refused_by_every_option(monkeypatch, capfd, tmp_path):
     "line",
     [
         "compare trajectory.csv trajectory.csv --relative nan",
+        "compare trajectory.csv trajectory.csv --relative inf",
+        "compare trajectory.csv trajectory.csv --tolerance X2=inf",
         "compare trajectory.csv trajectory.csv --tolerance X2=nan",
         "compare trajectory.csv trajectory.csv --tolerance X2=-1",
         "compare trajectory.csv trajectory.csv --tolerance X3=1",
@@ -262,6 +264,7 @@ WRONG = [
     "evaluate --controllers ,",
     "evaluate --controllers naive,naive --steps 3",
     "evaluate --scheduler nonsense --steps 3 --seeds 1",
+    "evaluate --first-seed 18446744073709551610 --seeds 10 --steps 3",
     "train --algorithm nothing",
     "train --algorithm a:b",
     "train --algorithm q-learning --resume",

@@ -1,7 +1,5 @@
 import json
-import os
 import shutil
-import subprocess
 import sys
 
 import numpy as np
@@ -22,6 +20,7 @@ from controllers.shared_library import find, find_compiler
 from cosim.scenario import Scenario
 from cosim.scenario.loading import presets
 from rti_storage.cache import TAG
+from tests.helpers.command import run_cosim
 from tests.helpers.sampling import evaporator_problem
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -226,12 +225,7 @@ def test_training_gives_the_same_bytes_compiled_and_interpreted(tmp_path, algori
         out = tmp_path / mode
         command = ["train", "--algorithm", algorithm, "--samples", "2500", "--out", str(out)]
         command += ["--evaluation-seeds", "1", "--evaluation-steps", "100"]
-        subprocess.run(
-            [sys.executable, "-m", "cosim", *command],
-            env=os.environ | {"COSIM_COMPILE": mode},
-            check=True,
-            capture_output=True,
-        )
+        run_cosim(*command, env={"COSIM_COMPILE": mode}, check=True)
         summary = json.loads((out / "summary.json").read_text())
         used = summary["timing"]["functions"]
         assert used == {"never": "interpreted", "now": "compiled"}[mode]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.command import run_cosim
 from tests.helpers.tank import build_tank, write_scenario
 
 
@@ -28,6 +29,7 @@ def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_pat
         "learning.csv",
         "learning.png",
         "parameters.toml",
+        "scenario.toml",
         "summary.json",
     }
     for name in names - {"demo.rrd"}:
@@ -182,9 +184,7 @@ def test_help_is_there_for_every_command_and_starts_quickly():
     times = []
     for _ in range(3):
         begin = time_of_children()
-        result = subprocess.run(
-            [sys.executable, "-m", "cosim", "--help"], capture_output=True, text=True, check=True
-        )
+        result = run_cosim("--help", check=True)
         times.append(time_of_children() - begin)
     for command in ("demo", "simulate", "view", "benchmark"):
         assert command in result.stdout

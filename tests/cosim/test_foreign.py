@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ import pytest
 import fmus
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import CapabilityError, PlantError
+from tests.helpers.command import run_cosim
 from tests.helpers.loop import Hold
 from tests.helpers.tank import build_tank, edited, without_attribute, write_scenario
 
@@ -126,10 +125,8 @@ def test_after_a_fatal_error_every_call_is_refused(tanks, tmp_path):
 
 def test_a_chatty_fmu_does_not_spoil_json(tanks, tmp_path):
     scenario = write_scenario(tmp_path, tanks[True], fault=4)
-    command = [sys.executable, "-m", "cosim", "simulate", "--scenario", str(scenario)]
-    command += ["--controller", "tests.helpers.loop:hold", "--steps", "3", "--json"]
-    command += ["--out", str(tmp_path / "out")]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    words = ["simulate", "--scenario", scenario, "--out", tmp_path / "out", "--json"]
+    result = run_cosim(*words, "--controller", "tests.helpers.loop:hold", "--steps", "3")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["samples"] == 3
     assert "a chatty FMU" in result.stderr

@@ -11,7 +11,7 @@ from cosim.errors import CapabilityError, PlantError, ScenarioError
 from cosim.plant.archive import unpack
 from cosim.plant.library import library_path
 from cosim.plant.suitability import refusals
-from tests.helpers.kinds import REALS, build_kind, scenario_for
+from tests.helpers.kinds import REALS, build_kind, scenario_for, write_fmi1
 
 CS = 'CoSimulation modelIdentifier="kinds" '
 VARIABLE_STEP = 'canHandleVariableCommunicationStepSize="true"'
@@ -241,21 +241,9 @@ def test_a_backslash_leads_nowhere_else(tmp_path, version, entry):
 
 
 def test_fmi1_is_named(tmp_path):
-    fmu = tmp_path / "one.fmu"
-    with zipfile.ZipFile(fmu, "w") as archive:
-        archive.writestr("modelDescription.xml", FMI1)
+    fmu = write_fmi1(tmp_path / "one.fmu")
     with pytest.raises(PlantError, match=r"is FMI 1\.0; 2\.0 and 3\.0 are supported"):
         FmuPlant(scenario_for(tmp_path, fmu))
-
-
-FMI1 = """<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="1.0" modelName="one" modelIdentifier="one" guid="{one}"
-  numberOfContinuousStates="0" numberOfEventIndicators="0">
-  <ModelVariables>
-    <ScalarVariable name="x" valueReference="0" causality="output"><Real/></ScalarVariable>
-  </ModelVariables>
-</fmiModelDescription>
-"""
 
 
 def test_a_plant_without_actions_is_no_scenario(tmp_path, version):

@@ -12,6 +12,7 @@ import fmus
 from cosim.plant import unpacking
 from cosim.plant.archive import unpack
 from rti_storage.cache import TAG, UNUSED_DAYS
+from tests.helpers.command import run_cosim
 
 DAY = 86400
 
@@ -152,11 +153,6 @@ def test_without_a_cache_the_folder_ends_with_the_process(tmp_path):
 def test_a_command_leaves_nothing_in_the_folder_for_temporary_files(tmp_path, words):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
-    subprocess.run(
-        [sys.executable, "-m", "cosim", *words.split()],
-        cwd=tmp_path,
-        env=os.environ | {"TMPDIR": str(temporary), "COSIM_CACHE": str(tmp_path / "cache")},
-        check=True,
-        capture_output=True,
-    )
+    own = {"TMPDIR": str(temporary), "COSIM_CACHE": str(tmp_path / "cache")}
+    run_cosim(*words.split(), folder=tmp_path, env=own, check=True)
     assert not list(temporary.rglob("*"))

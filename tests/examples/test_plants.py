@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import casadi as ca
@@ -14,6 +12,7 @@ from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from fmus.checks import Status, check
 from fmus.plant import build_plant
+from tests.helpers.command import run_cosim
 from tests.helpers.tank import edited, without_attribute
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -45,9 +44,8 @@ def example(request, tmp_path_factory):
         yield Example(request.param, folder)
 
 
-def cosim(folder, *words):
-    command = [sys.executable, "-m", "cosim", *words, "--json"]
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+def result_of(folder, *words):
+    result = run_cosim(*words, "--json", folder=folder)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 
@@ -135,7 +133,7 @@ def test_snapshots_are_carried_to_another_process(example):
 @pytest.mark.slow
 def test_it_runs_from_the_command_line(example):
     words = ["simulate", "--scenario", f"{example.name}.toml", "--steps", "200", "--out", "run"]
-    summary = cosim(example.folder, *words)
+    summary = result_of(example.folder, *words)
     assert summary["failures"] == 0
     assert summary["statuses"] == {"solved": 200}
 
@@ -151,7 +149,9 @@ def test_a_bound_is_active_so_that_the_naive_controller_pays(example):
 
 @pytest.mark.slow
 def test_tuning_finds_the_stored_reference_from_beside_the_scenario(example, tmp_path):
-    found = cosim(tmp_path, "tuning", "--scenario", str(example.folder / f"{example.name}.toml"))
+    found = result_of(
+        tmp_path, "tuning", "--scenario", str(example.folder / f"{example.name}.toml")
+    )
     steady = found["steady_state"]
     np.testing.assert_allclose(steady["states"], example.scenario.reference_state, rtol=1e-6)
     np.testing.assert_allclose(steady["actions"], example.scenario.reference_action, rtol=1e-6)
@@ -163,12 +163,10 @@ def test_a_plant_that_cannot_save_its_state_leaves_no_checkpoint_and_says_so(exa
     plain = edited(example.fmu, example.folder / "plain.fmu", drop)
     text = (example.folder / f"{example.name}.toml").read_text()
     (example.folder / "plain.toml").write_text(text.replace(example.fmu.name, plain.name))
-    command = [sys.executable, "-m", "cosim", "train", "-s", "plain.toml", "-a", "q-learning"]
-    command += ["--samples", "60", "--log-every", "60", "--evaluate-every", "60"]
-    command += ["--checkpoint-every", "60", "--out", "short"]
-    result = subprocess.run(
-        command, cwd=example.folder, capture_output=True, text=True, check=False
-    )
+    words = ["train", "-s", "plain.toml", "-a", "q-learning"]
+    words += ["--samples", "60", "--log-every", "60", "--evaluate-every", "60"]
+    words += ["--checkpoint-every", "60", "--out", "short"]
+    result = run_cosim(*words, folder=example.folder)
     assert "canGetAndSetFMUstate" in result.stderr
     assert "native code of" in result.stderr
     assert not (example.folder / "short" / "checkpoint.npz").exists()

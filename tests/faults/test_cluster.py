@@ -16,6 +16,7 @@ from cosim.errors import EvaluationError
 from cosim.evaluation import cluster, parallel
 from cosim.evaluation.parallel import run_all
 from cosim.evaluation.store import FILE
+from tests.helpers.command import run_cosim
 from tests.helpers.schedulers import ANSWERS, OURS, PACKAGES, ROOT, listener, processes
 from tests.helpers.workers import square
 
@@ -243,14 +244,7 @@ def test_a_plain_scheduler_asked_for_encryption_is_named(patient):
 def test_the_command_says_so_in_a_line_with_exit_code_2(tmp_path):
     with listener(ANSWERS["silent"]) as address:
         words = ["evaluate", "--seeds", "1", "-n", "3", "--scheduler", address, "-o", "out"]
-        done = subprocess.run(
-            [sys.executable, "-m", "cosim", *words],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=120,
-        )
+        done = run_cosim(*words, folder=tmp_path, timeout=120)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"error: no Dask scheduler answers at '{address}': no answer within")

@@ -20,11 +20,11 @@ from cosim.cli import locking
 from cosim.errors import RecordingError
 from cosim.recording.reader import read_recording
 from tests.faults.kill import JOBS, campaign
+from tests.helpers.command import run_cosim
 from tests.helpers.tank import build_tank, write_scenario
 from tests.helpers.training import make_run, train
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2
-COSIM = (sys.executable, "-m", "cosim")
 TRAIN = "train --algorithm q-learning --samples 600 --log-every 200 --evaluate-every 600"
 
 
@@ -40,14 +40,7 @@ def command_line(folder, *words, limit=None):
         if limit is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    return subprocess.run(
-        [*COSIM, *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=confine,
-    )
+    return run_cosim(*words, folder=folder, preexec_fn=confine)
 
 
 def refused(result):

@@ -1,7 +1,5 @@
 """What users bring along may fail in any way: one line that names it and the line at fault."""
 
-import os
-import subprocess
 import sys
 
 import pytest
@@ -12,6 +10,7 @@ from cosim.lookup import build_controller
 from cosim.plugins import load_plugin
 from learning.errors import AlgorithmLookupError
 from learning.registry import load_algorithm
+from tests.helpers.command import run_cosim
 
 PAPER = Scenario.load("paper")
 MODULES = {
@@ -99,14 +98,7 @@ def test_a_controller_that_fails_in_the_loop_leaves_a_report(tmp_path):
         "def make(scenario): return Broken()\n"
     )
     words = ["simulate", "-c", "broken:make", "-n", "10", "--out", "out"]
-    done = subprocess.run(
-        [sys.executable, "-m", "cosim", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"TMPDIR": str(tmp_path)},
-    )
+    done = run_cosim(*words, folder=tmp_path, env={"TMPDIR": str(tmp_path)})
     assert done.returncode == 70
     assert done.stderr.count("\n") == 1
     assert "ZeroDivisionError" in done.stderr

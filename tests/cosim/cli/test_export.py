@@ -17,6 +17,7 @@ from fmpy import fmi2
 from controllers.factories import naive, tuned
 from cosim import FmuPlant, Scenario, simulate
 from fmus.checks import Status, check
+from tests.helpers.command import run_cosim
 
 pytestmark = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
@@ -32,10 +33,7 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("export")
     fmu, ssp = folder / "controller.fmu", folder / "loop.ssp"
     command = ["export", "tuned", "--out", fmu, "--ssp", ssp, "--seed", "5", "--local", "--json"]
-    result = subprocess.run(
-        [sys.executable, "-m", "cosim", *map(str, command)],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+    result = run_cosim(*command, check=True)
     return fmu, ssp, json.loads(result.stdout)
 
 

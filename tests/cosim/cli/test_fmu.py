@@ -3,12 +3,11 @@
 import json
 import os
 import shutil
-import zipfile
 
 import pytest
 
 import fmus
-from tests.helpers.kinds import build_kind
+from tests.helpers.kinds import build_kind, write_fmi1
 
 needs_compiler = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
@@ -124,24 +123,12 @@ def test_info_says_what_bars_an_fmu_as_a_plant(cosim, tmp_path):
 
 
 def test_info_knows_fmi1_by_name(cosim, tmp_path):
-    path = tmp_path / "one.fmu"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", FMI1)
+    path = write_fmi1(tmp_path / "one.fmu")
     code, out, _ = cosim("fmu", "info", path, "--json")
     document = json.loads(out)
     assert code == 0
     assert (document["fmi_version"], document["interfaces"]) == ("1.0", ["model exchange"])
     assert "is FMI 1.0; 2.0 and 3.0 are supported" in document["refusals"][0]
-
-
-FMI1 = """<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="1.0" modelName="one" modelIdentifier="one" guid="{one}"
-  numberOfContinuousStates="0" numberOfEventIndicators="0">
-  <ModelVariables>
-    <ScalarVariable name="x" valueReference="0" causality="output"><Real/></ScalarVariable>
-  </ModelVariables>
-</fmiModelDescription>
-"""
 
 
 def test_info_lists_platforms_and_flags(cosim):

@@ -11,6 +11,7 @@ from cosim.cli import locking
 from cosim.cli.output import open_folder, output
 from cosim.errors import CosimError
 from cosim.recording.stream import Stream
+from tests.helpers.command import run_cosim
 
 HOLD = (
     "import sys, time\n"
@@ -21,15 +22,6 @@ HOLD = (
 TRAIN = ["train", "-a", "q-learning", "--scenario", "paper", "--json"]
 SHORT = ["--log-every", "100", "--evaluate-every", "300", "--evaluation-steps", "10"]
 EVERY = ["--evaluation-seeds", "1", "--checkpoint-every", "300"]
-
-
-def cosim(*words):
-    return subprocess.run(
-        [sys.executable, "-m", "cosim", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 @pytest.fixture
@@ -58,7 +50,7 @@ SLOW = pytest.mark.slow
     ],
 )
 def test_a_folder_that_is_being_written_is_refused(holder, tmp_path, command):
-    done = cosim(*command, "--out", tmp_path / "out")
+    done = run_cosim(*command, "--out", tmp_path / "out")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert re.search(
@@ -70,7 +62,7 @@ def test_a_folder_that_is_being_written_is_refused(holder, tmp_path, command):
 def test_the_lock_of_a_killed_process_is_given_back(holder, tmp_path):
     holder.kill()
     holder.wait()
-    assert cosim("simulate", "-n", "10", "--out", tmp_path / "out").returncode == 0
+    assert run_cosim("simulate", "-n", "10", "--out", tmp_path / "out").returncode == 0
     left = {path.name for path in (tmp_path / "out").iterdir()}
     assert not left & {locking.LOCK, locking.HOLDER}
 
@@ -101,23 +93,23 @@ def test_a_damaged_note_of_the_holder_does_not_hide_that_there_is_one(holder, tm
 
 @SLOW
 def test_a_recording_of_another_run_does_not_stand_beside_the_signals(tmp_path):
-    assert cosim("simulate", "-n", "20", "--record", "--out", tmp_path).returncode == 0
+    assert run_cosim("simulate", "-n", "20", "--record", "--out", tmp_path).returncode == 0
     assert (tmp_path / "run.rrd").exists()
-    assert cosim("simulate", "-n", "20", "--seed", "1", "--out", tmp_path).returncode == 0
+    assert run_cosim("simulate", "-n", "20", "--seed", "1", "--out", tmp_path).returncode == 0
     assert not (tmp_path / "run.rrd").exists()
 
 
 @SLOW
 def test_a_training_is_neither_overwritten_nor_mixed_unless_asked(tmp_path):
     words = [*TRAIN, *SHORT, *EVERY, "--out", tmp_path, "--samples", "300"]
-    assert cosim(*words).returncode == 0
+    assert run_cosim(*words).returncode == 0
     kept = (tmp_path / "learning.csv").read_bytes()
-    refused = cosim(*words, "--seed", "1")
+    refused = run_cosim(*words, "--seed", "1")
     assert refused.returncode == 2
     assert "--resume" in refused.stderr
     assert "--overwrite" in refused.stderr
     assert (tmp_path / "learning.csv").read_bytes() == kept
-    again = cosim(*words, "--seed", "1", "--overwrite")
+    again = run_cosim(*words, "--seed", "1", "--overwrite")
     assert again.returncode == 0
     assert json.loads(again.stdout)["seed"] == 1
     assert (tmp_path / "learning.csv").read_bytes() != kept

@@ -1,0 +1,34 @@
+"""The command line in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+NOTHING: Mapping[str, str] = {}
+
+
+def run_cosim(
+    *words: object,
+    folder: Path | None = None,
+    env: Mapping[str, str] = NOTHING,
+    check: bool = False,
+    **options: Any,
+) -> subprocess.CompletedProcess[str]:
+    """Run `cosim` in a folder to its end, with these values added to the environment.
+
+    `options` are further ones of `subprocess.run`.
+    """
+    return subprocess.run(
+        [sys.executable, "-m", "cosim", *map(str, words)],
+        cwd=folder,
+        env=os.environ | env,
+        capture_output=True,
+        text=True,
+        check=check,
+        **options,
+    )

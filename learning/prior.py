@@ -32,8 +32,6 @@ def prior_deviation(
     action_deviation: Vector,
     level: float,
     width: float,
-    *,
-    offset: bool = True,
 ) -> Vector:
     """Standard deviation of each entry of θ about its start, (n_θ,).
 
@@ -42,9 +40,8 @@ def prior_deviation(
     κ = max_i B_ii σ_i², the dearest typical move, or a share of the gradient that is there. λ_θ,
     which the policy does not feel, is as wide as V^f_θ or as its own start. Bounds get
     2·width/0.3 deviations of e, or of a slow state's movement; c_f little, since the mean of e says
-    what it must be, and none at all without `offset`; slack weights `width` of themselves.
-    `state_deviation` and `error_deviation` (n,), `action_deviation` (m,) are σ of s, e and the
-    exploration, `level` the size of c_lambda.
+    what it must be; slack weights `width` of themselves. `state_deviation` and `error_deviation`
+    (n,), `action_deviation` (m,) are σ of s, e and the exploration, `level` the size of c_lambda.
     """
     move = np.concatenate([np.maximum(state_deviation, error_deviation), action_deviation])
     stage, terminal = _root_diagonal(start["B_l"]), _root_diagonal(start["B_Vf"])
@@ -59,7 +56,7 @@ def prior_deviation(
         "b_Vf": width * np.maximum(terminal * dearest, GRADIENT * np.abs(start["b_Vf"])),
         "B_l": width * _packed(stage),
         "b_l": width * np.maximum(stage * dearest, GRADIENT * np.abs(start["b_l"])),
-        "c_f": OFFSET * error_deviation if offset else np.zeros_like(error_deviation),
+        "c_f": OFFSET * error_deviation,
         "x_l": bound,
         "x_u": bound,
     }
@@ -83,7 +80,7 @@ def measured_prior(
 ) -> tuple[Parameters, Vector]:
     """Mean and deviation (n_θ,) of the prior by the first samples' states and errors e, (K, n).
 
-    The mean is the start, with `measure_offset` c_f at the mean of e; else c_f stays as it is.
+    The mean is the start, with `measure_offset` c_f at the mean of e.
     `noise` is the standard deviation of the TD errors, which c_lambda's level is not below.
     """
     if measure_offset:
@@ -96,7 +93,6 @@ def measured_prior(
         action_deviation,
         level,
         width,
-        offset=measure_offset,
     )
     return start, deviation
 

@@ -48,7 +48,7 @@ class QConfiguration(GlobalisedConfiguration):
     measure_offset: bool = Field(
         True,
         description="kalman: c_f becomes the mean of the first prediction errors; false: it "
-        "stays as it is, for a start that has learnt its offset",
+        "starts as it is, for a start that has learnt its offset",
     )
     innovation_clip: Positive = Field(
         3.0, description="kalman: innovations are cut at this many standard deviations"

@@ -137,5 +137,4 @@ def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenar
             updates = [learner.advance()[1] is not None for _ in range(120)]
         assert np.flatnonzero(updates).tolist() == [59, 79, 99, 119]
         offsets[measured] = learner.controller.parameters["c_f"]
-    assert np.abs(offsets[True]).min() > 0
-    assert np.abs(offsets[False]).max() < 1e-60, "the tuned start's offset is zero"
+    assert np.abs(offsets[False]).max() < 0.1 * np.abs(offsets[True]).max()

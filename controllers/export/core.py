@@ -20,6 +20,7 @@ from controllers.rti.hessian import Exact, make_hessian
 from controllers.rti.preparation import preparation
 
 SOURCES = Path(__file__).parent / "sources"
+QP_SOURCES = ("qp.h", "qp_enter.h", "qp_refine.h", "qp_residual.h", "qp_set.h")
 RULES = {"gauss-newton": "gauss_newton.h", "exact": "exact.h"}
 # A sample's arrays live on the stack, of which a thread has 1 MB on some platforms.
 STACK_LIMIT = 400_000
@@ -67,7 +68,7 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     called: dict[str, BufferedFunction] = {**functions}
     if hessian == "exact":
         (called["CURVATURE"],) = rule.functions
-    wanted = ("core.h", "rti.h", "qp.h", "costs.h", RULES[hessian])
+    wanted = ("core.h", "rti.h", *QP_SOURCES, "costs.h", RULES[hessian])
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
     sources["functions.h"] = _functions(list(called.values())).encode()
     sources["problem.h"] = _constants(problem, parameters, hessian, functions, called).encode()

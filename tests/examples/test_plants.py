@@ -1,6 +1,7 @@
 """The example plants: built, in agreement with the controller's model, run and learnt from."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from fmus.checks import Status, check
 from fmus.plant import build_plant
+from rti_storage.cache import CACHE_VARIABLE
 from tests.helpers.command import run_cosim
 from tests.helpers.tank import edited, without_attribute
 
@@ -155,6 +157,19 @@ def test_tuning_finds_the_stored_reference_from_beside_the_scenario(example, tmp
     steady = found["steady_state"]
     np.testing.assert_allclose(steady["states"], example.scenario.reference_state, rtol=1e-6)
     np.testing.assert_allclose(steady["actions"], example.scenario.reference_action, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_optimum_of_an_own_model_is_the_documented_one(example, tmp_path, monkeypatch):
+    """By the documented route, from beside the scenario; the tanks have too many states."""
+    if len(example.scenario.plant.states) > 2:
+        pytest.skip("a grid over four states is out of reach")
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    found = cosim(tmp_path, "optimum", "--scenario", str(example.folder / f"{example.name}.toml"))
+    page = (EXAMPLES.parent / "docs" / "how-to" / "fmu.md").read_text("utf-8")
+    stated = re.search(rf"`{example.name}`.*J\* = ([\d.]+) by `cosim optimum`", page)
+    assert stated is not None
+    assert found["J"] == pytest.approx(float(stated[1]), rel=5e-4)
 
 
 @pytest.mark.slow

@@ -165,7 +165,8 @@ def test_the_optimum_of_an_own_model_is_the_documented_one(example, tmp_path, mo
     if len(example.scenario.plant.states) > 2:
         pytest.skip("a grid over four states is out of reach")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    found = cosim(tmp_path, "optimum", "--scenario", str(example.folder / f"{example.name}.toml"))
+    scenario = str(example.folder / f"{example.name}.toml")
+    found = result_of(tmp_path, "optimum", "--scenario", scenario)
     page = (EXAMPLES.parent / "docs" / "how-to" / "fmu.md").read_text("utf-8")
     stated = re.search(rf"`{example.name}`.*J\* = ([\d.]+) by `cosim optimum`", page)
     assert stated is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,9 @@ from controllers.ocp import merit
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp
+from controllers.qp.problem import NOT_CONVEX
 from controllers.rti import RtiNmpc
+from controllers.rti.hessian import Exact
 from controllers.rti.solution import LinearisationPoint, RtiSolution
 
 Vector = NDArray[np.float64]
@@ -22,14 +25,27 @@ Vector = NDArray[np.float64]
 class _Known:
     """A backend that returns the solution it is given: to read out a QP already solved."""
 
-    solution: QpSolution
+    def __init__(self, solution: QpSolution) -> None:
+        self._solution = solution
 
     def load(self, qp: SoftQp) -> None:
         """Do nothing."""
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Return the known solution."""
-        return self.solution
+        return self._solution
+
+
+class _Measured(NamedTuple):
+    """What the merit function is made of at a point; `gradient` is that of the cost."""
+
+    cost: float
+    penalty: float
+    infeasibility: float
+    gradient: Vector
+
+    def merit(self, weight: float) -> float:
+        return self.cost + self.penalty + weight * self.infeasibility
 
 
 class ConvergedNmpc(RtiNmpc):
@@ -37,10 +53,10 @@ class ConvergedNmpc(RtiNmpc):
 
     Q, V and π are those of the nonlinear programme, and so are their sensitivities (paper.tex,
     Sensitivities of Fully Converged NMPC): at the solution the QP with the exact Hessian has the
-    KKT matrix of the programme, so its read-outs are the programme's. SQP iterates on convexified
-    QPs; an ℓ1 merit function chooses the step length. `tolerance` is on the largest change of
-    states, actions and, relative to 1 + ‖χ‖∞, costates; QpError is raised where `iterations` do
-    not reach it.
+    KKT matrix of the programme, so its read-outs are the programme's. SQP solves that QP, which
+    converges quadratically, and where it is not convex one whose Hessian is lifted; an ℓ1 merit
+    function chooses the step length. `tolerance` is on the largest change of states, actions and,
+    relative to 1 + ‖χ‖∞, costates; QpError is raised where `iterations` do not reach it.
     """
 
     name = "converged"
@@ -57,31 +73,61 @@ class ConvergedNmpc(RtiNmpc):
         """Build the functions; see the class."""
         self._tolerance, self._iterations = tolerance, iterations
         self._merit = merit(problem, parameters.blocks)
-        self._known = _Known()
-        self._programme = RtiNmpc(
-            problem, parameters, hessian="exact-unlifted", backend=lambda: self._known
-        )
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
     def _compilable(self) -> list[BufferedFunction]:
         return [*super()._compilable(), self._merit]
 
+    @property
+    def _lifts(self) -> bool:
+        assert isinstance(self._hessian, Exact)
+        return self._hessian.lifts
+
+    def _linearise(self) -> None:
+        """Prepare the QP of the exact Hessian; the lifted one where a backend refuses that."""
+        try:
+            self._linearise_as(lifts=False)
+        except QpError as error:
+            if error.status != NOT_CONVEX:
+                raise
+            self._linearise_as(lifts=True)
+
+    def _linearise_as(self, *, lifts: bool) -> None:
+        assert isinstance(self._hessian, Exact)
+        self._hessian.lifts = lifts
+        super()._linearise()
+
+    def _solve_qp(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
+        """Solve the prepared QP; the lifted one in its place where it is not convex."""
+        try:
+            return super()._solve(s, a)
+        except QpError as error:
+            if error.status != NOT_CONVEX or self._lifts:
+                raise
+        self._linearise_as(lifts=True)
+        return super()._solve(s, a)
+
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
-        solution = super()._solve(s, a)
+        solution = self._solve_qp(s, a)
         x, u, _ = self.linearisation_point
         # The programme's x_0 is s; the guess for the other states and controls is the prepared one.
         at = np.vstack([np.asarray(s, dtype=np.float64), x[1:], solution.predicted_states[-1:]])
         controls = u if a is None else np.vstack([a, u[1:]])
-        weight = 0.0
-        for count in range(self._iterations):
+        weight, measured = 0.0, None
+        for _ in range(self._iterations):
             weight = max(weight, 1.5 * float(np.abs(solution.costates).max()))
-            length = self._step_length(at, controls, solution, weight) if count else 1.0
-            at = at + length * (solution.predicted_states - at)
-            controls = controls + length * (solution.predicted_actions - controls)
+            states, actions = solution.predicted_states, solution.predicted_actions
+            if measured is None:
+                at, controls = states, actions
+                measured = self._measure(at, controls)
+            else:
+                at, controls, measured = self._search(
+                    at, controls, states - at, actions - controls, weight, measured
+                )
             before = self._costates.copy()
             self._x[:], self._u[:], self._costates[:] = at[:-1], controls, solution.costates[1:]
             self._linearise()
-            solution = super()._solve(s, a)
+            solution = self._solve_qp(s, a)
             change = max(
                 float(np.abs(solution.predicted_states - at).max()),
                 float(np.abs(solution.predicted_actions - controls).max()),
@@ -89,7 +135,7 @@ class ConvergedNmpc(RtiNmpc):
                 / (1 + float(np.abs(before).max())),
             )
             if change < self._tolerance:
-                return self._read_out(s, a, solution)
+                return self._read_out(s, a, solution) if self._lifts else solution
         raise QpError(
             f"SQP did not converge in {self._iterations} iterations at s = {at[0]}; "
             f"last change {change:.1e}",
@@ -97,43 +143,48 @@ class ConvergedNmpc(RtiNmpc):
             qp=solution.qp.copy(),
         )
 
-    def _step_length(
-        self, at: Vector, controls: Vector, solution: RtiSolution, weight: float
-    ) -> float:
-        """Largest of 1, ½, ¼, … that gives the ℓ1 merit function a sufficient decrease."""
-        step, turn = solution.predicted_states - at, solution.predicted_actions - controls
-        cost, penalty, infeasibility, gradient = self._measure(at, controls)
+    def _search(
+        self,
+        at: Vector,
+        controls: Vector,
+        step: Vector,
+        turn: Vector,
+        weight: float,
+        here: _Measured,
+    ) -> tuple[Vector, Vector, _Measured]:
+        """The point by the largest of 1, ½, ¼, … that gives the merit a sufficient decrease."""
         move = np.concatenate([step[1:].reshape(-1), turn.reshape(-1)])
-        _, end, _, _ = self._measure(at + step, controls + turn)
-        slope = float(gradient @ move) + end - penalty - weight * infeasibility
-        start = cost + penalty + weight * infeasibility
-        length = 1.0
+        trial = end = self._measure(at + step, controls + turn)
+        slope = float(here.gradient @ move) + end.penalty - here.penalty
+        slope -= weight * here.infeasibility
+        start, length = here.merit(weight), 1.0
+        # Rounding of values near 1e6 must not stop the last, tiny steps.
+        rounding = 1e-12 * abs(start)
         while length > 1e-6:
-            trial = self._measure(at + length * step, controls + length * turn)
-            merit_value = trial[0] + trial[1] + weight * trial[2]
-            # Rounding of values near 1e6 must not stop the last, tiny steps.
-            if merit_value <= start + 1e-4 * length * min(slope, 0.0) + 1e-12 * abs(start):
-                return length
+            if trial.merit(weight) <= start + 1e-4 * length * min(slope, 0.0) + rounding:
+                break
             length /= 2
-        return length
+            trial = self._measure(at + length * step, controls + length * turn)
+        return at + length * step, controls + length * turn, trial
 
-    def _measure(self, at: Vector, controls: Vector) -> tuple[float, float, float, Vector]:
+    def _measure(self, at: Vector, controls: Vector) -> _Measured:
         function = self._merit
         function.inputs["s"][:], function.inputs["x"][:] = at[0], at[1:].reshape(-1)
         function.inputs["u"][:] = controls.reshape(-1)
         function.inputs["theta"][:] = self.theta
         function()
-        cost, penalty, infeasibility = function.stack[-3:].tolist()
-        return cost, penalty, infeasibility, function.part("gradient").copy()
+        return _Measured(*function.stack[-3:].tolist(), function.part("gradient").copy())
 
     def _read_out(self, s: ArrayLike, a: ArrayLike | None, solution: RtiSolution) -> RtiSolution:
-        """Read the solution out of the QP with the programme's own, unlifted Hessian."""
-        self._known.solution = solution.multipliers
-        if self._programme.parameters is not self.parameters:
-            self._programme.parameters = self.parameters
-        self._programme.prepare_at(
-            LinearisationPoint(
-                solution.predicted_states[:-1], solution.predicted_actions, solution.costates[1:]
-            )
+        """Read a lifted QP's solution out of the programme's own QP, which need not be convex."""
+        point = LinearisationPoint(
+            solution.predicted_states[:-1], solution.predicted_actions, solution.costates[1:]
         )
-        return self._programme.feedback(s, a)
+        backend, self._backend = self._backend, _Known(solution.multipliers)
+        try:
+            self._x[:], self._u[:], self._costates[:] = point
+            self._linearise_as(lifts=False)
+            return super()._solve(s, a)
+        finally:
+            self._backend = backend
+            self._linearise_as(lifts=True)

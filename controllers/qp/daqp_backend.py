@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import QpError
+from controllers.qp import problem
 from controllers.qp.problem import QpSolution, SoftQp
 
 Matrix = NDArray[np.float64]
@@ -20,7 +21,7 @@ MEANING = {
     -2: "cycling",
     -3: "unbounded",
     -4: "iteration limit",
-    NOT_CONVEX: "not convex",
+    NOT_CONVEX: problem.NOT_CONVEX,
     -6: "overdetermined start",
     -7: "time limit",
 }

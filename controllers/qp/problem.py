@@ -13,6 +13,8 @@ from controllers.errors import QpError
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+NOT_CONVEX = "not convex"
+"""Status of the QpError of a QP whose Hessian is not positive definite."""
 
 
 @dataclass
@@ -76,7 +78,7 @@ class SoftQp:
             np.linalg.cholesky(self.H)
         except np.linalg.LinAlgError as error:
             raise QpError(
-                "the QP is not strictly convex", status="not convex", qp=self.copy()
+                "the QP is not strictly convex", status=NOT_CONVEX, qp=self.copy()
             ) from error
 
     def slack(self, v: Vector) -> Vector:

@@ -34,6 +34,11 @@ class Spectrum:
         distance = np.abs(self.values - self.floor)
         return bool((distance < tolerance * np.maximum(1.0, np.abs(self.values))).any())
 
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """Which eigenvalues were not lifted, (N, s)."""
+        return self.values > self.floor
+
     def contract(self, seed: Vector) -> Vector:
         """Adjoint of the derivative of L = P(·): M with ⟨seed, dL⟩ = ⟨M, dX⟩, shapes (N, s, s).
 
@@ -43,17 +48,35 @@ class Spectrum:
         lifted = np.maximum(self.values, self.floor)
         gap = self.values[:, :, None] - self.values[:, None, :]
         rise = lifted[:, :, None] - lifted[:, None, :]
-        kept = (self.values > self.floor).astype(float)
+        kept = self.kept.astype(float)
         same = np.abs(gap) < 1e-12 * np.maximum(1.0, np.abs(self.values).max())
         divided = np.where(same, kept[:, :, None] * kept[:, None, :], rise / np.where(same, 1, gap))
         transposed = self.vectors.transpose(0, 2, 1)
         return self.vectors @ (divided * (transposed @ seed @ self.vectors)) @ transposed
 
 
+class Unlifted:
+    """In place of `Spectrum` where the blocks are left as they are: P is the identity."""
+
+    kept: NDArray[np.bool_] = np.ones(0, dtype=np.bool_)
+
+    def undecided(self) -> bool:
+        """No: nothing is lifted."""
+        return False
+
+    def contract(self, seed: Vector) -> Vector:
+        """The identity's adjoint."""
+        return seed
+
+
+Lift = Spectrum | Unlifted
+"""What P did to the blocks of an exact Hessian."""
+
+
 class HessianRule(Protocol):
     """Fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation."""
 
-    spectrum: Spectrum | None
+    spectrum: Lift | None
     functions: Sequence[BufferedFunction]
     """The CasADi functions that it calls."""
 
@@ -67,7 +90,7 @@ class HessianRule(Protocol):
 class GaussNewton:
     """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is."""
 
-    spectrum: Spectrum | None = None
+    spectrum: Lift | None = None
     functions: Sequence[BufferedFunction] = ()
 
     def __init__(self, problem: Problem, prepared: BufferedFunction) -> None:
@@ -95,20 +118,22 @@ class Exact:
 
     P lifts the eigenvalues of each stage's block to at least γᵏ·`FLOOR`, so that the QP keeps its
     stage structure and is strictly convex. The floor does not depend on θ, so that P can be
-    differentiated. The terminal cost has no curvature of the model and stays as it is.
+    differentiated. The terminal cost has no curvature of the model and stays as it is. Where
+    `lifts` is false P is the identity, and the QP may be indefinite.
     """
 
     FLOOR = 1e-3
-    spectrum: Spectrum | None = None
+    spectrum: Lift | None = None
 
     def __init__(
         self,
         problem: Problem,
         blocks: ThetaBlocks,
         prepared: BufferedFunction,
-        floor: float = FLOOR,
+        *,
+        lifts: bool = True,
     ) -> None:
-        self._floor = floor
+        self.lifts = lifts
         self._cost = GaussNewton(problem, prepared)
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = np.concatenate([problem.reference_state, problem.reference_action])
@@ -141,11 +166,15 @@ class Exact:
             # The controller refuses the QP; an eigenvalue solver would raise its own error.
             L[:] = np.nan
             return np.nan
-        values, vectors = np.linalg.eigh(raw)
-        floor = np.asarray(self._floor * discounts[:, None], dtype=np.float64)
-        self.spectrum = Spectrum(values, vectors, floor)
-        lifted = np.maximum(values, floor)
-        L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
+        if self.lifts:
+            values, vectors = np.linalg.eigh(raw)
+            floor = np.asarray(self.FLOOR * discounts[:, None], dtype=np.float64)
+            self.spectrum = Spectrum(values, vectors, floor)
+            lifted = np.maximum(values, floor)
+            L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
+        else:
+            self.spectrum = Unlifted()
+            L[:] = raw
         at = np.concatenate([x, u], axis=1) - self._reference
         curved = np.einsum("kij,kj->ki", L, at)
         flat = 2 * discounts[:, None] * (at @ self._B)
@@ -166,5 +195,5 @@ def make_hessian(
     if name == "exact":
         return Exact(problem, blocks, prepared)
     if name == "exact-unlifted":
-        return Exact(problem, blocks, prepared, floor=-np.inf)
+        return Exact(problem, blocks, prepared, lifts=False)
     raise ControllerError(f"there is no Hessian '{name}'; choose {' or '.join(RULES)}")

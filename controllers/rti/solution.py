@@ -15,7 +15,7 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp.problem import QpSolution, Residuals, SoftQp
 from controllers.qp.stagewise import StageMatrices
-from controllers.rti.hessian import Spectrum
+from controllers.rti.hessian import Lift
 from controllers.sensitivities import adjoint_directions, curvature_directions
 
 Vector = NDArray[np.float64]
@@ -65,7 +65,7 @@ class Prepared(NamedTuple):
     L_N: Vector
     w: Vector
     W: Vector
-    spectrum: Spectrum | None
+    spectrum: Lift | None
     functions: Functions
 
 

@@ -33,7 +33,7 @@ def activity(solution: RtiSolution) -> bytes:
     masks = [*solution.multipliers.active(solution.qp), s < problem.state_lower]
     spectrum = solution.prepared.spectrum
     if spectrum is not None:
-        masks.append(spectrum.values > spectrum.floor)
+        masks.append(spectrum.kept)
     return b"".join(mask.tobytes() for mask in (*masks, s > problem.state_upper))
 
 

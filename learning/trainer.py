@@ -93,6 +93,14 @@ class Trainer:
             theta = Parameters.load(path, problem)
         return build_controller(training.nmpc, training.scenario, theta)
 
+    def scales(self, training: Training) -> Mapping[str, float]:
+        """Learning scale of each entry of θ, by its column of the log."""
+        run = _run(training)
+        problem = Problem.from_scenario(run.scenario)
+        blocks = starting_parameters(problem, run.configuration, run.start).blocks
+        names = (f"theta {label}" for label in blocks.labels)
+        return dict(zip(names, blocks.scale.tolist(), strict=True))
+
     def controller(self, name: str, scenario: Scenario) -> Controller:
         """A controller by name, parameters file or `module:factory`; ControllerLookupError."""
         return controller_by_name(name, scenario)

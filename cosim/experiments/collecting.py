@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.experiments import theta
 from cosim.experiments.online import ONLINE, online_csv
 from cosim.experiments.plan import Plan, Run
 from cosim.experiments.records import CURVE, EVALUATED, RunResult
@@ -75,6 +76,8 @@ def collect(plan: Plan, out: Path, stores: Mapping[str, RunStore]) -> StudyResul
         "pictures": [],
         "made_with": plan.provenance,
     }
+    if (settings := definition.table.theta) is not None:
+        about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
     return StudyResults(out, json.loads(json.dumps(about)), found)
 
 
@@ -131,6 +134,8 @@ def write(results: StudyResults, plan: Plan, stores: Mapping[str, RunStore], fig
     write_atomically(out / CURVES, curves_csv(results.runs))
     if plan.definition.table.online is not None:
         write_atomically(out / ONLINE, online_csv(plan, results.runs, stores))
+    if plan.definition.table.theta is not None:
+        write_atomically(out / theta.FILE, theta.theta_csv(results.runs, stores, plan))
     write_atomically(out / RUNS, to_csv(RUN_COLUMNS, run_rows(results)))
     write_atomically(out / SUMMARY, to_csv(COLUMNS, summary_rows(results)))
     aggregate = aggregate_rows(results)

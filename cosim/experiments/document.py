@@ -81,6 +81,15 @@ class OnlineTable(Table):
         return self
 
 
+class ThetaTable(Table):
+    """Where the trainings led θ: whether it has converged, and how far cases are apart."""
+
+    without: list[Source] = []
+    """Blocks of θ that distances leave out, such as those that no action depends on."""
+    blocks: list[Source] = []
+    """Blocks whose entries have columns of their own."""
+
+
 class CaseTable(Table):
     """A table `[[case]]`: an algorithm to train, or a controller to evaluate as it is.
 
@@ -173,6 +182,8 @@ class StudyTable(Table):
     """Table `[curves]`."""
     online: OnlineTable | None = None
     """Table `[online]`: what the runs themselves cost; not measured, if left out."""
+    theta: ThetaTable | None = None
+    """Table `[theta]`: where θ went; not shown, if left out."""
     case: Annotated[list[CaseTable], Field(min_length=1)]
     """Tables `[[case]]`."""
     trajectory: list[TrajectoryTable] = []

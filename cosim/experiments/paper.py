@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cosim.evaluation.statistics import Estimate, gain, shown
-from cosim.experiments.online import tables
+from cosim.experiments import online, theta
 from cosim.experiments.records import RunResult
 from cosim.experiments.results import StudyResults
 
@@ -80,4 +80,5 @@ FURTHER: dict[str, Callable[[StudyResults], tuple[str, tuple[str, ...], Lines]]]
 
 def further(results: StudyResults) -> list[tuple[str, tuple[str, ...], Lines]]:
     """The further tables that a study asks for."""
-    return [*tables(results), *(FURTHER[name](results) for name in results.about["tables"])]
+    own = [*online.tables(results), *theta.tables(results)]
+    return [*own, *(FURTHER[name](results) for name in results.about["tables"])]

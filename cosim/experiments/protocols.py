@@ -81,6 +81,12 @@ class Trainer(Protocol):
     def policy(self, training: Training, parameters: str) -> Controller:
         """The greedy controller of a training's θ."""
 
+    def scales(self, training: Training) -> Mapping[str, float]:
+        """Typical size of a change of each entry of a training's θ, by its column of the log.
+
+        Asked for by studies with a table `[theta]` only.
+        """
+
     def controller(self, name: str, scenario: Scenario) -> Controller:
         """A controller by name, parameters file or `module:factory`."""
 

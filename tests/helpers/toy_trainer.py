@@ -62,6 +62,9 @@ class ToyTrainer:
         theta = json.loads(parameters)
         return Proportional(training.scenario, gain=theta["gain"] + theta["seed"])
 
+    def scales(self, training):
+        return {"theta g": 2.0, "theta h[0]": 1.0}
+
     def controller(self, name, scenario):
         controllers = {"naive": Hold(scenario.reference_action), "best": Proportional(scenario)}
         return controllers[name]

@@ -1,0 +1,233 @@
+"""Where the trainings of a study led θ: whether it has converged, and how far cases are apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import StudyError
+from cosim.evaluation.statistics import Estimate, mean, shown
+from cosim.experiments.document import ThetaTable
+from cosim.experiments.plan import Plan
+from cosim.experiments.records import RunResult
+from cosim.experiments.results import StudyResults
+from cosim.experiments.store import RunStore
+from cosim.experiments.tables import KEYS, to_csv
+from cosim.experiments.traces import THETA
+from cosim.text_tables import parse_records, read_records
+from cosim.validation import suggestion
+
+Array = NDArray[np.float64]
+Lines = list[list[str]]
+Where = tuple[str, str]
+"""Scenario and case."""
+
+FILE = "theta.csv"
+SHARES = (0.0, 0.5, 0.8, 1.0)
+"""Shares of a training's samples at which θ is kept."""
+COURSE = "Where θ went"
+APART = "How far θ and J of two cases are apart, training seed by training seed"
+CONVERGED = 0.05
+"""Movement in the last fifth of a training, as a share of the way, below which it converged."""
+
+
+def scales(plan: Plan) -> dict[str, float]:
+    """Typical size of a change of each entry of θ, by name, over all trained cases."""
+    found: dict[str, float] = {}
+    for run in plan.runs:
+        if run.training is not None:
+            found |= plan.definition.trainer.scales(run.training)
+    return found
+
+
+def theta_csv(runs: Iterable[RunResult], stores: Mapping[str, RunStore], plan: Plan) -> str:
+    """A row for each training and share of its samples: θ as the log has it there."""
+    keys = (run.key for run in plan.runs)
+    names = {(key.scenario, key.case, key.seed): str(key) for key in keys}
+    rows: list[dict[str, Any]] = []
+    for run in runs:
+        if run.seed is None:
+            continue
+        log = parse_records(stores[names[run.key]].progress().log)
+        samples = np.array([float(row["samples"]) for row in log])
+        for share in SHARES:
+            row = log[int(np.flatnonzero(samples <= share * samples[-1] + 0.5)[-1])]
+            entries = {k: float(v) for k, v in row.items() if k.startswith(THETA)}
+            key = dict(zip(KEYS, run.key, strict=True))
+            rows.append(key | {"share": share, "samples": int(float(row["samples"]))} | entries)
+    entries = list(dict.fromkeys(name for row in rows for name in row if name.startswith(THETA)))
+    return to_csv((*KEYS, "share", "samples", *entries), rows)
+
+
+@dataclass(frozen=True)
+class Course:
+    """θ of the trainings of a case, in scaled entries: `theta` (runs, shares, entries)."""
+
+    seeds: tuple[int, ...]
+    theta: Array
+
+    @property
+    def end(self) -> Array:
+        """Where they ended, (runs, entries)."""
+        last: Array = self.theta[:, -1]
+        return last
+
+    def moved(self, share: float) -> Array:
+        """‖θ_K − θ_share·K‖ as a share of the way ‖θ_K − θ_0‖, (runs,)."""
+        late = np.linalg.norm(self.end - self.theta[:, SHARES.index(share)], axis=1)
+        return late / np.maximum(self.way, np.finfo(np.float64).tiny)
+
+    @property
+    def way(self) -> Array:
+        """‖θ_K − θ_0‖, (runs,)."""
+        way: Array = np.linalg.norm(self.end - self.theta[:, 0], axis=1)
+        return way
+
+    @property
+    def between_seeds(self) -> float:
+        """Median distance of two trainings' ends."""
+        pairs = combinations(self.end, 2)
+        return float(np.median([np.linalg.norm(a - b) for a, b in pairs] or [np.nan]))
+
+
+def tables(results: StudyResults) -> list[tuple[str, tuple[str, ...], Lines]]:
+    """Title, header and rows: the course of θ in each case, and every two cases beside each other.
+
+    Distances are Euclidean norms of scaled entries, those of the blocks `without` left out.
+    """
+    if results.about.get("theta") is None:
+        return []
+    settings = ThetaTable.model_validate(results.about["theta"]["settings"])
+    scale: Mapping[str, float] = results.about["theta"]["scales"]
+    records = read_records(results.folder / FILE, StudyError)
+    entries = [name for name in records[0] if name.startswith(THETA)] if records else []
+    blocks = list(dict.fromkeys(map(_block, entries)))
+    for name in (*settings.without, *settings.blocks):
+        if name not in blocks:
+            raise StudyError(
+                f"[theta]: no log has a block '{name}'{suggestion(name, blocks)}; there are "
+                f"{', '.join(blocks)}"
+            )
+    counted = [name for name in entries if _block(name) not in settings.without]
+    courses = _courses(records, counted, scale)
+    several = len({scenario for scenario, _ in courses}) > 1
+    shown_entries = [name for name in entries if _block(name) in settings.blocks]
+    title = f"{COURSE}, in scaled entries" + (
+        f" without {', '.join(settings.without)}" if settings.without else ""
+    )
+    return [
+        (title, *_course_lines(courses, several)),
+        (APART, *_apart(results, courses, _courses(records, shown_entries), several)),
+    ]
+
+
+def _block(entry: str) -> str:
+    return entry.removeprefix(THETA).partition("[")[0]
+
+
+def _courses(
+    records: Sequence[Mapping[str, str]],
+    entries: Sequence[str],
+    scale: Mapping[str, float] | None = None,
+) -> dict[Where, Course]:
+    units = np.array([1.0 if scale is None else scale[name] for name in entries])
+    grouped: dict[Where, dict[int, list[Array]]] = {}
+    for row in records:
+        runs = grouped.setdefault((row["scenario"], row["case"]), {})
+        values = np.array([float(row[name] or "nan") for name in entries]) / units
+        runs.setdefault(int(row["training_seed"]), []).append(values)
+    return {
+        where: Course(tuple(runs), np.array(list(runs.values()))) for where, runs in grouped.items()
+    }
+
+
+def _course_lines(courses: Mapping[Where, Course], several: bool) -> tuple[tuple[str, ...], Lines]:
+    header = (
+        "case", "runs", "way, median", "last half / way, median", "worst",
+        "last fifth / way, median", "worst", f"converged (< {CONVERGED})", "between seeds",
+    )  # fmt: skip
+    lines = []
+    for where, course in courses.items():
+        half, fifth = course.moved(0.5), course.moved(0.8)
+        lines.append(
+            [
+                _name(where, several),
+                str(len(course.seeds)),
+                shown(float(np.median(course.way)), None, 1, 3),
+                *(shown(float(f(half)), None, 1, 2) for f in (np.median, np.max)),
+                *(shown(float(f(fifth)), None, 1, 2) for f in (np.median, np.max)),
+                f"{int((fifth < CONVERGED).sum())}/{len(fifth)}",
+                shown(course.between_seeds, None, 1, 3),
+            ]
+        )
+    return header, lines
+
+
+def _apart(
+    results: StudyResults,
+    courses: Mapping[Where, Course],
+    entries: Mapping[Where, Course],
+    several: bool,
+) -> tuple[tuple[str, ...], Lines]:
+    """Of every two cases the differences, second less first, over the seeds that both have."""
+    names = [name.removeprefix(THETA) for name in _entry_names(results)]
+    header = (
+        "cases", "seeds", "ΔJ, mean [95 %]", "‖Δθ‖, median", "‖mean Δθ‖", "by chance",
+        *(f"Δ {name}, mean [95 %]" for name in names),
+    )  # fmt: skip
+    cost = {run.key: run for run in results.runs if run.seed is not None}
+    lines = []
+    for first, second in combinations(courses, 2):
+        common = [seed for seed in courses[first].seeds if seed in courses[second].seeds]
+        if not common:
+            continue
+        a, b = (
+            courses[where].end[[courses[where].seeds.index(seed) for seed in common]]
+            for where in (first, second)
+        )
+        change = b - a
+        runs = [[cost[(*where, seed)] for seed in common] for where in (first, second)]
+        paired = runs[0][0].seeds == runs[1][0].seeds and runs[0][0].steps == runs[1][0].steps
+        difference = np.array([y.J - x.J for x, y in zip(*runs, strict=True)])
+        moved = (
+            np.array([entries[where].end[entries[where].seeds.index(s)] for s in common])
+            for where in (first, second)
+        )
+        before, after = moved
+        lines.append(
+            [
+                f"{_name(second, several)} − {_name(first, several)}",
+                str(len(common)),
+                _shown(mean(difference)) if paired else "",
+                shown(float(np.median(np.linalg.norm(change, axis=1))), None, 1, 3),
+                shown(float(np.linalg.norm(change.mean(axis=0))), None, 1, 3),
+                shown(_by_chance(change), None, 1, 3) if len(common) > 1 else "",
+                *(_shown(mean(column)) for column in (after - before).T),
+            ]
+        )
+    return header, lines
+
+
+def _entry_names(results: StudyResults) -> list[str]:
+    wanted = results.about["theta"]["settings"]["blocks"]
+    header = read_records(results.folder / FILE, StudyError)[0]
+    return [name for name in header if name.startswith(THETA) and _block(name) in wanted]
+
+
+def _by_chance(change: Array) -> float:
+    """Root of E‖mean‖² of as many differences whose expectation is zero, from their variance."""
+    return float(np.sqrt(change.var(axis=0, ddof=1).sum() / len(change)))
+
+
+def _shown(estimate: Estimate) -> str:
+    return shown(estimate.value, estimate.t, 1, 3)
+
+
+def _name(where: Where, several: bool) -> str:
+    scenario, case = where
+    return f"{case} on {scenario}" if several else case

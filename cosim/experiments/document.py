@@ -88,6 +88,10 @@ class ThetaTable(Table):
     """Blocks of θ that distances leave out, such as those that no action depends on."""
     blocks: list[Source] = []
     """Blocks whose entries have columns of their own."""
+    pairs: list[Annotated[list[Source], Field(min_length=2, max_length=2)]] = []
+    """Names of the two cases of each comparison; every two cases, if left out."""
+    late: bool = True
+    """Whether to say how far θ went late in the samples; not of a rule that moves it at the end."""
 
 
 class CaseTable(Table):

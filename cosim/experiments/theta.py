@@ -71,6 +71,10 @@ class Course:
     seeds: tuple[int, ...]
     theta: Array
 
+    def of(self, seeds: Sequence[int]) -> Course:
+        """That of these seeds alone."""
+        return Course(tuple(seeds), self.theta[[self.seeds.index(seed) for seed in seeds]])
+
     @property
     def end(self) -> Array:
         """Where they ended, (runs, entries)."""
@@ -121,8 +125,8 @@ def tables(results: StudyResults) -> list[tuple[str, tuple[str, ...], Lines]]:
         f" without {', '.join(settings.without)}" if settings.without else ""
     )
     return [
-        (title, *_course_lines(courses, several)),
-        (APART, *_apart(results, courses, _courses(records, shown_entries), several)),
+        (title, *_course_lines(courses, several, settings.late)),
+        (APART, *_apart(results, courses, _courses(records, shown_entries), shown_entries)),
     ]
 
 
@@ -146,82 +150,102 @@ def _courses(
     }
 
 
-def _course_lines(courses: Mapping[Where, Course], several: bool) -> tuple[tuple[str, ...], Lines]:
-    header = (
-        "case", "runs", "way, median", "last half / way, median", "worst",
-        "last fifth / way, median", "worst", f"converged (< {CONVERGED})", "between seeds",
-    )  # fmt: skip
+def _course_lines(
+    courses: Mapping[Where, Course], several: bool, late: bool
+) -> tuple[tuple[str, ...], Lines]:
+    header = ("case", "runs", "way, median", "between seeds")
+    if late:
+        header += (
+            "last half / way, median", "worst", "last fifth / way, median", "worst",
+            f"converged (< {CONVERGED})",
+        )  # fmt: skip
     lines = []
     for where, course in courses.items():
-        half, fifth = course.moved(0.5), course.moved(0.8)
-        lines.append(
-            [
-                _name(where, several),
-                str(len(course.seeds)),
-                shown(float(np.median(course.way)), None, 1, 3),
-                *(shown(float(f(half)), None, 1, 2) for f in (np.median, np.max)),
-                *(shown(float(f(fifth)), None, 1, 2) for f in (np.median, np.max)),
-                f"{int((fifth < CONVERGED).sum())}/{len(fifth)}",
-                shown(course.between_seeds, None, 1, 3),
-            ]
-        )
+        line = [
+            _name(where, several),
+            str(len(course.seeds)),
+            shown(float(np.median(course.way)), None, 1, 3),
+            shown(course.between_seeds, None, 1, 3),
+        ]
+        if late:
+            half, fifth = course.moved(0.5), course.moved(0.8)
+            line += [shown(float(f(half)), None, 1, 2) for f in (np.median, np.max)]
+            line += [shown(float(f(fifth)), None, 1, 2) for f in (np.median, np.max)]
+            line.append(f"{int((fifth < CONVERGED).sum())}/{len(fifth)}")
+        lines.append(line)
     return header, lines
+
+
+def _pairs(results: StudyResults, courses: Mapping[Where, Course]) -> list[tuple[Where, Where]]:
+    """The pairs that the study names, else all; raises StudyError on a name of no trained case."""
+    wanted = results.about["theta"]["settings"]["pairs"]
+    trained = [name for name, case in results.cases.items() if case.trained]
+    for name in (name for pair in wanted for name in pair):
+        if name not in trained:
+            raise StudyError(
+                f"[theta], pairs: there is no trained case '{name}'{suggestion(name, trained)}; "
+                f"there are {', '.join(trained)}"
+            )
+    if not wanted:
+        return list(combinations(courses, 2))
+    return [
+        (a, b) for first, second in wanted for a in courses for b in courses
+        if a[1] == first and b[1] == second
+    ]  # fmt: skip
 
 
 def _apart(
     results: StudyResults,
     courses: Mapping[Where, Course],
-    entries: Mapping[Where, Course],
-    several: bool,
+    shown_courses: Mapping[Where, Course],
+    entries: Sequence[str],
 ) -> tuple[tuple[str, ...], Lines]:
-    """Of every two cases the differences, second less first, over the seeds that both have."""
-    names = [name.removeprefix(THETA) for name in _entry_names(results)]
+    """Of two cases the differences, second less first, over the seeds that both have."""
     header = (
-        "cases", "seeds", "ΔJ, mean [95 %]", "‖Δθ‖, median", "‖mean Δθ‖", "by chance",
-        *(f"Δ {name}, mean [95 %]" for name in names),
+        "cases", "seeds", "ΔJ, mean [95 %]", "‖Δθ‖, median", "of the way", "‖mean Δθ‖",
+        "by chance", "entries that differ",
+        *(f"Δ {name.removeprefix(THETA)}, mean [95 %]" for name in entries),
     )  # fmt: skip
-    cost = {run.key: run for run in results.runs if run.seed is not None}
+    several = len({scenario for scenario, _ in courses}) > 1
     lines = []
-    for first, second in combinations(courses, 2):
+    for first, second in _pairs(results, courses):
         common = [seed for seed in courses[first].seeds if seed in courses[second].seeds]
         if not common:
             continue
-        a, b = (
-            courses[where].end[[courses[where].seeds.index(seed) for seed in common]]
-            for where in (first, second)
-        )
-        change = b - a
-        runs = [[cost[(*where, seed)] for seed in common] for where in (first, second)]
-        paired = runs[0][0].seeds == runs[1][0].seeds and runs[0][0].steps == runs[1][0].steps
-        difference = np.array([y.J - x.J for x, y in zip(*runs, strict=True)])
-        moved = (
-            np.array([entries[where].end[entries[where].seeds.index(s)] for s in common])
-            for where in (first, second)
-        )
-        before, after = moved
+        before, after = courses[first].of(common), courses[second].of(common)
+        change = after.end - before.end
+        size = np.linalg.norm(change, axis=1)
+        moved = shown_courses[second].of(common).end - shown_courses[first].of(common).end
         lines.append(
             [
                 f"{_name(second, several)} − {_name(first, several)}",
                 str(len(common)),
-                _shown(mean(difference)) if paired else "",
-                shown(float(np.median(np.linalg.norm(change, axis=1))), None, 1, 3),
+                _shown(mean(_costs(results, second, common) - _costs(results, first, common))),
+                shown(float(np.median(size)), None, 1, 3),
+                shown(float(np.median(2 * size / (before.way + after.way))), None, 1, 3),
                 shown(float(np.linalg.norm(change.mean(axis=0))), None, 1, 3),
                 shown(_by_chance(change), None, 1, 3) if len(common) > 1 else "",
-                *(_shown(mean(column)) for column in (after - before).T),
+                f"{sum(_differs(mean(column)) for column in change.T)}/{change.shape[1]}",
+                *(_shown(mean(column)) for column in moved.T),
             ]
         )
     return header, lines
 
 
-def _entry_names(results: StudyResults) -> list[str]:
-    wanted = results.about["theta"]["settings"]["blocks"]
-    header = read_records(results.folder / FILE, StudyError)[0]
-    return [name for name in header if name.startswith(THETA) and _block(name) in wanted]
+def _costs(results: StudyResults, where: Where, seeds: Sequence[int]) -> Array:
+    """J of a case's trainings, (runs,)."""
+    runs = {run.seed: run.J for run in results.of(where[1], where[0])}
+    return np.array([runs[seed] for seed in seeds])
 
 
 def _by_chance(change: Array) -> float:
     """Root of E‖mean‖² of as many differences whose expectation is zero, from their variance."""
     return float(np.sqrt(change.var(axis=0, ddof=1).sum() / len(change)))
+
+
+def _differs(estimate: Estimate) -> bool:
+    """Whether the 95 % interval leaves zero out, which one in twenty does by chance."""
+    return estimate.t is not None and not estimate.t[0] <= 0 <= estimate.t[1]
 
 
 def _shown(estimate: Estimate) -> str:

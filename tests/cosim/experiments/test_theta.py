@@ -73,6 +73,7 @@ def test_the_course_is_in_scaled_entries_without_what_is_left_out(results):
 def test_two_cases_are_paired_by_training_seed(results):
     (line,) = lines_of(results, 1)
     assert line["cases"] == "go(rate=3.0) − go(rate=1.0)"
+    assert float(line["of the way"]) == pytest.approx(1.0)
     # 20 and 40 in entries of scale 2; h goes the same way in both.
     assert float(line["‖Δθ‖, median"]) == pytest.approx(15.0)
     assert float(line["‖mean Δθ‖"]) == pytest.approx(15.0)
@@ -93,3 +94,27 @@ def test_a_block_that_no_log_has_is_named(tmp_path):
     found = wandering(without=["hh"]).run(tmp_path)
     with pytest.raises(StudyError, match=r"no log has a block 'hh'.*'h'.*there are g, h"):
         tables(found)
+
+
+def test_pairs_are_the_study_s_in_its_order(results):
+    about = dict(results.about)
+    settings = dict(about["theta"]["settings"])
+    for pairs, expected in (
+        ([["go(rate=3.0)", "go(rate=1.0)"]], "go(rate=1.0) − go(rate=3.0)"),
+        ([["go(rate=3.0)", "go(rate=1)"]], None),
+    ):
+        about["theta"] = dict(about["theta"]) | {"settings": settings | {"pairs": pairs}}
+        other = StudyResults(results.folder, about, results.runs)
+        if expected is None:
+            with pytest.raises(StudyError, match=r"no trained case 'go\(rate=1\)'"):
+                tables(other)
+        else:
+            assert [line["cases"] for line in lines_of(other, 1)] == [expected]
+
+
+def test_how_far_it_went_late_is_left_out_where_the_study_says_so(results):
+    about = dict(results.about)
+    settings = dict(about["theta"]["settings"]) | {"late": False}
+    about["theta"] = dict(about["theta"]) | {"settings": settings}
+    _, header, _ = tables(StudyResults(results.folder, about, results.runs))[0]
+    assert header == ("case", "runs", "way, median", "between seeds")

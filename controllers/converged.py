@@ -173,7 +173,8 @@ class ConvergedNmpc(RtiNmpc):
         function.inputs["u"][:] = controls.reshape(-1)
         function.inputs["theta"][:] = self.theta
         function()
-        return _Measured(*function.stack[-3:].tolist(), function.part("gradient").copy())
+        cost, penalty, infeasibility = function.stack[-3:].tolist()
+        return _Measured(cost, penalty, infeasibility, function.part("gradient").copy())
 
     def _read_out(self, s: ArrayLike, a: ArrayLike | None, solution: RtiSolution) -> RtiSolution:
         """Read a lifted QP's solution out of the programme's own QP, which need not be convex."""

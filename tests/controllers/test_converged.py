@@ -6,6 +6,8 @@ import pytest
 from controllers import ConvergedNmpc, LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import QpError
 from controllers.ipopt import IpoptNmpc
+from controllers.qp.daqp_backend import DaqpBackend
+from controllers.qp.problem import NOT_CONVEX
 from tests.helpers.differences import assert_close, derivative, natural_scale
 from tests.helpers.sampling import (
     evaporator_problem,
@@ -167,3 +169,51 @@ def test_too_few_iterations_raise_and_the_qp_is_carried(problem):
 def test_a_state_that_is_not_finite_raises(converged):
     with pytest.raises(QpError, match="not finite"):
         converged.feedback([np.nan, 50.0])
+
+
+def test_few_qps_are_enough_from_a_near_guess(problem, blocks):
+    # A cost as it is learnt, flat in the actions: the lifted Hessian takes dozens of QPs here.
+    theta = Parameters.naive(problem, blocks).replace(
+        {
+            "B_l": np.diag([1.7, 3.8, 0.06, 0.013]),
+            "b_l": [2.6, -33.0, 34.0, -3.0],
+            "b_Vf": [5.8, -1.4],
+            "x_l": [27.7, 40.0],
+        }
+    )
+    converged = ConvergedNmpc(problem, theta)
+    converged.feedback([28.5, 52.0])
+    count, linearise = 0, converged._linearise
+
+    def counted():
+        nonlocal count
+        count += 1
+        linearise()
+
+    converged._linearise = counted
+    converged.prepare()
+    converged.feedback([29.5, 53.0])
+    assert count <= 8
+
+
+@pytest.mark.parametrize("where", ["load", "solve"])
+def test_a_qp_that_is_not_convex_is_lifted_and_read_out_as_it_is(
+    where, converged, problem, blocks, monkeypatch
+):
+    theta, s, a = sample(problem, blocks, 6)
+    expected = solved(converged, theta, s, a)
+    lifting = ConvergedNmpc(problem, theta, tolerance=1e-10)
+    ordinary = getattr(DaqpBackend, where)
+
+    def refusing(self, qp):
+        if not lifting._hessian.lifts and self is lifting._backend:
+            raise QpError("refused", status=NOT_CONVEX)
+        return ordinary(self, qp)
+
+    monkeypatch.setattr(DaqpBackend, where, refusing)
+    solution = lifting.feedback(s, a)
+    assert solution.value == pytest.approx(expected.value, rel=1e-10)
+    assert_close(solution.value_gradient, expected.value_gradient, blocks.slices, "dV/dθ", 1e-7)
+    assert_close(solution.policy_jacobian, expected.policy_jacobian, blocks.slices, "dπ", 1e-6)
+    # The next feedback of the sample still has the QP that can be solved.
+    assert lifting.feedback(s, a).value == pytest.approx(expected.value, rel=1e-10)

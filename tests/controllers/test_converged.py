@@ -172,13 +172,23 @@ def test_a_state_that_is_not_finite_raises(converged):
 
 
 def test_few_qps_are_enough_from_a_near_guess(problem, blocks):
-    # A cost as it is learnt, flat in the actions: the lifted Hessian takes dozens of QPs here.
+    # A θ as it is learnt, flat in the actions: QPs that are lifted all along take dozens here.
+    B_l = [
+        [1.71, -0.087, 0.113, 0.032],
+        [-0.087, 3.79, 0.4, -0.1087],
+        [0.113, 0.4, 0.0568, -0.0127],
+        [0.032, -0.1087, -0.0127, 0.0135],
+    ]
     theta = Parameters.naive(problem, blocks).replace(
         {
-            "B_l": np.diag([1.7, 3.8, 0.06, 0.013]),
-            "b_l": [2.6, -33.0, 34.0, -3.0],
+            "B_l": B_l,
+            "b_l": [2.66, -33.06, 34.45, -2.94],
+            "B_Vf": [[1.11, 0.126], [0.126, 1.207]],
             "b_Vf": [5.8, -1.4],
-            "x_l": [27.7, 40.0],
+            "c_f": [0.16, 0.004],
+            "x_l": [27.67, 40.0],
+            "w_sigma": [349.0, 100.0],
+            "W_sigma": [1.0, 1000.0],
         }
     )
     converged = ConvergedNmpc(problem, theta)

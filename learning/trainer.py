@@ -21,7 +21,7 @@ from learning.log import COLUMNS, LogRow, to_csv
 from learning.optimum import stored_optimum
 from learning.registry import GROUP as ALGORITHMS
 from learning.registry import load_algorithm
-from learning.starting_point import build_controller
+from learning.starting_point import build_controller, starting_parameters
 from learning.training_loop import CHECKPOINT, training_loop
 from learning.training_run import TrainingRun, prepare
 from rti_storage.temporary import temporary_folder

@@ -48,20 +48,20 @@ def scales(plan: Plan) -> dict[str, float]:
 def theta_csv(runs: Iterable[RunResult], stores: Mapping[str, RunStore], plan: Plan) -> str:
     """A row for each training and share of its samples: θ as the log has it there."""
     keys = (run.key for run in plan.runs)
-    names = {(key.scenario, key.case, key.seed): str(key) for key in keys}
+    store_names = {(key.scenario, key.case, key.seed): str(key) for key in keys}
     rows: list[dict[str, Any]] = []
     for run in runs:
         if run.seed is None:
             continue
-        log = parse_records(stores[names[run.key]].progress().log)
+        log = parse_records(stores[store_names[run.key]].progress().log)
         samples = np.array([float(row["samples"]) for row in log])
         for share in SHARES:
             row = log[int(np.flatnonzero(samples <= share * samples[-1] + 0.5)[-1])]
             entries = {k: float(v) for k, v in row.items() if k.startswith(THETA)}
             key = dict(zip(KEYS, run.key, strict=True))
             rows.append(key | {"share": share, "samples": int(float(row["samples"]))} | entries)
-    entries = list(dict.fromkeys(name for row in rows for name in row if name.startswith(THETA)))
-    return to_csv((*KEYS, "share", "samples", *entries), rows)
+    names = list(dict.fromkeys(name for row in rows for name in row if name.startswith(THETA)))
+    return to_csv((*KEYS, "share", "samples", *names), rows)
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ class Course:
     def moved(self, share: float) -> Array:
         """‖θ_K − θ_share·K‖ as a share of the way ‖θ_K − θ_0‖, (runs,)."""
         late = np.linalg.norm(self.end - self.theta[:, SHARES.index(share)], axis=1)
-        return late / np.maximum(self.way, np.finfo(np.float64).tiny)
+        moved: Array = late / np.maximum(self.way, np.finfo(np.float64).tiny)
+        return moved
 
     @property
     def way(self) -> Array:
@@ -95,8 +96,8 @@ class Course:
     @property
     def between_seeds(self) -> float:
         """Median distance of two trainings' ends."""
-        pairs = combinations(self.end, 2)
-        return float(np.median([np.linalg.norm(a - b) for a, b in pairs] or [np.nan]))
+        distances = [float(np.linalg.norm(a - b)) for a, b in combinations(self.end, 2)]
+        return float(np.median(distances)) if distances else float("nan")
 
 
 def tables(results: StudyResults) -> list[tuple[str, tuple[str, ...], Lines]]:
@@ -153,7 +154,7 @@ def _courses(
 def _course_lines(
     courses: Mapping[Where, Course], several: bool, late: bool
 ) -> tuple[tuple[str, ...], Lines]:
-    header = ("case", "runs", "way, median", "between seeds")
+    header: tuple[str, ...] = ("case", "runs", "way, median", "between seeds")
     if late:
         header += (
             "last half / way, median", "worst", "last fifth / way, median", "worst",

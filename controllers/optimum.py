@@ -15,11 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.dynamic_programming import archive
 from controllers.dynamic_programming.bellman import BellmanOperator
 from controllers.dynamic_programming.plant import PlantProblem, StochasticScenario
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum, Progress, solve
 from controllers.errors import ModelError, OptimumError, QpError
-from controllers.problem import Problem
 
 Vector = NDArray[np.float64]
 
@@ -48,17 +46,10 @@ class OptimalPolicy:
 
     name = "optimal"
 
-    def __init__(
-        self,
-        problem: Problem,
-        law: DisturbanceLaw,
-        optimum: Optimum,
-        parameters: Vector | None = None,
-    ) -> None:
-        self.problem = problem
-        self.law = law
-        self.optimum = optimum
-        self._parameters = problem.model.nominal_parameters if parameters is None else parameters
+    def __init__(self, plant: PlantProblem, optimum: Optimum) -> None:
+        problem = plant.problem
+        self.problem, self.optimum = problem, optimum
+        self._plant = plant
         m = problem.n_actions
         if optimum.actions.shape[1] != m or len(optimum.grid.axes) != problem.n_states:
             raise OptimumError(
@@ -72,20 +63,6 @@ class OptimalPolicy:
             (corner, sum(s for s, high in zip(self._strides, corner, strict=True) if high))
             for corner in itertools.product((False, True), repeat=len(self._axes))
         ]
-
-    @classmethod
-    def solve(
-        cls,
-        problem: Problem,
-        law: DisturbanceLaw,
-        settings: Settings | None = None,
-        *,
-        parameters: Vector | None = None,
-        progress: Callable[[Progress], None] | None = None,
-    ) -> OptimalPolicy:
-        """Solve a problem under a law, nothing stored; raises OptimumError."""
-        optimum = solve(problem, law, settings, parameters=parameters, progress=progress)
-        return cls(problem, law, optimum, parameters)
 
     @classmethod
     def from_scenario(
@@ -104,13 +81,12 @@ class OptimalPolicy:
         """
         plant = PlantProblem.from_scenario(scenario, overrides)
         settings = settings or Settings()
-        problem, law, parameters = plant.problem, plant.law, plant.parameters
         optimum = archive.obtain(
             archive.key(plant, settings),
-            problem,
-            lambda: solve(problem, law, settings, parameters=parameters, progress=progress),
+            plant.problem,
+            lambda: solve(plant, settings, progress=progress),
         )
-        return cls(problem, law, optimum, parameters)
+        return cls(plant, optimum)
 
     @classmethod
     def stored(
@@ -129,8 +105,7 @@ class OptimalPolicy:
         path = archive.stored(name)
         if path is None:
             return None
-        optimum = archive.read(path, name, plant.problem)
-        return cls(plant.problem, plant.law, optimum, plant.parameters)
+        return cls(plant, archive.read(path, name, plant.problem))
 
     @property
     def gain(self) -> float:
@@ -186,13 +161,8 @@ class OptimalPolicy:
 
     @cached_property
     def _operator(self) -> BellmanOperator:
-        return BellmanOperator(
-            self.problem,
-            self.law,
-            self._parameters,
-            self.optimum.accuracy,
-            discount=self.optimum.discount,
-        )
+        optimum = self.optimum
+        return BellmanOperator(self._plant, optimum.accuracy, discount=optimum.discount)
 
     def _lookup(self, state: list[float]) -> tuple[list[float], bool]:
         """Row (action…, W) interpolated at a state in plain Python: a tenth of NumPy's time."""

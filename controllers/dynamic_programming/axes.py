@@ -66,7 +66,7 @@ def finer_grid(
     the support is a point, which says nothing of that, and the box stays. `smooth`: cubic
     interpolation within the support, else linear everywhere.
     """
-    problem, law = operator.problem, operator.law
+    problem = operator.problem
     span = problem.state_upper - problem.state_lower
     mass = np.maximum(distribution, 0.0)
     mean = mass @ np.column_stack([grid.points, actions]) / mass.sum()
@@ -85,7 +85,7 @@ def finer_grid(
         ]
         near = max(deviation[i], 1e-3 * span[i])
         features += [Feature(b - near, b + near, near / 2**level) for b in bounds]
-        beyond = max(width, (1.0 if law.deterministic else 0.05) * span[i])
+        beyond = max(width, (1.0 if operator.deterministic else 0.05) * span[i])
         low = max(axis[0], min(first, reference) - beyond)
         high = min(axis[-1], max(last, reference) + beyond)
         marks = [low, *(x for x in sorted({*bounds, reference}) if low < x < high), high]

@@ -14,9 +14,9 @@ from scipy import sparse
 
 from controllers.dynamic_programming.elementwise import Elementwise
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.quadrature import DisturbanceLaw, Refinement
+from controllers.dynamic_programming.plant import PlantProblem
+from controllers.dynamic_programming.quadrature import Refinement
 from controllers.model import discretise, economic_cost
-from controllers.problem import Problem
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -61,28 +61,26 @@ class BellmanOperator:
     """Q(s, a) = E[ℓ(s, a, d) + γ penalty(s₊) + γ W(s₊)] with V = penalty + W.
 
     The penalty's kink is known in closed form, so only the smooth W is interpolated. γ = 1
-    for the average-cost criterion. `parameters` are the plant's physical ones, (n_p,); `workers`
-    threads share the blocks of states, whose results do not depend on their number.
+    for the average-cost criterion. `workers` threads share the blocks of states, whose results do
+    not depend on their number.
     """
 
     def __init__(
         self,
-        problem: Problem,
-        law: DisturbanceLaw,
-        parameters: Array,
+        plant: PlantProblem,
         accuracy: Accuracy,
         *,
         discount: float = 1.0,
         workers: int = 1,
     ) -> None:
-        self.problem = problem
-        self.law = law
+        problem, law = plant.problem, plant.law
+        self.problem, self.deterministic = problem, law.deterministic
         self.discount = discount
         self._step = Elementwise(
             discretise(problem.model, problem.sampling_time, accuracy.substeps)
         )
         self._cost = Elementwise(economic_cost(problem.model))
-        self._parameters = parameters
+        self._parameters = plant.parameters
         rule = law.rule(accuracy.nodes)
         self._weights = rule.weights
         self._disturbance = [rule.nodes[None, :, i] for i in range(rule.nodes.shape[1])]

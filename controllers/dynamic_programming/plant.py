@@ -40,6 +40,20 @@ class PlantProblem:
     law: DisturbanceLaw
     parameters: Vector
 
+    def __post_init__(self) -> None:
+        """Raise OptimumError where the law has not the model's disturbances."""
+        model = self.problem.model
+        if len(self.law.nominal) != len(model.disturbances):
+            raise OptimumError(
+                f"the law has {len(self.law.nominal)} disturbances, model '{model.name}' "
+                f"{len(model.disturbances)}"
+            )
+
+    @classmethod
+    def nominal(cls, problem: Problem, law: DisturbanceLaw) -> PlantProblem:
+        """A plant that has the model's nominal parameters."""
+        return cls(problem, law, problem.model.nominal_parameters)
+
     @classmethod
     def from_scenario(
         cls,

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from controllers.dynamic_programming.bellman import Accuracy
 from controllers.dynamic_programming.elementwise import Elementwise
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.errors import OptimumError
 from controllers.model import discretise
-from controllers.problem import Problem
 
 Array = NDArray[np.float64]
 
@@ -57,26 +56,24 @@ class Settings:
                 "and the other numbers positive"
             )
 
-    def accuracy(self, problem: Problem, law: DisturbanceLaw, parameters: Array) -> Accuracy:
+    def accuracy(self, plant: PlantProblem) -> Accuracy:
         """Integrator and quadrature for a problem."""
-        count = len(law.nominal)
+        count = len(plant.law.nominal)
         return Accuracy(
-            accurate_substeps(problem, law, parameters, self.integration_tolerance),
+            accurate_substeps(plant, self.integration_tolerance),
             self.nodes or (7, 7, *(2,) * count)[:count],
             self.penalty_nodes or (20, 20, 4, *(2,) * count)[:count],
         )
 
 
-def accurate_substeps(
-    problem: Problem, law: DisturbanceLaw, parameters: Array, tolerance: float
-) -> int:
+def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     """Least power of two of RK4 substeps whose doubling moves no next state by more than allowed.
 
     Allowed is `tolerance`·(1 + |x|), tried at 2000 points: states within the first quarter of the
     bounds' box around the reference, actions in their box, disturbances of the law. Raises
     OptimumError where 128 substeps do not do.
     """
-    generator = np.random.default_rng(0)
+    problem, generator = plant.problem, np.random.default_rng(0)
     reach = 0.25 * (problem.state_upper - problem.state_lower)
     x = generator.uniform(
         np.maximum(problem.state_lower, problem.reference_state - reach),
@@ -84,13 +81,13 @@ def accurate_substeps(
         (2000, problem.n_states),
     )
     u = generator.uniform(problem.action_lower, problem.action_upper, (2000, problem.n_actions))
-    d = law.draw(generator, 2000)
+    d = plant.law.draw(generator, 2000)
     before: Array | None = None
     for substeps in 2 ** np.arange(8):
         step = Elementwise(discretise(problem.model, problem.sampling_time, int(substeps)))
         # A step that is too long may overflow; then the next one is tried.
         with np.errstate(all="ignore"):
-            entries = step(x.T, u.T, d.T, parameters)
+            entries = step(x.T, u.T, d.T, plant.parameters)
             x_next = np.stack([np.broadcast_to(entry, 2000) for entry in entries], axis=1)
             moved = np.inf if before is None else np.abs(x_next - before)
         if np.all(moved <= tolerance * (1 + np.abs(x))):

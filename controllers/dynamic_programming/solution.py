@@ -13,10 +13,9 @@ from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
 from controllers.dynamic_programming.certificate import Certificate
 from controllers.dynamic_programming.grid import Grid
 from controllers.dynamic_programming.howard import Iterate, begin, iterate_policy
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.settings import Settings
 from controllers.errors import OptimumError
-from controllers.problem import Problem
 
 Array = NDArray[np.float64]
 
@@ -60,27 +59,22 @@ class Optimum:
 
 
 def solve(
-    problem: Problem,
-    law: DisturbanceLaw,
+    plant: PlantProblem,
     settings: Settings | None = None,
     *,
-    parameters: Array | None = None,
     workers: int = 2,
     progress: Callable[[Progress], None] | None = None,
 ) -> Optimum:
     """Solve for the optimal policy of the stochastic plant by Howard's policy iteration.
 
-    `parameters` (n_p,) are the plant's physical ones (default: the model's nominal). Raises
-    OptimumError where the bounds do not close to 1 % of the gain, or where the closed loop leaves
-    the grid's box in more than one of 10⁴ samples.
+    Raises OptimumError where the bounds do not close to 1 % of the gain, or where the closed loop
+    leaves the grid's box in more than one of 10⁴ samples.
     """
-    settings = settings or Settings()
-    _check(problem, law)
-    parameters = problem.model.nominal_parameters if parameters is None else parameters
-    accuracy = settings.accuracy(problem, law, parameters)
+    problem, settings = plant.problem, settings or Settings()
+    accuracy = settings.accuracy(plant)
     discount = 1.0 if settings.criterion == "average" else problem.discount
     draft, operator = (
-        BellmanOperator(problem, law, parameters, how, discount=discount, workers=workers)
+        BellmanOperator(plant, how, discount=discount, workers=workers)
         for how in (accuracy.draft(), accuracy)
     )
     grid = first_grid(problem, draft, settings)
@@ -100,14 +94,12 @@ def solve(
 
 
 def refine(
-    problem: Problem,
-    law: DisturbanceLaw,
+    plant: PlantProblem,
     settings: Settings,
     optimum: Optimum,
     *,
     level: int | None = None,
     accuracy: Accuracy | None = None,
-    parameters: Array | None = None,
     workers: int = 2,
     progress: Callable[[Progress], None] | None = None,
 ) -> Optimum:
@@ -116,24 +108,13 @@ def refine(
     Raises OptimumError as `solve` does.
     """
     accuracy = accuracy or optimum.accuracy
-    parameters = problem.model.nominal_parameters if parameters is None else parameters
-    operator = BellmanOperator(
-        problem, law, parameters, accuracy, discount=optimum.discount, workers=workers
-    )
+    operator = BellmanOperator(plant, accuracy, discount=optimum.discount, workers=workers)
     start = begin(operator, optimum.grid, optimum.actions)
     report = _Reporter(progress)
     report.level = settings.level if level is None else level
     grid = optimum.grid if level is None else _finer(operator, start, settings, level)
     iterate = _converge(operator, _transfer(operator, start, grid), settings, report)
     return _optimum(iterate, operator, accuracy)
-
-
-def _check(problem: Problem, law: DisturbanceLaw) -> None:
-    if len(law.nominal) != len(problem.model.disturbances):
-        raise OptimumError(
-            f"the law has {len(law.nominal)} disturbances, model '{problem.model.name}' "
-            f"{len(problem.model.disturbances)}"
-        )
 
 
 def _optimum(iterate: Iterate, operator: BellmanOperator, accuracy: Accuracy) -> Optimum:

@@ -5,18 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from controllers.dynamic_programming.certificate import Certificate, Figure
 from controllers.dynamic_programming.plant import PlantProblem
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.simulation import simulate_policy
 from controllers.dynamic_programming.solution import Optimum, Progress, refine
-from controllers.problem import Problem
 
-Array = NDArray[np.float64]
 STABLE = 1e-3
 _MOST_GRIDS = 3
 
@@ -36,12 +30,10 @@ class Row:
 
 
 def study(
-    problem: Problem,
-    law: DisturbanceLaw,
+    plant: PlantProblem,
     settings: Settings,
     optimum: Optimum,
     *,
-    parameters: Array | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> list[Row]:
     """Refine a solution of `settings` until J* is stable to 0.1 %, then its quadrature once.
@@ -52,27 +44,12 @@ def study(
     rows = [Row("solution", optimum)]
     for level in range(settings.level + 1, settings.level + 1 + _MOST_GRIDS):
         before = rows[-1].optimum
-        after = refine(
-            problem,
-            law,
-            settings,
-            before,
-            level=level,
-            parameters=parameters,
-            progress=progress,
-        )
+        after = refine(plant, settings, before, level=level, progress=progress)
         rows.append(Row("grid twice as fine", after, _change(before, after)))
         if rows[-1].stable:
             break
-    after = refine(
-        problem,
-        law,
-        settings,
-        optimum,
-        accuracy=optimum.accuracy.finer(),
-        parameters=parameters,
-        progress=progress,
-    )
+    finer = optimum.accuracy.finer()
+    after = refine(plant, settings, optimum, accuracy=finer, progress=progress)
     return [*rows, Row("quadrature finer", after, _change(optimum, after))]
 
 

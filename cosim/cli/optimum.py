@@ -135,13 +135,12 @@ def _solve(
     from cosim.cli.optimum_study import held_against, refined
 
     plant = PlantProblem.from_scenario(task)
-    problem, law, parameters = plant.problem, plant.law, plant.parameters
     settings = Settings(criterion=criterion.value)
     key = archive.key(plant, settings)
     with _progress(out_) as show:
 
         def make() -> Optimum:
-            return solve(problem, law, settings, parameters=parameters, progress=show)
+            return solve(plant, settings, progress=show)
 
         if refine:
             archive.require_cache()
@@ -150,7 +149,9 @@ def _solve(
                 solved = held_against(against, solved, plant, task)
             archive.keep(key, lambda: solved)
         else:
-            solved = archive.keep(key, make) if recompute else archive.obtain(key, problem, make)
+            solved = (
+                archive.keep(key, make) if recompute else archive.obtain(key, plant.problem, make)
+            )
             rows = [Row("stored" if solved.certificate else "solution", solved)]
     certificate = solved.certificate
     objection = "no certificate; make one with --refine"

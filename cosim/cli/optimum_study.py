@@ -27,9 +27,7 @@ def refined(
     plant: PlantProblem, settings: Settings, solved: Optimum, show: Callable[[Progress], None]
 ) -> tuple[list[Row], Optimum]:
     """The solution and what refines it, and the refinement that is kept with its certificate."""
-    rows = study(
-        plant.problem, plant.law, settings, solved, parameters=plant.parameters, progress=show
-    )
+    rows = study(plant, settings, solved, progress=show)
     return rows, certify(plant, rows)
 
 
@@ -41,7 +39,7 @@ def held_against(theta: Path, found: Optimum, plant: PlantProblem, scenario: Sce
     assert found.certificate is not None
     base = found.certificate["simulation"]
     assert base is not None
-    policy = OptimalPolicy(plant.problem, plant.law, found, plant.parameters)
+    policy = OptimalPolicy(plant, found)
     searched = factories.from_file(scenario, theta)
     with FmuPlant(scenario) as fmu:
         costs = [

@@ -148,8 +148,8 @@ def test_no_other_controller_has_a_lower_cost(name):
 def test_refinement_leaves_the_optimum_where_it_is():
     scenario = Scenario.load("fast-sampling")
     plant = PlantProblem.from_scenario(scenario)
-    optimum = solve(plant.problem, plant.law, parameters=plant.parameters)
-    rows = study(plant.problem, plant.law, Settings(), optimum, parameters=plant.parameters)
+    optimum = solve(plant)
+    rows = study(plant, Settings(), optimum)
     sizes = [row.optimum.grid.size for row in rows]
     assert all(fine > 1.5 * coarse for coarse, fine in pairwise(sizes[:-1]))
     assert all(row.stable for row in rows)

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from controllers import Model, Problem, Quantity
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 
 
@@ -49,7 +50,8 @@ class LinearPlant:
             reference_action=np.zeros(m),
             reference_cost=0.0,
         )
-        self.law = DisturbanceLaw("normal", np.zeros(p), np.array(sigma, dtype=float))
+        law = DisturbanceLaw("normal", np.zeros(p), np.array(sigma, dtype=float))
+        self.plant = PlantProblem.nominal(self.problem, law)
 
     def riccati(self, discount=1.0):
         """Value matrix P and gain K of u = Kx for a discount."""

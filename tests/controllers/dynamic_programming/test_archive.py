@@ -21,7 +21,7 @@ P = PROBLEM.model.nominal_parameters
 
 @pytest.fixture(scope="module")
 def optimum():
-    found = solve(SCALAR.problem, SCALAR.law, Settings(level=1))
+    found = solve(SCALAR.plant, Settings(level=1))
     figure = Figure("solution", found.gain, found.lower, found.upper)
     return replace(found, certificate=Certificate((figure,)))
 

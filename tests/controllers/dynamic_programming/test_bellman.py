@@ -4,6 +4,7 @@ from scipy.integrate import solve_ivp
 
 from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
 from controllers.dynamic_programming.grid import Grid
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings, accurate_substeps
 from controllers.errors import OptimumError
@@ -13,12 +14,13 @@ from tests.helpers.sampling import evaporator_problem
 PROBLEM = evaporator_problem()
 P = PROBLEM.model.nominal_parameters
 LAW = DisturbanceLaw("uniform", PROBLEM.model.nominal_disturbance, np.array([1.0, 2.0, 8.0, 5.0]))
+PLANT = PlantProblem(PROBLEM, LAW, P)
 GRID = Grid((np.linspace(20, 32, 13), np.linspace(40, 60, 5)))
 STATE, ACTION = np.array([[25.8, 50.0]]), np.array([[226.0, 217.0]])
 
 
 def operator(substeps=8, nodes=(7, 7, 2, 2), penalty_nodes=(20, 20, 4, 2), **options):
-    return BellmanOperator(PROBLEM, LAW, P, Accuracy(substeps, nodes, penalty_nodes), **options)
+    return BellmanOperator(PLANT, Accuracy(substeps, nodes, penalty_nodes), **options)
 
 
 def test_expected_cost_and_penalty_agree_with_monte_carlo():
@@ -66,8 +68,10 @@ def test_next_state_is_scipys_integration_of_the_model():
         rtol=1e-12,
         atol=1e-12,
     ).y[:, -1]
-    substeps = accurate_substeps(PROBLEM, LAW, P, 1e-7)
-    plant = BellmanOperator(PROBLEM, nominal, P, Accuracy(substeps, (1,) * 4, (1,) * 4))
+    substeps = accurate_substeps(PLANT, 1e-7)
+    plant = BellmanOperator(
+        PlantProblem(PROBLEM, nominal, P), Accuracy(substeps, (1,) * 4, (1,) * 4)
+    )
     fine = Grid(tuple(np.array([x - 1e-3, x + 1e-3]) for x in exact))
     for i in range(2):
         cost = plant.values(STATE, ACTION, fine, np.zeros(fine.size))
@@ -90,7 +94,7 @@ def test_chain_is_stochastic_and_agrees_with_values():
 
 def test_model_that_no_step_integrates_is_refused():
     with pytest.raises(OptimumError, match="128 RK4 substeps a sample do not integrate"):
-        accurate_substeps(evaporator_problem(sampling_time=1e5), LAW, P, 1e-7)
+        accurate_substeps(PlantProblem(evaporator_problem(sampling_time=1e5), LAW, P), 1e-7)
 
 
 BAD_SETTINGS = {

@@ -1,18 +1,17 @@
 import pytest
 
-from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.simulation import simulate_policy
 from controllers.dynamic_programming.solution import solve
 from controllers.dynamic_programming.study import certify, study
 from tests.helpers.linear_plant import SCALAR
 
-PLANT = PlantProblem(SCALAR.problem, SCALAR.law, SCALAR.problem.model.nominal_parameters)
+PLANT = SCALAR.plant
 
 
 @pytest.fixture(scope="module")
 def optimum():
-    return solve(SCALAR.problem, SCALAR.law, Settings())
+    return solve(PLANT, Settings())
 
 
 def test_the_simulated_mean_cost_is_the_linear_regulators(optimum):
@@ -31,7 +30,7 @@ def test_equal_seeds_give_equal_means(optimum):
 
 
 def test_a_study_is_certified_by_what_it_found(optimum):
-    rows = study(SCALAR.problem, SCALAR.law, Settings(), optimum)
+    rows = study(PLANT, Settings(), optimum)
     certified = certify(PLANT, rows, paths=200, steps=500)
     certificate = certified.certificate
     assert [figure.name for figure in certificate.figures] == [

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from controllers.dynamic_programming.plant import PlantProblem
 from controllers.dynamic_programming.quadrature import DisturbanceLaw
 from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import refine, solve
@@ -9,7 +10,7 @@ from tests.helpers.linear_plant import PLANE, SCALAR, LinearPlant
 
 
 def solved(plant, level, criterion="average", **settings):
-    return solve(plant.problem, plant.law, Settings(level=level, criterion=criterion, **settings))
+    return solve(plant.plant, Settings(level=level, criterion=criterion, **settings))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_two_states_and_two_disturbances_agree_with_riccati():
 def test_bounds_enclose_the_optimum_in_every_round_and_the_gain_falls():
     rounds = []
     settings = Settings(level=2, tolerance=1e-7)
-    optimum = solve(SCALAR.problem, SCALAR.law, settings, progress=rounds.append)
+    optimum = solve(SCALAR.plant, settings, progress=rounds.append)
     final = [progress for progress in rounds if progress.level == 2]
     assert len(final) >= 3
     # Two quadratures are at work, the draft's and the last one's.
@@ -76,9 +77,7 @@ def test_bounds_enclose_the_optimum_in_every_round_and_the_gain_falls():
 
 
 def test_number_of_workers_changes_no_bit():
-    one, three = (
-        solve(SCALAR.problem, SCALAR.law, Settings(level=4), workers=workers) for workers in (1, 3)
-    )
+    one, three = (solve(SCALAR.plant, Settings(level=4), workers=workers) for workers in (1, 3))
     assert one.grid.size > 128
     np.testing.assert_array_equal(one.actions, three.actions)
     assert one.gain == three.gain
@@ -86,10 +85,10 @@ def test_number_of_workers_changes_no_bit():
 
 def test_refining_a_solution_equals_solving_finely(scalar_levels):
     coarse, fine = scalar_levels
-    refined = refine(SCALAR.problem, SCALAR.law, Settings(), coarse, level=2)
+    refined = refine(SCALAR.plant, Settings(), coarse, level=2)
     assert refined.grid.size > 1.4 * coarse.grid.size
     assert refined.gain == pytest.approx(fine.gain, rel=1e-5)
-    again = refine(SCALAR.problem, SCALAR.law, Settings(), coarse, accuracy=coarse.accuracy.finer())
+    again = refine(SCALAR.plant, Settings(), coarse, accuracy=coarse.accuracy.finer())
     np.testing.assert_array_equal(again.grid.points, coarse.grid.points)
     assert again.gain == pytest.approx(coarse.gain, rel=1e-5)
 
@@ -104,4 +103,4 @@ def test_unstable_plant_that_leaves_its_box_is_refused():
 
 def test_law_of_another_size_is_refused():
     with pytest.raises(OptimumError, match=r"the law has 2 disturbances, model 'linear' 1"):
-        solve(SCALAR.problem, DisturbanceLaw("none", np.zeros(2), np.zeros(2)))
+        PlantProblem.nominal(SCALAR.problem, DisturbanceLaw("none", np.zeros(2), np.zeros(2)))

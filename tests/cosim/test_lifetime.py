@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from tests.helpers.command import start_cosim
 from tests.helpers.processes import alive, eventually
 
 WORKERS = (
@@ -31,9 +32,8 @@ def test_workers_end_with_the_parent(tmp_path):
 
 
 def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
-    command = [sys.executable, "-m", "cosim", "simulate", "--scenario", "paper"]
     options = ["--controller", "naive", "--steps", "2000000", "--out", str(tmp_path / "out")]
-    with subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True) as process:
+    with start_cosim("simulate", "--scenario", "paper", *options) as process:
         assert eventually((tmp_path / "out").is_dir)
         time.sleep(1.0)  # into the run
         process.terminate()

@@ -158,7 +158,7 @@ def trial(one: Trial[Job], number: signal.Signals) -> dict[str, float]:
     ended = survive(folder, began)
     assert process.stderr is not None
     with process.stderr as stream:
-        said = stream.read().decode()
+        said = stream.read()
     what = f"{job.name}, {number.name} at {one.delay:.2f} s"
     assert "Traceback" not in said, f"{what}:\n{said}"
     if running:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
+
+from tests.helpers.command import start_cosim
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
@@ -91,23 +91,16 @@ def trials(
 
 def start(
     words: Sequence[str], folder: Path, more: Mapping[str, str] = EMPTY, *, group: bool = False
-) -> subprocess.Popen[bytes]:
+) -> subprocess.Popen[str]:
     """Start `cosim` in a trial's folder, in an environment of `more`, in a process `group`."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "cosim", *words],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder.parent / "code")} | more,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        start_new_session=group,
-    )
+    code = {"PYTHONPATH": str(folder.parent / "code")}
+    return start_cosim(*words, folder=folder, env=code | dict(more), start_new_session=group)
 
 
-def finish(process: subprocess.Popen[bytes], what: str) -> None:
+def finish(process: subprocess.Popen[str], what: str) -> None:
     """Wait for a command; raises AssertionError with its last words where it failed."""
     _, said = process.communicate()
-    assert process.returncode == 0, f"{what}: exit code {process.returncode}\n{said.decode()}"
+    assert process.returncode == 0, f"{what}: exit code {process.returncode}\n{said}"
 
 
 def main(

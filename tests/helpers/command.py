@@ -32,3 +32,19 @@ def run_cosim(
         check=check,
         **options,
     )
+
+
+def start_cosim(
+    *words: object, folder: Path | None = None, env: Mapping[str, str] = NOTHING, **options: Any
+) -> subprocess.Popen[str]:
+    """Start `cosim` in a folder, with a pipe from its standard error."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "cosim", *map(str, words)],
+        cwd=folder,
+        env=os.environ | env,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        **options,
+    )

@@ -1,6 +1,4 @@
 import dataclasses
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -19,6 +17,8 @@ from learning.q_learning import StepwiseQLearning
 from learning.registry import load_algorithm
 from learning.training_run import late_movement
 from tests.helpers import training
+from tests.helpers.command import run_cosim, start_cosim
+from tests.helpers.processes import eventually
 from tests.helpers.training import killed_and_resumed, train
 
 SETTINGS = {
@@ -264,42 +264,27 @@ def test_counts_that_make_no_run_are_refused(scenario, change, message):
         make_run(scenario, "q-learning", **change)
 
 
+def written(path):
+    """When a file was written, 0 where there is none."""
+    return path.stat().st_mtime_ns if path.exists() else 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_kill_minus_nine_at_any_moment_then_resume_gives_the_same_files(name, tmp_path):
-    def command(out, *more):
-        settings = [f"--set={key}={value}" for key, value in SETTINGS[name].items()]
-        counts = ["--log-every=50", "--evaluate-every=500", "--checkpoint-every=250"]
-        return [
-            sys.executable, "-m", "cosim", "train", "-a", name, "-n", "4000", "--out", str(out),
-            "--json", *settings, *counts, *more,
-        ]  # fmt: skip
-
+    settings = [f"--set={key}={value}" for key, value in SETTINGS[name].items()]
+    counts = ["--log-every=50", "--evaluate-every=500", "--checkpoint-every=250"]
+    words = ["train", "-a", name, "-n", "4000", "--json", *settings, *counts]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run(command(whole), check=True, capture_output=True)
-    rng = np.random.default_rng(1)
-    process = subprocess.Popen(
-        command(killed), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    for _ in range(3):
-        deadline = time.monotonic() + 120
-        seen = (
-            (killed / "checkpoint.npz").stat().st_mtime_ns
-            if (killed / "checkpoint.npz").exists()
-            else 0
-        )
-        while process.poll() is None and time.monotonic() < deadline:
-            path = killed / "checkpoint.npz"
-            if path.exists() and path.stat().st_mtime_ns != seen:
-                break
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0.0, 0.3))
-        process.kill()
-        process.wait()
-        process = subprocess.Popen(
-            command(killed, "--resume"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-    assert process.wait() == 0
+    run_cosim(*words, "--out", whole, check=True)
+    rng, path, seen = np.random.default_rng(1), killed / "checkpoint.npz", 0
+    for resume in ([], ["--resume"], ["--resume"]):
+        with start_cosim(*words, "--out", killed, *resume) as process:
+            eventually(lambda: process.poll() is not None or written(path) != seen, 120)  # noqa: B023
+            time.sleep(rng.uniform(0.0, 0.3))
+            process.kill()
+        seen = written(path)
+    run_cosim(*words, "--out", killed, "--resume", check=True)
     for file in ("learning.csv", "parameters.toml"):
         assert (whole / file).read_bytes() == (killed / file).read_bytes()
 

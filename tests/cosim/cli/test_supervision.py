@@ -1,15 +1,13 @@
 """Foreign native code may end or spoil the process: never exit code 0 without results."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from tests.helpers.command import run_cosim, start_cosim
 from tests.helpers.kinds import build_kind, scenario_for
 
 
@@ -19,17 +17,15 @@ def fmu(request, tmp_path):
 
 
 def command(folder, fmu, fault, *more):
+    """Words and environment of a run."""
     scenario = scenario_for(folder, fmu, fault=fault)
     words = ["simulate", "-s", scenario, "-c", "tests.helpers.loop:hold", "-n", 3, "--out", "out"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
-    return [sys.executable, "-m", "cosim", *map(str, (*words, *more))], environment
+    return [*words, *more], {"PYTHONPATH": str(Path(__file__).parents[3])}
 
 
 def run(folder, fmu, fault, *more):
     words, environment = command(folder, fmu, fault, *more)
-    return subprocess.run(
-        words, cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
+    return run_cosim(*words, folder=folder, env=environment)
 
 
 def test_an_fmu_that_exits_is_one_line_and_exit_code_2(tmp_path):
@@ -95,9 +91,7 @@ def test_json_and_notes_come_through_the_watching_process(tmp_path):
 @pytest.mark.slow
 def test_the_watched_process_ends_with_the_watching_one(tmp_path, fmu):
     words, environment = command(tmp_path, fmu, 12)
-    with subprocess.Popen(
-        words, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
-    ) as process:
+    with start_cosim(*words, folder=tmp_path, env=environment) as process:
         assert "native code of" in process.stderr.readline()
         process.send_signal(signal.SIGKILL)
         process.wait()

@@ -8,7 +8,8 @@ from controllers.model import Model, Quantity
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.rti.prepared import LinearisationPoint
+from controllers.rti.solution import RtiSolution
 from controllers.theta import ThetaBlocks
 
 if TYPE_CHECKING:

@@ -17,7 +17,8 @@ from controllers.qp import QpBackend, QpSolution, SoftQp
 from controllers.qp.problem import NOT_CONVEX
 from controllers.rti import RtiNmpc
 from controllers.rti.hessian import Exact
-from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.rti.prepared import LinearisationPoint
+from controllers.rti.solution import RtiSolution
 
 Vector = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Literal
 
 FmiVersion = Literal[2, 3]
+C_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class Kind(StrEnum):

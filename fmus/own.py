@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -10,10 +9,10 @@ from xml.etree import ElementTree
 from fmus.archive import write_archive
 from fmus.compiler import Compiler, cross_compiler, local_compiler
 from fmus.errors import BuildError
+from fmus.model import C_IDENTIFIER
 from fmus.platforms import PLATFORMS
 from fmus.universal import universal_binary
 
-_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _QUIET = ("-w",)
 
 
@@ -114,7 +113,7 @@ def _model(description: bytes) -> tuple[str, str]:
             f"not {len(identifiers)}"
         )
     identifier = identifiers.pop()
-    if not _IDENTIFIER.fullmatch(identifier):
+    if not C_IDENTIFIER.fullmatch(identifier):
         raise BuildError(
             f"modelDescription.xml: modelIdentifier {identifier!r} is not a C identifier"
         )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import QpError
-from controllers.rti.solution import LinearisationPoint
+from controllers.rti.prepared import LinearisationPoint
 from cosim.protocols import recover
 from learning.exploration import Strategy
 from learning.protocols import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
-from controllers.rti.solution import LinearisationPoint
+from controllers.rti.prepared import LinearisationPoint
 from cosim.protocols import Controller, Solution, Step
 from cosim.scenario import Scenario
 from learning.configuration import Configuration

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import QpError
-from controllers.rti.solution import LinearisationPoint
+from controllers.rti.prepared import LinearisationPoint
 from learning.average_cost import AverageCost
 from learning.protocols import LearnableController, LearnableSolution, Transition
 

@@ -2,6 +2,7 @@
 
 from controllers.rti.iterated import IteratedNmpc
 from controllers.rti.nmpc import RtiNmpc
-from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.rti.prepared import LinearisationPoint
+from controllers.rti.solution import RtiSolution
 
 __all__ = ["IteratedNmpc", "LinearisationPoint", "RtiNmpc", "RtiSolution"]

@@ -11,7 +11,8 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend
 from controllers.rti.nmpc import RtiNmpc
-from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.rti.prepared import LinearisationPoint
+from controllers.rti.solution import RtiSolution
 
 
 class IteratedNmpc(RtiNmpc):

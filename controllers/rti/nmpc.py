@@ -19,8 +19,9 @@ from controllers.qp.enforced_action import multipliers_at_kink
 from controllers.rti.feedback import embedding, readout
 from controllers.rti.hessian import make_hessian
 from controllers.rti.preparation import preparation, qp_in_memory
+from controllers.rti.prepared import Functions, LinearisationPoint, Prepared
 from controllers.rti.riccati import LEAST_CONTROLS, limits_of, riccati
-from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
+from controllers.rti.solution import RtiSolution
 from controllers.sensitivities import sensitivities
 
 Vector = NDArray[np.float64]

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 from fmus.errors import BuildError
-from fmus.model import Kind, Model, Type, Unit, Variable
+from fmus.model import C_IDENTIFIER, Kind, Model, Type, Unit, Variable
 from fmus.variables import UNITS
 
-_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _INFINITE = float("inf")
 _LARGEST = sys.float_info.max
 _SAMPLES = 100
@@ -65,7 +63,7 @@ class SampledSystem:
 
     def __post_init__(self) -> None:
         """Check what the model description and the C header rely on."""
-        if not _IDENTIFIER.fullmatch(self.identifier):
+        if not C_IDENTIFIER.fullmatch(self.identifier):
             raise BuildError(f"'{self.identifier}' is not a C identifier")
         if not 0 < self.sampling_time < float("inf"):
             raise BuildError(f"the sampling time must be positive, not {self.sampling_time}")

@@ -38,7 +38,7 @@ class _Known:
 
 
 class _Measured(NamedTuple):
-    """What the merit function is made of at a point; `gradient` is that of the cost."""
+    """Of a point `cost` and its `gradient`, the states' `penalty`, `infeasibility` ‖defects‖₁."""
 
     cost: float
     penalty: float

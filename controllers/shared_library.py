@@ -28,7 +28,7 @@ WAIT = 0.01
 
 
 class Compiler(NamedTuple):
-    """A C compiler: its `path`, and what tells it from others, in one line."""
+    """A C compiler: its `path`, and its `identity`, one line that tells it from others."""
 
     path: str
     identity: str

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import casadi as ca
 
 from controllers.problem import Problem
-from controllers.theta import SymbolicTheta, ThetaBlocks
+from controllers.symbolic_theta import SymbolicTheta
+from controllers.theta import ThetaBlocks
 
 
 def sampled_jacobian(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from controllers.buffered import StackedFunction, stacked
 from controllers.dynamics import sampled_jacobian
 from controllers.problem import Problem
-from controllers.theta import SymbolicTheta, ThetaBlocks
+from controllers.symbolic_theta import SymbolicTheta
+from controllers.theta import ThetaBlocks
 
 Vector = NDArray[np.float64]
 

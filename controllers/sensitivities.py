@@ -20,7 +20,8 @@ from controllers.problem import Problem
 from controllers.qp.active_set import kkt_solve
 from controllers.qp.problem import QpSolution, SoftQp
 from controllers.qp.stagewise import LEAST_CONTROLS, StageMatrices, kkt_solve_by_stages
-from controllers.theta import SymbolicTheta, ThetaBlocks
+from controllers.symbolic_theta import SymbolicTheta
+from controllers.theta import ThetaBlocks
 
 Matrix = NDArray[np.float64]
 SOLUTION = ("xi", "t", "chi", "v", "lam")

@@ -47,9 +47,8 @@ class TrainingLoop:
     learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on; a plant
     that cannot serialise its state leaves no checkpoint, and the result says so.
 
-    The log of a plant that drifts has its present state too (`Drift`).
-
-    Log, evaluations and files show the θ that the run would end with if it ended there.
+    Log, evaluations and files show the θ that the run would end with if it ended there; the log of
+    a plant that drifts has its present state too (`Drift`).
     """
 
     def __init__(
@@ -216,8 +215,8 @@ class TrainingLoop:
         before = next((judged for judged in earlier if isfinite(judged)), limit)
         if before <= limit and row["samples"] < self._run.samples:
             return None
-        where = f"at sample {int(row['samples'])}"
-        return f"diverged: greedy J = {shown(greedy)} exceeds {shown(limit)} {where}"
+        reason = f"greedy J = {shown(greedy)} exceeds {shown(limit)}"
+        return f"diverged: {reason} at sample {int(row['samples'])}"
 
     def _record(self, row: LogRow) -> None:
         if self._recorder is not None:

@@ -6,7 +6,8 @@ import casadi as ca
 
 from controllers.buffered import StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.theta import SymbolicTheta, ThetaBlocks
+from controllers.symbolic_theta import SymbolicTheta
+from controllers.theta import ThetaBlocks
 
 
 def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:

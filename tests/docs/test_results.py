@@ -1,4 +1,4 @@
-"""The results tables that README and docs show are those of results/learning, row by row."""
+"""The results tables that README and docs show are those of the stored studies, row by row."""
 
 import csv
 import math
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-STUDY = ROOT / "results" / "learning"
+RULES = ("q-learning", "batch-q-learning", "actor-critic")
 
 PAGES = {
     "fouled": "README.md",
@@ -44,10 +44,15 @@ LABELS = {
 }
 
 
+def summary(study: str) -> list[dict[str, str]]:
+    """The rows of a stored study's summary."""
+    with (ROOT / "results" / study / "summary.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def table(scenario: str) -> str:
     """The table of a scenario, best median regret first."""
-    with (STUDY / "summary.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["scenario"] == scenario]
+    rows = [row for row in summary("learning") if row["scenario"] == scenario]
     rows.sort(key=lambda row: float(row["regret_median"]))
     lines = [
         f"| `{scenario}` | plant samples | J, median | regret %, median [95 %] | "
@@ -87,3 +92,28 @@ def test_the_table_is_the_stored_one(scenario):
     expected = table(scenario)
     page = ROOT / PAGES[scenario]
     assert expected in page.read_text(), f"{page.name}'s table of {scenario} shall be\n{expected}"
+
+
+def bounds_line(scenario: str) -> str:
+    """What a long policy search reaches on a scenario, beside the rules' medians."""
+    found = {
+        (row["scenario"], row["case"]): float(row["regret_median"])
+        for study in ("bounds", "learning")
+        for row in summary(study)
+    }
+    searches = [
+        percent(found[scenario, f"policy-search(parametrisation={kind})"])
+        for kind in ("paper", "extended")
+    ]
+    medians = [
+        [found[scenario, f"{rule}(start={start})"] for rule in RULES]
+        for start in ("naive", "tuned")
+    ]
+    rules = [f"{percent(min(each))}–{percent(max(each))}" for each in medians]
+    return f"| `{scenario}` | {' | '.join((*searches, *rules))} |"
+
+
+@pytest.mark.parametrize("scenario", PAGES)
+def test_the_bounds_are_the_stored_ones(scenario):
+    expected = bounds_line(scenario)
+    assert expected in (ROOT / "docs" / "benchmark.md").read_text(), expected

@@ -132,7 +132,7 @@ class Judge:
 
     @cached_property
     def _start_cost(self) -> NDArray[np.float64]:
-        return self._evaluation.costs(self._build(self._start))["J"]
+        return self._evaluation.costs(self.controller(self._start.theta))["J"]
 
     @cached_property
     def _optimal_cost(self) -> NDArray[np.float64]:

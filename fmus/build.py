@@ -9,12 +9,13 @@ from pathlib import Path
 
 from fmus.archive import read_archive, write_archive
 from fmus.compiler import COMPILER_FLAGS, WARNINGS, Compiler
-from fmus.description import MODEL_IDENTIFIER, build_description, model_description
+from fmus.description import build_description, model_description
 from fmus.documentation import RESOURCES, documentation_page
 from fmus.errors import BuildError
 from fmus.header import c_header
 from fmus.model import FmiVersion
 from fmus.own import binaries, compilers
+from fmus.variables import EVAPORATOR, VARIABLES
 from rti_storage.temporary import temporary_folder
 
 PACKAGE = Path(__file__).parent
@@ -30,10 +31,16 @@ def hand_written_sources() -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in files if path.name != HEADER}
 
 
+def header(token: str) -> str:
+    """The text of `variables.h` with the model's `token`."""
+    return c_header(token, VARIABLES, "from fmus/variables.py by `cosim fmu build --in-place`")
+
+
 def model_token() -> str:
     """GUID of FMI 2.0 and instantiation token of FMI 3.0: a digest of all that makes the model."""
     digest = hashlib.sha256()
-    for text in (c_header(""), model_description(2, ""), model_description(3, "")):
+    descriptions = (model_description(version, "", EVAPORATOR) for version in FILE_NAMES)
+    for text in (header(""), *descriptions):
         digest.update(text.encode())
     for name, content in hand_written_sources().items():
         digest.update(name.encode() + b"\0" + content)
@@ -44,8 +51,8 @@ def sources(version: FmiVersion) -> dict[str, bytes]:
     """File name → bytes of the folder `sources/` of the FMU, generated files included."""
     other = "fmi3.c" if version == 2 else "fmi2.c"
     files = {name: data for name, data in hand_written_sources().items() if name != other}
-    files[HEADER] = c_header(model_token()).encode()
-    files["buildDescription.xml"] = build_description(version).encode()
+    files[HEADER] = header(model_token()).encode()
+    files["buildDescription.xml"] = build_description(version, EVAPORATOR).encode()
     return files
 
 
@@ -72,11 +79,11 @@ def contents(version: FmiVersion, every_platform: bool) -> dict[str, bytes]:
     code = sources(version)
     used = compilers(every_platform)
     files = {
-        "modelDescription.xml": model_description(version, model_token()).encode(),
+        "modelDescription.xml": model_description(version, model_token(), EVAPORATOR).encode(),
         "documentation/index.html": documentation_page(version, BUILD_FILE).encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
         BUILD_FILE: build_record(used),
-        **binaries(code, MODEL_IDENTIFIER, f"{version}.0", used, WARNINGS),
+        **binaries(code, EVAPORATOR.identifier, f"{version}.0", used, WARNINGS),
         **{f"sources/{name}": data for name, data in code.items()},
     }
     if version == 2:
@@ -122,5 +129,5 @@ def compare_with_shipped() -> dict[str, list[str]]:
 
 def build_in_place() -> list[Path]:
     """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
-    (SOURCES / HEADER).write_text(c_header(model_token()))
+    (SOURCES / HEADER).write_text(header(model_token()))
     return build(PACKAGE, every_platform=True)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from functools import cache
 
 from fmus.model import Kind, Model
-from fmus.variables import EVAPORATOR
 
 _CALCULATED = (Kind.OUTPUT, Kind.DERIVATIVE)
 
 
 @cache
-def closure(name: str, model: Model = EVAPORATOR) -> frozenset[str]:
+def closure(name: str, model: Model) -> frozenset[str]:
     """All variables that calculated variable `name` depends on, states not resolved further."""
     found: set[str] = set()
     for used in model.by_name[name].uses:
@@ -21,7 +20,7 @@ def closure(name: str, model: Model = EVAPORATOR) -> frozenset[str]:
     return frozenset(found)
 
 
-def continuous_dependencies(name: str, model: Model = EVAPORATOR) -> tuple[str, ...]:
+def continuous_dependencies(name: str, model: Model) -> tuple[str, ...]:
     """States and inputs that `name` depends on during the simulation, in table order."""
     if model.by_name[name].kind is Kind.STATE:
         return (name,)
@@ -29,7 +28,7 @@ def continuous_dependencies(name: str, model: Model = EVAPORATOR) -> tuple[str, 
     return tuple(n for n in model.names(Kind.STATE, Kind.INPUT) if n in known)
 
 
-def initial_dependencies(name: str, model: Model = EVAPORATOR) -> tuple[str, ...]:
+def initial_dependencies(name: str, model: Model) -> tuple[str, ...]:
     """Parameters and inputs that `name` depends on at initialisation, in table order."""
     names = set(closure(name, model))
     for state in [n for n in names if model.by_name[n].kind is Kind.STATE]:

@@ -7,9 +7,7 @@ from xml.etree import ElementTree
 
 from fmus.model import LAWS, FmiVersion, Kind, Model, Type, Unit, Variable
 from fmus.structure import add_structure, index
-from fmus.variables import EVAPORATOR
 
-MODEL_IDENTIFIER = EVAPORATOR.identifier
 LICENSE = "MIT"
 
 _LOG_CATEGORIES = {
@@ -31,7 +29,7 @@ _INT32 = ("-2147483648", "2147483647")
 _COMMON_CAPABILITIES = {"canBeInstantiatedOnlyOncePerProcess": "false"}
 
 
-def model_description(version: FmiVersion, token: str, model: Model = EVAPORATOR) -> str:
+def model_description(version: FmiVersion, token: str, model: Model) -> str:
     """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
     root = _root(version, token, model)
     _interfaces(root, version, model)
@@ -51,7 +49,7 @@ def model_description(version: FmiVersion, token: str, model: Model = EVAPORATOR
     return to_text(root)
 
 
-def build_description(version: FmiVersion, model: Model = EVAPORATOR) -> str:
+def build_description(version: FmiVersion, model: Model) -> str:
     """The text of sources/buildDescription.xml: one C99 source file, linked with libm."""
     root = ElementTree.Element("fmiBuildDescription", fmiVersion="3.0")
     build = ElementTree.SubElement(

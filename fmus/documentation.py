@@ -8,7 +8,7 @@ from string import Template
 
 from fmus.description import LICENSE
 from fmus.model import FmiVersion, Variable
-from fmus.variables import EVAPORATOR, exported, value_reference
+from fmus.variables import EVAPORATOR
 
 RESOURCES = Path(__file__).parent / "resources"
 
@@ -22,7 +22,7 @@ def documentation_page(version: FmiVersion, build_file: str) -> str:
         model_version=EVAPORATOR.version,
         license=LICENSE,
         diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
-        rows="\n".join(_row(variable) for variable in exported(version)),
+        rows="\n".join(_row(variable) for variable in EVAPORATOR.exported(version)),
         source=f"fmi{version}.c",
         build_file=build_file,
     )
@@ -33,8 +33,9 @@ def _row(variable: Variable) -> str:
         f'<td class="n">{_number(value)}</td>'
         for value in (variable.start, variable.min, variable.max)
     )
+    reference = EVAPORATOR.value_reference(variable.name)
     return (
-        f'<tr><td>{variable.name}</td><td class="n">{value_reference(variable.name)}</td>'
+        f'<tr><td>{variable.name}</td><td class="n">{reference}</td>'
         f"<td>{variable.kind}</td><td>{escape(variable.unit)}</td>{numbers}"
         f"<td>{escape(variable.description)}</td></tr>"
     )

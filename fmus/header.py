@@ -1,4 +1,4 @@
-"""Generate the C header `sources/variables.h` from the table of variables."""
+"""Generate the C header `variables.h` from a table of variables."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Sequence
 
 from fmus.model import Kind, Type, Variable
-from fmus.variables import VARIABLES
 
 _TYPES = {
     Type.REAL: "REAL",
@@ -27,11 +26,7 @@ _KINDS = {
 _SEED_MAX = 4294967295.0
 
 
-def c_header(
-    token: str,
-    variables: Sequence[Variable] = VARIABLES,
-    origin: str = "from fmus/variables.py by `cosim fmu build --in-place`",
-) -> str:
+def c_header(token: str, variables: Sequence[Variable], origin: str) -> str:
     """The header's text: value references, types, starts and ranges, and the model's `token`."""
     references = "\n".join(f"    VR_{v.identifier} = {i}," for i, v in enumerate(variables))
     rows = "\n".join(f"    {_row(variable)}," for variable in variables)

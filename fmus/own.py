@@ -31,7 +31,6 @@ def build_fmu(
     *,
     every_platform: bool = False,
     files: Mapping[str, bytes] | None = None,
-    warnings: tuple[str, ...] = _QUIET,
 ) -> Path:
     """Compile C sources and write them with their model description as the FMU `target`.
 
@@ -50,7 +49,7 @@ def build_fmu(
         raise BuildError(f"{path}: there is no C source (*.c) to build it from")
     members = {
         "modelDescription.xml": text,
-        **binaries(sources, identifier, version, compilers(every_platform), warnings),
+        **binaries(sources, identifier, version, compilers(every_platform), _QUIET),
         **{f"sources/{name}": data for name, data in sources.items()},
     }
     return write_archive({**(files or {}), **members}, path)

@@ -7,17 +7,14 @@ from xml.etree import ElementTree
 
 from fmus.dependencies import continuous_dependencies, initial_dependencies
 from fmus.model import FmiVersion, Kind, Model
-from fmus.variables import EVAPORATOR
 
 
-def add_structure(
-    root: ElementTree.Element, version: FmiVersion, model: Model = EVAPORATOR
-) -> None:
+def add_structure(root: ElementTree.Element, version: FmiVersion, model: Model) -> None:
     """Append ModelStructure to the model description `root`."""
     (_structure2 if version == 2 else _structure3)(root, model)
 
 
-def index(name: str, model: Model = EVAPORATOR) -> int:
+def index(name: str, model: Model) -> int:
     """Position of a variable in the model description of FMI 2.0, from 1."""
     return [v.name for v in model.exported(2)].index(name) + 1
 

@@ -6,12 +6,7 @@ variable's value reference is its position in the table, the same in FMI 2.0 and
 
 from __future__ import annotations
 
-from fmus.model import LAWS, SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
-
-__all__ = [
-    "BY_NAME", "DISTURBANCES", "EVAPORATOR", "LAWS", "STATES", "UNITS", "VARIABLES", "FmiVersion",
-    "Kind", "Type", "Unit", "Variable", "exported", "value_reference",
-]  # fmt: skip
+from fmus.model import SATURATE, Kind, Model, Type, Unit, Variable
 
 UNITS = (
     Unit("1"),
@@ -185,13 +180,3 @@ EVAPORATOR = Model(
 )
 
 BY_NAME = EVAPORATOR.by_name
-
-
-def value_reference(name: str) -> int:
-    """The value reference of the evaporator's variable `name`; KeyError when there is none."""
-    return EVAPORATOR.value_reference(name)
-
-
-def exported(version: FmiVersion) -> list[Variable]:
-    """The evaporator's variables that FMI `version` shows."""
-    return EVAPORATOR.exported(version)

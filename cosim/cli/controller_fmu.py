@@ -11,8 +11,8 @@ from controllers.export import Entry, core, table
 from cosim.errors import ControllerLookupError
 from cosim.lookup import build_controller
 from cosim.scenario import Scenario
+from fmus.model import FmiVersion
 from fmus.sampled import SampledSystem, Signal, build_sampled
-from fmus.variables import FmiVersion
 
 IDENTIFIER = "rti_nmpc"
 RECORD = "extra/org.rti-cosim/controller.json"

@@ -12,9 +12,11 @@ import pytest
 from fmpy import fmi2, fmi3
 
 import fmus
-from fmus.variables import BY_NAME, VARIABLES, Type, value_reference
+from fmus.model import Type
+from fmus.variables import BY_NAME, EVAPORATOR, VARIABLES
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
+value_reference = EVAPORATOR.value_reference
 
 
 @cache
@@ -128,7 +130,10 @@ class Instance:
         return (fmu.deSerializeFMUstate if self.version == 2 else fmu.deserializeFMUState)(data)
 
     def directional(self, unknowns: list[str], knowns: list[str], seed: list[float]) -> list[float]:
-        arguments = [value_reference(n) for n in unknowns], [value_reference(n) for n in knowns]
+        arguments = (
+            [value_reference(n) for n in unknowns],
+            [value_reference(n) for n in knowns],
+        )
         return list(self.fmu.getDirectionalDerivative(*arguments, seed))
 
     def start_continuous_time(self) -> float | None:

@@ -19,6 +19,7 @@ from fmus.archive import write_archive
 from fmus.errors import BuildError
 from fmus.own import compilers
 from fmus.platforms import PLATFORMS, present
+from fmus.variables import EVAPORATOR
 
 HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
 needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="there is no C compiler")
@@ -120,7 +121,7 @@ def test_every_member_but_the_binary_is_up_to_date(version: int) -> None:
     with zipfile.ZipFile(fmus.path(name)) as container:
         for member, data in build.sources(version).items():
             assert container.read(f"sources/{member}") == data, member
-        description = build.model_description(version, build.model_token()).encode()
+        description = build.model_description(version, build.model_token(), EVAPORATOR).encode()
         assert container.read("modelDescription.xml") == description
         page = build.documentation_page(version, build.BUILD_FILE).encode()
         assert container.read("documentation/index.html") == page

@@ -10,7 +10,8 @@ from lxml import etree
 
 import fmus
 from fmus.description import build_description, model_description
-from fmus.variables import VARIABLES, Kind, Type
+from fmus.model import Kind, Type
+from fmus.variables import EVAPORATOR, VARIABLES
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 
@@ -38,7 +39,7 @@ def test_capabilities(description, version: int) -> None:
     assert description.coSimulation.canHandleVariableCommunicationStepSize
     assert not description.coSimulation.fixedInternalStepSize
     name = "providesDirectionalDerivative" + ("s" if version == 3 else "")
-    root = ElementTree.fromstring(model_description(version, ""))
+    root = ElementTree.fromstring(model_description(version, "", EVAPORATOR))
     assert [root.find(t).get(name) for t in ("CoSimulation", "ModelExchange")] == ["true", "true"]
 
 
@@ -78,7 +79,7 @@ def test_table_and_description_agree(description) -> None:
 def test_further_xml_follows_the_standard_schema(name: str) -> None:
     schema = etree.XMLSchema(etree.parse(str(files("fmpy") / "schema" / "fmi3" / f"{name}.xsd")))
     if name == "fmi3BuildDescription":
-        document = etree.fromstring(build_description(3).encode())
+        document = etree.fromstring(build_description(3, EVAPORATOR).encode())
     else:
         resource = files("fmus") / "resources" / "terminalsAndIcons.xml"
         document = etree.fromstring(resource.read_bytes())

@@ -6,6 +6,7 @@ import pytest
 import fmus
 from fmus.dependencies import initial_dependencies
 from fmus.structure import index
+from fmus.variables import EVAPORATOR
 
 
 @pytest.fixture
@@ -26,10 +27,10 @@ def test_states_are_the_two_of_the_model(description) -> None:
 def test_dependencies_of_the_file_are_those_of_the_table(description, version: int) -> None:
     for unknown in description.initialUnknowns:
         names = [v.name for v in unknown.dependencies]
-        expected = initial_dependencies(unknown.variable.name)
+        expected = initial_dependencies(unknown.variable.name, EVAPORATOR)
         assert names == [n for n in expected if version == 2 or n != "seedHigh"]
 
 
 def test_index_counts_from_one_as_the_file_does() -> None:
     variables = fmpy.read_model_description(str(fmus.path())).modelVariables
-    assert [index(v.name) for v in variables] == list(range(1, len(variables) + 1))
+    assert [index(v.name, EVAPORATOR) for v in variables] == list(range(1, len(variables) + 1))

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmus.variables import BY_NAME, UNITS, VARIABLES, Kind, Type, value_reference
+from fmus.model import Kind, Type
+from fmus.variables import BY_NAME, EVAPORATOR, UNITS, VARIABLES
 
 
 def test_names_are_unique() -> None:
@@ -11,7 +12,7 @@ def test_names_are_unique() -> None:
 
 
 def test_value_reference_is_the_position() -> None:
-    assert [value_reference(v.name) for v in VARIABLES] == list(range(len(VARIABLES)))
+    assert [EVAPORATOR.value_reference(v.name) for v in VARIABLES] == list(range(len(VARIABLES)))
 
 
 @pytest.mark.parametrize("variable", VARIABLES, ids=lambda v: v.name)

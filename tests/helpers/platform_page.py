@@ -11,8 +11,8 @@ from pathlib import Path
 
 from cosim.text_tables import markdown_table
 from fmus.checks import check
+from fmus.model import FmiVersion
 from fmus.platforms import PLATFORMS
-from fmus.variables import FmiVersion
 from tests.helpers.platforms import (
     LAWS,
     NATIVE,

@@ -22,11 +22,11 @@ from cosim import FmuPlant, Scenario
 from cosim.cli.controller_fmu import IDENTIFIER, rti_controller, sampled_controller, write_fmu
 from fmus.build import HEADER, SOURCES
 from fmus.compiler import cross_compiler
-from fmus.description import MODEL_IDENTIFIER
+from fmus.model import FmiVersion
 from fmus.platforms import PLATFORMS, Platform
 from fmus.sampled import SampledSystem
 from fmus.sampled.build import sampled_sources
-from fmus.variables import FmiVersion
+from fmus.variables import EVAPORATOR
 
 HOSTS = Path(__file__).parents[1] / "fmus" / "platforms"
 BY_NAME = {platform.tuple: platform for platform in PLATFORMS}
@@ -130,7 +130,7 @@ def hosted_plant(version: FmiVersion, folder: Path) -> Hosted:
     """The shipped plant."""
     fmu = fmus.path(fmus.NAMES[version - 2])
     importer = Importer("host.c", {HEADER: (SOURCES / HEADER).read_bytes()}, folder / "host")
-    return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, MODEL_IDENTIFIER)
+    return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, EVAPORATOR.identifier)
 
 
 def hosted_controller(version: FmiVersion, folder: Path) -> Hosted:

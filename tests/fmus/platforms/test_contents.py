@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 import fmus
-from fmus.description import MODEL_IDENTIFIER
 from fmus.platforms import PLATFORMS
 from fmus.universal import universal_binary
+from fmus.variables import EVAPORATOR
 from tests.helpers import mach_o
 
 NOT_OURS = {"__dso_handle", "_mh_dylib_header"}
@@ -41,7 +41,7 @@ def functions(version: int) -> set[str]:
 
 
 def test_there_is_a_library_for_each_platform(binaries, version: int) -> None:
-    expected = {f"{p.folder(f'{version}.0')}/{MODEL_IDENTIFIER}{p.suffix}" for p in PLATFORMS}
+    expected = {f"{p.folder(f'{version}.0')}/{EVAPORATOR.identifier}{p.suffix}" for p in PLATFORMS}
     assert set(binaries) == expected
 
 
@@ -64,7 +64,7 @@ def test_macos_libraries_export_the_functions_of_the_standard_and_need_the_syste
             library = mach_o.read(part)
             assert library.exports - NOT_OURS == functions
             assert library.needs == ("/usr/lib/libSystem.B.dylib",)
-            assert library.name == f"{MODEL_IDENTIFIER}.dylib"
+            assert library.name == f"{EVAPORATOR.identifier}.dylib"
             assert library.least_version == (11, 0)
             assert library.signed or library.architecture == "x86_64"
             found.append((name.split("/")[0], library.architecture))

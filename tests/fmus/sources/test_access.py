@@ -7,7 +7,8 @@ from ctypes import c_double, c_uint32
 
 import pytest
 
-from fmus.variables import BY_NAME, VARIABLES, Kind, Type, value_reference
+from fmus.model import Kind, Type
+from fmus.variables import BY_NAME, EVAPORATOR, VARIABLES
 
 DISCARD, ERROR = 2, 3
 REAL_SETTABLE = [v.name for v in VARIABLES if v.settable and v.type is Type.REAL]
@@ -80,7 +81,7 @@ def test_unknown_value_reference_is_an_error(refused, plant, reference: int) -> 
 
 def test_variable_of_another_type_is_an_error(refused, plant) -> None:
     plant.initialise()
-    status, text = refused(plant, lambda: plant.fmu.getBoolean([value_reference("X2")]))
+    status, text = refused(plant, lambda: plant.fmu.getBoolean([EVAPORATOR.value_reference("X2")]))
     assert status == ERROR
     assert "X2" in text
     assert "another type" in text
@@ -92,7 +93,7 @@ def test_calculated_variable_cannot_be_set(refused, plant, kind: Kind) -> None:
     for variable in (v for v in VARIABLES if v.kind is kind):
         suffix = "Real" if plant.version == 2 else "Float64"
         setter = getattr(plant.fmu, f"set{suffix}")
-        reference = value_reference(variable.name)
+        reference = EVAPORATOR.value_reference(variable.name)
         status, text = refused(plant, lambda s=setter, r=reference: s([r], [1.0]))
         assert status == ERROR
         assert f"{variable.name} cannot be set" in text
@@ -111,7 +112,7 @@ def test_refused_call_with_several_values_changes_none_of_them(refused, plant) -
     plant.initialise()
     before = plant.get("P100", "F200")
     suffix = "Real" if plant.version == 2 else "Float64"
-    references = [value_reference("P100"), value_reference("F200")]
+    references = [EVAPORATOR.value_reference("P100"), EVAPORATOR.value_reference("F200")]
     setter = getattr(plant.fmu, f"set{suffix}")
     assert refused(plant, lambda: setter(references, [300.0, math.nan]))[0] == ERROR
     assert plant.get("P100", "F200") == before
@@ -130,7 +131,7 @@ def test_instance_goes_on_after_a_refused_call(refused, open_fmu, version: int) 
 def test_null_array_is_an_error(refused, plant) -> None:
     plant.initialise()
     fmu, null = plant.fmu, None
-    reference = (c_uint32 * 1)(value_reference("X2"))
+    reference = (c_uint32 * 1)(EVAPORATOR.value_reference("X2"))
     if plant.version == 2:
         calls = [
             lambda: fmu.fmi2GetReal(fmu.component, reference, 1, null),
@@ -152,7 +153,7 @@ def test_null_array_is_an_error(refused, plant) -> None:
 def test_value_array_of_another_length_is_an_error(refused, open_fmu) -> None:
     plant = open_fmu(3).initialise()
     fmu = plant.fmu
-    reference = (c_uint32 * 1)(value_reference("X2"))
+    reference = (c_uint32 * 1)(EVAPORATOR.value_reference("X2"))
     status, text = refused(
         plant, lambda: fmu.fmi3GetFloat64(fmu.component, reference, 1, (c_double * 2)(), 2)
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmus.variables import VARIABLES, Kind, Type, value_reference
+from fmus.model import Kind, Type
+from fmus.variables import EVAPORATOR, VARIABLES
 
 REALS = [v for v in VARIABLES if v.type is Type.REAL]
 UNKNOWNS = [v.name for v in REALS if v.kind in (Kind.OUTPUT, Kind.DERIVATIVE, Kind.STATE)]
@@ -13,7 +14,7 @@ KNOWNS = [v.name for v in REALS if v.kind in (Kind.INPUT, Kind.TUNABLE, Kind.FIX
 
 
 def references(names: list[str]) -> list[int]:
-    return [value_reference(name) for name in names]
+    return [EVAPORATOR.value_reference(name) for name in names]
 
 
 def adjoint(instance, seed: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
 
-from fmus.variables import BY_NAME, VARIABLES, Kind, Type, value_reference
+from fmus.model import Kind, Type
+from fmus.variables import BY_NAME, EVAPORATOR, VARIABLES
 
 REALS = [v for v in VARIABLES if v.type is Type.REAL]
 UNKNOWNS = [v.name for v in REALS if v.kind in (Kind.OUTPUT, Kind.DERIVATIVE, Kind.STATE)]
@@ -97,7 +98,7 @@ def test_variable_in_the_wrong_role_is_an_error(plant, unknown: str, known: str)
 def test_unknown_reference_is_an_error(plant) -> None:
     plant.initialise()
     with pytest.raises(FMICallException):
-        plant.fmu.getDirectionalDerivative([value_reference("F2")], [999], [1.0])
+        plant.fmu.getDirectionalDerivative([EVAPORATOR.value_reference("F2")], [999], [1.0])
     assert "unknown value reference 999" in plant.messages[-1][2]
 
 

@@ -117,3 +117,19 @@ def bounds_line(scenario: str) -> str:
 def test_the_bounds_are_the_stored_ones(scenario):
     expected = bounds_line(scenario)
     assert expected in (ROOT / "docs" / "benchmark.md").read_text(), expected
+
+
+OUTSIDERS = {
+    "mpcrl": "mpcrl: LSTD Q-learning on IPOPT | 3 000",
+    "sac": "Stable-Baselines3: SAC | 30 000",
+    "ppo": "Stable-Baselines3: PPO | 200 000",
+}
+
+
+@pytest.mark.parametrize("case", OUTSIDERS)
+def test_an_outsiders_row_is_the_stored_one(case):
+    (row,) = (row for row in summary("outsiders") if row["case"] == case)
+    values = [percent(float(row[f"regret_median{end}"])) for end in ("", "_low", "_high")]
+    cost = f"{float(row['J_median']):.1f}"
+    expected = f"| {OUTSIDERS[case]} | {cost} | {values[0]} [{values[1]}, {values[2]}] |"
+    assert expected in (ROOT / "docs" / "benchmark.md").read_text(), expected

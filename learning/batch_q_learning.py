@@ -12,6 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 from cosim.scenario import Scenario
 from learning.average_cost import AverageCost
 from learning.batch_configuration import BatchQLearningConfiguration
+from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration
 from learning.constrained_step import ConstrainedStep
 from learning.exploration import Strategy
@@ -140,7 +141,7 @@ class ReplayedQLearning:
         return {
             "radius": np.array(self._radius),
             "mean_cost": np.array(self._average_cost.mean_cost),
-            **{f"buffer_{name}": values for name, values in self._buffer.state().items()},
+            **prefixed("buffer_", self._buffer.state()),
             **{f"trial_{name}": np.asarray(value) for name, value in trial.items()},
         }
 
@@ -148,16 +149,8 @@ class ReplayedQLearning:
         """Take back what `state` gave."""
         self._radius = float(state["radius"])
         self._average_cost.mean_cost = float(state["mean_cost"])
-        part = {
-            prefix: {
-                name.removeprefix(f"{prefix}_"): values
-                for name, values in state.items()
-                if name.startswith(f"{prefix}_")
-            }
-            for prefix in ("buffer", "trial")
-        }
-        self._buffer.restore(part["buffer"])
-        trial = part["trial"]
+        self._buffer.restore(group(state, "buffer_"))
+        trial = group(state, "trial_")
         self._trial = Trial(*(trial[name] for name in Trial._fields)) if trial else None
 
 

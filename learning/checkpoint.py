@@ -82,6 +82,16 @@ def load(
     return Checkpoint(found, about["state"], entries)
 
 
+def prefixed(prefix: str, arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Arrays that shall stand beside others, a prefix before each name."""
+    return {f"{prefix}{name}": values for name, values in arrays.items()}
+
+
+def group(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
+    """What `prefixed` gave, found among others."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
 def _entries(path: Path) -> dict[str, Array]:
     try:
         return read_arrays(path)

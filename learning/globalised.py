@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.scenario import Scenario
+from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration
 from learning.definiteness import certificate
 from learning.episode_data import EpisodeData
@@ -174,14 +175,14 @@ class GlobalisedLearning:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """The rule's state; under globalisation every result so far and the open episode's data."""
-        rule = {f"rule {name}": values for name, values in self._rule.state().items()}
+        rule = prefixed("rule ", self._rule.state())
         if self._search is None:
             return rule
         state = rule | self._episode.state()
         state |= {"learnt": np.array(self._learnt), "results": np.array(len(self._results))}
         for k, result in enumerate(self._results):
             if isinstance(result, Learned):
-                state |= {f"result {k} {name}": v for name, v in result._asdict().items()}
+                state |= prefixed(f"result {k} ", result._asdict())
                 continue
             state[f"result {k} costs"] = np.array([result.stage_cost, result.penalty])
             state[f"result {k} data"] = np.stack([result.predictions, result.errors])
@@ -191,14 +192,13 @@ class GlobalisedLearning:
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
-        rule = {k.removeprefix("rule "): v for k, v in state.items() if k.startswith("rule ")}
         if self._search is not None:
             theta = self._controller.theta
             self._replay(state)
             self._controller.theta = theta
             self._episode.restore(state)
             self._learnt = int(state["learnt"])
-        self._rule.restore(rule)
+        self._rule.restore(group(state, "rule "))
 
     def _replay(self, state: dict[str, NDArray[Any]]) -> None:
         """Put the plan where it was by the results that it had been given."""

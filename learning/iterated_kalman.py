@@ -11,6 +11,7 @@ from scipy.linalg import cho_factor, cho_solve
 from cosim.scenario import Scenario
 from learning.average_cost import AverageCost
 from learning.batch_configuration import BatchQLearningConfiguration
+from learning.checkpoint import group, prefixed
 from learning.constrained_step import ConstrainedStep
 from learning.errors import DivergenceError
 from learning.fit import Fit
@@ -172,7 +173,7 @@ class IteratedKalman:
             "information": self._information.copy(),
             "mean": self._mean.copy(),
             "sums": np.array(sums),
-            **{f"buffer_{name}": values for name, values in self._buffer.state().items()},
+            **prefixed("buffer_", self._buffer.state()),
         }
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
@@ -187,8 +188,7 @@ class IteratedKalman:
         )
         self._filled, self._last = int(filled), int(last)
         self._buffer = ReplayBuffer(self._length)
-        buffer = {k.removeprefix("buffer_"): v for k, v in state.items() if k.startswith("buffer_")}
-        self._buffer.restore(buffer)
+        self._buffer.restore(group(state, "buffer_"))
 
 
 def _newton(information: Matrix, slope: Vector) -> Fit:

@@ -12,6 +12,7 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from cosim.scenario import Scenario
 from learning.back_off_search import BackOffSearch
+from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration, Share
 from learning.definiteness import certificate
 from learning.exploration import Strategy
@@ -142,7 +143,7 @@ class Practitioner:
             "reported": self._reported.theta,
         }
         if self._search is not None:
-            kept |= {f"search_{name}": value for name, value in self._search.state().items()}
+            kept |= prefixed("search_", self._search.state())
             kept["search_start"] = self._search.start.theta
         return kept
 
@@ -155,5 +156,4 @@ class Practitioner:
             start = self._reported.with_theta(state["search_start"])
             budget = self._samples - (self._estimation if self._estimation else 0)
             self._search = BackOffSearch(start, self._problem, self._scenario, budget, rng)
-            search = {k.removeprefix("search_"): v for k, v in state.items() if "search_" in k}
-            self._search.restore(search)
+            self._search.restore(group(state, "search_"))

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim.errors import PlantError
 from cosim.plant import FmuPlant
 from learning import checkpoint
-from learning.checkpoint import Checkpoint
+from learning.checkpoint import Checkpoint, group, prefixed
 from learning.errors import CheckpointError
 from learning.learner import Learner
 from learning.log import LogRow, Totals
 from learning.training_run import TrainingRun
 from learning.validation import Validation
-
-Arrays = Mapping[str, NDArray[Any]]
 
 
 @dataclass
@@ -39,10 +34,10 @@ class RunState:
         learner = self.learner
         plant = self.plant.serialise(self.plant.snapshot())
         numbers, arrays = learner.interaction.state()
-        stored = _prefixed("interaction", arrays)
-        stored |= _prefixed("algorithm", learner.algorithm.state())
+        stored = prefixed("interaction ", arrays)
+        stored |= prefixed("algorithm ", learner.algorithm.state())
         if self.validation is not None:
-            stored |= _prefixed("validation", self.validation.state())
+            stored |= prefixed("validation ", self.validation.state())
         stored |= {
             "theta": learner.controller.theta,
             "plant": np.frombuffer(plant, dtype=np.uint8),
@@ -92,10 +87,10 @@ class RunState:
         self.totals = Totals(**state["totals"])
         learner.controller.theta = arrays["theta"]
         if self.validation is not None:
-            self.validation.restore(_group(arrays, "validation"))
+            self.validation.restore(group(arrays, "validation "))
         self.plant.restore(self.plant.deserialise(arrays["plant"].tobytes()))
-        learner.algorithm.restore(_group(arrays, "algorithm"))
-        learner.interaction.resume(state["interaction"], _group(arrays, "interaction"))
+        learner.algorithm.restore(group(arrays, "algorithm "))
+        learner.interaction.resume(state["interaction"], group(arrays, "interaction "))
 
     def _require_same_beginning(self, path: Path, samples: int) -> None:
         """Raise CheckpointError where a run of `samples` samples was no part of this one."""
@@ -120,12 +115,3 @@ class RunState:
                     f"{path}: a run of {samples} samples cannot be given more, since it ended "
                     f"between two multiples of {name} = {every}, where a longer run does not stop"
                 )
-
-
-def _prefixed(name: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
-    return {f"{name} {key}": values for key, values in arrays.items()}
-
-
-def _group(arrays: Arrays, name: str) -> dict[str, NDArray[Any]]:
-    start = f"{name} "
-    return {k.removeprefix(start): values for k, values in arrays.items() if k.startswith(start)}

@@ -193,8 +193,8 @@ h1 { font-size: 1.7rem; margin: 0 0 .3rem; } h2 { font-size: 1.25rem; margin: 2.
 nav { display: flex; flex-wrap: wrap; gap: 4px 16px; border-bottom: 1px solid var(--line);
   padding-bottom: 8px; } a { color: var(--link); }
 .wide { overflow-x: auto; margin: 10px 0 18px; }
-table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
-th, td { padding: 3px 10px; text-align: right; white-space: nowrap;
+table { border-collapse: collapse; font-size: 12.5px; font-variant-numeric: tabular-nums; }
+th, td { padding: 3px 7px; text-align: right; white-space: nowrap;
   border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: #fff; }
 th { cursor: pointer; color: var(--soft); font-weight: 600; vertical-align: bottom; }

@@ -58,10 +58,10 @@ def collect(plan: Plan, out: Path, stores: Mapping[str, RunStore]) -> StudyResul
             {
                 "name": case.name,
                 "group": case.group,
-                "target": _relative(case.target, definition.folder),
+                "target": definition.relative(case.target),
                 "trained": case.algorithm is not None,
                 "samples": case.samples,
-                "start": _relative(case.start, definition.folder),
+                "start": definition.relative(case.start),
                 "nmpc": case.nmpc,
                 "settings": dict(case.settings),
                 "scenarios": list(case.scenarios),
@@ -79,13 +79,6 @@ def collect(plan: Plan, out: Path, stores: Mapping[str, RunStore]) -> StudyResul
     if (settings := definition.table.theta) is not None:
         about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
     return StudyResults(out, json.loads(json.dumps(about)), found)
-
-
-def _relative(path: str, folder: Path) -> str:
-    """A file's path as the study names it: no result depends on where the checkout lies."""
-    if not path.endswith(".toml"):
-        return path
-    return Path(path).relative_to(folder).as_posix() if folder in Path(path).parents else path
 
 
 def _result(run: Run, store: RunStore) -> RunResult | None:

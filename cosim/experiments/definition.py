@@ -132,6 +132,12 @@ class Definition:
         """A case's name for a controller: the study's, if it has one for it."""
         return next((c.name for c in self.cases if c.controller == controller), controller)
 
+    def relative(self, path: str) -> str:
+        """A parameters file's path as the study names it: results depend on no checkout's place."""
+        if not path.endswith(".toml") or self.folder not in Path(path).parents:
+            return path
+        return Path(path).relative_to(self.folder).as_posix()
+
     @cached_property
     def naive(self) -> str:
         """Name of the case that the gap closed starts from."""

@@ -90,9 +90,12 @@ def plan(definition: Definition) -> Plan:
             "code": code,
         }
         if training is None:
-            facts["controller"] = case.controller
+            facts["controller"] = definition.relative(case.controller or "")
         else:
-            facts["training"] = asdict(training) | {"scenario": scenario}
+            facts["training"] = asdict(training) | {
+                "scenario": scenario,
+                "start": definition.relative(training.start),
+            }
             if case.start.endswith(".toml"):
                 facts["start"] = dict(definition.trainer.sources(case.start))
         key = RunKey(scenario, case.name, seed)

@@ -46,7 +46,7 @@ def demo(
 
         scenario = Scenario.load(SCENARIO)
         folder = open_folder(out)
-        out_.note(f"{scenario.description}; the controllers are not told")
+        out_.note(scenario.description)
         backed_off = _train(scenario, "backoff", "tuned", BACKOFF_SAMPLES, seed, out_)
         learnt = _train(scenario, "q-learning", "naive", samples, seed, out_)
         trained = {BACKED_OFF: backed_off, LEARNT: learnt}

@@ -204,6 +204,7 @@ def test_a_killed_worker_loses_nothing(paper, tmp_path, ledger):
     assert contents(broken) == contents(whole)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     root = str(Path(__file__).parents[3])
     environment = os.environ | {LEDGER: str(tmp_path / "ledger"), "PYTHONPATH": root}

@@ -75,6 +75,7 @@ def test_a_signal_that_no_log_has_is_named(results, tmp_path):
         write_report(damaged, tmp_path)
 
 
+@pytest.mark.slow
 def test_two_workers_give_the_bytes_of_one(results, tmp_path):
     again = online().run(tmp_path, jobs=2)
     content = [(folder / "online.csv").read_bytes() for folder in (results.folder, again.folder)]

@@ -89,7 +89,13 @@ def panels(results: StudyResults, scenario: str, baselines: bool = False) -> dic
 
 
 def _curves(results: StudyResults, scenario: str, target: Path) -> list[str]:
-    """Figures of the learning curves: relative to J* in %, where it is known."""
+    """Figures of the learning curves: relative to J* in %, where it is known.
+
+    None where no training was looked at more than once: a point is no curve.
+    """
+    trained = (run for name in results.cases for run in results.of(name, scenario) if run.curve)
+    if not any(np.isfinite(run.curve["greedy_J"]).sum() > 1 for run in trained):
+        return []
     optimum = results.optimum(scenario)
     known = optimum is not None and np.isfinite(optimum.greedy_J)
     best = optimum.greedy_J if optimum is not None and known else float("nan")

@@ -95,9 +95,9 @@ class Course:
 
     @property
     def between_seeds(self) -> float:
-        """Median distance of two trainings' ends."""
+        """Median distance of two trainings' ends; there must be two."""
         distances = [float(np.linalg.norm(a - b)) for a, b in combinations(self.end, 2)]
-        return float(np.median(distances)) if distances else float("nan")
+        return float(np.median(distances))
 
 
 def tables(results: StudyResults) -> list[tuple[str, tuple[str, ...], Lines]]:
@@ -166,7 +166,7 @@ def _course_lines(
             _name(where, several),
             str(len(course.seeds)),
             shown(float(np.median(course.way)), None, 1, 3),
-            shown(course.between_seeds, None, 1, 3),
+            shown(course.between_seeds, None, 1, 3) if len(course.seeds) > 1 else "",
         ]
         if late:
             half, fifth = course.moved(0.5), course.moved(0.8)

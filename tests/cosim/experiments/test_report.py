@@ -1,10 +1,11 @@
 """The report of a study: whole in one page, and it says what the tables say."""
 
 import re
+from dataclasses import replace
 
 import pytest
 
-from cosim.experiments.charts import shortened
+from cosim.experiments.charts import draw, shortened
 from cosim.experiments.formatting import HEADER, lines
 from cosim.experiments.outcome import StudyOutcome
 from cosim.experiments.report import write_report
@@ -52,6 +53,16 @@ def test_the_page_holds_every_row_and_figure(results, page):
 def test_the_report_repeats_its_bytes(results, page, tmp_path):
     again = write_report(StudyResults.load(results.folder), tmp_path).read_text("utf-8")
     assert again == page
+
+
+def test_one_point_is_no_curve(results, tmp_path):
+    runs = [
+        replace(run, curve={name: values[-1:] for name, values in run.curve.items()})
+        for run in results.runs
+    ]
+    drawn = draw(StudyResults(results.folder, results.about, runs), tmp_path)
+    assert not any(name.startswith("curves") for name in drawn["paper"])
+    assert not list((tmp_path / "figures").glob("curves*"))
 
 
 def test_diverged_runs_are_counted_in_the_table(results):

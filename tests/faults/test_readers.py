@@ -19,7 +19,7 @@ from learning.errors import CheckpointError
 
 NAMES = ("scenario", "theta", "checkpoint", "trajectory", "recording", "fmu", "unit")
 # A recording and an FMU cost much more to read than a page of text.
-EXAMPLES = {"recording": 15, "fmu": 8}
+EXAMPLES = {"recording": 6, "fmu": 8}
 LENIENT = {
     "deadline": None,
     "database": None,

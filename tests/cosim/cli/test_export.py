@@ -44,6 +44,7 @@ def test_the_summary_says_what_was_written(exported):
     assert len(summary["platforms"]) == 1
 
 
+@pytest.mark.slow
 def test_every_installed_importer_takes_the_fmu(exported):
     findings = check(exported[0])
     assert not [f for f in findings if f.status is Status.FAILED], findings

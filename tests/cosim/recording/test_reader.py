@@ -55,6 +55,7 @@ def test_another_programs_recording_is_refused(tmp_path):
         read_recording(path)
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_leaves_is_repaired_as_the_message_says(tmp_path, paper, rng):
     recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng, 0, 3000)], steps=3000)
     torn = tmp_path / "torn.rrd"

@@ -24,7 +24,7 @@ def draw(stream: Stream, scenario: Scenario, controller: str, theta: str | None)
         "controller": (policy, (0.0, 170.0), SERIES[2]),
         "exploration": (f"exploration: {explore}, if on", (-250.0, 170.0), SERIES[3]),
         "cost": ("stage cost + penalty", (250.0, 0.0), SERIES[1]),
-        "recorder": ("recorder, learner", (250.0, 170.0), "#606870"),
+        "recorder": ("recorder, learner", (250.0, 170.0), FRAME),
     }
     signals = {
         "d": ("d = " + ", ".join(scenario.plant.disturbances), "noise", "plant", (-125.0, -50.0)),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 SERIES = ("#3B94DE", "#E8731F", "#22AC7E", "#CC79A7", "#E5A11A", "#6CC3F0")
 BOUND = "#D8392B"
 REFERENCE = "#8A96A3"
-FRAME = "#9AA0A6"
+FRAME = "#767C82"
 GOOD = "#3A9A5B"
 
 

@@ -62,7 +62,8 @@ def test_every_proof_selects_something():
         if words[1:3] == ["-m", "pytest"]:
             tests.append(words[3:])
         else:
-            scripts.append(words[1])
+            module = f"{words[2].replace('.', '/')}.py" if words[1] == "-m" else words[1]
+            scripts.append(module)
     assert all((ROOT / script).is_file() for script in scripts)
     # One process for all, or each would import everything anew.
     result = subprocess.run(

@@ -136,9 +136,12 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
 
         try:
             _wait(answers, deadline, "starting the viewer")
-            client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
             try:
-                yield client
+                yield ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            except TimeoutError as error:
+                raise RecordingError(
+                    "the viewer did not answer in time; the machine may be busy: try again"
+                ) from error
             except (ConnectionError, RuntimeError) as error:
                 raise RecordingError(_complaint(log.fileno())) from error
         finally:

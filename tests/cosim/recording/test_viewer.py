@@ -144,3 +144,27 @@ def test_the_window_binds_loopback(recording, monkeypatch):
     command = commands[0]
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert command[-1] == str(recording)
+
+
+@pytest.mark.parametrize("call", ["connect", "open", "get_state", "take_screenshot"])
+def test_a_viewer_that_does_not_answer_is_a_line(recording, tmp_path, monkeypatch, call):
+    def late(*_):
+        raise TimeoutError("Deadline expired before operation could complete")
+
+    client = SimpleNamespace(
+        open=lambda _: None,
+        get_state=lambda: SimpleNamespace(loading=False, recordings=[], views=[]),
+        set_time=lambda *_, **__: None,
+        take_screenshot=lambda: b"",
+    )
+    connect = late if call == "connect" else lambda _: client
+    setattr(client, call, late)
+    monkeypatch.setattr(viewer, "ViewerClient", SimpleNamespace(connect=connect))
+    monkeypatch.setattr(viewer, "start_guarded", lambda *_, **__: None)
+    monkeypatch.setattr(viewer, "end_guarded", lambda _: None)
+    wait = viewer._wait
+    skipped = ("starting the viewer",)
+    monkeypatch.setattr(viewer, "_wait", lambda d, t, what: what in skipped or wait(d, t, what))
+    with pytest.raises(RecordingError, match="did not answer in time; the machine may be busy"):
+        render(recording, tmp_path / "a.png", at=1.0)
+    assert not (tmp_path / "a.png").exists()

@@ -49,17 +49,18 @@ def ignore_sigterm() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
-def follow_parent() -> None:
+def follow_parent(number: int | None = None) -> None:
     """End this worker process, without further ado, as soon as the process that started it ends.
 
-    To be called once in a worker, whose work is lost with its parent anyway.
+    To be called once in a worker, whose work is lost with its parent anyway. `number` is the
+    parent's, which may have ended before the worker could ask for it.
     """
     from multiprocessing import parent_process  # noqa: PLC0415
     from multiprocessing.connection import wait  # noqa: PLC0415
 
     parent = parent_process()
     sentinel = None if parent is None else parent.sentinel
-    number = os.getppid()
+    number = os.getppid() if number is None else number
 
     def watch() -> None:
         if sentinel is not None:

@@ -168,6 +168,7 @@ def _crew(jobs: int, scheduler: str | None) -> Iterator[_Crew]:
             | _inherited()
             | dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(temporary)),
             initializer=follow_parent,
+            initargs=(os.getpid(),),
         )
         try:
             yield _Crew(executor, lambda: jobs)

@@ -31,6 +31,12 @@ def test_workers_end_with_the_parent(tmp_path):
     assert eventually(lambda: not any(map(alive, workers)))
 
 
+def test_a_worker_whose_parent_ended_before_it_asked_ends(tmp_path):
+    program = "import time; from cosim.lifetime import follow_parent; follow_parent(1 << 30); "
+    with subprocess.Popen([sys.executable, "-c", f"{program}time.sleep(600)"]) as worker:
+        assert worker.wait(60) == 1
+
+
 def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
     options = ["--controller", "naive", "--steps", "2000000", "--out", str(tmp_path / "out")]
     with start_cosim("simulate", "--scenario", "paper", *options) as process:

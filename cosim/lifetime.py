@@ -60,7 +60,8 @@ def follow_parent(number: int | None = None) -> None:
 
     parent = parent_process()
     sentinel = None if parent is None else parent.sentinel
-    number = os.getppid() if number is None else number
+    if number is None or os.name == "nt":  # where a launcher may stand between the two
+        number = os.getppid()
 
     def watch() -> None:
         if sentinel is not None:

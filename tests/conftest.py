@@ -5,6 +5,7 @@ The user's cache is left alone: what tests unpack and solve ends with them.
 
 import os
 import shutil
+import signal
 import tempfile
 
 from hypothesis import settings
@@ -12,6 +13,10 @@ from hypothesis import settings
 # The same examples in every run, so that a failure is the change's.
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
+
+# A shell's background job ignores Ctrl-C, what it starts inherits that, and tests send it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # pytest's own filter ends with this process; what tests start has to be as strict.
 os.environ.setdefault("PYTHONWARNINGS", "error")

@@ -1,6 +1,6 @@
 """Endurance: a long learning run, or an evaluation of very many units; memory, time, failures.
 
-    python tests/faults/endurance.py --samples 1000000 [--record]
+    python tests/faults/endurance.py --samples 1000000 [--record] [--globalisation none]
     python tests/faults/endurance.py --units 1000000 [--jobs 2]
 
 The first one trains on one plant and looks at every tenth of the run; the second one evaluates a
@@ -44,7 +44,9 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
 
-def endure(samples: int, folder: Path, *, record: bool = False) -> dict[str, object]:
+def endure(
+    samples: int, folder: Path, *, record: bool = False, globalisation: str = "validated"
+) -> dict[str, object]:
     """Train for `samples` samples with checkpoints; figures of each tenth of the run.
 
     Recorded, the log has a row for each thousandth of the run.
@@ -57,7 +59,7 @@ def endure(samples: int, folder: Path, *, record: bool = False) -> dict[str, obj
         scenario=scenario,
         samples=tenth * TENTHS,
         seed=0,
-        configuration=QLearning.Configuration(),
+        configuration=QLearning.Configuration.from_dict({"globalisation": globalisation}),
         log_every=every,
         evaluate_every=tenth * TENTHS,
         checkpoint_every=tenth,
@@ -178,6 +180,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--record", action="store_true", help="write a recording, too")
+    parser.add_argument("--globalisation", choices=("validated", "none"), default="validated")
     parser.add_argument("--units", type=int, help="evaluate as many units in place of training")
     parser.add_argument("--jobs", type=int, default=1, help="processes that evaluate them")
     parser.add_argument("--megabytes", type=float, default=5.0)
@@ -185,7 +188,12 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if options.units is None:
-            figures = endure(options.samples, Path(folder), record=options.record)
+            figures = endure(
+                options.samples,
+                Path(folder),
+                record=options.record,
+                globalisation=options.globalisation,
+            )
         else:
             figures = evaluate_units(options.units, Path(folder), jobs=options.jobs)
     print(json.dumps(figures, indent=2))

@@ -21,6 +21,8 @@ LINES = (
     "from rti_storage.temporary import new_temporary_folder, temporary_folder\n"
 )
 HOLDER = LINES + (
+    "import signal\n"
+    "signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup ignores\n"
     "with temporary_folder('a-') as first, temporary_folder('b-', Path({parent!r})) as second:\n"
     "    for folder in (first, second, first / 'within'):\n"
     "        folder.mkdir(exist_ok=True)\n"

@@ -144,7 +144,7 @@ def learning(
     scenario: ScenarioOption = "paper",
     samples: Annotated[
         int, count("--samples", "-n", least=100, text="Samples per repetition.")
-    ] = 2000,
+    ] = 1000,
     against: Annotated[
         Path | None,
         typer.Option(

@@ -17,7 +17,8 @@ from controllers.compilation import COMPILED, SWITCH
 from cosim.cli.benchmark.figures import figure
 from cosim.errors import CosimError
 
-REPETITIONS = 5
+REPETITIONS = 20
+"""Short turns and many: the clock rate of a shared machine changes within seconds."""
 SETTLING = 1000
 """Samples before the clock starts: warm-up of the rule, caches, and the naive θ's worst QPs."""
 EXPLORATION = {"exploration_probability": 0.3, "exploration_deviation": [10.0]}

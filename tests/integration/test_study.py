@@ -65,6 +65,7 @@ class Hold:
 def hold(scenario):
     return Hold(scenario.reference_action)
 """
+UNDER_WAY = "runs/*/*/*/checkpoint.npz"
 # Checkpoints are handed over after every piece, not only after some seconds.
 COMMAND = """\
 import sys
@@ -127,9 +128,12 @@ def trained(out):
 
 
 def kill_after(process, out, samples):
-    """Kill a run and its workers once so many samples are stored; returns how many there are."""
+    """Kill a run and its workers once so many samples are stored; returns how many there are.
+
+    A training is under way then: between two of them a kill would show nothing.
+    """
     deadline = time.monotonic() + 300
-    while trained(out) < samples:
+    while trained(out) < samples or not list(out.glob(UNDER_WAY)):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -142,7 +146,7 @@ def test_a_run_that_was_killed_twice_ends_in_the_same_bytes(folder, undisturbed,
     first = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, 600)
     second = kill_after(start(folder, tmp_path, "--jobs", "2"), tmp_path, first + 3000)
     assert second < 2 * 12 * 600, "it was killed before its end"
-    assert list(tmp_path.glob("runs/*/*/*/checkpoint.npz")), "a training was under way"
+    assert list(tmp_path.glob(UNDER_WAY)), "a training was under way"
     finish(start(folder, tmp_path, "--jobs", "2"))
     assert contents(tmp_path) == undisturbed
 
@@ -151,7 +155,7 @@ def test_a_cluster_of_two_ends_in_the_same_bytes(folder, undisturbed, tmp_path):
     from distributed import LocalCluster
 
     with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as cluster:
         finish(start(folder, tmp_path, "--scheduler", cluster.scheduler_address))
     assert contents(tmp_path) == undisturbed

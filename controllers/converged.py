@@ -126,8 +126,7 @@ class ConvergedNmpc(RtiNmpc):
                     at, controls, states - at, actions - controls, weight, measured
                 )
             before = self._costates.copy()
-            self._x[:], self._u[:], self._costates[:] = at[:-1], controls, solution.costates[1:]
-            self._linearise()
+            self._linearise_at(LinearisationPoint(at[:-1], controls, solution.costates[1:]))
             solution = self._solve_qp(s, a)
             change = max(
                 float(np.abs(solution.predicted_states - at).max()),
@@ -179,13 +178,9 @@ class ConvergedNmpc(RtiNmpc):
 
     def _read_out(self, s: ArrayLike, a: ArrayLike | None, solution: RtiSolution) -> RtiSolution:
         """Read a lifted QP's solution out of the programme's own QP, which need not be convex."""
-        point = LinearisationPoint(
-            solution.predicted_states[:-1], solution.predicted_actions, solution.costates[1:]
-        )
         backend, self._backend = self._backend, _Known(solution.multipliers)
         try:
-            self._x[:], self._u[:], self._costates[:] = point
-            self._linearise_as(lifts=False)
+            self._linearise_at(solution.unshifted)
             return super()._solve(s, a)
         finally:
             self._backend = backend

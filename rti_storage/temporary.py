@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rti_storage import caretaker
+from rti_storage.guarded import end_guarded
 
 _lock = threading.Lock()
 # The process's caretaker: of this process, not of one that it was forked from.
@@ -92,8 +93,4 @@ def _caretaker() -> subprocess.Popen[bytes]:
 def _dismiss(number: int) -> None:
     if number != os.getpid():
         return
-    process = _caretakers.pop(number)
-    if process.stdin is not None:
-        with suppress(OSError):
-            process.stdin.close()
-    process.wait()
+    end_guarded(_caretakers.pop(number))

@@ -11,7 +11,6 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend
 from controllers.rti.nmpc import RtiNmpc
-from controllers.rti.prepared import LinearisationPoint
 from controllers.rti.solution import RtiSolution
 
 
@@ -45,19 +44,9 @@ class IteratedNmpc(RtiNmpc):
         prepared = self.linearisation_point
         try:
             for _ in range(self._qps - 1):
-                self._linearise_at(
-                    LinearisationPoint(
-                        solution.predicted_states[:-1],
-                        solution.predicted_actions,
-                        solution.costates[1:],
-                    )
-                )
+                self._linearise_at(solution.unshifted)
                 solution = super()._solve(s, a)
         finally:
             if self._qps > 1:
                 self._linearise_at(prepared)
         return solution
-
-    def _linearise_at(self, point: LinearisationPoint) -> None:
-        self._x[:], self._u[:], self._costates[:] = point
-        self._linearise()

@@ -182,9 +182,12 @@ class RtiNmpc:
                     f"linearisation point: {name} must be finite with shape {target.shape}, "
                     f"not {array.shape}"
                 )
-        for target, array in zip(targets, arrays, strict=True):
-            target[:] = array
         self._pending = None
+        self._linearise_at(LinearisationPoint(*arrays))
+
+    def _linearise_at(self, point: LinearisationPoint) -> None:
+        """Make a point the guess and linearise there."""
+        self._x[:], self._u[:], self._costates[:] = point
         self._linearise()
 
     def _weigh(self, w: Vector, W: Vector) -> None:

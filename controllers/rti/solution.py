@@ -80,6 +80,13 @@ class RtiSolution:
         )
 
     @property
+    def unshifted(self) -> LinearisationPoint:
+        """The solution as it is, as a point of linearisation for the same sample."""
+        return LinearisationPoint(
+            self.predicted_states[:-1], self.predicted_actions, self.costates[1:]
+        )
+
+    @property
     def slack(self) -> Matrix:
         """Slack of the soft state bounds at stages 1 … N, shape (N, n)."""
         return self._part("t")

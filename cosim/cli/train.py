@@ -194,6 +194,7 @@ def _execute(
 ) -> Training:
     from cosim.cli.compose import announce
     from learning.training import carry_out
+    from learning.training_loop import CHECKPOINT
 
     recorder: Any = None
     if record:
@@ -201,7 +202,7 @@ def _execute(
 
         recorder = TrainingRecorder(folder / "training.rrd")
     announce(run.scenario, output)
-    checkpoint = folder / "checkpoint.npz"
+    checkpoint = folder / CHECKPOINT
 
     def how() -> str:
         there = f"the same command with --resume goes on from {checkpoint}"

@@ -85,9 +85,9 @@ def _result(run: Run, store: RunStore) -> RunResult | None:
     """The run's result; None while it is not finished."""
     if store.missing_online(run.online):
         return None
-    noise = {file: store.indicators(file, steps) for file, (_, steps) in run.noise.items()}
-    if any(seed not in noise[file] for file, (seeds, _) in run.noise.items() for seed in seeds):
+    if any(store.missing(file, seeds, steps) for file, (seeds, steps) in run.noise.items()):
         return None
+    noise = {file: store.indicators(file, steps) for file, (_, steps) in run.noise.items()}
     progress = store.progress()
     if run.training is not None and not progress.ended:
         return None
@@ -128,7 +128,7 @@ def write(results: StudyResults, plan: Plan, stores: Mapping[str, RunStore], fig
     if plan.definition.table.online is not None:
         write_atomically(out / ONLINE, online_csv(plan, results.runs, stores))
     if plan.definition.table.theta is not None:
-        write_atomically(out / theta.FILE, theta.theta_csv(results.runs, stores, plan))
+        write_atomically(out / theta.FILE, theta.theta_csv(results.runs, stores))
     write_atomically(out / RUNS, to_csv(RUN_COLUMNS, run_rows(results)))
     write_atomically(out / SUMMARY, to_csv(COLUMNS, summary_rows(results)))
     aggregate = aggregate_rows(results)

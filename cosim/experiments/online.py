@@ -15,7 +15,7 @@ from cosim.experiments.document import OnlineTable
 from cosim.experiments.plan import Plan, Run
 from cosim.experiments.records import RunResult
 from cosim.experiments.results import StudyResults
-from cosim.experiments.store import RunStore, safe
+from cosim.experiments.store import RunKey, RunStore, safe
 from cosim.experiments.tables import KEYS, read_numbers, to_csv
 from cosim.experiments.traces import LOGS
 from cosim.figures.online import Course, plot_online
@@ -31,10 +31,10 @@ TITLE = "The runs' own samples on `{}`: regret in %, exploration's cost included
 
 def online_csv(plan: Plan, runs: Iterable[RunResult], stores: Mapping[str, RunStore]) -> str:
     """A row for each block of each run: the samples at its end and its mean cost."""
-    planned = {(run.key.scenario, run.key.case, run.key.seed): run for run in plan.runs}
+    planned = {run.key: run for run in plan.runs}
     rows: list[dict[str, Any]] = []
     for result in runs:
-        run = planned[result.key]
+        run = planned[RunKey(*result.key)]
         for seed, samples, costs in _blocks(run, result, stores[str(run.key)]):
             key = {"scenario": result.scenario, "case": result.case, "training_seed": seed}
             rows += [

@@ -16,7 +16,7 @@ from cosim.experiments.document import ThetaTable
 from cosim.experiments.plan import Plan
 from cosim.experiments.records import RunResult
 from cosim.experiments.results import StudyResults
-from cosim.experiments.store import RunStore
+from cosim.experiments.store import RunKey, RunStore
 from cosim.experiments.tables import KEYS, to_csv
 from cosim.experiments.traces import THETA
 from cosim.text_tables import parse_records, read_records
@@ -45,15 +45,13 @@ def scales(plan: Plan) -> dict[str, float]:
     return found
 
 
-def theta_csv(runs: Iterable[RunResult], stores: Mapping[str, RunStore], plan: Plan) -> str:
+def theta_csv(runs: Iterable[RunResult], stores: Mapping[str, RunStore]) -> str:
     """A row for each training and share of its samples: θ as the log has it there."""
-    keys = (run.key for run in plan.runs)
-    store_names = {(key.scenario, key.case, key.seed): str(key) for key in keys}
     rows: list[dict[str, Any]] = []
     for run in runs:
         if run.seed is None:
             continue
-        log = parse_records(stores[store_names[run.key]].progress().log)
+        log = parse_records(stores[str(RunKey(*run.key))].progress().log)
         samples = np.array([float(row["samples"]) for row in log])
         for share in SHARES:
             row = log[int(np.flatnonzero(samples <= share * samples[-1] + 0.5)[-1])]
@@ -127,7 +125,17 @@ def tables(results: StudyResults) -> list[tuple[str, tuple[str, ...], Lines]]:
     )
     return [
         (title, *_course_lines(courses, several, settings.late)),
-        (APART, *_apart(results, courses, _courses(records, shown_entries), shown_entries)),
+        (
+            APART,
+            *_apart(
+                results,
+                _pairs(results, settings.pairs, courses),
+                courses,
+                _courses(records, shown_entries),
+                shown_entries,
+                several,
+            ),
+        ),
     ]
 
 
@@ -177,9 +185,10 @@ def _course_lines(
     return header, lines
 
 
-def _pairs(results: StudyResults, courses: Mapping[Where, Course]) -> list[tuple[Where, Where]]:
-    """The pairs that the study names, else all; raises StudyError on a name of no trained case."""
-    wanted = results.about["theta"]["settings"]["pairs"]
+def _pairs(
+    results: StudyResults, wanted: Sequence[Sequence[str]], courses: Mapping[Where, Course]
+) -> list[tuple[Where, Where]]:
+    """The wanted pairs, else all; raises StudyError on a name of no trained case."""
     trained = [name for name, case in results.cases.items() if case.trained]
     for name in (name for pair in wanted for name in pair):
         if name not in trained:
@@ -197,9 +206,11 @@ def _pairs(results: StudyResults, courses: Mapping[Where, Course]) -> list[tuple
 
 def _apart(
     results: StudyResults,
+    pairs: Sequence[tuple[Where, Where]],
     courses: Mapping[Where, Course],
     shown_courses: Mapping[Where, Course],
     entries: Sequence[str],
+    several: bool,
 ) -> tuple[tuple[str, ...], Lines]:
     """Of two cases the differences, second less first, over the seeds that both have."""
     header = (
@@ -207,9 +218,8 @@ def _apart(
         "by chance", "entries that differ",
         *(f"Δ {name.removeprefix(THETA)}, mean [95 %]" for name in entries),
     )  # fmt: skip
-    several = len({scenario for scenario, _ in courses}) > 1
     lines = []
-    for first, second in _pairs(results, courses):
+    for first, second in pairs:
         common = [seed for seed in courses[first].seeds if seed in courses[second].seeds]
         if not common:
             continue

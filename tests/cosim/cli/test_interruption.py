@@ -32,12 +32,6 @@ COMMANDS = {
         "checkpoint.npz",
     ),
 }
-# What a shell's background starts is born deaf to Ctrl-C.
-HEARING = (
-    "import runpy, signal\n"
-    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    "runpy.run_module('cosim', run_name='__main__')\n"
-)
 ENDS = {"SIGINT": ("interrupted", 130), "SIGTERM": ("terminated", 143)}
 
 
@@ -61,7 +55,7 @@ def test_an_interrupted_command_says_how_it_goes_on(tmp_path, command, number):
     words, how, file = COMMANDS[command]
     word, code = ENDS[number]
     with subprocess.Popen(
-        [sys.executable, "-c", HEARING, *words.split(), "--out", "out"],
+        [sys.executable, "-m", "cosim", *words.split(), "--out", "out"],
         cwd=tmp_path,
         env=os.environ | {"COSIM_COMPILE": "never"},
         stdout=subprocess.DEVNULL,

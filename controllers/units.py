@@ -10,11 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
+import daqp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import lsq_linear
 
+from controllers.errors import ModelError
 from controllers.model import Model
+from controllers.qp.daqp_backend import FIXED, MEANING, SETTINGS
 
 Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,7 +44,8 @@ class Units:
     ) -> Units:
         """Units of a nominal model at a reference w_s = (x_s, u_s) with this cost ℓ_s.
 
-        `lower`, `upper` and `reference` are (n+m,).
+        `lower`, `upper` and `reference` are (n+m,). Raises ModelError where the multipliers cannot
+        be computed.
         """
         n = len(model.states)
         widths = upper - lower
@@ -89,18 +92,32 @@ def _derivatives(model: Model, reference: Vector) -> tuple[Vector, Vector, Vecto
 
 
 def _multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
-    """|μ| (n+m,) of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs."""
-    active = np.flatnonzero(below | above)
-    found = np.zeros(gradient.size)
-    signs = np.where(below, -1.0, 1.0)
-    columns = np.hstack([rates.T, np.diag(signs)[:, active]])
-    if not active.size or not (np.isfinite(columns).all() and np.isfinite(gradient).all()):
-        return found
-    free = np.full(len(rates), -np.inf)
-    least = np.concatenate([free, np.zeros(active.size)])
-    solved = lsq_linear(columns, -gradient, (least, np.inf), method="bvls")
-    found[active] = solved.x[len(rates) :]
-    return found
+    """|μ| (n+m,) of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs.
+
+    They are the multipliers of the QP min ½|w|² + ∇ℓᵀw over what equation and active bounds leave,
+    the projection of −∇ℓ on these directions.
+    """
+    size = np.abs(gradient).max()
+    if not size or not (np.isfinite(gradient).all() and np.isfinite(rates).all()):
+        return np.zeros(gradient.size)
+    rows = rates / np.maximum(np.abs(rates).max(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    inequalities, equations = gradient.size, len(rates)
+    _, _, flag, info = daqp.solve(
+        np.eye(inequalities),
+        gradient / size,
+        rows,
+        np.r_[np.where(above, 0.0, np.inf), np.zeros(equations)],
+        np.r_[np.where(below, 0.0, -np.inf), np.zeros(equations)],
+        np.repeat(np.array([0, FIXED], dtype=np.int32), [inequalities, equations]),
+        **SETTINGS,
+    )
+    if flag <= 0:
+        raise ModelError(
+            "problem: the multipliers of the bounds at the reference cannot be computed "
+            f"({MEANING.get(flag, flag)}); look at the derivatives of cost and model there"
+        )
+    multipliers: Vector = np.abs(info["lam"][:inequalities]) * size
+    return multipliers
 
 
 def _power(size: ArrayLike) -> Vector:

@@ -61,6 +61,8 @@ class ConvergedNmpc(RtiNmpc):
     """
 
     name = "converged"
+    memoryless = False
+    """A second feedback starts its SQP where the first one ended."""
 
     def __init__(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from learning.constrained_step import ConstrainedStep
 from learning.fit import Fit
 
 Matrix = NDArray[np.float64]
+Values = TypeVar("Values", float, NDArray[np.float64])
 
 
 class AverageCost:
@@ -41,8 +43,8 @@ class AverageCost:
             scenario.controller.reference_cost,
         )
 
-    def target(self, cost: float, next_value: float) -> float:
-        """What Q(s, a) is fitted to."""
+    def target(self, cost: Values, next_value: Values) -> Values:
+        """What Q(s, a) is fitted to, of one sample or of several, (K,)."""
         return cost - self.mean_cost + self.discount * next_value
 
     def descent(self, change: Matrix) -> Matrix:

@@ -66,7 +66,7 @@ class ReplayedQLearning:
         self._moving = configuration.rule == "lstdq"
         self._step = ConstrainedStep(controller, configuration)
         self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
-        self._buffer = ReplayBuffer(configuration.buffer_size)
+        self._buffer = ReplayBuffer(self._controller, configuration.buffer_size)
         self._largest = configuration.radius * width
         self._radius = self._largest
         self._trial: Trial | None = None
@@ -80,11 +80,11 @@ class ReplayedQLearning:
             return None
         update: Update | None = None
         for _ in range(self._configuration.iterations):
-            replayed = self._buffer.replay(self._controller, self._average_cost)
+            replayed = self._buffer.replay(self._average_cost)
             if self._trial is not None and self._rose(self._trial, replayed):
                 self._controller.theta = self._trial.theta
                 self._average_cost.mean_cost = float(self._trial.mean_cost)
-                replayed = self._buffer.replay(self._controller, self._average_cost)
+                replayed = self._buffer.replay(self._average_cost)
             if not len(replayed.number):
                 break
             update = self._iterate(replayed, self._gain(transition.number))

@@ -55,7 +55,7 @@ class IteratedKalman:
         self._errors = PredictionErrors(scenario, configuration.prediction_errors)
         self._variance = 0.0
         rows, n = max(self._length, configuration.batch_size), scenario.state_lower.size
-        self._buffer = ReplayBuffer(self._length)
+        self._buffer = ReplayBuffer(self._controller, self._length)
         self._batch = {
             "states": np.zeros((rows, n)),
             "prediction_errors": np.zeros((rows, n)),
@@ -84,7 +84,7 @@ class IteratedKalman:
         first = self._variance == 0.0
         update = self._update()
         if first:
-            self._buffer = ReplayBuffer(self._length)
+            self._buffer = ReplayBuffer(self._controller, self._length)
         return update
 
     @property
@@ -99,7 +99,7 @@ class IteratedKalman:
         count = self._length
         information = self._information
         for _ in range(settings.relinearisations):
-            replayed = self._buffer.replay(self._controller, self._average_cost)
+            replayed = self._buffer.replay(self._average_cost)
             failures += replayed.failures
             if not len(replayed.number):
                 break
@@ -187,7 +187,7 @@ class IteratedKalman:
             float(value) for value in state["sums"]
         )
         self._filled, self._last = int(filled), int(last)
-        self._buffer = ReplayBuffer(self._length)
+        self._buffer = ReplayBuffer(self._controller, self._length)
         self._buffer.restore(group(state, "buffer_"))
 
 

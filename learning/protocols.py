@@ -39,9 +39,14 @@ class LearnableSolution(Solution, Protocol):
 
 
 class LearnableController(Controller, Protocol):
-    """A controller with parameters θ; `RtiNmpc` and `ConvergedNmpc` are."""
+    """A controller with parameters θ; `RtiNmpc` and `ConvergedNmpc` are.
+
+    `memoryless` says that a feedback depends, to the tolerance of its solver, on nothing but θ, the
+    point at which it was prepared, s and a; so what was solved for once need not be again.
+    """
 
     theta: Vector
+    memoryless: bool
 
     @property
     def parameters(self) -> Parameters:

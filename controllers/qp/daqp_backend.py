@@ -63,7 +63,7 @@ class DaqpBackend:
             self._parts = (self._lower[:n], self._upper[:n], self._lower[n:], self._upper[n:])
             self._free = np.repeat(np.array([0, SOFT], dtype=np.int32), [n, rows])
             self._sense = self._free.copy()
-            self._bounds_sense = self._sense[:n]
+            self._bounds_sense, self._fixed = self._sense[:n], bytes(n)
             self._model = daqp.Model()
             self._model.settings = SETTINGS
             self._write_limits(qp)
@@ -100,7 +100,10 @@ class DaqpBackend:
         T = None if self._limits is None else self._limits[:n]
         if flag >= 0:
             self._write_limits(qp)
-            np.multiply(qp.lower == qp.upper, FIXED, out=self._bounds_sense)
+            fixed = qp.lower == qp.upper
+            if (told := fixed.tobytes()) != self._fixed:
+                self._fixed = told
+                np.multiply(fixed, FIXED, out=self._bounds_sense)
             flag = self._model.update(
                 f=qp.f if T is None else np.einsum("ij,i->j", T, qp.f),
                 bupper=self._upper,

@@ -34,10 +34,10 @@ def average_cost(scenario):
 
 def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collected):
     controller, samples = collected
-    buffer = ReplayBuffer(100)
+    buffer = ReplayBuffer(controller, 100)
     for sample in samples:
         buffer.add(sample)
-    replayed = buffer.replay(controller, average_cost(scenario))
+    replayed = buffer.replay(average_cost(scenario))
     q = [sample.action_value.value for sample in samples]
     target = [sample.cost + scenario.discount * sample.next_policy.value for sample in samples]
     assert replayed.number.tolist() == list(range(60))
@@ -52,31 +52,31 @@ def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collecte
 
 def test_a_full_buffer_forgets_the_oldest(scenario, collected):
     controller, samples = collected
-    buffer = ReplayBuffer(20)
+    buffer = ReplayBuffer(controller, 20)
     for sample in samples:
         buffer.add(sample)
     assert len(buffer) == 20
-    assert buffer.replay(controller, average_cost(scenario)).number.tolist() == list(range(40, 60))
+    assert buffer.replay(average_cost(scenario)).number.tolist() == list(range(40, 60))
 
 
 def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, collected):
     controller, samples = collected
-    whole, gaps = ReplayBuffer(100), ReplayBuffer(100)
+    whole, gaps = ReplayBuffer(controller, 100), ReplayBuffer(controller, 100)
     for sample in samples:
         whole.add(sample)
     for sample in samples[::3]:
         gaps.add(sample)
-    expected = whole.replay(controller, average_cost(scenario))
-    found = gaps.replay(controller, average_cost(scenario))
+    expected = whole.replay(average_cost(scenario))
+    found = gaps.replay(average_cost(scenario))
     assert found.td_error == pytest.approx(expected.td_error[::3], rel=1e-9, abs=1e-6)
 
 
 def test_replay_sees_the_present_theta(scenario, collected):
     controller, samples = collected
-    buffer = ReplayBuffer(100)
+    buffer = ReplayBuffer(controller, 100)
     for sample in samples:
         buffer.add(sample)
-    before = buffer.replay(controller, average_cost(scenario))
+    before = buffer.replay(average_cost(scenario))
     theta = controller.theta.copy()
     h = 1e-3
     position = controller.parameters.blocks.slices["b_l"].start
@@ -84,7 +84,7 @@ def test_replay_sees_the_present_theta(scenario, collected):
     moved[position] += h
     try:
         controller.theta = moved
-        after = buffer.replay(controller, average_cost(scenario))
+        after = buffer.replay(average_cost(scenario))
     finally:
         controller.theta = theta
     slope = (after.action_value - before.action_value) / h
@@ -93,15 +93,110 @@ def test_replay_sees_the_present_theta(scenario, collected):
 
 def test_a_restored_buffer_replays_alike(scenario, collected):
     controller, samples = collected
-    buffer, other = ReplayBuffer(20), ReplayBuffer(20)
+    buffer, other = ReplayBuffer(controller, 20), ReplayBuffer(controller, 20)
     for sample in samples[:30]:
         buffer.add(sample)
     other.restore(buffer.state())
     for sample in samples[30:35]:
         buffer.add(sample)
         other.add(sample)
-    first = buffer.replay(controller, average_cost(scenario))
+    first = buffer.replay(average_cost(scenario))
     controller.reset()
-    second = other.replay(controller, average_cost(scenario))
+    second = other.replay(average_cost(scenario))
     assert np.array_equal(first.number, second.number)
     assert first.td_error == pytest.approx(second.td_error, rel=1e-9, abs=1e-6)
+
+
+class Counting:
+    """A controller that counts its feedbacks."""
+
+    def __init__(self, controller, *, memoryless=True):
+        self._controller, self.memoryless, self.feedbacks = controller, memoryless, 0
+
+    @property
+    def theta(self):
+        return self._controller.theta
+
+    @theta.setter
+    def theta(self, theta):
+        self._controller.theta = theta
+
+    def prepare_at(self, point):
+        self._controller.prepare_at(point)
+
+    def feedback(self, *arguments):
+        self.feedbacks += 1
+        return self._controller.feedback(*arguments)
+
+
+def replayed(controller, samples, cost):
+    """A replay that remembers nothing."""
+    buffer = ReplayBuffer(Counting(controller, memoryless=False), 100)
+    for sample in samples:
+        buffer.add(sample)
+    return buffer.replay(cost)
+
+
+def assert_same(first, second):
+    for name in ("number", "action_value", "target", "gradient", "next_gradient", "failures"):
+        assert np.array_equal(getattr(first, name), getattr(second, name)), name
+
+
+def test_what_the_loop_solved_is_not_solved_again(scenario, collected):
+    controller, samples = collected
+    counting = Counting(controller)
+    buffer = ReplayBuffer(counting, 100)
+    for sample in samples:
+        buffer.add(sample)
+    found = buffer.replay(average_cost(scenario))
+    assert counting.feedbacks == sum(sample.explored for sample in samples)
+    assert_same(found, replayed(controller, samples, average_cost(scenario)))
+
+
+def test_going_back_to_a_theta_solves_for_what_is_new_only(scenario, collected):
+    controller, samples = collected
+    counting, start = Counting(controller), controller.theta
+    buffer = ReplayBuffer(counting, 100)
+    try:
+        for sample in samples[:40]:
+            buffer.add(sample)
+        buffer.replay(average_cost(scenario))
+        counting.theta = start + 1e-3
+        for sample in samples[40:]:  # as if they had been taken at this θ
+            buffer.add(sample)
+        buffer.replay(average_cost(scenario))
+    finally:
+        counting.theta = start
+    counting.feedbacks = 0
+    found = buffer.replay(average_cost(scenario))
+    assert 20 <= counting.feedbacks <= 20 + sum(sample.explored for sample in samples)
+    assert_same(found, replayed(controller, samples, average_cost(scenario)))
+
+
+def test_a_row_that_another_transition_takes_is_forgotten_at_every_theta(scenario, collected):
+    controller, samples = collected
+    buffer, start = ReplayBuffer(controller, 20), controller.theta
+    try:
+        for sample in samples[:20]:
+            buffer.add(sample)
+        buffer.replay(average_cost(scenario))
+        controller.theta = start + 1e-3
+        for sample in samples[20:30]:
+            buffer.add(sample)
+    finally:
+        controller.theta = start
+    found = buffer.replay(average_cost(scenario))
+    assert_same(found, replayed(controller, samples[10:30], average_cost(scenario)))
+
+
+def test_a_restored_buffer_remembers_what_was_solved(scenario, collected):
+    controller, samples = collected
+    buffer = ReplayBuffer(controller, 100)
+    for sample in samples:
+        buffer.add(sample)
+    first = buffer.replay(average_cost(scenario))
+    counting = Counting(controller)
+    other = ReplayBuffer(counting, 100)
+    other.restore(buffer.state())
+    assert_same(other.replay(average_cost(scenario)), first)
+    assert counting.feedbacks == 0

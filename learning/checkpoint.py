@@ -21,7 +21,7 @@ from learning.errors import CheckpointError
 from rti_storage import write_atomically
 from rti_storage.files import read_arrays
 
-SCHEMA = 5
+SCHEMA = 6
 Array = NDArray[Any]
 
 

@@ -88,7 +88,7 @@ class EpisodeData:
         candidates = np.array(self._candidates).reshape(-1, len(self._metric))
         if not len(errors):
             errors, states = np.zeros((1, n)), np.zeros((1, n))
-        return Learned(candidates, errors, states.std(axis=0))
+        return Learned(candidates, errors, states.std(axis=0), errors.std(axis=0))
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All that was taken, as arrays."""

@@ -50,26 +50,29 @@ class Learned(NamedTuple):
     """What a phase of learning gives.
 
     `candidates` (K, n_θ), the last is where it ended; `errors` (M, n) one-step prediction errors;
-    `state_deviation` (n,).
+    `state_deviation` and `error_deviation` (n,).
     """
 
     candidates: Matrix
     errors: Matrix
     state_deviation: Vector
+    error_deviation: Vector
 
 
 class Block(NamedTuple):
     """What a block gives: mean `stage_cost` and `penalty` a sample, `predictions` f(s, a) (K, n).
 
     `errors` (K, n) beside them are e = s₊ − f(s, a); `metric` is E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ) if it
-    was asked for, with Σ the exploration's variance.
+    was asked for, with Σ the exploration's variance. `expected` is the penalty that a race expects
+    of the predictions, None where it has not judged them yet.
     """
 
     stage_cost: float
     penalty: float
     predictions: Matrix
     errors: Matrix
-    metric: Matrix | None
+    metric: Matrix | None = None
+    expected: float | None = None
 
 
 Request = Learn | Settle | Trial

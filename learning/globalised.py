@@ -12,11 +12,13 @@ from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration
 from learning.definiteness import certificate
 from learning.episode_data import EpisodeData
-from learning.episodes import Block, Learn, Learned, Request, Result, Settle, Trial
+from learning.episodes import Learn, Request, Result, Settle, Trial
 from learning.errors import DivergenceError
 from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel
 from learning.protocols import LearnableController, Rule, Transition, Update
+from learning.race import Races
+from learning.search_history import SearchHistory, results
 from learning.validated_search import ValidatedSearch
 
 Vector = NDArray[np.float64]
@@ -117,7 +119,7 @@ class GlobalisedLearning:
             blocks=settings.blocks,
         )
         self._plan = self._search.plan()
-        self._results: list[Result] = []
+        self._history = SearchHistory(Races.MEMORY)
         self._request: Request | None = next(self._plan, None)
         self._open()
 
@@ -164,11 +166,13 @@ class GlobalisedLearning:
         )
 
     def _advance(self, result: Result) -> None:
-        self._results.append(result)
+        assert self._search is not None
+        answered = self._request
         try:
             self._request = self._plan.send(result)
         except StopIteration:
             self._request = None
+        self._history.add(answered, result, self._search.expected)
         self._open()
 
     # checkpoints --------------------------------------------------------------------------------
@@ -179,35 +183,15 @@ class GlobalisedLearning:
         if self._search is None:
             return rule
         state = rule | self._episode.state()
-        state |= {"learnt": np.array(self._learnt), "results": np.array(len(self._results))}
-        for k, result in enumerate(self._results):
-            if isinstance(result, Learned):
-                state |= prefixed(f"result {k} ", result._asdict())
-                continue
-            state[f"result {k} costs"] = np.array([result.stage_cost, result.penalty])
-            state[f"result {k} data"] = np.stack([result.predictions, result.errors])
-            if result.metric is not None:
-                state[f"result {k} metric"] = result.metric
-        return state
+        return state | {"learnt": np.array(self._learnt)} | self._history.state()
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         if self._search is not None:
             theta = self._controller.theta
-            self._replay(state)
+            for result in results(state):
+                self._advance(result)
             self._controller.theta = theta
             self._episode.restore(state)
             self._learnt = int(state["learnt"])
         self._rule.restore(group(state, "rule "))
-
-    def _replay(self, state: dict[str, NDArray[Any]]) -> None:
-        """Put the plan where it was by the results that it had been given."""
-        for k in range(len(self._results), int(state["results"])):
-            if isinstance(self._request, Learn):
-                learned = (state[f"result {k} {name}"] for name in Learned._fields)
-                self._advance(Learned(*learned))
-                continue
-            stage_cost, penalty = (float(value) for value in state[f"result {k} costs"])
-            predictions, errors = state[f"result {k} data"]
-            metric = state.get(f"result {k} metric")
-            self._advance(Block(stage_cost, penalty, predictions, errors, metric))

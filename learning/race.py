@@ -66,6 +66,8 @@ class Races:
         self.least = 0.5 * max(certificate(start.blocks, start.theta).smallest, 0.0)
         """Least eigenvalue that the Hessians of a candidate may have."""
         self.spent, self.limit = 0, samples
+        self.expected = float("nan")
+        """Penalty expected of the latest block."""
         self._errors: Matrix = np.zeros((0, scenario.state_lower.size))
         self._pool = SortedErrors(self._errors)
         self.incumbent = Candidate(start.theta)
@@ -86,12 +88,18 @@ class Races:
         self.spend(self.block)
         block = yield Trial(candidate.theta, begins=not candidate.realised)
         assert isinstance(block, Block)
-        expected = block.penalty
-        if len(block.predictions) and len(self._pool):
-            expected = self._penalty.expected(block.predictions, self._pool)
+        self.expected = self._expected(block)
         candidate.realised.append(block.stage_cost + block.penalty)
-        candidate.expected.append(block.stage_cost + expected)
+        candidate.expected.append(block.stage_cost + self.expected)
         self.remember(block.errors)
+
+    def _expected(self, block: Block) -> float:
+        """Penalty expected of a block's predictions, its own where there is no pool yet."""
+        if block.expected is not None:
+            return block.expected
+        if len(block.predictions) and len(self._pool):
+            return self._penalty.expected(block.predictions, self._pool)
+        return block.penalty
 
     def renew(self, blocks: int, episode: int | None = None) -> Generator[Request, Result, None]:
         """Run the incumbent on from where the plant is, or in a new episode, on new noise."""

@@ -84,6 +84,11 @@ class ValidatedSearch:
         return self._races.accepted
 
     @property
+    def expected(self) -> float:
+        """Penalty expected of the latest block in a race."""
+        return self._races.expected
+
+    @property
     def spent(self) -> int:
         """Samples asked for so far."""
         return self._races.spent
@@ -176,7 +181,7 @@ class ValidatedSearch:
         self._lines.scale = prior_deviation(
             start,
             learned.state_deviation,
-            learned.errors.std(axis=0),
+            learned.error_deviation,
             self._action_deviation,
             abs(float(start["c_lambda"])),
             0.3,

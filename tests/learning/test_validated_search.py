@@ -37,7 +37,7 @@ class Quadratic:
             self.samples += request.samples
             candidate = self.learner(request.theta, request.width)
             errors = self.rng.uniform(-1, 1, size=(500, 2)) * [2.0, 0.2]
-            return Learned(candidate[None, :], errors, np.array([1.6, 1.5]))
+            return Learned(candidate[None, :], errors, np.array([1.6, 1.5]), errors.std(axis=0))
         self.samples += 100
         if isinstance(request, Settle):
             self.rounds += 1

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import inf, isnan
+
+import numpy as np
 
 from controllers.parameters import Parameters
 from cosim.text_tables import csv_text
@@ -37,27 +40,37 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
 class LogRow(Mapping[str, float]):
     """A line of the log: `figures` by column, NaN where not measured, and the `parameters` then.
 
     It reads as the mapping of its figures; the entries of θ get names in the CSV alone.
     """
 
-    figures: Mapping[str, float]
-    parameters: Parameters
+    # A long run keeps many: numbers in one array, their names once for all rows.
+    __slots__ = ("_positions", "_values", "parameters")
+
+    def __init__(self, figures: Mapping[str, float], parameters: Parameters) -> None:
+        self._positions = _positions(tuple(figures))
+        self._values = np.fromiter(figures.values(), np.float64, len(figures))
+        self.parameters = parameters
 
     def __getitem__(self, name: str) -> float:
         """A figure by its column."""
-        return self.figures[name]
+        return float(self._values[self._positions[name]])
 
     def __iter__(self) -> Iterator[str]:
         """The columns."""
-        return iter(self.figures)
+        return iter(self._positions)
 
     def __len__(self) -> int:
         """Return the number of figures."""
-        return len(self.figures)
+        return len(self._positions)
+
+
+@cache
+def _positions(columns: tuple[str, ...]) -> dict[str, int]:
+    """Where a column stands; the same dictionary for the same columns."""
+    return {name: k for k, name in enumerate(columns)}
 
 
 @dataclass

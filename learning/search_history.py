@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,8 @@ class SearchHistory:
     def add(self, request: Request | None, result: Result, expected: float) -> None:
         """Keep the answer to a request; `expected` is the penalty expected of a block in a race."""
         if isinstance(result, Block):
-            result = result._replace(predictions=_none(result.predictions), expected=expected)
+            none = _no_rows(result.predictions.shape[1])
+            result = result._replace(predictions=none, expected=expected)
         self._results.append(result)
         if not _remembered(request):
             self._drop_errors(len(self._results) - 1)
@@ -48,7 +50,7 @@ class SearchHistory:
 
     def _drop_errors(self, k: int) -> None:
         result = self._results[k]
-        self._results[k] = result._replace(errors=_none(result.errors))
+        self._results[k] = result._replace(errors=_no_rows(result.errors.shape[1]))
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything kept, as arrays."""
@@ -69,7 +71,7 @@ def results(state: Mapping[str, NDArray[Any]]) -> Iterator[Result]:
             continue
         numbers = {name: float(kept[name]) for name in ("stage_cost", "penalty", "expected")}
         yield Block(
-            predictions=_none(kept["errors"]),
+            predictions=_no_rows(kept["errors"].shape[1]),
             errors=kept["errors"],
             metric=kept.get("metric"),
             **numbers,
@@ -81,6 +83,7 @@ def _remembered(request: Request | None) -> bool:
     return not (isinstance(request, Settle) or (isinstance(request, Trial) and request.sensitive))
 
 
-def _none(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """No rows, of the same width, in memory of their own."""
-    return np.zeros((0, *rows.shape[1:]))
+@cache
+def _no_rows(width: int) -> NDArray[np.float64]:
+    """No rows, (0, width): one array for all results."""
+    return np.zeros((0, width))

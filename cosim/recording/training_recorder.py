@@ -23,7 +23,8 @@ from cosim.recording.stream import SAMPLE, Stream, line, mark
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
-ROWS = 64
+FIRST_ROWS, ROWS = 16, 256
+"""Rows that are sent together: Rerun keeps about 2 kB in memory of what is sent to an entity."""
 _TOGETHER = {
     "cost per sample": ("J", "greedy_J", "reference_J"),
     "heat transfer": ("UA2",),
@@ -130,7 +131,7 @@ class TrainingRecorder:
         self._thetas.append(parameters.theta.copy())
         if self._map is not None and isfinite(row.get("greedy_J", nan)):
             self._map.send(int(row["samples"]), controller)
-        if len(self._rows) >= ROWS:
+        if len(self._rows) >= (ROWS if self._stream.begun else FIRST_ROWS):
             self._send()
 
     def close(self) -> None:

@@ -7,6 +7,8 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 # Every command imports this file; processes are imported where one is started.
@@ -16,7 +18,7 @@ POLL = 0.5
 
 
 AGAIN = 1.0
-"""Seconds after which a SIGTERM whose exception was lost comes again."""
+"""Seconds after which a signal whose exception was lost comes again."""
 
 
 class Terminated(BaseException):
@@ -27,26 +29,80 @@ class Interrupted(BaseException):
     """Ctrl-C was pressed, and the command has unwound; its arguments say how it goes on."""
 
 
-def unwind_on_sigterm() -> None:
-    """Let SIGTERM raise `Terminated` in this process's main thread, until that has unwound.
+def unwind_on_signals() -> None:
+    """Let SIGTERM raise `Terminated` and Ctrl-C KeyboardInterrupt, until the command has unwound.
 
     An exception out of a signal handler is lost where C code clears errors that it did not expect,
-    in an import for instance; so the signal comes again until the exception is on its way.
+    in an import for instance; so the signal comes again until the exception is on its way. A
+    Ctrl-C that is ignored, as a shell's background jobs ignore it, stays so.
     """
-
-    def terminate(number: int, frame: FrameType | None) -> None:
-        again = threading.Timer(AGAIN, signal.raise_signal, [signal.SIGTERM])
-        again.daemon = True
-        again.start()
-        if not isinstance(sys.exc_info()[1], Terminated):
-            raise Terminated
-
-    signal.signal(signal.SIGTERM, terminate)
+    signal.signal(signal.SIGTERM, _raising(signal.SIGTERM, Terminated))
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _raising(signal.SIGINT, KeyboardInterrupt))
 
 
-def ignore_sigterm() -> None:
-    """Take no more notice of SIGTERM: the process is ending."""
+def ignore_signals() -> None:
+    """Take no more notice of SIGTERM and Ctrl-C: the process is ending."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _raising(
+    number: signal.Signals, error: type[BaseException]
+) -> Callable[[int, FrameType | None], None]:
+    """Handler that raises an error and, after `AGAIN` seconds, sends the signal once more."""
+    own = False
+
+    def send_again() -> None:
+        nonlocal own
+        own = True
+        # To the process, so that the main thread is woken out of a wait; Windows knows no such.
+        (signal.raise_signal if os.name == "nt" else _send)(number)
+
+    def handle(_: int, frame: FrameType | None) -> None:
+        nonlocal own
+        again, own = own, False
+        timer = threading.Timer(AGAIN, send_again)
+        timer.daemon = True
+        timer.start()
+        # A second Ctrl-C of the user's may end an unwinding that hangs; a process that is watched
+        # gets SIGTERM from its group and from its parent.
+        if _on_its_way(error) and (again or number == signal.SIGTERM):
+            return
+        raise error
+
+    return handle
+
+
+def _send(number: int) -> None:
+    os.kill(os.getpid(), number)
+
+
+def _on_its_way(error: type[BaseException]) -> bool:
+    """Whether such an exception is being handled, or what is arose in handling one."""
+    found = sys.exc_info()[1]
+    while found is not None and not isinstance(found, error):
+        found = found.__context__
+    return found is not None
+
+
+@contextmanager
+def out_of_reach_of_ctrl_c() -> Iterator[None]:
+    """Start a process here that Ctrl-C in the terminal does not reach: its parent decides.
+
+    Its threads and its children inherit that. On Windows nothing is done.
+    """
+    if os.name == "nt":
+        yield
+        return
+    from multiprocessing.resource_tracker import ensure_running  # noqa: PLC0415
+
+    ensure_running()  # it would be started first, and let Ctrl-C through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def follow_parent(number: int | None = None) -> None:

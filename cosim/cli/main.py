@@ -30,7 +30,7 @@ from cosim.cli import (
 )
 from cosim.cli.streams import open_streams
 from cosim.errors import CosimError
-from cosim.lifetime import Interrupted, Terminated, ignore_sigterm, unwind_on_sigterm
+from cosim.lifetime import Interrupted, Terminated, ignore_signals, unwind_on_signals
 
 
 class _Commands(TyperGroup):
@@ -132,7 +132,7 @@ def main() -> None:
     a report with the traceback and exit code 70.
     """
     open_streams()
-    unwind_on_sigterm()
+    unwind_on_signals()
     supervision.enter()
     try:
         _run()
@@ -153,9 +153,10 @@ def _run() -> None:
     except MemoryError as error:
         _fail(f"not enough memory ({error}); ask for fewer samples")
     except Interrupted as error:
+        ignore_signals()
         _end("interrupted", error.args, EXIT_INTERRUPTED)
     except Terminated as error:
-        ignore_sigterm()
+        ignore_signals()
         _end("terminated", getattr(error, "__notes__", ()), EXIT_TERMINATED)
     except Exception as error:
         _report(error)

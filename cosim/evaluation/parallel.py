@@ -16,7 +16,7 @@ import loky
 
 from cosim.errors import EvaluationError
 from cosim.evaluation.cluster import cluster
-from cosim.lifetime import follow_parent
+from cosim.lifetime import follow_parent, out_of_reach_of_ctrl_c
 from rti_storage.temporary import temporary_folder
 
 Task = TypeVar("Task")
@@ -129,7 +129,7 @@ def _feed(
             limit = 2 * crew.workers() if broken is None else 0
             while waiting and len(given) < limit:
                 key, task = waiting.take()
-                with crew.translated():
+                with crew.translated(), out_of_reach_of_ctrl_c():  # which may start a worker
                     given[crew.executor.submit(function, task)] = (key, task)
             finished, _ = wait(given, LOOK_SECONDS, return_when=FIRST_COMPLETED)
             if not finished:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cosim import errors
 from cosim.errors import CosimError, PlantError
-from cosim.lifetime import follow_parent
+from cosim.lifetime import follow_parent, out_of_reach_of_ctrl_c
 from cosim.plant.fmu_plant import FmuPlant
 from cosim.plant.resource import Resource
 from cosim.plant.snapshot import Snapshot
@@ -62,7 +62,8 @@ class IsolatedPlant(Resource):
             args=(remote, self.scenario.to_dict(), None if fmu is None else str(fmu)),
             daemon=True,
         )
-        self._process.start()
+        with out_of_reach_of_ctrl_c():
+            self._process.start()
         remote.close()
         about: dict[str, Any] = self._answer()
         self.units: dict[str, str] = about["units"]
@@ -166,7 +167,7 @@ def _receive(pipe: Connection) -> Any:
 
 def _serve(pipe: Connection, scenario: dict[str, Any], fmu: str | None) -> None:
     """Answer the other process's calls until it closes the pipe."""
-    # Ctrl-C reaches the whole group; the parent decides what becomes of it.
+    # On Windows Ctrl-C reaches it all the same; the parent decides what becomes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     follow_parent()  # an FMU that hangs never sees the pipe close
     try:

@@ -1,5 +1,7 @@
 """What a command starts ends with it, whatever ends the command itself."""
 
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -47,3 +49,87 @@ def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
     assert process.returncode == 143
     assert words == "terminated\n"
     assert list((tmp_path / "out").iterdir()) == []
+
+
+LOST = """
+import sys, time
+from cosim.lifetime import Terminated, ignore_signals, unwind_on_signals
+
+class Slow:
+    def __del__(self):  # what is raised in here is lost
+        print("ready", flush=True)
+        time.sleep(60)
+
+unwind_on_signals()
+sys.unraisablehook = lambda _: print("lost", flush=True)
+try:
+    slow = Slow()
+    del slow
+    time.sleep(60)
+except (KeyboardInterrupt, Terminated) as error:
+    try:
+        time.sleep(2.5)  # the signal comes again, and is not raised again
+        {}["unwinding"]
+    except KeyError:
+        time.sleep(1.5)
+    ignore_signals()
+    print(type(error).__name__)
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "word"), [(signal.SIGINT, "KeyboardInterrupt"), (signal.SIGTERM, "Terminated")]
+)
+def test_a_signal_whose_exception_was_lost_comes_again_and_unwinds_once(number, word):
+    with subprocess.Popen(
+        [sys.executable, "-c", LOST], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        assert process.communicate(timeout=30) == (f"lost\n{word}\n", "")
+
+
+def test_a_second_ctrl_c_ends_an_unwinding_that_hangs():
+    program = (
+        "import time\n"
+        "from cosim.lifetime import unwind_on_signals\n"
+        "unwind_on_signals()\n"
+        "try:\n    print('ready', flush=True)\n    time.sleep(60)\n"
+        "finally:\n    print('unwinding', flush=True)\n    time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
+        for word in (b"ready\n", b"unwinding\n"):
+            assert process.stdout.readline() == word
+            process.send_signal(signal.SIGINT)
+        assert process.wait(30) in (-signal.SIGINT, 130)
+
+
+def test_a_background_job_goes_on_ignoring_ctrl_c():
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "from cosim.lifetime import unwind_on_signals; unwind_on_signals()\n"
+        "assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_ctrl_c_does_not_reach_what_is_started_out_of_its_reach():
+    program = (
+        "import subprocess, sys\n"
+        "from cosim.lifetime import out_of_reach_of_ctrl_c\n"
+        "with out_of_reach_of_ctrl_c():\n"
+        "    child = subprocess.Popen([sys.executable, '-c', 'print(1); input(); print(2)'],\n"
+        "        stdin=subprocess.PIPE, text=True)\n"
+        "try:\n    print('ready', flush=True)\n    child.wait()\n"
+        "except KeyboardInterrupt:\n    child.communicate('go on\\n')\n"
+        "sys.exit(child.returncode)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-uc", program], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        os.killpg(process.pid, signal.SIGINT)  # also while the child's Python is starting
+        assert process.communicate(timeout=30)[0] == "1\n2\n"
+        assert process.returncode == 0

@@ -35,17 +35,6 @@ COMMANDS = {
 ENDS = {"SIGINT": ("interrupted", 130), "SIGTERM": ("terminated", 143)}
 
 
-def press(process):
-    """Ctrl-C as a terminal sends it, to all in the foreground; again where it did nothing.
-
-    Python loses an exception out of a signal handler where C code clears errors, as imports do.
-    """
-    for _ in range(5):
-        os.killpg(process.pid, signal.SIGINT)
-        if eventually(lambda: process.poll() is not None, 20):
-            break
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("number", ENDS)
@@ -63,11 +52,10 @@ def test_an_interrupted_command_says_how_it_goes_on(tmp_path, command, number):
         text=True,
         start_new_session=True,
     ) as process:
-        # Not before the workers are up: Python itself speaks where it is interrupted in its start.
         assert eventually(lambda: any((tmp_path / "out").glob(file)), 120)
         try:
-            if number == "SIGINT":
-                press(process)
+            if number == "SIGINT":  # as a terminal sends it, to all in the foreground
+                os.killpg(process.pid, signal.SIGINT)
             else:
                 process.terminate()
             _, said = process.communicate(timeout=120)

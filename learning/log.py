@@ -46,17 +46,23 @@ class LogRow(Mapping[str, float]):
     It reads as the mapping of its figures; the entries of θ get names in the CSV alone.
     """
 
-    # A long run keeps many: numbers in one array, their names once for all rows.
-    __slots__ = ("_positions", "_values", "parameters")
+    # A long run keeps many rows: small NumPy arrays, each alive among what comes and goes, would
+    # hold a page of memory each.
+    __slots__ = ("_blocks", "_figures", "_positions", "_theta")
 
     def __init__(self, figures: Mapping[str, float], parameters: Parameters) -> None:
         self._positions = _positions(tuple(figures))
-        self._values = np.fromiter(figures.values(), np.float64, len(figures))
-        self.parameters = parameters
+        self._figures = np.fromiter(figures.values(), np.float64, len(figures)).tobytes()
+        self._blocks, self._theta = parameters.blocks, parameters.theta.tobytes()
+
+    @property
+    def parameters(self) -> Parameters:
+        """θ at the time of the row."""
+        return Parameters(self._blocks, np.frombuffer(self._theta))
 
     def __getitem__(self, name: str) -> float:
         """A figure by its column."""
-        return float(self._values[self._positions[name]])
+        return float(np.frombuffer(self._figures)[self._positions[name]])
 
     def __iter__(self) -> Iterator[str]:
         """The columns."""

@@ -22,7 +22,7 @@ from cosim.recording.palette import BOUND, GOOD, SERIES, packed
 from cosim.recording.stream import Stream, line, lines, mark, sample_times
 from cosim.scenario import Scenario
 
-ROWS = 2000
+ROWS = 4096
 
 
 class RerunRecorder:

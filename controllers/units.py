@@ -53,8 +53,8 @@ class Units:
         gradient, curvature, rates = _derivatives(model, reference)
         near = ACTIVE * widths
         below, above = reference <= lower + near, reference >= upper - near
-        multipliers = _multipliers(gradient * both, rates * both, below, above)
-        dearest = float(multipliers[:n].max())
+        found = multipliers(gradient * both, rates * both, below, above)
+        dearest = float(found[:n].max())
         sizes = (
             dearest,
             float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max()),
@@ -91,11 +91,12 @@ def _derivatives(model: Model, reference: Vector) -> tuple[Vector, Vector, Vecto
     return first.reshape(-1), second.reshape(-1), jacobian
 
 
-def _multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
+def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
     """|μ| (n+m,) of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs.
 
-    They are the multipliers of the QP min ½|w|² + ∇ℓᵀw over what equation and active bounds leave,
-    the projection of −∇ℓ on these directions.
+    `gradient` is ∇ℓ (n+m,), `rates` ∂x' (n, n+m); `below` and `above` say which bounds are active.
+    They are those of the QP min ½|w|² + ∇ℓᵀw over what equation and active bounds leave, the
+    projection of −∇ℓ on these directions. Raises ModelError where DAQP finds none.
     """
     size = np.abs(gradient).max()
     if not size or not (np.isfinite(gradient).all() and np.isfinite(rates).all()):
@@ -116,8 +117,8 @@ def _multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> V
             "problem: the multipliers of the bounds at the reference cannot be computed "
             f"({MEANING.get(flag, flag)}); look at the derivatives of cost and model there"
         )
-    multipliers: Vector = np.abs(info["lam"][:inequalities]) * size
-    return multipliers
+    found: Vector = np.abs(info["lam"][:inequalities]) * size
+    return found
 
 
 def _power(size: ArrayLike) -> Vector:

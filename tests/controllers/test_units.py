@@ -4,10 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from controllers.economic.steady_state import optimal_steady_state
 from controllers.problem import Problem
 from controllers.theta import ThetaBlocks
+from controllers.units import multipliers
 from cosim.scenario import Scenario
 from tests.helpers import linear_plant
 from tests.helpers.other_units import ACTION, COST, STATE, factors, problems
@@ -83,3 +85,28 @@ def test_bounds_however_near_or_far_have_units(width):
     )
     blocks = ThetaBlocks.of(extreme, slack_weights=True)
     assert np.isfinite(blocks.scale).all() and (blocks.scale > 0).all()
+
+
+def test_multipliers_are_those_of_bounded_least_squares():
+    """SciPy's solver of min ‖∇ℓ + (∂x')ᵀλ − μ‖ with signs on μ is the independent one."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        n, m = int(rng.integers(1, 4)), int(rng.integers(1, 4))
+        gradient, rates = rng.normal(size=n + m), rng.normal(size=(n, n + m))
+        place = rng.permutation(n + m)
+        below, above = place == 0, place == 1
+        signs, active = np.where(below, -1.0, 1.0), np.flatnonzero(below | above)
+        columns = np.hstack([rates.T, np.diag(signs)[:, active]])
+        least = np.r_[np.full(n, -np.inf), np.zeros(active.size)]
+        expected = np.zeros(n + m)
+        expected[active] = lsq_linear(columns, -gradient, (least, np.inf), method="bvls").x[n:]
+        residual = [
+            columns @ np.r_[_costates(columns, n, gradient, mu[active]), mu[active]] + gradient
+            for mu in (expected, multipliers(gradient, rates, below, above))
+        ]
+        assert np.linalg.norm(residual[1]) == pytest.approx(np.linalg.norm(residual[0]), abs=1e-9)
+
+
+def _costates(columns, n, gradient, mu):
+    """λ that belongs to given multipliers."""
+    return np.linalg.lstsq(columns[:, :n], -gradient - columns[:, n:] @ mu)[0]

@@ -205,6 +205,21 @@ def test_help_loads_no_numerics():
     assert result.stderr.strip() == "[]"
 
 
+def test_a_short_run_loads_no_scipy(tmp_path):
+    """Importing it takes as long as all the rest of `simulate --steps 1`."""
+    code = (
+        "import sys; sys.argv[:1] = ['cosim', 'simulate', '--steps', '1', '--out']\n"
+        "from cosim.cli import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "print('scipy' in sys.modules, file=sys.stderr)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True
+    )
+    assert (tmp_path / "summary.json").is_file()
+    assert result.stderr.splitlines()[-1] == "False"
+
+
 BAD_INPUT = {
     "unknown preset": (["simulate", "-s", "papr"], ["unknown scenario 'papr'", "paper"]),
     "missing scenario": (["simulate", "-s", "no.toml"], ["no.toml", "does not exist"]),

@@ -122,14 +122,21 @@ def survive(folder: Path, began: float) -> float:
     return time.monotonic() - began
 
 
-def leftovers(folder: Path, numbers: set[int]) -> list[str]:
-    """What a killed command has left where nothing may be left."""
+def shared_memory() -> set[str]:
+    """Names of semaphores and other shared memory, of whichever process."""
+    place = Path("/dev/shm")
+    return {path.name for path in place.iterdir()} if place.is_dir() else set()
+
+
+def leftovers(folder: Path, numbers: set[int], before: set[str]) -> list[str]:
+    """What a killed command has left where nothing may be left.
+
+    Of shared memory that was not there `before`: an older process may have had the same number.
+    """
     found = [str(path) for path in (folder / "temporary").rglob("*")]
     found += [str(path) for path in (folder / "cache").glob("*/.partial-*")]
-    shared = Path("/dev/shm")
-    if shared.is_dir():
-        marks = [f"-{number}-" for number in numbers]
-        found += [p.name for p in shared.iterdir() if any(mark in p.name for mark in marks)]
+    marks = [f"-{number}-" for number in numbers]
+    found += [s for s in shared_memory() - before if any(mark in s for mark in marks)]
     sockets = Path("/proc/net/unix").read_text().splitlines()
     found += [line for line in sockets if str(folder) in line]
     for path in folder.rglob("*.lock"):
@@ -145,7 +152,7 @@ def leftovers(folder: Path, numbers: set[int]) -> list[str]:
 
 def trial(one: Trial[Job], number: signal.Signals) -> dict[str, float]:
     """Kill a job's first process once, look, and run it again; what was seen."""
-    job, folder = one.job, one.folder
+    job, folder, before = one.job, one.folder, shared_memory()
     process = start(job.words.split(), folder, environment(folder))
     time.sleep(one.delay)
     members = family(folder)
@@ -165,7 +172,7 @@ def trial(one: Trial[Job], number: signal.Signals) -> dict[str, float]:
         # A signal before Python has begun to handle it ends the process as the system does.
         expected = {0, -number} | ({143} if number == signal.SIGTERM else set())
         assert code in expected, f"{what}: exit code {code}\n{said}"
-    left = leftovers(folder, set(members))
+    left = leftovers(folder, set(members), before)
     assert not left, f"{what} left {left}"
     whole([*job.words.split(), *(job.again.split() if (folder / "out").exists() else [])], folder)
     assert (folder / job.result).is_file()
@@ -185,7 +192,7 @@ def campaign(
 
     def undisturbed(job: Job, folder: Path) -> None:
         whole(job.words.split(), folder)
-        assert not (left := leftovers(folder, set())), f"{job.name} left {left}"
+        assert not (left := leftovers(folder, set(), set())), f"{job.name} left {left}"
 
     for one in trials(jobs, count, seed, undisturbed, seconds=seconds):
         kind = (signal.SIGKILL, signal.SIGTERM)[one.number // len(jobs) % 2]

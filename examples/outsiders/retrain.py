@@ -1,7 +1,7 @@
 """Retrain the outsiders and evaluate them beside the baselines: one command, one table.
 
     pip install 'rti-cosim[outsiders]'
-    python examples/outsiders/retrain.py --out outsiders                  # the full budgets: minutes
+    python examples/outsiders/retrain.py --out outsiders                 # the full budgets: minutes
     python examples/outsiders/retrain.py --out outsiders --share 0.01 --only sac,ppo
 
 The study is results/outsiders.toml with the policies trained anew; `--share` scales every budget,

@@ -137,6 +137,7 @@ def main() -> None:
     try:
         _run()
     finally:
+        ignore_signals()  # nothing is left to unwind but the interpreter
         supervision.finish()
 
 

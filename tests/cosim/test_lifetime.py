@@ -133,3 +133,22 @@ def test_ctrl_c_does_not_reach_what_is_started_out_of_its_reach():
         os.killpg(process.pid, signal.SIGINT)  # also while the child's Python is starting
         assert process.communicate(timeout=30)[0] == "1\n2\n"
         assert process.returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_after_the_command_has_ended_changes_nothing(number):
+    program = (
+        "import atexit, sys, time\n"
+        "from cosim.cli import main\n"
+        "atexit.register(lambda: (print('ending', flush=True), time.sleep(1)))\n"
+        "sys.argv[1:] = ['--help']\n"
+        "main()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while process.stdout.readline() != "ending\n":
+            pass
+        process.send_signal(number)
+        assert process.communicate(timeout=30) == ("", "")
+    assert process.returncode == 0

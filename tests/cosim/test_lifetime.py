@@ -53,7 +53,10 @@ def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
 
 LOST = """
 import sys, time
+from cosim import lifetime
 from cosim.lifetime import Terminated, ignore_signals, unwind_on_signals
+
+lifetime.AGAIN = 0.2
 
 class Slow:
     def __del__(self):  # what is raised in here is lost
@@ -68,10 +71,10 @@ try:
     time.sleep(60)
 except (KeyboardInterrupt, Terminated) as error:
     try:
-        time.sleep(2.5)  # the signal comes again, and is not raised again
+        time.sleep(0.5)  # the signal comes again, and is not raised again
         {}["unwinding"]
     except KeyError:
-        time.sleep(1.5)
+        time.sleep(0.5)
     ignore_signals()
     print(type(error).__name__)
 """
@@ -140,7 +143,7 @@ def test_a_signal_after_the_command_has_ended_changes_nothing(number):
     program = (
         "import atexit, sys, time\n"
         "from cosim.cli import main\n"
-        "atexit.register(lambda: (print('ending', flush=True), time.sleep(1)))\n"
+        "atexit.register(lambda: (print('ending', flush=True), time.sleep(0.5)))\n"
         "sys.argv[1:] = ['--help']\n"
         "main()\n"
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -20,6 +21,8 @@ POLL = 0.5
 AGAIN = 1.0
 """Seconds after which a signal whose exception was lost comes again."""
 
+_unwound = threading.Event()
+
 
 class Terminated(BaseException):
     """SIGTERM was received; raised so that a command unwinds as it does on Ctrl-C."""
@@ -29,22 +32,38 @@ class Interrupted(BaseException):
     """Ctrl-C was pressed, and the command has unwound; its arguments say how it goes on."""
 
 
-def unwind_on_signals() -> None:
+@contextmanager
+def unwinding_on_signals() -> Iterator[None]:
     """Let SIGTERM raise `Terminated` and Ctrl-C KeyboardInterrupt, until the command has unwound.
 
     An exception out of a signal handler is lost where C code clears errors that it did not expect,
-    in an import for instance; so the signal comes again until the exception is on its way. A
-    Ctrl-C that is ignored, as a shell's background jobs ignore it, stays so.
+    in an import for instance; so the signal comes again until the exception is on its way, or
+    `unwound` says that it has arrived. A Ctrl-C that is ignored, as a shell's background jobs
+    ignore it, stays so. Afterwards the handlers are those of before, and when the interpreter ends,
+    where an exception is nobody's any more, none.
     """
+    _unwound.clear()
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     signal.signal(signal.SIGTERM, _raising(signal.SIGTERM, Terminated))
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if before[signal.SIGINT] is signal.default_int_handler:
         signal.signal(signal.SIGINT, _raising(signal.SIGINT, KeyboardInterrupt))
+    try:
+        yield
+    finally:
+        unwound()
+        atexit.register(_ignore)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
-def ignore_signals() -> None:
-    """Take no more notice of SIGTERM and Ctrl-C: the process is ending."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def unwound() -> None:
+    """Take no more notice of SIGTERM and Ctrl-C: the command has unwound."""
+    _unwound.set()
+
+
+def _ignore() -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _raising(
@@ -55,12 +74,16 @@ def _raising(
 
     def send_again() -> None:
         nonlocal own
+        if _unwound.is_set():
+            return
         own = True
         # To the process, so that the main thread is woken out of a wait; Windows knows no such.
         (signal.raise_signal if os.name == "nt" else _send)(number)
 
     def handle(_: int, frame: FrameType | None) -> None:
         nonlocal own
+        if _unwound.is_set():
+            return
         again, own = own, False
         timer = threading.Timer(AGAIN, send_again)
         timer.daemon = True

@@ -30,7 +30,7 @@ from cosim.cli import (
 )
 from cosim.cli.streams import open_streams
 from cosim.errors import CosimError
-from cosim.lifetime import Interrupted, Terminated, ignore_signals, unwind_on_signals
+from cosim.lifetime import Interrupted, Terminated, unwinding_on_signals, unwound
 
 
 class _Commands(TyperGroup):
@@ -132,13 +132,12 @@ def main() -> None:
     a report with the traceback and exit code 70.
     """
     open_streams()
-    unwind_on_signals()
-    supervision.enter()
-    try:
-        _run()
-    finally:
-        ignore_signals()  # nothing is left to unwind but the interpreter
-        supervision.finish()
+    with unwinding_on_signals():
+        supervision.enter()
+        try:
+            _run()
+        finally:
+            supervision.finish()
 
 
 def _run() -> None:
@@ -154,10 +153,10 @@ def _run() -> None:
     except MemoryError as error:
         _fail(f"not enough memory ({error}); ask for fewer samples")
     except Interrupted as error:
-        ignore_signals()
+        unwound()
         _end("interrupted", error.args, EXIT_INTERRUPTED)
     except Terminated as error:
-        ignore_signals()
+        unwound()
         _end("terminated", getattr(error, "__notes__", ()), EXIT_TERMINATED)
     except Exception as error:
         _report(error)

@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from cosim.lifetime import unwinding_on_signals
 from tests.helpers.command import start_cosim
 from tests.helpers.processes import alive, eventually
 
@@ -54,7 +55,7 @@ def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
 LOST = """
 import sys, time
 from cosim import lifetime
-from cosim.lifetime import Terminated, ignore_signals, unwind_on_signals
+from cosim.lifetime import Terminated, unwinding_on_signals, unwound
 
 lifetime.AGAIN = 0.2
 
@@ -63,20 +64,21 @@ class Slow:
         print("ready", flush=True)
         time.sleep(60)
 
-unwind_on_signals()
 sys.unraisablehook = lambda _: print("lost", flush=True)
-try:
-    slow = Slow()
-    del slow
-    time.sleep(60)
-except (KeyboardInterrupt, Terminated) as error:
+with unwinding_on_signals():
     try:
-        time.sleep(0.5)  # the signal comes again, and is not raised again
-        {}["unwinding"]
-    except KeyError:
-        time.sleep(0.5)
-    ignore_signals()
-    print(type(error).__name__)
+        slow = Slow()
+        del slow
+        time.sleep(60)
+    except (KeyboardInterrupt, Terminated) as error:
+        try:
+            time.sleep(0.5)  # the signal comes again, and is not raised again
+            {}["unwinding"]
+        except KeyError:
+            time.sleep(0.5)
+        unwound()
+        print(type(error).__name__)
+time.sleep(0.5)
 """
 
 
@@ -95,10 +97,10 @@ def test_a_signal_whose_exception_was_lost_comes_again_and_unwinds_once(number, 
 def test_a_second_ctrl_c_ends_an_unwinding_that_hangs():
     program = (
         "import time\n"
-        "from cosim.lifetime import unwind_on_signals\n"
-        "unwind_on_signals()\n"
-        "try:\n    print('ready', flush=True)\n    time.sleep(60)\n"
-        "finally:\n    print('unwinding', flush=True)\n    time.sleep(60)\n"
+        "from cosim.lifetime import unwinding_on_signals\n"
+        "with unwinding_on_signals():\n"
+        "  try:\n    print('ready', flush=True)\n    time.sleep(60)\n"
+        "  finally:\n    print('unwinding', flush=True)\n    time.sleep(60)\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
@@ -112,8 +114,9 @@ def test_a_second_ctrl_c_ends_an_unwinding_that_hangs():
 def test_a_background_job_goes_on_ignoring_ctrl_c():
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "from cosim.lifetime import unwind_on_signals; unwind_on_signals()\n"
-        "assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN\n"
+        "from cosim.lifetime import unwinding_on_signals\n"
+        "with unwinding_on_signals():\n"
+        "    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
 
@@ -155,3 +158,10 @@ def test_a_signal_after_the_command_has_ended_changes_nothing(number):
         process.send_signal(number)
         assert process.communicate(timeout=30) == ("", "")
     assert process.returncode == 0
+
+
+def test_the_handlers_of_before_are_put_back():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with unwinding_on_signals():
+        assert signal.getsignal(signal.SIGTERM) is not before[signal.SIGTERM]
+    assert before == {number: signal.getsignal(number) for number in before}

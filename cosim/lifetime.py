@@ -77,8 +77,10 @@ def _raising(
         if _unwound.is_set():
             return
         own = True
-        # To the process, so that the main thread is woken out of a wait; Windows knows no such.
-        (signal.raise_signal if os.name == "nt" else _send)(number)
+        if os.name == "nt":
+            signal.raise_signal(number)
+        else:  # to the process, so that the main thread is woken out of a wait
+            os.kill(os.getpid(), number)
 
     def handle(_: int, frame: FrameType | None) -> None:
         nonlocal own
@@ -95,10 +97,6 @@ def _raising(
         raise error
 
     return handle
-
-
-def _send(number: int) -> None:
-    os.kill(os.getpid(), number)
 
 
 def _on_its_way(error: type[BaseException]) -> bool:

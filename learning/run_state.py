@@ -79,7 +79,7 @@ class RunState:
         checkpoint.restore_generator(learner.algorithm_rng, state["algorithm_generator"])
         self.rows = [
             LogRow(
-                dict(zip(state["columns"], map(float, figures), strict=True)),
+                dict(zip(state["columns"], figures, strict=True)),
                 learner.start.with_theta(theta),
             )
             for figures, theta in zip(arrays["rows"], arrays["row_thetas"], strict=True)

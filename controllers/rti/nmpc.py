@@ -86,7 +86,6 @@ class RtiNmpc:
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
         self._u = self._prepare.inputs["u"].reshape(horizon, m)
         self._costates = np.zeros((horizon, n))
-        self._shapes = (horizon, n), (horizon, m), (horizon, n)
         # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
         start, end = (self._prepare.positions[name] for name in ("x", "u"))
         self._point = self._prepare.arguments[start.start : end.stop]
@@ -177,21 +176,16 @@ class RtiNmpc:
         Raises ControllerError where an array has a wrong shape or is not finite, and then changes
         nothing; QpError where the QP is not finite.
         """
-        x, u, costates = (np.asarray(values, dtype=np.float64) for values in point)
-        shapes = x.shape, u.shape, costates.shape
-        # Plain numbers: their sum costs half as much as NumPy's.
-        total = sum(x.ravel().tolist()) + sum(u.ravel().tolist()) + sum(costates.ravel().tolist())
-        if shapes != self._shapes or not isfinite(total):
-            for name, array, shape in zip(
-                point._fields, (x, u, costates), self._shapes, strict=True
-            ):
-                if array.shape != shape or not isfinite(array.sum()):
-                    raise ControllerError(
-                        f"linearisation point: {name} must be finite with shape {shape}, "
-                        f"not {array.shape}"
-                    )
+        targets = (self._x, self._u, self._costates)
+        arrays = [np.asarray(values, dtype=np.float64) for values in point]
+        for name, target, array in zip(point._fields, targets, arrays, strict=True):
+            if array.shape != target.shape or not isfinite(sum(array.reshape(-1).tolist())):
+                raise ControllerError(
+                    f"linearisation point: {name} must be finite with shape {target.shape}, "
+                    f"not {array.shape}"
+                )
         self._pending = None
-        self._linearise_at(LinearisationPoint(x, u, costates))
+        self._linearise_at(LinearisationPoint(*arrays))
 
     def _linearise_at(self, point: LinearisationPoint) -> None:
         """Make a point the guess and linearise there."""

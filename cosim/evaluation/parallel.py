@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -84,12 +84,12 @@ def run_all(
 
 @dataclass(frozen=True)
 class _Crew:
-    """Who works: an executor, how many workers it has now, and whether it is still there.
+    """Who works: how a task is given out, how many workers there are, whether they still are there.
 
-    `look` raises EvaluationError where it is not; `translated` says in a line what it raises.
+    `look` raises EvaluationError where they are not; `translated` says in a line what they raise.
     """
 
-    executor: Executor
+    submit: Callable[..., Future[Any]]
     workers: Callable[[], int]
     look: Callable[[], None] = lambda: None
     translated: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -129,8 +129,8 @@ def _feed(
             limit = 2 * crew.workers() if broken is None else 0
             while waiting and len(given) < limit:
                 key, task = waiting.take()
-                with crew.translated(), out_of_reach_of_ctrl_c():  # which may start a worker
-                    given[crew.executor.submit(function, task)] = (key, task)
+                with crew.translated():
+                    given[crew.submit(function, task)] = (key, task)
             finished, _ = wait(given, LOOK_SECONDS, return_when=FIRST_COMPLETED)
             if not finished:
                 crew.look()
@@ -158,7 +158,7 @@ def _feed(
 def _crew(jobs: int, scheduler: str | None) -> Iterator[_Crew]:
     if scheduler is not None:
         with cluster(scheduler) as there:
-            yield _Crew(there.executor, there.workers, there.look, there.translated)
+            yield _Crew(there.executor.submit, there.workers, there.look, there.translated)
         return
     # The workers' temporary files, which a worker that is killed leaves to us.
     with temporary_folder("cosim-") as temporary:
@@ -170,8 +170,14 @@ def _crew(jobs: int, scheduler: str | None) -> Iterator[_Crew]:
             initializer=follow_parent,
             initargs=(os.getpid(),),
         )
+
+        def submit(function: Callable[[Any], Any], task: Any) -> Future[Any]:
+            with out_of_reach_of_ctrl_c():  # the first one starts the workers
+                future: Future[Any] = executor.submit(function, task)
+            return future
+
         try:
-            yield _Crew(executor, lambda: jobs)
+            yield _Crew(submit, lambda: jobs)
         except BaseException:
             executor.shutdown(wait=True, kill_workers=True)
             raise

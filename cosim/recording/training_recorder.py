@@ -24,7 +24,10 @@ from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
 FIRST_ROWS, ROWS = 16, 256
-"""Rows that are sent together: Rerun keeps about 2 kB in memory of what is sent to an entity."""
+"""Rows that are sent together: Rerun keeps about 2 kB in memory of what is sent to an entity.
+
+The first ones come sooner, so that a training that is killed has left a layout.
+"""
 _TOGETHER = {
     "cost per sample": ("J", "greedy_J", "reference_J"),
     "heat transfer": ("UA2",),

@@ -21,19 +21,11 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.helpers.command import start_cosim
+from tests.helpers.command import LONG_STUDY, start_cosim
 from tests.helpers.processes import eventually
 
 EARLY = 2.5
 """Seconds within which the key is pressed."""
-STUDY = """\
-schema = 1
-name = "long"
-scenarios = ["paper"]
-evaluation = { seeds = 4000, steps = 1000 }
-[[case]]
-controller = "naive"
-"""
 COMMANDS = (
     "evaluate --seeds 9999 -n 1000 --jobs 2",
     "study run study.toml --jobs 2",
@@ -47,7 +39,7 @@ def trial(command: str, delay: float) -> None:
     """Interrupt a command `delay` seconds after its folder was made; raises AssertionError."""
     with tempfile.TemporaryDirectory() as top:
         folder = Path(top)
-        (folder / "study.toml").write_text(STUDY)
+        (folder / "study.toml").write_text(LONG_STUDY)
         words = [*command.split(), "--out", "out"]
         # A compiler would make the moments of the imports other ones.
         environment = {"COSIM_COMPILE": "never"}

@@ -10,6 +10,15 @@ from pathlib import Path
 from typing import Any
 
 NOTHING: Mapping[str, str] = {}
+LONG_STUDY = """\
+schema = 1
+name = "long"
+scenarios = ["paper"]
+evaluation = { seeds = 4000, steps = 1000 }
+[[case]]
+controller = "naive"
+"""
+"""A study that nobody waits for, to be interrupted."""
 
 
 def run_cosim(

@@ -32,11 +32,17 @@ def average_cost(scenario):
     return AverageCost(scenario.discount, 0, 1.0, 0.0)
 
 
-def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collected):
-    controller, samples = collected
-    buffer = ReplayBuffer(controller, 100)
+def filled(controller, samples, capacity=100):
+    """A buffer that these samples were put into."""
+    buffer = ReplayBuffer(controller, capacity)
     for sample in samples:
         buffer.add(sample)
+    return buffer
+
+
+def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collected):
+    controller, samples = collected
+    buffer = filled(controller, samples)
     replayed = buffer.replay(average_cost(scenario))
     q = [sample.action_value.value for sample in samples]
     target = [sample.cost + scenario.discount * sample.next_policy.value for sample in samples]
@@ -52,20 +58,14 @@ def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collecte
 
 def test_a_full_buffer_forgets_the_oldest(scenario, collected):
     controller, samples = collected
-    buffer = ReplayBuffer(controller, 20)
-    for sample in samples:
-        buffer.add(sample)
+    buffer = filled(controller, samples, 20)
     assert len(buffer) == 20
     assert buffer.replay(average_cost(scenario)).number.tolist() == list(range(40, 60))
 
 
 def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, collected):
     controller, samples = collected
-    whole, gaps = ReplayBuffer(controller, 100), ReplayBuffer(controller, 100)
-    for sample in samples:
-        whole.add(sample)
-    for sample in samples[::3]:
-        gaps.add(sample)
+    whole, gaps = filled(controller, samples), filled(controller, samples[::3])
     expected = whole.replay(average_cost(scenario))
     found = gaps.replay(average_cost(scenario))
     assert found.td_error == pytest.approx(expected.td_error[::3], rel=1e-9, abs=1e-6)
@@ -73,9 +73,7 @@ def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, colle
 
 def test_replay_sees_the_present_theta(scenario, collected):
     controller, samples = collected
-    buffer = ReplayBuffer(controller, 100)
-    for sample in samples:
-        buffer.add(sample)
+    buffer = filled(controller, samples)
     before = buffer.replay(average_cost(scenario))
     theta = controller.theta.copy()
     h = 1e-3
@@ -93,9 +91,7 @@ def test_replay_sees_the_present_theta(scenario, collected):
 
 def test_a_restored_buffer_replays_alike(scenario, collected):
     controller, samples = collected
-    buffer, other = ReplayBuffer(controller, 20), ReplayBuffer(controller, 20)
-    for sample in samples[:30]:
-        buffer.add(sample)
+    buffer, other = filled(controller, samples[:30], 20), ReplayBuffer(controller, 20)
     other.restore(buffer.state())
     for sample in samples[30:35]:
         buffer.add(sample)
@@ -131,9 +127,7 @@ class Counting:
 
 def replayed(controller, samples, cost):
     """A replay that remembers nothing."""
-    buffer = ReplayBuffer(Counting(controller, memoryless=False), 100)
-    for sample in samples:
-        buffer.add(sample)
+    buffer = filled(Counting(controller, memoryless=False), samples)
     return buffer.replay(cost)
 
 
@@ -145,9 +139,7 @@ def assert_same(first, second):
 def test_what_the_loop_solved_is_not_solved_again(scenario, collected):
     controller, samples = collected
     counting = Counting(controller)
-    buffer = ReplayBuffer(counting, 100)
-    for sample in samples:
-        buffer.add(sample)
+    buffer = filled(counting, samples)
     found = buffer.replay(average_cost(scenario))
     assert counting.feedbacks == sum(sample.explored for sample in samples)
     assert_same(found, replayed(controller, samples, average_cost(scenario)))
@@ -191,9 +183,7 @@ def test_a_row_that_another_transition_takes_is_forgotten_at_every_theta(scenari
 
 def test_a_restored_buffer_remembers_what_was_solved(scenario, collected):
     controller, samples = collected
-    buffer = ReplayBuffer(controller, 100)
-    for sample in samples:
-        buffer.add(sample)
+    buffer = filled(controller, samples)
     first = buffer.replay(average_cost(scenario))
     counting = Counting(controller)
     other = ReplayBuffer(counting, 100)

@@ -10,17 +10,10 @@ import pytest
 
 from cosim.cli import output
 from cosim.lifetime import Terminated
+from tests.helpers.command import LONG_STUDY
 from tests.helpers.processes import eventually
 
 AGAIN = "; what is finished is kept: the same command goes on from there"
-STUDY = """\
-schema = 1
-name = "long"
-scenarios = ["paper"]
-evaluation = { seeds = 4000, steps = 1000 }
-[[case]]
-controller = "naive"
-"""
 COMMANDS = {
     "simulate": ("simulate -n 5000000", "", ".cosim.lock"),
     "evaluate": ("evaluate --seeds 9999 -n 1000 --jobs 1", AGAIN, ".units.jsonl"),
@@ -40,7 +33,7 @@ ENDS = {"SIGINT": ("interrupted", 130), "SIGTERM": ("terminated", 143)}
 @pytest.mark.parametrize("number", ENDS)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_an_interrupted_command_says_how_it_goes_on(tmp_path, command, number):
-    (tmp_path / "study.toml").write_text(STUDY)
+    (tmp_path / "study.toml").write_text(LONG_STUDY)
     words, how, file = COMMANDS[command]
     word, code = ENDS[number]
     with subprocess.Popen(

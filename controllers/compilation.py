@@ -15,7 +15,7 @@ from controllers.buffered import BufferedFunction
 from controllers.code_generation import c_source
 from controllers.errors import ControllerError
 from controllers.shared_library import FLAGS, Build, find, find_compiler, lock_of
-from rti_storage.cache import sweep, trusted_folder
+from cosim.cache import sweep, trusted_folder
 
 KIND = "compiled"
 SWITCH = "COSIM_COMPILE"

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ModelError, ParameterError
 from controllers.problem import Problem
 from controllers.theta import ThetaBlocks
-from rti_storage import write_atomically
-from rti_storage.documents import read_toml
+from cosim.files import read_toml, write_atomically
 
 Vector = NDArray[np.float64]
 SCHEMA = 1

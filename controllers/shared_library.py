@@ -16,8 +16,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from rti_storage.cache import read_own
-from rti_storage.guarded import end_guarded, exit_code, start_guarded
+from cosim.cache import read_own
+from cosim.guarded import end_guarded, exit_code, start_guarded
 
 if TYPE_CHECKING:
     import filelock

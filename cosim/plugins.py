@@ -11,7 +11,7 @@ from typing import Any
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 
 
-OURS = ("rti_storage", "fmus", "cosim", "controllers", "learning")
+OURS = ("fmus", "cosim", "controllers", "learning")
 """The packages of this distribution; any other is a user's."""
 
 

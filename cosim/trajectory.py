@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from cosim import text_tables
 from cosim.errors import TrajectoryError
+from cosim.files import write_atomically
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
 from cosim.signals import signal_names, whole
 from cosim.text_tables import PIECE, csv_pieces
-from rti_storage import write_atomically
 
 Array = NDArray[np.float64]
 STATUS = "status"

@@ -7,6 +7,7 @@ import json
 import uuid
 from pathlib import Path
 
+from cosim.temporary import temporary_folder
 from fmus.archive import read_archive, write_archive
 from fmus.compiler import COMPILER_FLAGS, WARNINGS, Compiler
 from fmus.description import build_description, model_description
@@ -16,7 +17,6 @@ from fmus.header import c_header
 from fmus.model import FmiVersion
 from fmus.own import binaries, compilers
 from fmus.variables import EVAPORATOR, VARIABLES
-from rti_storage.temporary import temporary_folder
 
 PACKAGE = Path(__file__).parent
 SOURCES = PACKAGE / "sources"

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import fmpy
 
+from cosim.temporary import temporary_folder
 from fmus.errors import BuildError
 from fmus.platforms import Platform, present
-from rti_storage.temporary import temporary_folder
 
 # No path, date or identification may enter the binary; no fused multiply-add may change a result.
 COMPILER_FLAGS = (

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.files import read_arrays, write_atomically
 from learning.errors import CheckpointError
-from rti_storage import write_atomically
-from rti_storage.files import read_arrays
 
 SCHEMA = 6
 Array = NDArray[Any]

@@ -16,6 +16,7 @@ from cosim.lookup import build_controller as controller_by_name
 from cosim.lookup import import_from_here
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
+from cosim.temporary import temporary_folder
 from learning.errors import ConfigurationError
 from learning.log import COLUMNS, LogRow, to_csv
 from learning.optimum import stored_optimum
@@ -24,7 +25,6 @@ from learning.registry import load_algorithm
 from learning.starting_point import build_controller, starting_parameters
 from learning.training_loop import CHECKPOINT, training_loop
 from learning.training_run import TrainingRun, prepare
-from rti_storage.temporary import temporary_folder
 
 SEQUENCES = (list, tuple, set, frozenset)
 

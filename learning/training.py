@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from cosim.evaluation.statistics import shown
+from cosim.files import write_atomically
 from cosim.lookup import build_controller
 from cosim.scenario import Scenario
 from learning.configuration import Configuration
@@ -24,7 +25,6 @@ from learning.protocols import LearnableController
 from learning.starting_point import build_controller as build_learnt
 from learning.training_loop import Progress, training_loop
 from learning.training_run import TrainingRecorder, TrainingResult, TrainingRun, prepare
-from rti_storage import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,6 +13,7 @@ import numpy as np
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError
 from cosim.evaluation.statistics import shown
+from cosim.files import write_atomically
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller, functions_of
 from learning.definiteness import certificate
@@ -32,7 +33,6 @@ from learning.training_run import (
     late_movement,
 )
 from learning.validation import Validation
-from rti_storage import write_atomically
 
 CHECKPOINT = "checkpoint.npz"
 Progress = Callable[[int, LogRow], None]

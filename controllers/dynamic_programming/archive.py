@@ -22,9 +22,8 @@ from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum
 from controllers.errors import OptimumError
 from controllers.problem import Problem
-from rti_storage import user_cache, write_atomically
-from rti_storage.cache import CACHE_VARIABLE, is_closed, is_own_file, own_folder
-from rti_storage.files import read_arrays
+from cosim.cache import CACHE_VARIABLE, is_closed, is_own_file, own_folder, user_cache
+from cosim.files import read_arrays, write_atomically
 
 # Part of every key: raise it when the solver changes what it finds.
 VERSION = 2

@@ -41,8 +41,8 @@ def demo(
     """
     with output(json) as out_:
         from cosim.figures import plot_overlay
+        from cosim.files import write_atomically
         from cosim.scenario import Scenario
-        from rti_storage import write_atomically
 
         scenario = Scenario.load(SCENARIO)
         folder = open_folder(out)

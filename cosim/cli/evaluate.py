@@ -50,11 +50,11 @@ def evaluate(
         from cosim.cli.compose import announce
         from cosim.evaluation import evaluate as run
         from cosim.evaluation.parallel import cores
+        from cosim.files import write_atomically
         from cosim.kpis import comes_to_rest
         from cosim.lookup import build_controller
         from cosim.scenario import Scenario
         from learning.optimum import stored_optimum
-        from rti_storage import write_atomically
 
         task = Scenario.load(scenario)
         named = named_controllers(controllers)

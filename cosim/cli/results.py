@@ -51,7 +51,7 @@ def check(
         from cosim.experiments.check import differences, load_tolerances
         from cosim.experiments.results import StudyResults
         from cosim.experiments.stored import chosen, stored_results, stored_studies
-        from rti_storage.temporary import temporary_folder
+        from cosim.temporary import temporary_folder
 
         folder = folder or (Path("results") if Path("results").is_dir() else stored_results())
         tolerances, studies = load_tolerances(folder), stored_studies(folder)

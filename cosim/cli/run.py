@@ -32,10 +32,10 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     the summary's `timing`; all other bytes are the same for the same command and seed.
     """
     from cosim.cli.compose import announce, load_scenario
+    from cosim.files import write_atomically
     from cosim.lookup import build_controller
     from cosim.plant import FmuPlant, IsolatedPlant
     from cosim.simulation import simulate
-    from rti_storage import write_atomically
 
     scenario = load_scenario(run.scenario)
     folder = open_folder(run.out).absolute()  # an FMU may change the working directory

@@ -87,9 +87,9 @@ def init(
     with output(json) as out_:
         from cosim.cli.compose import announce_fmu
         from cosim.errors import CosimError
+        from cosim.files import write_atomically
         from cosim.plant.draft import draft_scenario
         from cosim.scenario import Scenario
-        from rti_storage import write_atomically
 
         target = (out or Path(f"{Path(fmu).stem}.toml")).absolute()
         if target.exists() and not overwrite:

@@ -154,8 +154,8 @@ def write_summary(results: StudyResults) -> dict[str, Any]:
     from cosim.errors import StudyError
     from cosim.experiments.summary import aggregate_rows, summary_rows
     from cosim.experiments.tables import TIMING
+    from cosim.files import write_atomically
     from cosim.text_tables import read_records
-    from rti_storage import write_atomically
 
     document = {
         **results.about,

@@ -49,7 +49,7 @@ def watch(fmu: Path, stdout: int | None) -> None:
     """
     if not _marks or _marks[-1] is not None:
         return
-    from rti_storage.temporary import temporary_folder  # here: few commands watch another
+    from cosim.temporary import temporary_folder  # here: few commands watch another
 
     flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
     command = [sys.executable, *flags, "-m", "cosim", *sys.argv[1:]]

@@ -241,7 +241,7 @@ def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:
 
 
 def _write(folder: Path, training: Training, summary: dict[str, Any]) -> None:
-    from rti_storage import write_atomically
+    from cosim.files import write_atomically
 
     training.save(folder)
     write_atomically(folder / "summary.json", dump(summary))

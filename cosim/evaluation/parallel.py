@@ -17,7 +17,7 @@ import loky
 from cosim.errors import EvaluationError
 from cosim.evaluation.cluster import cluster
 from cosim.lifetime import follow_parent, out_of_reach_of_ctrl_c
-from rti_storage.temporary import temporary_folder
+from cosim.temporary import temporary_folder
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")

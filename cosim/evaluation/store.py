@@ -12,7 +12,7 @@ from typing import Any
 
 from cosim.errors import EvaluationError
 from cosim.evaluation.unit import UnitResult, as_document, from_document
-from rti_storage.documents import parse_json
+from cosim.files import parse_json
 
 FILE = ".units.jsonl"
 FORMAT = 3

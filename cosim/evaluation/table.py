@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from cosim.evaluation.runs import Runs
 from cosim.evaluation.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
+from cosim.files import write_atomically
 from cosim.text_tables import cell, csv_pieces
-from rti_storage import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

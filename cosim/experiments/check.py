@@ -15,8 +15,8 @@ from cosim.experiments.document import Table
 from cosim.experiments.keyed import KeyedTable, read
 from cosim.experiments.tables import CURVES, EVALUATION
 from cosim.experiments.traces import LOGS, TRAJECTORIES
+from cosim.files import read_toml
 from cosim.validation import describe
-from rti_storage.documents import read_toml
 
 TOLERANCES = "tolerances.toml"
 

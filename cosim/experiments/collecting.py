@@ -26,8 +26,8 @@ from cosim.experiments.summary import (
 )
 from cosim.experiments.tables import CURVES, RUNS, TIMING, curves_csv, evaluation_csv, to_csv
 from cosim.experiments.traces import draw, keep
+from cosim.files import write_atomically
 from cosim.text_tables import parse_records
-from rti_storage import write_atomically
 
 Array = NDArray[np.float64]
 SUMMARY, AGGREGATE = "summary.csv", "aggregate.csv"

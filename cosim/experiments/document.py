@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cosim.errors import StudyError
+from cosim.files import read_toml
 from cosim.validation import describe
-from rti_storage.documents import read_toml
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]

@@ -20,8 +20,8 @@ from cosim.experiments.formatting import (
 )
 from cosim.experiments.paper import further
 from cosim.experiments.results import StudyResults
+from cosim.files import write_atomically
 from cosim.text_tables import markdown_table
-from rti_storage import write_atomically
 
 PAGE, TABLES = "report.html", "report.md"
 CAPTIONS = {

@@ -15,7 +15,7 @@ from cosim.errors import StudyError
 from cosim.evaluation.statistics import Estimate, gap_closed, regret
 from cosim.experiments.records import CaseResult, RunResult
 from cosim.experiments.tables import read_runs
-from rti_storage.documents import read_json
+from cosim.files import read_json
 
 Array = NDArray[np.float64]
 ABOUT = "study.json"

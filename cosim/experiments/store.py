@@ -19,9 +19,8 @@ from typing import Any
 from cosim.errors import StudyError
 from cosim.experiments.document import TrajectoryTable
 from cosim.experiments.protocols import Progress
+from cosim.files import read_json, write_atomically
 from cosim.text_tables import cell, csv_pieces, csv_text, read_records
-from rti_storage import write_atomically
-from rti_storage.documents import read_json
 
 RUNS = "runs"
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"

@@ -17,9 +17,9 @@ from cosim.experiments.report import TABLES, report_markdown
 from cosim.experiments.results import ABOUT, StudyResults
 from cosim.experiments.store import RUNS
 from cosim.experiments.tables import TIMING
+from cosim.files import write_atomically
 from cosim.text_tables import markdown_table
 from cosim.validation import suggestion
-from rti_storage import write_atomically
 
 WORK = ".work"
 """Folder within the folder: what long studies have finished."""

@@ -23,10 +23,10 @@ from cosim.figures import (
     plot_trajectory,
     policy_on_grid,
 )
+from cosim.files import write_atomically
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.trajectory import Trajectory, read_csv
-from rti_storage import write_atomically
 
 Array = NDArray[np.float64]
 Policy = Callable[[Array], Array]

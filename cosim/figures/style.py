@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cosim.errors import FigureError
-from rti_storage import write_atomically
+from cosim.files import write_atomically
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""

@@ -11,8 +11,8 @@ import zipfile
 from contextlib import suppress
 from pathlib import Path
 
-from rti_storage.cache import sweep, trusted_folder
-from rti_storage.temporary import temporary_folder
+from cosim.cache import sweep, trusted_folder
+from cosim.temporary import temporary_folder
 
 _CHUNK = 1 << 20
 

@@ -18,10 +18,10 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cosim.errors import RecordingError
+from cosim.files import make_public
 from cosim.recording.channels import Channel, Range
 from cosim.recording.glyphs import drawable
 from cosim.recording.palette import packed_all
-from rti_storage.files import make_public
 
 APPLICATION = "rti-cosim"
 SIGNAL = "cosim.Signal"

@@ -15,10 +15,10 @@ from pathlib import Path
 from rerun.experimental import ViewerClient
 
 from cosim.errors import RecordingError
+from cosim.files import write_atomically
+from cosim.guarded import end_guarded, start_guarded
 from cosim.recording.moment import telling_moment
 from cosim.recording.stream import SAMPLE, TIME
-from rti_storage import write_atomically
-from rti_storage.guarded import end_guarded, start_guarded
 
 LOOPBACK = "127.0.0.1"
 _NOWHERE = f"http://{LOOPBACK}:9"

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import ScenarioError
+from cosim.files import parse_toml, read_toml
 from cosim.validation import suggestion
-from rti_storage.documents import parse_toml, read_toml
 
 LONGEST = 16
 """Files that may extend one another in a chain."""

@@ -17,9 +17,9 @@ from controllers import (
 from controllers.buffered import BufferedFunction
 from controllers.compilation import Compilation, description
 from controllers.shared_library import find, find_compiler
+from cosim.cache import TAG
 from cosim.scenario import Scenario
 from cosim.scenario.loading import presets
-from rti_storage.cache import TAG
 from tests.helpers.command import run_cosim
 from tests.helpers.sampling import evaporator_problem
 

@@ -1,8 +1,8 @@
 import pytest
 
 from cosim.errors import CosimError
+from cosim.files import write_atomically
 from cosim.text_tables import cell, csv_text, markdown_table, read_csv, read_records
-from rti_storage import write_atomically
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 import fmus
+from cosim.cache import TAG, UNUSED_DAYS
 from cosim.plant import unpacking
 from cosim.plant.archive import unpack
-from rti_storage.cache import TAG, UNUSED_DAYS
 from tests.helpers.command import run_cosim
 
 DAY = 86400

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from tests.helpers.optional import OPTIONAL
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
-PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
+PACKAGES = ("fmus", "cosim", "controllers", "learning")
 
 
 def modules():

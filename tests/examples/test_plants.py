@@ -11,9 +11,9 @@ import pytest
 
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
+from cosim.cache import CACHE_VARIABLE
 from fmus.checks import Status, check
 from fmus.plant import build_plant
-from rti_storage.cache import CACHE_VARIABLE
 from tests.helpers.command import run_cosim
 from tests.helpers.tank import edited, without_attribute
 

@@ -9,8 +9,8 @@ from controllers import Parameters, Problem
 from controllers.errors import ParameterError
 from cosim import Scenario, Study
 from cosim.errors import ScenarioError, StudyError
+from cosim.files import DEEPEST, LARGEST, parse_toml
 from cosim.scenario.loading import LONGEST
-from rti_storage.documents import DEEPEST, LARGEST, parse_toml
 
 
 def theta(path):

@@ -17,7 +17,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from tests.helpers.command import start_cosim
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
+PACKAGES = ("fmus", "cosim", "controllers", "learning")
 EMPTY: Mapping[str, str] = {}
 
 

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 # A process that has everything but our packages.
 WITHOUT = "import sys; sys.modules.update(dict.fromkeys({names}))\n"
 MAIN = "from distributed.cli.dask_{role} import main; main()"
-PACKAGES = ("rti_storage", "fmus", "cosim", "controllers", "learning")
+PACKAGES = ("fmus", "cosim", "controllers", "learning")
 OURS = PACKAGES
 
 

@@ -97,7 +97,7 @@ def test_the_sdist_holds_what_a_fork_needs(sdist):
 def test_the_wheel_holds_the_committed_data_to_the_byte(wheel, checkout):
     with zipfile.ZipFile(wheel) as archive:
         stored = {name: archive.read(name) for name in archive.namelist()}
-    packages = ("rti_storage", "fmus", "cosim", "controllers", "learning")
+    packages = ("fmus", "cosim", "controllers", "learning")
     assert {f"{package}/py.typed" for package in packages} <= stored.keys()
     patterns = (
         "fmus/*.fmu", "fmus/sources/*", "fmus/plant_sources/*", "fmus/resources/*",
@@ -145,9 +145,7 @@ def test_the_installed_results_hold(installed, tmp_path):
 
 
 def test_importing_warns_of_nothing(installed, tmp_path):
-    code = (
-        "import cosim.cli, cosim.figures, cosim.recording, controllers, fmus, learning, rti_storage"
-    )
+    code = "import cosim.cli, cosim.figures, cosim.recording, controllers, fmus, learning"
     run(installed, "-W", "error", "-c", code, cwd=tmp_path, env=bare_environment(installed))
 
 

@@ -7,7 +7,7 @@ from tests.helpers.optional import OPTIONAL
 
 CODE = """
 import importlib, pkgutil
-for package in ("rti_storage", "fmus", "cosim", "controllers", "learning"):
+for package in ("fmus", "cosim", "controllers", "learning"):
     root = importlib.import_module(package)
     for found in pkgutil.walk_packages(root.__path__, package + "."):
         if not found.name.endswith("__main__") and found.name not in OPTIONAL:

@@ -13,8 +13,8 @@ from cosim.cli.compose import build_plant
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
+from cosim.temporary import temporary_folder
 from fmus.sampled import SampledInstance
-from rti_storage.temporary import temporary_folder
 
 TARGET = 30.0
 WARM_UP = 20

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from rti_storage.guarded import end_guarded, exit_code, start_guarded
+from cosim.guarded import end_guarded, exit_code, start_guarded
 from tests.helpers.processes import eventually, running
 
 SLEEPER = (
@@ -19,7 +19,7 @@ SLEEPER = (
 )
 GUARDED = (
     "import sys, time\n"
-    "from rti_storage.guarded import end_guarded, start_guarded\n"
+    "from cosim.guarded import end_guarded, start_guarded\n"
     "process = start_guarded([sys.executable, '-c', {program!r}])\n"
     "print('started', flush=True)\n"
     "time.sleep(600)\n"
@@ -27,7 +27,7 @@ GUARDED = (
 FOLDER = (
     "import subprocess, sys, time\n"
     "from pathlib import Path\n"
-    "from rti_storage.guarded import start_guarded\n"
+    "from cosim.guarded import start_guarded\n"
     "process = start_guarded([sys.executable, '-c', {program!r}], folder=Path({folder!r}))\n"
     "print('started', flush=True)\n"
     "time.sleep(600)\n"

@@ -4,8 +4,7 @@ import stat
 import numpy as np
 import pytest
 
-from rti_storage import write_atomically
-from rti_storage.files import read_arrays
+from cosim.files import read_arrays, write_atomically
 
 
 def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path):

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 import platformdirs
 
-from rti_storage.temporary import delete_temporary_folder, new_temporary_folder
+from cosim.temporary import delete_temporary_folder, new_temporary_folder
 
 CACHE_VARIABLE = "COSIM_CACHE"
 UNUSED_DAYS = 30

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rti_storage import caretaker
-from rti_storage.guarded import end_guarded
+from cosim import caretaker
+from cosim.guarded import end_guarded
 
 _lock = threading.Lock()
 # The process's caretaker: of this process, not of one that it was forked from.

@@ -3,8 +3,8 @@ import stat
 
 import pytest
 
-from rti_storage import cache
-from rti_storage.cache import (
+from cosim import cache
+from cosim.cache import (
     TAG,
     TAGGED,
     UNFINISHED_DAYS,

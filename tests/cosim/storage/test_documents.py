@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from rti_storage.documents import DEEPEST, LARGEST, read_json, read_toml
+from cosim.files import DEEPEST, LARGEST, read_json, read_toml
 
 READERS = {"json": read_json, "toml": read_toml}
 BAD = {

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from rti_storage import guardian
+from cosim import guardian
 
 
 def start_guarded(

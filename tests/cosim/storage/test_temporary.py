@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from rti_storage import caretaker
-from rti_storage.temporary import new_temporary_folder, temporary_folder
+from cosim import caretaker
+from cosim.temporary import new_temporary_folder, temporary_folder
 from tests.helpers.processes import eventually
 
 LINES = (
     "import os, sys, time\n"
     "from pathlib import Path\n"
-    "from rti_storage.temporary import new_temporary_folder, temporary_folder\n"
+    "from cosim.temporary import new_temporary_folder, temporary_folder\n"
 )
 HOLDER = LINES + (
     "import signal\n"

@@ -8,13 +8,13 @@ from cosim.registration import register_environments
 if TYPE_CHECKING:
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
-    from cosim.experiments.outcome import StudyOutcome as StudyOutcome
-    from cosim.experiments.outcome import study as study
-    from cosim.experiments.results import StudyResults as StudyResults
-    from cosim.experiments.study import Study as Study
     from cosim.plant import FmuPlant as FmuPlant
     from cosim.scenario import Scenario as Scenario
     from cosim.simulation import simulate as simulate
+    from cosim.study.engine import Study as Study
+    from cosim.study.outcome import StudyOutcome as StudyOutcome
+    from cosim.study.outcome import run_study as run_study
+    from cosim.study.results import StudyResults as StudyResults
     from cosim.trajectory import Trajectory as Trajectory
 
 # Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
@@ -26,11 +26,11 @@ __getattr__, __dir__ = on_first_use(
         "FmuPlant": "cosim.plant",
         "Scenario": "cosim.scenario",
         "Trajectory": "cosim.trajectory",
-        "Study": "cosim.experiments.study",
-        "StudyOutcome": "cosim.experiments.outcome",
-        "StudyResults": "cosim.experiments.results",
+        "Study": "cosim.study.engine",
+        "StudyOutcome": "cosim.study.outcome",
+        "StudyResults": "cosim.study.results",
         "simulate": "cosim.simulation",
-        "study": "cosim.experiments.outcome",
+        "run_study": "cosim.study.outcome",
     },
 )
 
@@ -43,8 +43,8 @@ __all__ = [
     "StudyResults",
     "Trajectory",
     "evaluate",
+    "run_study",
     "simulate",
-    "study",
 ]
 
 

@@ -39,13 +39,13 @@ def reproduce(
     tables of `cosim study run`. Run again with the same --out to go on after an interruption.
     """
     with output(json) as out_:
-        from cosim.experiments.paper import comparison
-        from cosim.experiments.report import write_report
-        from cosim.experiments.stored import stored_results
+        from cosim.study.paper import comparison
+        from cosim.study.report import write_report
+        from cosim.study.stored import stored_results
 
         name = "reproduce" if budget is BudgetName.quick else "reproduce-full"
         execute(stored_results() / f"{name}.toml", out, out_, jobs=jobs)
-        from cosim.experiments.results import StudyResults
+        from cosim.study.results import StudyResults
 
         results = StudyResults.load(out)
         summary = write_summary(results)

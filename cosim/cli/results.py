@@ -48,9 +48,9 @@ def check(
     2 where a stored table is missing or damaged. Writes nothing.
     """
     with output(json) as out_:
-        from cosim.experiments.check import differences, load_tolerances
-        from cosim.experiments.results import StudyResults
-        from cosim.experiments.stored import chosen, stored_results, stored_studies
+        from cosim.study.check import differences, load_tolerances
+        from cosim.study.results import StudyResults
+        from cosim.study.stored import chosen, stored_results, stored_studies
         from cosim.temporary import temporary_folder
 
         folder = folder or (Path("results") if Path("results").is_dir() else stored_results())
@@ -85,7 +85,7 @@ def update(
     What long studies have finished is kept in the folder's `.work`; run again to go on.
     """
     with output(json) as out_:
-        from cosim.experiments.stored import (
+        from cosim.study.stored import (
             WORK,
             chosen,
             report,

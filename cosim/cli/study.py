@@ -11,8 +11,8 @@ from cosim.cli.options import JobsOption, JsonOption, OutOption, SchedulerOption
 from cosim.cli.output import Output, again, dump, open_folder, output, resumable
 
 if TYPE_CHECKING:
-    from cosim.experiments.results import StudyResults
-    from cosim.experiments.runner import State
+    from cosim.study.results import StudyResults
+    from cosim.study.runner import State
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 
@@ -53,7 +53,7 @@ def execute(
     """Run a study with a progress bar; exits with code 1 where runs failed."""
     from cosim.errors import FailedRunsError
     from cosim.evaluation.parallel import cores
-    from cosim.experiments.study import Study
+    from cosim.study.engine import Study
 
     study = Study.load(file)
     folder = open_folder(out)
@@ -89,8 +89,8 @@ def execute(
 def plan(file: FileArgument, json: JsonOption = False) -> None:
     """Show what a study will do, and about how long: nothing is trained or written."""
     with output(json) as out_:
-        from cosim.experiments.estimate import estimate
-        from cosim.experiments.study import Study
+        from cosim.study.engine import Study
+        from cosim.study.estimate import estimate
 
         planned = Study.load(file).plan()
         rows, seconds = estimate(planned)
@@ -129,8 +129,8 @@ def report(
     A study that is not finished, or a stored one, is reported with what it has.
     """
     with output(json) as out_:
-        from cosim.experiments.report import write_report
-        from cosim.experiments.results import StudyResults
+        from cosim.study.report import write_report
+        from cosim.study.results import StudyResults
 
         results = StudyResults.load(folder)
         page = write_report(results)
@@ -152,9 +152,9 @@ def _thousands(samples: int) -> int:
 def write_summary(results: StudyResults) -> dict[str, Any]:
     """Write summary.json and return what it says; `timing` is what timing.csv says of each run."""
     from cosim.errors import StudyError
-    from cosim.experiments.summary import aggregate_rows, summary_rows
-    from cosim.experiments.tables import TIMING
     from cosim.files import write_atomically
+    from cosim.study.summary import aggregate_rows, summary_rows
+    from cosim.study.tables import TIMING
     from cosim.text_tables import read_records
 
     document = {
@@ -175,7 +175,7 @@ def write_summary(results: StudyResults) -> dict[str, Any]:
 
 def show(results: StudyResults, out_: Output) -> None:
     """Print a table for each scenario."""
-    from cosim.experiments.formatting import HEADER, lines
+    from cosim.study.formatting import HEADER, lines
 
     for scenario in results.scenarios:
         out_.table(f"{results.name}: {scenario}", HEADER, lines(results, scenario))

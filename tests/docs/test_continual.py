@@ -1,7 +1,7 @@
 """The page's table of the study that goes on while the plant drifts is the stored one."""
 
-from cosim.experiments.online import tables
-from cosim.experiments.results import StudyResults
+from cosim.study.online import tables
+from cosim.study.results import StudyResults
 from tests.helpers.code_blocks import ROOT
 
 LABELS = {

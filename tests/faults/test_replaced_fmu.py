@@ -10,8 +10,8 @@ from controllers.factories import naive
 from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.errors import EvaluationError, PlantError, StudyError
 from cosim.evaluation.provenance import code_hash
-from cosim.experiments.units import Place
 from cosim.plugins import OURS
+from cosim.study.units import Place
 from tests.helpers.loop import Proportional
 
 

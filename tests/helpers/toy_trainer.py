@@ -4,7 +4,7 @@ import json
 
 from cosim import Study
 from cosim.errors import StudyError
-from cosim.experiments.protocols import Progress
+from cosim.study.protocols import Progress
 from tests.helpers.loop import Hold, Proportional
 
 PIECE = 500

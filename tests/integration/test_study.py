@@ -69,8 +69,8 @@ UNDER_WAY = "runs/*/*/*/checkpoint.npz"
 # Checkpoints are handed over after every piece, not only after some seconds.
 COMMAND = """\
 import sys
-import cosim.experiments.runner
-cosim.experiments.runner.SLICE = 0.0
+import cosim.study.runner
+cosim.study.runner.SLICE = 0.0
 from cosim.cli import main
 sys.argv = ["cosim", *sys.argv[1:]]
 main()

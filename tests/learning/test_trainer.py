@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from cosim import Scenario
-from cosim.experiments.protocols import Training
+from cosim.study.protocols import Training
 from learning.errors import ConfigurationError
 from learning.trainer import Trainer
 

@@ -11,11 +11,11 @@ from pydantic import Field, ValidationError
 
 from cosim.comparison import RunSignals, compare
 from cosim.errors import ResultsError
-from cosim.experiments.document import Table
-from cosim.experiments.keyed import KeyedTable, read
-from cosim.experiments.tables import CURVES, EVALUATION
-from cosim.experiments.traces import LOGS, TRAJECTORIES
 from cosim.files import read_toml
+from cosim.study.document import Table
+from cosim.study.keyed import KeyedTable, read
+from cosim.study.tables import CURVES, EVALUATION
+from cosim.study.traces import LOGS, TRAJECTORIES
 from cosim.validation import describe
 
 TOLERANCES = "tolerances.toml"

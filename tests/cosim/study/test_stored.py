@@ -8,13 +8,13 @@ from typer.testing import CliRunner
 
 from cosim.cli.main import app
 from cosim.errors import ResultsError
-from cosim.experiments.check import compared_tables
-from cosim.experiments.document import read
-from cosim.experiments.keyed import rounded_csv
-from cosim.experiments.results import StudyResults
-from cosim.experiments.stored import stored_studies
-from cosim.experiments.tables import read_numbers
 from cosim.stored_run import load_run
+from cosim.study.check import compared_tables
+from cosim.study.document import read
+from cosim.study.keyed import rounded_csv
+from cosim.study.results import StudyResults
+from cosim.study.stored import stored_studies
+from cosim.study.tables import read_numbers
 
 STORED = Path(__file__).parents[3] / "results"
 MINIMAL = """\
@@ -218,7 +218,7 @@ samples = 400
 
 def test_the_reproduction_is_a_study_with_the_paper_s_table_and_figure(tmp_path, monkeypatch):
     (tmp_path / "reproduce.toml").write_text(PAPER)
-    monkeypatch.setattr("cosim.experiments.stored.stored_results", lambda: tmp_path)
+    monkeypatch.setattr("cosim.study.stored.stored_results", lambda: tmp_path)
     out = tmp_path / "out"
     result = CliRunner().invoke(app, ["reproduce", "--out", str(out), "--jobs", "1"])
     assert result.exit_code == 0, result.output + repr(result.exception)

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from cosim.experiments.charts import FOLDER, draw
-from cosim.experiments.formatting import (
+from cosim.files import write_atomically
+from cosim.study.charts import FOLDER, draw
+from cosim.study.formatting import (
     AGGREGATE_HEADER,
     HEADER,
     aggregate_lines,
@@ -18,9 +19,8 @@ from cosim.experiments.formatting import (
     run_lines,
     setting_lines,
 )
-from cosim.experiments.paper import further
-from cosim.experiments.results import StudyResults
-from cosim.files import write_atomically
+from cosim.study.paper import further
+from cosim.study.results import StudyResults
 from cosim.text_tables import markdown_table
 
 PAGE, TABLES = "report.html", "report.md"

@@ -1,7 +1,7 @@
 from pathlib import Path
 
-from cosim.experiments.cases import expand
-from cosim.experiments.document import CaseTable, SeedsTable
+from cosim.study.cases import expand
+from cosim.study.document import CaseTable, SeedsTable
 from tests.helpers.toy_trainer import ToyTrainer
 
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from cosim.experiments.charts import draw, shortened
-from cosim.experiments.formatting import HEADER, lines
-from cosim.experiments.outcome import StudyOutcome
-from cosim.experiments.report import write_report
-from cosim.experiments.results import StudyResults
-from cosim.experiments.summary import aggregate_rows, summary_rows
+from cosim.study.charts import draw, shortened
+from cosim.study.formatting import HEADER, lines
+from cosim.study.outcome import StudyOutcome
+from cosim.study.report import write_report
+from cosim.study.results import StudyResults
+from cosim.study.summary import aggregate_rows, summary_rows
 from tests.helpers.toy_trainer import study
 
 CASES = [

@@ -10,7 +10,7 @@ import pytest
 from cosim import FmuPlant, Study, simulate
 from cosim.cli.study import write_summary
 from cosim.errors import FailedRunsError, StudyError
-from cosim.experiments.results import StudyResults
+from cosim.study.results import StudyResults
 from tests.helpers.loop import Proportional
 from tests.helpers.toy_trainer import ToyTrainer, document, study
 

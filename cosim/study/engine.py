@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from cosim.errors import FailedRunsError
-from cosim.experiments import collecting
-from cosim.experiments.definition import Definition
-from cosim.experiments.plan import Plan, plan
-from cosim.experiments.results import StudyResults
-from cosim.experiments.runner import Report, Runner, State
+from cosim.study import collecting
+from cosim.study.definition import Definition
+from cosim.study.plan import Plan, plan
+from cosim.study.results import StudyResults
+from cosim.study.runner import Report, Runner, State
 
 
 def silent(state: State, line: str) -> None:

@@ -7,9 +7,9 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import StudyError
-from cosim.experiments.online import tables
-from cosim.experiments.report import write_report
-from cosim.experiments.results import StudyResults
+from cosim.study.online import tables
+from cosim.study.report import write_report
+from cosim.study.results import StudyResults
 from tests.helpers.loop import Proportional
 from tests.helpers.toy_trainer import ToyTrainer, study
 

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.experiments import theta
-from cosim.experiments.online import ONLINE, online_csv
-from cosim.experiments.plan import Plan, Run
-from cosim.experiments.records import CURVE, EVALUATED, RunResult
-from cosim.experiments.results import ABOUT, SCHEMA, StudyResults
-from cosim.experiments.store import EVALUATION, GREEDY, INDICATORS, RunStore
-from cosim.experiments.summary import (
+from cosim.files import write_atomically
+from cosim.study import theta
+from cosim.study.online import ONLINE, online_csv
+from cosim.study.plan import Plan, Run
+from cosim.study.records import CURVE, EVALUATED, RunResult
+from cosim.study.results import ABOUT, SCHEMA, StudyResults
+from cosim.study.store import EVALUATION, GREEDY, INDICATORS, RunStore
+from cosim.study.summary import (
     AGGREGATE_COLUMNS,
     COLUMNS,
     RUN_COLUMNS,
@@ -24,9 +25,8 @@ from cosim.experiments.summary import (
     run_rows,
     summary_rows,
 )
-from cosim.experiments.tables import CURVES, RUNS, TIMING, curves_csv, evaluation_csv, to_csv
-from cosim.experiments.traces import draw, keep
-from cosim.files import write_atomically
+from cosim.study.tables import CURVES, RUNS, TIMING, curves_csv, evaluation_csv, to_csv
+from cosim.study.traces import draw, keep
 from cosim.text_tables import parse_records
 
 Array = NDArray[np.float64]

@@ -11,14 +11,14 @@ from time import perf_counter
 from cosim.errors import StudyError
 from cosim.evaluation import reuse
 from cosim.evaluation.reuse import require_code, require_fmu
-from cosim.experiments.protocols import Progress, Trainer, Training
-from cosim.experiments.store import INDICATORS, Indicators
 from cosim.kpis import indicators
 from cosim.lookup import import_from
 from cosim.plugins import OURS
 from cosim.protocols import Controller, functions_of
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
+from cosim.study.protocols import Progress, Trainer, Training
+from cosim.study.store import INDICATORS, Indicators
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`study`: a study in one call, and results that show themselves."""
+"""`run_study`: a study in one call, and results that show themselves."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cosim.experiments.formatting import HEADER, lines
-from cosim.experiments.report import write_report
-from cosim.experiments.results import StudyResults
-from cosim.experiments.runner import Report
-from cosim.experiments.study import Study, silent
+from cosim.study.engine import Study, silent
+from cosim.study.formatting import HEADER, lines
+from cosim.study.report import write_report
+from cosim.study.results import StudyResults
+from cosim.study.runner import Report
 from cosim.text_tables import markdown_table
 
 
@@ -28,7 +28,7 @@ class StudyOutcome(StudyResults):
         return markdown_table(HEADER, lines(self, scenario))
 
 
-def study(
+def run_study(
     source: str | Path | Mapping[str, Any],
     out: str | Path,
     *,

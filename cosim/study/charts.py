@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.evaluation.statistics import LEVEL, regrets
-from cosim.experiments import online
-from cosim.experiments.cases import BASELINES
-from cosim.experiments.records import RunResult
-from cosim.experiments.results import StudyResults
-from cosim.experiments.summary import summary_rows
 from cosim.figures.curves import LearningCurve, chunks, plot_curves
 from cosim.figures.regret import FINE, Dots, Profile, plot_profiles, plot_regret
+from cosim.study import online
+from cosim.study.cases import BASELINES
+from cosim.study.records import RunResult
+from cosim.study.results import StudyResults
+from cosim.study.summary import summary_rows
 
 Array = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ from typing import Any
 
 from cosim.errors import StudyError
 from cosim.evaluation.provenance import code_hash, versions
-from cosim.experiments.cases import Case
-from cosim.experiments.definition import HELD_OUT, Definition, Sizes
-from cosim.experiments.document import TrajectoryTable
-from cosim.experiments.protocols import Training
-from cosim.experiments.store import EVALUATION, GREEDY, Online, RunKey
 from cosim.plant import FmuPlant
 from cosim.plugins import OURS
+from cosim.study.cases import Case
+from cosim.study.definition import HELD_OUT, Definition, Sizes
+from cosim.study.document import TrajectoryTable
+from cosim.study.protocols import Training
+from cosim.study.store import EVALUATION, GREEDY, Online, RunKey
 from cosim.validation import suggestion
 
 BLOCK = 20_000

@@ -10,10 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.evaluation.statistics import TD_WINDOW, td_error_mean
-from cosim.experiments.document import TrajectoryTable
-from cosim.experiments.plan import Plan, Run
-from cosim.experiments.store import RunStore, safe
-from cosim.experiments.tables import read_numbers
 from cosim.figures import (
     Portrait,
     plot_density,
@@ -26,6 +22,10 @@ from cosim.figures import (
 from cosim.files import write_atomically
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
+from cosim.study.document import TrajectoryTable
+from cosim.study.plan import Plan, Run
+from cosim.study.store import RunStore, safe
+from cosim.study.tables import read_numbers
 from cosim.trajectory import Trajectory, read_csv
 
 Array = NDArray[np.float64]

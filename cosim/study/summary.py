@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from cosim.evaluation.statistics import Estimate, over_runs
-from cosim.experiments.records import RunResult
-from cosim.experiments.results import StudyResults
+from cosim.study.records import RunResult
+from cosim.study.results import StudyResults
 
 NAN = float("nan")
 MEDIANS = ("economic_cost", "mean_violation", "violating_share", "failures")

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.evaluation.statistics import Estimate, gap_closed, regret
-from cosim.experiments.records import CaseResult, RunResult
-from cosim.experiments.tables import read_runs
 from cosim.files import read_json
+from cosim.study.records import CaseResult, RunResult
+from cosim.study.tables import read_runs
 
 Array = NDArray[np.float64]
 ABOUT = "study.json"

@@ -3,8 +3,8 @@
 import shutil
 from pathlib import Path
 
-from cosim.experiments.definition import Definition
-from cosim.experiments.plan import plan
+from cosim.study.definition import Definition
+from cosim.study.plan import plan
 
 ROOT = Path(__file__).parents[3]
 DOCUMENT = {

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import StudyError
-from cosim.experiments.document import CaseTable, SeedsTable
-from cosim.experiments.protocols import Trainer
+from cosim.study.document import CaseTable, SeedsTable
+from cosim.study.protocols import Trainer
 
 BASELINES = "baselines"
 

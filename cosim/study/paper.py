@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from cosim.evaluation.statistics import Estimate, gain, shown
-from cosim.experiments import online, theta
-from cosim.experiments.records import RunResult
-from cosim.experiments.results import StudyResults
+from cosim.study import online, theta
+from cosim.study.records import RunResult
+from cosim.study.results import StudyResults
 
 Lines = list[list[str]]
 

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.evaluation.statistics import regret, regret_terms, regrets, shown
-from cosim.experiments.document import OnlineTable
-from cosim.experiments.plan import Plan, Run
-from cosim.experiments.records import RunResult
-from cosim.experiments.results import StudyResults
-from cosim.experiments.store import RunKey, RunStore, safe
-from cosim.experiments.tables import KEYS, read_numbers, to_csv
-from cosim.experiments.traces import LOGS
 from cosim.figures.online import Course, plot_online
+from cosim.study.document import OnlineTable
+from cosim.study.plan import Plan, Run
+from cosim.study.records import RunResult
+from cosim.study.results import StudyResults
+from cosim.study.store import RunKey, RunStore, safe
+from cosim.study.tables import KEYS, read_numbers, to_csv
+from cosim.study.traces import LOGS
 from cosim.text_tables import read_records
 from cosim.validation import suggestion
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Self
 
 from cosim.errors import StudyError
-from cosim.experiments.cases import BASELINES, Case, expand
-from cosim.experiments.document import DEFAULT, PerScenario, StudyTable, read, validate
-from cosim.experiments.protocols import Trainer, Training, registered_trainer
 from cosim.lookup import import_from
 from cosim.scenario import Scenario
 from cosim.scenario.loading import resolved
+from cosim.study.cases import BASELINES, Case, expand
+from cosim.study.document import DEFAULT, PerScenario, StudyTable, read, validate
+from cosim.study.protocols import Trainer, Training, registered_trainer
 from cosim.validation import suggestion
 
 NAIVE = "naive"

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.evaluation.statistics import Estimate, mean, shown
-from cosim.experiments.document import ThetaTable
-from cosim.experiments.plan import Plan
-from cosim.experiments.records import RunResult
-from cosim.experiments.results import StudyResults
-from cosim.experiments.store import RunKey, RunStore
-from cosim.experiments.tables import KEYS, to_csv
-from cosim.experiments.traces import THETA
+from cosim.study.document import ThetaTable
+from cosim.study.plan import Plan
+from cosim.study.records import RunResult
+from cosim.study.results import StudyResults
+from cosim.study.store import RunKey, RunStore
+from cosim.study.tables import KEYS, to_csv
+from cosim.study.traces import THETA
 from cosim.text_tables import parse_records, read_records
 from cosim.validation import suggestion
 

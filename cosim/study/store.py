@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from cosim.errors import StudyError
-from cosim.experiments.document import TrajectoryTable
-from cosim.experiments.protocols import Progress
 from cosim.files import read_json, write_atomically
+from cosim.study.document import TrajectoryTable
+from cosim.study.protocols import Progress
 from cosim.text_tables import cell, csv_pieces, csv_text, read_records
 
 RUNS = "runs"

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from cosim.evaluation.parallel import run_all
 from cosim.evaluation.reuse import release
-from cosim.experiments.plan import BLOCK, Plan, Run
-from cosim.experiments.protocols import Progress
-from cosim.experiments.store import EVALUATION, RunStore
-from cosim.experiments.units import (
+from cosim.study.plan import BLOCK, Plan, Run
+from cosim.study.protocols import Progress
+from cosim.study.store import EVALUATION, RunStore
+from cosim.study.units import (
     Accompanied,
     Accompany,
     Advance,

@@ -6,9 +6,9 @@ import time
 from dataclasses import dataclass, replace
 
 from cosim.errors import StudyError
-from cosim.experiments.plan import Plan, Run
-from cosim.experiments.protocols import Training
-from cosim.experiments.units import simulated
+from cosim.study.plan import Plan, Run
+from cosim.study.protocols import Training
+from cosim.study.units import simulated
 
 TRIED, SIMULATED = (500, 1500), 200
 """Samples of two trainings, and of a closed loop, that are timed."""

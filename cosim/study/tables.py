@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
-from cosim.experiments.records import CURVE, RunResult
-from cosim.experiments.store import INDICATORS
+from cosim.study.records import CURVE, RunResult
+from cosim.study.store import INDICATORS
 from cosim.text_tables import cell, csv_text, read_records
 
 Array = NDArray[np.float64]

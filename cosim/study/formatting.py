@@ -6,8 +6,8 @@ import json
 from typing import Any
 
 from cosim.evaluation.statistics import shown
-from cosim.experiments.results import StudyResults
-from cosim.experiments.summary import aggregate_rows, run_rows, summary_rows
+from cosim.study.results import StudyResults
+from cosim.study.summary import aggregate_rows, run_rows, summary_rows
 
 Lines = list[list[str]]
 

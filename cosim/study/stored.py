@@ -7,17 +7,17 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from cosim.errors import ResultsError
-from cosim.experiments.charts import draw
-from cosim.experiments.check import TOLERANCES
-from cosim.experiments.document import StudyTable
-from cosim.experiments.document import read as read_study
-from cosim.experiments.formatting import HEADER, lines
-from cosim.experiments.keyed import rounded_csv
-from cosim.experiments.report import TABLES, report_markdown
-from cosim.experiments.results import ABOUT, StudyResults
-from cosim.experiments.store import RUNS
-from cosim.experiments.tables import TIMING
 from cosim.files import write_atomically
+from cosim.study.charts import draw
+from cosim.study.check import TOLERANCES
+from cosim.study.document import StudyTable
+from cosim.study.document import read as read_study
+from cosim.study.formatting import HEADER, lines
+from cosim.study.keyed import rounded_csv
+from cosim.study.report import TABLES, report_markdown
+from cosim.study.results import ABOUT, StudyResults
+from cosim.study.store import RUNS
+from cosim.study.tables import TIMING
 from cosim.text_tables import markdown_table
 from cosim.validation import suggestion
 

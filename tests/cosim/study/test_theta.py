@@ -8,9 +8,9 @@ import pytest
 
 from cosim import Study
 from cosim.errors import StudyError
-from cosim.experiments.report import write_report
-from cosim.experiments.results import StudyResults
-from cosim.experiments.theta import tables
+from cosim.study.report import write_report
+from cosim.study.results import StudyResults
+from cosim.study.theta import tables
 from tests.helpers.toy_trainer import ToyTrainer, document
 
 ROWS = {0: 0.0, 200: 3.0, 500: 6.0, 700: 7.0, 800: 9.0, 1000: 10.0}

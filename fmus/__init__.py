@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fmus.errors import BuildError, CheckError, FmuError
-
 __all__ = ["NAMES", "BuildError", "CheckError", "FmuError", "path"]
 
 NAMES = ("evaporator", "evaporator_fmi3")
+
+
+class FmuError(Exception):
+    """Base of every error that `fmus` raises for a bad input or environment."""
+
+
+class BuildError(FmuError):
+    """No usable C compiler, or the compiler refused the sources."""
+
+
+class CheckError(FmuError):
+    """The file to check is missing or is not an FMU."""
 
 
 def path(name: str = "evaporator") -> Path:

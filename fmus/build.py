@@ -1,133 +1,416 @@
-"""Build the FMUs from the table of variables and the C sources, byte for byte reproducibly."""
+"""C sources and a model description made an FMU: platforms, compilers, archives that repeat."""
 
 from __future__ import annotations
 
 import hashlib
-import json
+import importlib.util
+import os
+import platform as host
+import shutil
+import struct
+import subprocess
+import sys
 import uuid
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
+from xml.etree import ElementTree
+
+import fmpy
 
 from cosim.temporary import temporary_folder
-from fmus.archive import read_archive, write_archive
-from fmus.compiler import COMPILER_FLAGS, WARNINGS, Compiler
-from fmus.description import build_description, model_description
-from fmus.documentation import RESOURCES, documentation_page
-from fmus.errors import BuildError
-from fmus.header import c_header
-from fmus.model import FmiVersion
-from fmus.own import binaries, compilers
-from fmus.variables import EVAPORATOR, VARIABLES
+from fmus import BuildError
+from fmus.description import build_description, c_header, model_description
+from fmus.model import C_IDENTIFIER, FmiVersion, Model, Variable
 
 PACKAGE = Path(__file__).parent
 SOURCES = PACKAGE / "sources"
-FILE_NAMES: dict[FmiVersion, str] = {2: "evaporator.fmu", 3: "evaporator_fmi3.fmu"}
-HEADER = "variables.h"
-BUILD_FILE = "extra/org.rti-cosim/build.json"
+RESOURCES = PACKAGE / "resources"
 
 
-def hand_written_sources() -> dict[str, bytes]:
-    """File name → bytes of every C source but the generated header."""
-    files = sorted(SOURCES.glob("*.[ch]"))
-    return {path.name: path.read_bytes() for path in files if path.name != HEADER}
+@dataclass(frozen=True)
+class Platform:
+    """A platform by its FMI 3.0 tuple.
+
+    Its folder under ``binaries/`` in FMI 2.0, the suffix of shared libraries there, and the target
+    by which the cross-compiler knows it.
+    """
+
+    tuple: str
+    fmi2_folder: str
+    suffix: str
+    target: str
+
+    def folder(self, fmi_version: str) -> str:
+        """The name of its folder under ``binaries/`` in FMI `fmi_version`."""
+        return self.fmi2_folder if fmi_version.startswith("2") else self.tuple
 
 
-def header(token: str) -> str:
-    """The text of `variables.h` with the model's `token`."""
-    return c_header(token, VARIABLES, "from fmus/variables.py by `cosim fmu build --in-place`")
+PLATFORMS = (
+    Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
+    Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
+    Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu"),
+    Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos.11.0"),
+    Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos.11.0"),
+)
+
+_ARCHITECTURES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
+_SYSTEMS = {"linux": "linux", "win32": "windows", "darwin": "darwin"}
 
 
-def model_token() -> str:
-    """GUID of FMI 2.0 and instantiation token of FMI 3.0: a digest of all that makes the model."""
-    digest = hashlib.sha256()
-    descriptions = (model_description(version, "", EVAPORATOR) for version in FILE_NAMES)
-    for text in (header(""), *descriptions):
-        digest.update(text.encode())
-    for name, content in hand_written_sources().items():
-        digest.update(name.encode() + b"\0" + content)
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
+def present() -> Platform:
+    """The platform at hand; raises BuildError for one that is not in `PLATFORMS`."""
+    machine = host.machine().lower()
+    name = f"{_ARCHITECTURES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
+    for platform in PLATFORMS:
+        if platform.tuple == name:
+            return platform
+    known = ", ".join(platform.tuple for platform in PLATFORMS)
+    raise BuildError(f"no binaries are built for {name}; known are {known}")
 
 
-def sources(version: FmiVersion) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of the FMU, generated files included."""
-    other = "fmi3.c" if version == 2 else "fmi2.c"
-    files = {name: data for name, data in hand_written_sources().items() if name != other}
-    files[HEADER] = header(model_token()).encode()
-    files["buildDescription.xml"] = build_description(version, EVAPORATOR).encode()
+_ELF = {0x3E: "x86_64", 0xB7: "aarch64", 0x03: "x86", 0x28: "aarch32"}
+_PE = {0x8664: "x86_64", 0xAA64: "aarch64", 0x14C: "x86", 0x1C4: "aarch32"}
+_MACH_O = {0x01000007: "x86_64", 0x0100000C: "aarch64", 7: "x86"}
+_UNIVERSAL, _MACH_O_64, _MACH_O_32 = 0xCAFEBABE, 0xFEEDFACF, 0xFEEDFACE
+
+
+def platforms_of(library: bytes) -> tuple[str, ...]:
+    """FMI 3.0's tuples of the platforms that can load `library`: none where it is no library.
+
+    Several for macOS' universal binaries. An architecture unknown here reads ``?``.
+    """
+    try:
+        if library[:4] == b"\x7fELF":
+            order = "<" if library[5] == 1 else ">"
+            return (f"{_ELF.get(struct.unpack_from(order + 'H', library, 18)[0], '?')}-linux",)
+        if library[:2] == b"MZ":
+            start = struct.unpack_from("<I", library, 0x3C)[0]
+            if library[start : start + 4] == b"PE\0\0":
+                machine = struct.unpack_from("<H", library, start + 4)[0]
+                return (f"{_PE.get(machine, '?')}-windows",)
+        if struct.unpack_from("<I", library)[0] in (_MACH_O_64, _MACH_O_32):
+            return (f"{_MACH_O.get(struct.unpack_from('<I', library, 4)[0], '?')}-darwin",)
+        magic, count = struct.unpack_from(">II", library)
+        if magic == _UNIVERSAL and count < 10:
+            codes = (struct.unpack_from(">I", library, 8 + 20 * i)[0] for i in range(count))
+            return tuple(f"{_MACH_O.get(code, '?')}-darwin" for code in codes)
+    except (struct.error, IndexError):
+        pass
+    return ()
+
+
+_MAGIC = 0xCAFEBABE
+_ALIGNMENT = 14  # binary digits: pages of 16 KiB on Apple silicon
+
+
+def universal_binary(libraries: Sequence[bytes]) -> bytes:
+    """Join 64-bit Mach-O files: a big-endian table of the slices, then each on a page of its own.
+
+    The layout is that of ``fat_header`` and ``fat_arch`` in macOS' mach-o/fat.h.
+    """
+    page = 1 << _ALIGNMENT
+    table = struct.pack(">II", _MAGIC, len(libraries))
+    body = b""
+    for library in libraries:
+        architecture = struct.unpack_from("<II", library, 4)  # cputype, cpusubtype
+        body += b"\0" * (-len(body) % page)
+        offset = page + len(body)
+        table += struct.pack(">IIIII", *architecture, offset, len(library), _ALIGNMENT)
+        body += library
+    return table.ljust(page, b"\0") + body
+
+
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def write_archive(files: Mapping[str, bytes], target: Path) -> Path:
+    """Write `files`, by their path in the archive, to `target`, whole or not at all."""
+    partial = target.with_name(f".{target.name}.partial")
+    with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as container:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(name, _DATE)
+            entry.create_system = 3
+            entry.external_attr = 0o100644 << 16
+            container.writestr(entry, files[name])
+    return partial.replace(target)
+
+
+def read_archive(path: Path) -> dict[str, bytes]:
+    """Every file in a zip archive by its path there."""
+    with zipfile.ZipFile(path) as container:
+        return {name: container.read(name) for name in container.namelist()}
+
+
+# No path, date or identification may enter the binary; no fused multiply-add may change a result.
+COMPILER_FLAGS = (
+    "-std=c99",
+    "-O2",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fPIC",
+    "-fno-ident",
+    "-fvisibility=hidden",
+)
+WARNINGS = ("-Wall", "-Wextra")
+_LINKER_FLAGS = {
+    ".so": ("-shared", "-s", "-Wl,--build-id=none", "-lm"),
+    ".dll": ("-shared", "-s"),
+    ".dylib": ("-dynamiclib",),
+}
+_CROSS_FLAGS = {
+    ".so": ("-shared", "-s", "-lm"),
+    # Windows' own printf, which knows C99's formats, in place of a second one linked in.
+    ".dll": ("-shared", "-s", "-D__USE_MINGW_ANSI_STDIO=0"),
+    ".dylib": ("-shared", "-s"),
+}
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler for one platform: the command that calls it and the flags of its linker."""
+
+    platform: Platform
+    command: tuple[str, ...]
+    linker_flags: tuple[str, ...]
+
+    @property
+    def version(self) -> str:
+        """What it says of itself, one line."""
+        result = subprocess.run(
+            [*self.command, "--version"], capture_output=True, text=True, check=True
+        )
+        return result.stdout.splitlines()[0]
+
+    def library(
+        self, sources: Mapping[str, bytes], name: str, warnings: tuple[str, ...] = WARNINGS
+    ) -> bytes:
+        """Compile every ``*.c`` of `sources`, files by name, into one shared library.
+
+        `name` is the library's, without suffix; the FMI headers are fmpy's. Returns its bytes.
+        Raises BuildError with the compiler's words on anything that it says; `warnings` chooses
+        what it warns of.
+        """
+        headers = Path(fmpy.__file__).parent / "c-code"
+        file = name + self.platform.suffix
+        with temporary_folder("cosim-") as folder:
+            for path, data in sources.items():
+                (folder / path).write_bytes(data)
+            units = sorted(path for path in sources if path.endswith(".c"))
+            command = [
+                *self.command, *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
+                *units, "-o", file, *self.linker_flags,
+            ]  # fmt: skip
+            result = subprocess.run(
+                command, cwd=folder, capture_output=True, text=True, check=False
+            )
+            if result.returncode != 0 or result.stderr:
+                raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
+            return (folder / file).read_bytes()
+
+
+def local_compiler() -> Compiler:
+    """``$CC``, else ``cc``, for the platform at hand; raises BuildError when there is none."""
+    name = os.environ.get("CC", "cc")
+    if shutil.which(name) is None:
+        raise BuildError(f"no C compiler: {name!r} is not on the path; install gcc or set CC")
+    platform = present()
+    return Compiler(platform, (name,), _LINKER_FLAGS[platform.suffix])
+
+
+def cross_compiler(platform: Platform) -> Compiler:
+    """Zig's C compiler for any platform, from PyPI; raises BuildError when it is not installed."""
+    if importlib.util.find_spec("ziglang") is None:
+        raise BuildError("no cross-compiler: pip install 'rti-cosim[cross]'")
+    command = (sys.executable, "-m", "ziglang", "cc", "-target", platform.target)
+    return Compiler(platform, command, _CROSS_FLAGS[platform.suffix])
+
+
+_QUIET = ("-w",)
+
+
+def compilers(every_platform: bool) -> list[Compiler]:
+    """The local compiler alone, or the cross-compiler for each of `PLATFORMS`.
+
+    Raises BuildError where it is not installed.
+    """
+    return [cross_compiler(p) for p in PLATFORMS] if every_platform else [local_compiler()]
+
+
+def build_fmu(
+    target: str | Path,
+    sources: Mapping[str, bytes],
+    description: str | bytes,
+    *,
+    every_platform: bool = False,
+    files: Mapping[str, bytes] | None = None,
+) -> Path:
+    """Compile C sources and write them with their model description as the FMU `target`.
+
+    `sources` are the files of the folder ``sources/`` by name; every ``*.c`` is compiled, as C99,
+    against fmpy's FMI headers. `description` is the text of modelDescription.xml, FMI 2.0 or 3.0;
+    its interfaces must name one modelIdentifier. The binary is for the platform at hand, made by
+    the local compiler, or, with `every_platform`, one for each of `fmus.platforms.PLATFORMS`, made
+    by the extra ``cross``. `files` are further members by their path in the archive. With the same
+    compiler the bytes repeat. Raises BuildError where there is no compiler, it complains, or the
+    description names no model.
+    """
+    path = Path(target)
+    text = description.encode() if isinstance(description, str) else description
+    version, identifier = _model(text)
+    if not any(name.endswith(".c") for name in sources):
+        raise BuildError(f"{path}: there is no C source (*.c) to build it from")
+    members = {
+        "modelDescription.xml": text,
+        **binaries(sources, identifier, version, compilers(every_platform), _QUIET),
+        **{f"sources/{name}": data for name, data in sources.items()},
+    }
+    return write_archive({**(files or {}), **members}, path)
+
+
+def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
+    """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into the FMU `target`.
+
+    As `build_fmu`; raises BuildError also where a file is missing.
+    """
+    folder = Path(folder)
+    description = folder / "modelDescription.xml"
+    try:
+        text = description.read_bytes()
+    except OSError as error:
+        raise BuildError(f"{description}: {error.strerror}") from None
+    sources = {path.name: path.read_bytes() for path in sorted(folder.glob("*.[ch]"))}
+    if not any(name.endswith(".c") for name in sources):
+        raise BuildError(f"{folder}: there is no C source (*.c)")
+    return build_fmu(target, sources, text, every_platform=every_platform)
+
+
+def binaries(
+    sources: Mapping[str, bytes],
+    identifier: str,
+    version: str,
+    compilers: Sequence[Compiler],
+    warnings: tuple[str, ...],
+) -> dict[str, bytes]:
+    """The members under ``binaries/`` of an FMU for FMI `version`: one library a compiler.
+
+    FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both are
+    built, lies a universal binary.
+    """
+    libraries = {c.platform: c.library(sources, identifier, warnings) for c in compilers}
+    macos = [library for p, library in libraries.items() if p.suffix == ".dylib"]
+    found = {}
+    for platform, library in libraries.items():
+        folder = platform.folder(version)
+        universal = folder == "darwin64" and len(macos) > 1
+        name = f"binaries/{folder}/{identifier}{platform.suffix}"
+        found[name] = universal_binary(macos) if universal else library
+    return found
+
+
+def _model(description: bytes) -> tuple[str, str]:
+    """FMI version and model identifier."""
+    try:
+        root = ElementTree.fromstring(description)
+    except ElementTree.ParseError as error:
+        raise BuildError(f"modelDescription.xml is not XML: {error}") from None
+    version = root.get("fmiVersion", "")
+    if version[:2] not in ("2.", "3."):
+        raise BuildError(f"modelDescription.xml is for FMI {version or '?'}, not 2.0 or 3.0")
+    faces = [face for tag in ("CoSimulation", "ModelExchange") for face in root.findall(tag)]
+    identifiers = {face.get("modelIdentifier", "") for face in faces}
+    if len(identifiers) != 1:
+        raise BuildError(
+            "modelDescription.xml: CoSimulation and ModelExchange must name one modelIdentifier, "
+            f"not {len(identifiers)}"
+        )
+    identifier = identifiers.pop()
+    if not C_IDENTIFIER.fullmatch(identifier):
+        raise BuildError(
+            f"modelDescription.xml: modelIdentifier {identifier!r} is not a C identifier"
+        )
+    return version, identifier
+
+
+PLANT_SOURCES = PACKAGE / "plant_sources"
+# Of the evaporator's sources what serves any model: FMI's faces, and what they are made of.
+FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
+WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
+
+
+def sources_of(
+    model: Model,
+    version: FmiVersion,
+    own: Mapping[str, bytes],
+    rows: Sequence[Variable] | None = None,
+) -> dict[str, bytes]:
+    """File name → bytes of the folder `sources/` of an FMU without derivatives.
+
+    `own` is the model's own C; `rows` is its table as the C shall check it, where that differs.
+    """
+    paths = [SOURCES / name for name in (*FACES, f"fmi{version}.c")]
+    paths += [PLANT_SOURCES / name for name in WITHOUT_DERIVATIVES]
+    files = {path.name: path.read_bytes() for path in paths} | dict(own)
+    variables = model.variables if rows is None else rows
+    header = c_header(_token(model, version, files), variables, f"from the table of {model.name}")
+    files["variables.h"] = header.encode()
+    files["buildDescription.xml"] = build_description(version, model).encode()
     return files
 
 
-def build_record(with_compilers: list[Compiler]) -> bytes:
-    """How the binaries were made (JSON): for each platform the compiler and its flags."""
-    record = {
-        "compiler_flags": [*COMPILER_FLAGS, *WARNINGS],
-        "platforms": {
-            compiler.platform.tuple: {
-                "compiler": compiler.version,
-                "target": compiler.platform.target,
-                "linker_flags": list(compiler.linker_flags),
-            }
-            for compiler in with_compilers
-        },
-        "model_token": model_token(),
-    }
-    return (json.dumps(record, indent=2) + "\n").encode()
+def assemble(
+    model: Model,
+    version: FmiVersion,
+    sources: Mapping[str, bytes],
+    target: str | Path,
+    *,
+    remarks: str = "",
+    every_platform: bool = False,
+    files: Mapping[str, bytes] | None = None,
+) -> Path:
+    """Build the FMU `target` of what `sources_of` found, with a page that shows its table.
 
-
-def contents(version: FmiVersion, every_platform: bool) -> dict[str, bytes]:
-    """Every file of the FMU by its path in the archive."""
-    icon = (RESOURCES / "icon.png").read_bytes()
-    code = sources(version)
-    used = compilers(every_platform)
-    files = {
-        "modelDescription.xml": model_description(version, model_token(), EVAPORATOR).encode(),
-        "documentation/index.html": documentation_page(version, BUILD_FILE).encode(),
+    `remarks` are sentences on that page, `files` further members of the archive. As
+    `fmus.own.build_fmu`, whose BuildError it raises; with the same compiler the bytes repeat.
+    """
+    generated = ("variables.h", "buildDescription.xml")
+    written = {name: data for name, data in sources.items() if name not in generated}
+    members = {
+        "documentation/index.html": _page(model, version, remarks).encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
-        BUILD_FILE: build_record(used),
-        **binaries(code, EVAPORATOR.identifier, f"{version}.0", used, WARNINGS),
-        **{f"sources/{name}": data for name, data in code.items()},
+        **(files or {}),
     }
-    if version == 2:
-        return files | {"model.png": icon}
-    name = "terminalsAndIcons.xml"
-    return files | {
-        "terminalsAndIcons/icon.png": icon,
-        f"terminalsAndIcons/{name}": (RESOURCES / name).read_bytes(),
-    }
+    text = model_description(version, _token(model, version, written), model)
+    return build_fmu(target, sources, text, every_platform=every_platform, files=members)
 
 
-def build(folder: Path, every_platform: bool = False) -> list[Path]:
-    """Build both FMUs into `folder` (made when missing) and return their paths.
-
-    For the platform at hand by the local compiler, or for every one by the extra ``cross``.
-    """
-    files = {name: contents(v, every_platform) for v, name in FILE_NAMES.items()}
-    folder.mkdir(parents=True, exist_ok=True)
-    return [write_archive(members, folder / name) for name, members in files.items()]
+def _token(model: Model, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
+    """GUID or instantiation token: a digest of all that makes the model."""
+    digest = hashlib.sha256(model_description(version, "", model).encode())
+    for name in sorted(sources):
+        digest.update(name.encode() + b"\0" + sources[name])
+    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
 
 
-def differences(built: Path, shipped: Path) -> list[str]:
-    """The archive members that differ between two FMU files, or ``["(order or metadata)"]``.
-
-    Empty when the files are equal byte for byte. Raises BuildError when `shipped` is missing.
-    """
-    if not shipped.is_file():
-        raise BuildError(f"{shipped} is missing; reinstall the package")
-    if built.read_bytes() == shipped.read_bytes():
-        return []
-    members = [read_archive(path) for path in (built, shipped)]
-    names = sorted(set(members[0]) | set(members[1]))
-    differing = [name for name in names if members[0].get(name) != members[1].get(name)]
-    return differing or ["(order or metadata)"]
-
-
-def compare_with_shipped() -> dict[str, list[str]]:
-    """Build anew for every platform; file name → `differences` from the shipped file."""
-    with temporary_folder("cosim-") as folder:
-        built = build(folder, every_platform=True)
-        return {path.name: differences(path, PACKAGE / path.name) for path in built}
-
-
-def build_in_place() -> list[Path]:
-    """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
-    (SOURCES / HEADER).write_text(header(model_token()))
-    return build(PACKAGE, every_platform=True)
+def _page(model: Model, version: FmiVersion, remarks: str) -> str:
+    rows = "\n".join(
+        f"<tr><td>{escape(v.name)}</td><td>{v.kind}</td><td>{escape(v.unit)}</td>"
+        f"<td>{escape(v.description)}</td></tr>"
+        for v in model.exported(version)
+    )
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head><meta charset="utf-8"><title>{escape(model.name)}</title></head>
+<body>
+<h1>{escape(model.name)}</h1>
+<p>{escape(model.description)}</p>
+<p>{escape(remarks)} The model can be restored, serialised and instantiated many times.</p>
+<table>
+<tr><th>variable</th><th>kind</th><th>unit</th><th>meaning</th></tr>
+{rows}
+</table>
+</body>
+</html>
+"""

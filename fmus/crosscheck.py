@@ -15,9 +15,9 @@ import fmpy
 import numpy as np
 from numpy.typing import NDArray
 
-from fmus.errors import FmuError
+from fmus import FmuError
+from fmus.evaporator import BY_NAME, DISTURBANCES
 from fmus.information import description_of
-from fmus.variables import BY_NAME, DISTURBANCES
 
 FOLDER = Path(__file__).parent / "reference"
 CASES: dict[str, dict[str, str]] = {

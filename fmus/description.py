@@ -1,12 +1,22 @@
-"""Generate `modelDescription.xml` for FMI 2.0 and FMI 3.0, and the build description."""
+"""An FMU's generated texts: model description (FMI 2.0, 3.0), build description, C header."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import hashlib
+from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree
 
-from fmus.model import LAWS, FmiVersion, Kind, Model, Type, Unit, Variable
-from fmus.structure import add_structure, index
+from fmus.model import (
+    LAWS,
+    FmiVersion,
+    Kind,
+    Model,
+    Type,
+    Unit,
+    Variable,
+    continuous_dependencies,
+    initial_dependencies,
+)
 
 LICENSE = "MIT"
 
@@ -221,3 +231,138 @@ def _variable3(parent: ElementTree.Element, variable: Variable, model: Model) ->
         if variable.kind is Kind.DERIVATIVE:
             attributes["derivative"] = str(model.value_reference(_state_of(variable)))
         ElementTree.SubElement(parent, "Float64", attributes)
+
+
+def add_structure(root: ElementTree.Element, version: FmiVersion, model: Model) -> None:
+    """Append ModelStructure to the model description `root`."""
+    (_structure2 if version == 2 else _structure3)(root, model)
+
+
+def index(name: str, model: Model) -> int:
+    """Position of a variable in the model description of FMI 2.0, from 1."""
+    return [v.name for v in model.exported(2)].index(name) + 1
+
+
+_UNKNOWNS = (
+    ("Output", "Outputs", (Kind.STATE, Kind.OUTPUT), False),
+    ("ContinuousStateDerivative", "Derivatives", (Kind.DERIVATIVE,), False),
+    ("InitialUnknown", "InitialUnknowns", (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT), True),
+)
+
+
+def _dependencies(name: str, initial: bool, model: Model) -> tuple[str, ...]:
+    return (initial_dependencies if initial else continuous_dependencies)(name, model)
+
+
+def _kinds_text(name: str, dependencies: Iterable[str], model: Model) -> str:
+    """The states depend on themselves or on their start with constant factor 1."""
+    is_state = model.by_name[name].kind is Kind.STATE
+    return " ".join("constant" if is_state else "dependent" for _ in dependencies)
+
+
+def _structure2(root: ElementTree.Element, model: Model) -> None:
+    structure = ElementTree.SubElement(root, "ModelStructure")
+    for _, tag, kinds, initial in _UNKNOWNS:
+        unknowns = model.names(*kinds)
+        if not unknowns:
+            continue
+        group = ElementTree.SubElement(structure, tag)
+        for name in unknowns:
+            names = _dependencies(name, initial, model)
+            ElementTree.SubElement(
+                group,
+                "Unknown",
+                index=str(index(name, model)),
+                dependencies=" ".join(str(index(n, model)) for n in names),
+                dependenciesKind=_kinds_text(name, names, model),
+            )
+
+
+def _structure3(root: ElementTree.Element, model: Model) -> None:
+    structure = ElementTree.SubElement(root, "ModelStructure")
+    shown = {v.name for v in model.exported(3)}
+    for tag, _, kinds, initial in _UNKNOWNS:
+        for name in model.names(*kinds):
+            names = _dependencies(name, initial, model)
+            names = tuple(n for n in names if n in shown)
+            ElementTree.SubElement(
+                structure,
+                tag,
+                valueReference=str(model.value_reference(name)),
+                dependencies=" ".join(str(model.value_reference(n)) for n in names),
+                dependenciesKind=_kinds_text(name, names, model),
+            )
+
+
+_TYPES = {
+    Type.REAL: "REAL",
+    Type.BOOLEAN: "BOOLEAN",
+    Type.LAW: "LAW",
+    Type.SEED: "SEED",
+    Type.SEED_HIGH: "SEED_HIGH",
+}
+_KINDS = {
+    Kind.INDEPENDENT: "INDEPENDENT",
+    Kind.INPUT: "INPUT",
+    Kind.STATE: "STATE",
+    Kind.DERIVATIVE: "DERIVATIVE",
+    Kind.OUTPUT: "OUTPUT",
+    Kind.FIXED: "FIXED",
+    Kind.TUNABLE: "TUNABLE",
+}
+_SEED_MAX = 4294967295.0
+
+
+def c_header(token: str, variables: Sequence[Variable], origin: str) -> str:
+    """The header's text: value references, types, starts and ranges, and the model's `token`."""
+    references = "\n".join(f"    VR_{v.identifier} = {i}," for i, v in enumerate(variables))
+    rows = "\n".join(f"    {_row(variable)}," for variable in variables)
+    return f"""\
+/* Generated {origin}; do not edit. */
+#ifndef VARIABLES_H
+#define VARIABLES_H
+
+#define MODEL_TOKEN "{token}"
+
+/* Digest of the variables' names and order: marks the layout of a serialised state. */
+#define LAYOUT_DIGEST UINT64_C(0x{_layout_digest(variables)})
+
+enum {{
+{references}
+    N_VARIABLES = {len(variables)}
+}};
+
+typedef enum {{ {", ".join(_TYPES.values())} }} VariableType;
+
+typedef enum {{ {", ".join(_KINDS.values())} }} VariableKind;
+
+typedef struct {{
+    const char *name;
+    VariableType type;
+    VariableKind kind;
+    double start, min, max, nominal;
+}} VariableInfo;
+
+static const VariableInfo VARIABLES[N_VARIABLES] = {{
+{rows}
+}};
+
+#endif
+"""
+
+
+def _layout_digest(variables: Sequence[Variable]) -> str:
+    names = "\n".join(variable.name for variable in variables)
+    return hashlib.sha256(names.encode()).hexdigest()[:16]
+
+
+def _row(variable: Variable) -> str:
+    seed = variable.type in (Type.SEED, Type.SEED_HIGH)
+    numbers = (
+        variable.start,
+        0.0 if seed else variable.min,
+        _SEED_MAX if seed else variable.max,
+        1.0 if variable.nominal is None else variable.nominal,
+    )
+    values = ", ".join(repr(float(number or 0.0)) for number in numbers)
+    return f'{{"{variable.name}", {_TYPES[variable.type]}, {_KINDS[variable.kind]}, {values}}}'

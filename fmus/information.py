@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 from fmpy import read_model_description
 from fmpy.model_description import ModelDescription, ScalarVariable
 
-from fmus.binary import platforms_of
-from fmus.errors import FmuError
+from fmus import FmuError
+from fmus.build import platforms_of
 from fmus.flags import default_flags
 
 _INTERFACES = {

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fmus.assembly import PLANT_SOURCES, assemble, sources_of
-from fmus.build import SOURCES
+from fmus.build import PLANT_SOURCES, SOURCES, assemble, sources_of
 from fmus.model import SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.

@@ -9,9 +9,9 @@ from xml.etree import ElementTree
 
 import fmpy
 
-from fmus.archive import write_archive
+from fmus import BuildError
+from fmus.build import write_archive
 from fmus.description import to_text
-from fmus.errors import BuildError
 
 _SPACES = {
     "ssc": "http://ssp-standard.org/SSP1/SystemStructureCommon",

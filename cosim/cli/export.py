@@ -43,8 +43,8 @@ def export(
         from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
         from cosim.errors import CosimError
         from cosim.scenario import Scenario
+        from fmus.build import PLATFORMS, present
         from fmus.model import FmiVersion
-        from fmus.platforms import PLATFORMS, present
 
         for target in [out] if ssp is None else [out, ssp]:
             if not target.parent.is_dir():

@@ -149,10 +149,10 @@ def build(
     --check exits with code 1 if they differ from those shipped.
     """
     with output(json) as out_:
-        from fmus.build import build as build_fmus
-        from fmus.build import build_in_place, compare_with_shipped
-        from fmus.errors import BuildError
-        from fmus.own import build_folder
+        from fmus import BuildError
+        from fmus.build import build_folder
+        from fmus.evaporator import build as build_fmus
+        from fmus.evaporator import build_in_place, compare_with_shipped
 
         every = platforms is Platforms.ALL
         if (out is not None) + check + in_place != 1:

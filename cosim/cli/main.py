@@ -86,7 +86,7 @@ EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 # Looked up only among modules that are loaded: an error's class cannot come from another one.
 _ERRORS = (
-    ("fmus.errors", "FmuError"),
+    ("fmus", "FmuError"),
     ("cosim.errors", "CosimError"),
     ("controllers.errors", "ControllerError"),
     ("learning.errors", "LearningError"),

@@ -9,9 +9,8 @@ import fmpy
 
 from cosim.errors import PlantError
 from cosim.plant.archive import UnpackedFmu
-from fmus.binary import platforms_of
-from fmus.errors import BuildError
-from fmus.platforms import present
+from fmus import BuildError
+from fmus.build import platforms_of, present
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 # FMI 2.0's names are for x86, but exporters on ARM use them as well.

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from fmus import FmuError
 from fmus.checks import casadi_check, ecospy_check, fmpy_check, fmutool_check, libcosimpy_check
 from fmus.checks.outcome import NotedError, NotInstalledError, NotOfferedError
-from fmus.errors import FmuError
 from fmus.information import description_of
 
 TIMEOUT = 300.0  # s for one importer

@@ -10,8 +10,8 @@ import fmpy
 import numpy as np
 from numpy.typing import NDArray
 
+from fmus import CheckError
 from fmus.checks.outcome import NotOfferedError, require
-from fmus.errors import CheckError
 from fmus.information import information
 
 AGREEMENT = 1e-6

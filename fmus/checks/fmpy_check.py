@@ -12,9 +12,9 @@ from fmpy.model_description import ModelDescription, ScalarVariable
 from fmpy.validation import validate_fmu
 from numpy.typing import NDArray
 
+from fmus import CheckError
 from fmus.checks.outcome import NotedError, NotOfferedError
 from fmus.checks.trajectory import experiment, reference, relative_difference, require_identical
-from fmus.errors import CheckError
 
 CVODE_TOLERANCE = 1e-10
 AGREEMENT = 1e-6

@@ -6,8 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from fmus import CheckError
 from fmus.checks.outcome import require
-from fmus.errors import CheckError
 
 
 def conformity(fmu: Path) -> str:

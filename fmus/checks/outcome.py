@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-from fmus.errors import FmuError
+from fmus import FmuError
 
 
 class NotInstalledError(FmuError):

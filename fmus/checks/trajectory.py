@@ -13,8 +13,8 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.model_description import ModelDescription, ScalarVariable
 from numpy.typing import NDArray
 
+from fmus import CheckError
 from fmus.checks.outcome import NotOfferedError
-from fmus.errors import CheckError
 
 MAX_STEPS = 500
 _REALS = ("Real", "Float64")

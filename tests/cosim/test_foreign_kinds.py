@@ -271,7 +271,7 @@ def test_snapshots_are_refused_where_they_are_not_offered(tmp_path, version):
 )
 def test_on_arm_the_folder_of_fmi3_or_of_x86_serves(tmp_path, monkeypatch, machine, place, library):
     """FMI 2.0 names no folder for ARM; what counts is what the library is made for."""
-    from fmus.platforms import PLATFORMS
+    from fmus.build import PLATFORMS
 
     platform = next(p for p in PLATFORMS if p.tuple == machine)
     monkeypatch.setattr("cosim.plant.library.present", lambda: platform)
@@ -282,7 +282,7 @@ def test_on_arm_the_folder_of_fmi3_or_of_x86_serves(tmp_path, monkeypatch, machi
 
 
 def test_on_arm_a_library_for_x86_is_named(tmp_path, monkeypatch):
-    from fmus.platforms import PLATFORMS
+    from fmus.build import PLATFORMS
 
     platform = next(p for p in PLATFORMS if p.tuple == "aarch64-linux")
     fmu = unpack(build_kind(tmp_path, 2, place="linux64"))

@@ -12,8 +12,8 @@ import pytest
 from fmpy import fmi2, fmi3
 
 import fmus
+from fmus.evaporator import BY_NAME, EVAPORATOR, VARIABLES
 from fmus.model import Type
-from fmus.variables import BY_NAME, EVAPORATOR, VARIABLES
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 value_reference = EVAPORATOR.value_reference

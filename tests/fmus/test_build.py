@@ -14,12 +14,9 @@ import numpy as np
 import pytest
 
 import fmus
-from fmus import build, compiler, crosscheck
-from fmus.archive import write_archive
-from fmus.errors import BuildError
-from fmus.own import compilers
-from fmus.platforms import PLATFORMS, present
-from fmus.variables import EVAPORATOR
+from fmus import BuildError, build, crosscheck, evaporator
+from fmus.build import PLATFORMS, compilers, present, write_archive
+from fmus.evaporator import EVAPORATOR
 
 HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
 needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="there is no C compiler")
@@ -30,15 +27,17 @@ needs_zig = pytest.mark.skipif(
 
 def shipped_record(name: str = "evaporator") -> dict:
     with zipfile.ZipFile(fmus.path(name)) as container:
-        return json.loads(container.read(build.BUILD_FILE))
+        return json.loads(container.read(evaporator.BUILD_FILE))
 
 
 def build_elsewhere(root: Path, every_platform: bool) -> Path:
     """Both FMUs, built by a copy of the package in another folder."""
     ignored = shutil.ignore_patterns("__pycache__", "*.fmu", "variables.h")
-    shutil.copytree(build.PACKAGE, root / "fmus", ignore=ignored)
-    code = f"import pathlib, fmus.build; fmus.build.build(pathlib.Path('out'), {every_platform})"
-    subprocess.run([sys.executable, "-c", code], cwd=root, check=True)
+    shutil.copytree(evaporator.PACKAGE, root / "fmus", ignore=ignored)
+    code = (
+        "import pathlib, sys, fmus.evaporator as e; e.build(pathlib.Path('out'), len(sys.argv) > 1)"
+    )
+    subprocess.run([sys.executable, "-c", code, *["all"] * every_platform], cwd=root, check=True)
     return root / "out"
 
 
@@ -51,25 +50,25 @@ def test_clean_build_elsewhere_equals_the_shipped_files(tmp_path: Path) -> None:
         pytest.skip("another cross-compiler than the one of the shipped binaries")
     built = build_elsewhere(tmp_path, every_platform=True)
     for name in fmus.NAMES:
-        assert build.differences(built / f"{name}.fmu", fmus.path(name)) == []
+        assert evaporator.differences(built / f"{name}.fmu", fmus.path(name)) == []
 
 
 @needs_compiler
 def test_two_local_builds_are_byte_identical(tmp_path: Path) -> None:
     """And differ from the shipped files in nothing but binaries and the record of the build."""
     elsewhere = build_elsewhere(tmp_path / "clean checkout", every_platform=False)
-    for path in build.build(tmp_path / "here"):
+    for path in evaporator.build(tmp_path / "here"):
         assert path.read_bytes() == (elsewhere / path.name).read_bytes()
-        differing = build.differences(path, fmus.path(path.stem))
+        differing = evaporator.differences(path, fmus.path(path.stem))
         assert {name for name in differing if not name.startswith("binaries/")} == {
-            build.BUILD_FILE
+            evaporator.BUILD_FILE
         }
 
 
 @needs_compiler
 def test_local_build_gives_the_shipped_results(tmp_path: Path, version: int) -> None:
     """Another compiler, the same bits: the seeded normal law with fouling among them."""
-    build.build(tmp_path)
+    evaporator.build(tmp_path)
     own = tmp_path / f"{fmus.NAMES[version - 2]}.fmu"
     assert [str(d) for d in crosscheck.deviations(own)] == []
 
@@ -119,11 +118,13 @@ def test_every_member_but_the_binary_is_up_to_date(version: int) -> None:
     """Needs no compiler: generated text, sources and resources in the shipped file."""
     name = fmus.NAMES[version - 2]
     with zipfile.ZipFile(fmus.path(name)) as container:
-        for member, data in build.sources(version).items():
+        for member, data in evaporator.sources(version).items():
             assert container.read(f"sources/{member}") == data, member
-        description = build.model_description(version, build.model_token(), EVAPORATOR).encode()
+        description = evaporator.model_description(
+            version, evaporator.model_token(), EVAPORATOR
+        ).encode()
         assert container.read("modelDescription.xml") == description
-        page = build.documentation_page(version, build.BUILD_FILE).encode()
+        page = evaporator.documentation_page(version, evaporator.BUILD_FILE).encode()
         assert container.read("documentation/index.html") == page
 
 
@@ -145,26 +146,32 @@ def test_record_names_the_compiler() -> None:
     assert list(record["platforms"]) == [platform.tuple for platform in PLATFORMS]
     assert all("clang" in entry["compiler"] for entry in record["platforms"].values())
     assert "-ffp-contract=off" in record["compiler_flags"]
-    assert record["model_token"] == build.model_token()
+    assert record["model_token"] == evaporator.model_token()
 
 
 def test_missing_compiler_is_an_error_that_says_what_to_do(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(BuildError, match="install gcc or set CC"):
-        build.build(tmp_path)
+        evaporator.build(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 @needs_compiler
 def test_compiler_error_is_told(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(compiler, "COMPILER_FLAGS", ("--no-such-flag",))
+    monkeypatch.setattr(build, "COMPILER_FLAGS", ("--no-such-flag",))
     with pytest.raises(BuildError, match="no-such-flag"):
-        build.build(tmp_path)
+        evaporator.build(tmp_path)
 
 
 def test_difference_names_the_member(tmp_path: Path) -> None:
     write_archive({"a": b"1", "b": b"2"}, tmp_path / "one")
     write_archive({"a": b"1", "b": b"3", "c": b""}, tmp_path / "two")
-    assert build.differences(tmp_path / "one", tmp_path / "two") == ["b", "c"]
+    assert evaporator.differences(tmp_path / "one", tmp_path / "two") == ["b", "c"]
     with pytest.raises(BuildError, match="missing"):
-        build.differences(tmp_path / "one", tmp_path / "three")
+        evaporator.differences(tmp_path / "one", tmp_path / "three")
+
+
+def test_committed_header_is_not_stale() -> None:
+    assert (build.SOURCES / evaporator.HEADER).read_text() == evaporator.header(
+        evaporator.model_token()
+    ), "run `cosim fmu build --in-place` and commit what it writes"

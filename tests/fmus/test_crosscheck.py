@@ -10,9 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fmus
-from fmus import crosscheck
+from fmus import FmuError, crosscheck
 from fmus.checks.trajectory import relative_difference
-from fmus.errors import FmuError
 
 
 @pytest.mark.parametrize("name", fmus.NAMES)

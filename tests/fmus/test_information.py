@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 import fmus
-from fmus.errors import FmuError
+from fmus import FmuError
+from fmus.build import PLATFORMS
 from fmus.information import information
-from fmus.platforms import PLATFORMS
 
 
 def test_tells_what_is_in_the_file(version: int) -> None:

@@ -10,9 +10,9 @@ import tempfile
 from pathlib import Path
 
 from cosim.text_tables import markdown_table
+from fmus.build import PLATFORMS
 from fmus.checks import check
 from fmus.model import FmiVersion
-from fmus.platforms import PLATFORMS
 from tests.helpers.platforms import (
     LAWS,
     NATIVE,

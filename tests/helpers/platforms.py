@@ -20,13 +20,10 @@ import fmus
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario
 from cosim.cli.controller_fmu import IDENTIFIER, rti_controller, sampled_controller, write_fmu
-from fmus.build import HEADER, SOURCES
-from fmus.compiler import cross_compiler
+from fmus.build import PLATFORMS, SOURCES, Platform, cross_compiler
+from fmus.evaporator import EVAPORATOR, HEADER
 from fmus.model import FmiVersion
-from fmus.platforms import PLATFORMS, Platform
-from fmus.sampled import SampledSystem
-from fmus.sampled.build import sampled_sources
-from fmus.variables import EVAPORATOR
+from fmus.sampled import SampledSystem, sampled_sources
 
 HOSTS = Path(__file__).parents[1] / "fmus" / "platforms"
 BY_NAME = {platform.tuple: platform for platform in PLATFORMS}

@@ -9,8 +9,8 @@ from pathlib import Path
 import fmpy
 import pytest
 
+from fmus.build import PLATFORMS
 from fmus.information import information
-from fmus.platforms import PLATFORMS
 from tests.helpers.platforms import (
     MARKS,
     NATIVE,

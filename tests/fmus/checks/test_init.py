@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 import fmus
-from fmus import checks
+from fmus import FmuError, checks
 from fmus.checks import CHECKS, Status
-from fmus.errors import FmuError
 
 
 @pytest.mark.slow

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import fmus
+from fmus import CheckError
 from fmus.checks.trajectory import experiment, reference, relative_difference, require_identical
-from fmus.errors import CheckError
 
 
 def test_experiment_is_the_default_one() -> None:

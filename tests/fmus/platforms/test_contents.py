@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 import fmus
-from fmus.platforms import PLATFORMS
-from fmus.universal import universal_binary
-from fmus.variables import EVAPORATOR
+from fmus.build import PLATFORMS, universal_binary
+from fmus.evaporator import EVAPORATOR
 from tests.helpers import mach_o
 
 NOT_OURS = {"__dso_handle", "_mh_dylib_header"}

@@ -10,7 +10,7 @@ import fmpy
 import pytest
 from fmpy import fmi2, fmi3
 
-from fmus.errors import BuildError
+from fmus import BuildError
 from fmus.sampled import SampledSystem, Signal, build_sampled
 
 CORE = b"""

@@ -9,8 +9,8 @@ import fmpy
 import pytest
 from fmpy.validation import validate_fmu
 
-from fmus.compiler import COMPILER_FLAGS
-from fmus.errors import BuildError
+from fmus import BuildError
+from fmus.build import COMPILER_FLAGS
 from fmus.sampled import SampledSystem, build_sampled
 
 

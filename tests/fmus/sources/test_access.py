@@ -7,8 +7,8 @@ from ctypes import c_double, c_uint32
 
 import pytest
 
+from fmus.evaporator import BY_NAME, EVAPORATOR, VARIABLES
 from fmus.model import Kind, Type
-from fmus.variables import BY_NAME, EVAPORATOR, VARIABLES
 
 DISCARD, ERROR = 2, 3
 REAL_SETTABLE = [v.name for v in VARIABLES if v.settable and v.type is Type.REAL]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fmus.evaporator import EVAPORATOR, VARIABLES
 from fmus.model import Kind, Type
-from fmus.variables import EVAPORATOR, VARIABLES
 
 REALS = [v for v in VARIABLES if v.type is Type.REAL]
 UNKNOWNS = [v.name for v in REALS if v.kind in (Kind.OUTPUT, Kind.DERIVATIVE, Kind.STATE)]

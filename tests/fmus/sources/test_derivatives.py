@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
 
+from fmus.evaporator import BY_NAME, EVAPORATOR, VARIABLES
 from fmus.model import Kind, Type
-from fmus.variables import BY_NAME, EVAPORATOR, VARIABLES
 
 REALS = [v for v in VARIABLES if v.type is Type.REAL]
 UNKNOWNS = [v.name for v in REALS if v.kind in (Kind.OUTPUT, Kind.DERIVATIVE, Kind.STATE)]

@@ -11,8 +11,7 @@ from decimal import Decimal, getcontext, localcontext
 import numpy as np
 import pytest
 
-from fmus.build import SOURCES
-from fmus.compiler import local_compiler
+from fmus.build import SOURCES, local_compiler
 
 pytestmark = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from fmus.variables import BY_NAME
+from fmus.evaporator import BY_NAME
 
 DISTURBANCES = ("X1", "F1", "T1", "T200")
 PARAMETERS = [

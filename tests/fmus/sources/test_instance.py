@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from fmpy.fmi1 import FMICallException
 
+from fmus.evaporator import VARIABLES
 from fmus.model import Type
-from fmus.variables import VARIABLES
 
 DISCARD, ERROR = 2, 3
 

@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import zipfile
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+import fmus
+from fmus.evaporator import BUILD_FILE, BY_NAME, EVAPORATOR, UNITS, VARIABLES, documentation_page
+from fmus.model import Kind, Type
+
+
+def test_names_are_unique() -> None:
+    assert len(BY_NAME) == len(VARIABLES)
+
+
+def test_value_reference_is_the_position() -> None:
+    assert [EVAPORATOR.value_reference(v.name) for v in VARIABLES] == list(range(len(VARIABLES)))
+
+
+@pytest.mark.parametrize("variable", VARIABLES, ids=lambda v: v.name)
+def test_ranges_are_given_and_hold_the_start(variable) -> None:
+    if variable.kind is Kind.INDEPENDENT or variable.type in (Type.SEED, Type.SEED_HIGH):
+        return
+    assert variable.min < variable.max
+    if variable.settable:
+        assert variable.min <= variable.start <= variable.max
+    if variable.type is Type.REAL:
+        assert variable.nominal is not None
+        assert variable.unit in {unit.name for unit in UNITS}
+
+
+def test_uses_name_existing_variables() -> None:
+    assert all(used in BY_NAME for variable in VARIABLES for used in variable.uses)
+
+
+def test_extreme_normal_draws_stay_within_the_declared_range() -> None:
+    """The largest |Z| of 53-bit Box and Muller is √(106 ln 2) = 8.58."""
+    largest = np.sqrt(106 * np.log(2))
+    for name in ("X1", "F1", "T1", "T200"):
+        nominal, spread = BY_NAME[f"{name}_nominal"], BY_NAME[f"{name}_range"]
+        assert BY_NAME[name].min <= nominal.min - largest * spread.max
+        assert BY_NAME[name].max >= nominal.max + largest * spread.max
+
+
+def test_derived_units_follow_from_their_parts() -> None:
+    """kg/kPa, K/kPa and K/% agree with the units that they are made of."""
+    units = {unit.name: unit for unit in UNITS}
+    for quotient in ("kg/kPa", "K/kPa", "K/%", "kPa/s", "%/s", "kW/K"):
+        over, under = (units[part] for part in quotient.split("/"))
+        exponents: dict[str, int] = dict(over.exponents)
+        for base, exponent in under.exponents:
+            exponents[base] = exponents.get(base, 0) - exponent
+        exponents = {base: exponent for base, exponent in exponents.items() if exponent}
+        assert dict(units[quotient].exponents) == exponents
+        assert units[quotient].factor == pytest.approx(over.factor / under.factor)
+
+
+class Page(HTMLParser):
+    """Collects the text, and checks that every element that is opened is closed."""
+
+    VOID = ("meta", "rect", "path")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.cells: list[str] = []
+        self.tags: set[str] = set()
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attributes: object) -> None:
+        self.tags.add(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "td":
+            self.cells.append(data)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_page_is_well_formed_with_diagram_equations_and_every_variable(fmi: int) -> None:
+    text = documentation_page(fmi, BUILD_FILE)
+    page = Page(text)
+    assert {"svg", "table", "sub"} <= page.tags
+    assert {variable.name for variable in EVAPORATOR.exported(fmi)} <= set(page.cells)
+    assert "$" not in text
+    for term in ("economic_cost", "Philox4x32-10", "Runge", "C<sub>p</sub>"):
+        assert term in text
+
+
+@pytest.mark.parametrize("name", fmus.NAMES)
+def test_page_icon_and_licence_are_in_the_fmu(name: str) -> None:
+    with zipfile.ZipFile(fmus.path(name)) as container:
+        names = set(container.namelist())
+        assert {"documentation/index.html", "documentation/licenses/license.txt"} <= names
+        icon = "model.png" if name == "evaporator" else "terminalsAndIcons/icon.png"
+        assert container.read(icon).startswith(b"\x89PNG")
+
+
+def test_licence_in_the_fmu_is_the_project_licence() -> None:
+    from pathlib import Path
+
+    project = Path(__file__).parents[2] / "LICENSE"
+    with zipfile.ZipFile(fmus.path()) as container:
+        assert container.read("documentation/licenses/license.txt") == project.read_bytes()

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from controllers.problem import Problem
-from cosim.evaluation.statistics import Estimate, gap_closed, regret
 from cosim.protocols import Controller, Plant
 from cosim.simulation import simulate
+from cosim.statistics import Estimate, gap_closed, regret
 from learning.protocols import LearnableController
 from learning.starting_point import build_controller
 from learning.training_run import TrainingRun

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
-from cosim.evaluation.statistics import shown
 from cosim.files import write_atomically
 from cosim.lookup import build_controller
 from cosim.scenario import Scenario
+from cosim.statistics import shown
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.log import to_csv

@@ -12,10 +12,10 @@ import numpy as np
 
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError
-from cosim.evaluation.statistics import shown
 from cosim.files import write_atomically
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller, functions_of
+from cosim.statistics import shown
 from learning.definiteness import certificate
 from learning.drift import Drift
 from learning.errors import ConfigurationError, DivergenceError

@@ -146,7 +146,7 @@ def _table(
     """A row per controller: what it cost to learn and what it costs to run."""
     import numpy as np
 
-    from cosim.evaluation.statistics import regret
+    from cosim.statistics import regret
 
     figures = {name: [run.summary() for run in each] for name, each in runs.items()}
     costs = {name: np.array([run["J"] for run in each]) for name, each in figures.items()}
@@ -171,7 +171,7 @@ def _table(
 
 
 def _show(rows: list[dict[str, Any]], scenario: Scenario, steps: int, output: Output) -> None:
-    from cosim.evaluation.statistics import shown
+    from cosim.statistics import shown
 
     output.table(
         f"{scenario.name}, {RUNS} runs of {steps} samples, the same disturbances for all",

@@ -117,7 +117,7 @@ def _command(options: dict[str, Any]) -> str:
 
 def show(summary: dict[str, Any], output: Output) -> None:
     """Print the table of controllers and the paired comparisons."""
-    from cosim.evaluation.statistics import shown
+    from cosim.statistics import shown
 
     title = "{scenario}, {steps} samples × {count} seeds".format(
         **summary, count=len(summary["seeds"])
@@ -200,7 +200,7 @@ def _step_time(timing: dict[str, Any]) -> float:
 
 def interval(estimate: dict[str, Any], scale: float = 1.0, digits: int = 3) -> str:
     """An estimate of a summary with its t interval; nothing where it is undefined."""
-    from cosim.evaluation.statistics import shown
+    from cosim.statistics import shown
 
     if not isfinite(estimate["value"]):
         return ""

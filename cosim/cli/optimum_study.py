@@ -15,10 +15,10 @@ from controllers.dynamic_programming.settings import Settings
 from controllers.dynamic_programming.solution import Optimum, Progress
 from controllers.dynamic_programming.study import Row, certify, study
 from controllers.optimum import OptimalPolicy
-from cosim.evaluation.statistics import mean
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
+from cosim.statistics import mean
 
 SEEDS, STEPS = range(900_000, 900_010), 10_000
 

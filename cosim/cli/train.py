@@ -248,7 +248,7 @@ def _write(folder: Path, training: Training, summary: dict[str, Any]) -> None:
 
 
 def _show(summary: dict[str, Any], output: Output) -> None:
-    from cosim.evaluation.statistics import shown
+    from cosim.statistics import shown
 
     title = "{algorithm} on {scenario}, {samples} samples, seed {seed}: {status}".format(**summary)
     regret, gap = summary["regret"], summary["gap_closed"]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.evaluation.runs import Runs
-from cosim.evaluation.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.files import write_atomically
+from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.text_tables import cell, csv_pieces
 
 if TYPE_CHECKING:

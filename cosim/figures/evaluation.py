@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import Estimate, regret, regret_terms
-from cosim.evaluation.statistics import mean as mean_of
 from cosim.figures.pareto import FRONT, draw_pareto
 from cosim.figures.regret import percent, regret_axis
 from cosim.figures.style import REFERENCE, colors, figure, plain
+from cosim.statistics import Estimate, regret, regret_terms
+from cosim.statistics import mean as mean_of
 
 Array = NDArray[np.float64]
 VIOLATION = 1e-3

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import regrets
 from cosim.figures.labels import EndLabel, label_ends
 from cosim.figures.regret import cost_axis, percent
 from cosim.figures.style import REFERENCE, SERIES, figure, plain, symbol
+from cosim.statistics import regrets
 
 Array = NDArray[np.float64]
 GREEDY, TRAINING = SERIES[0], SERIES[1]

@@ -12,7 +12,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import TD_WINDOW, td_error_mean
 from cosim.protocols import Controller
 from cosim.recording.blueprint import framed, sample_axis, series, union
 from cosim.recording.channels import Channel, escaped
@@ -21,6 +20,7 @@ from cosim.recording.palette import SERIES, packed, packed_all
 from cosim.recording.policy_map import PolicyMap
 from cosim.recording.stream import SAMPLE, Stream, line, mark
 from cosim.scenario import Scenario
+from cosim.statistics import TD_WINDOW, td_error_mean
 
 Array = NDArray[np.float64]
 FIRST_ROWS, ROWS = 16, 256

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import LEVEL, regrets
 from cosim.figures.curves import LearningCurve, chunks, plot_curves
 from cosim.figures.regret import FINE, Dots, Profile, plot_profiles, plot_regret
+from cosim.statistics import LEVEL, regrets
 from cosim.study import online
 from cosim.study.cases import BASELINES
 from cosim.study.records import RunResult

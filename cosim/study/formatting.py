@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from cosim.evaluation.statistics import shown
+from cosim.statistics import shown
 from cosim.study.results import StudyResults
 from cosim.study.summary import aggregate_rows, run_rows, summary_rows
 

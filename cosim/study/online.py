@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
-from cosim.evaluation.statistics import regret, regret_terms, regrets, shown
 from cosim.figures.online import Course, plot_online
+from cosim.statistics import regret, regret_terms, regrets, shown
 from cosim.study.document import OnlineTable
 from cosim.study.plan import Plan, Run
 from cosim.study.records import RunResult

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cosim.evaluation.statistics import Estimate, gain, shown
+from cosim.statistics import Estimate, gain, shown
 from cosim.study import online, theta
 from cosim.study.records import RunResult
 from cosim.study.results import StudyResults

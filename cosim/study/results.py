@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
-from cosim.evaluation.statistics import Estimate, gap_closed, regret
 from cosim.files import read_json
+from cosim.statistics import Estimate, gap_closed, regret
 from cosim.study.records import CaseResult, RunResult
 from cosim.study.tables import read_runs
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.evaluation.statistics import Estimate, over_runs
+from cosim.statistics import Estimate, over_runs
 from cosim.study.records import RunResult
 from cosim.study.results import StudyResults
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
-from cosim.evaluation.statistics import Estimate, mean, shown
+from cosim.statistics import Estimate, mean, shown
 from cosim.study.document import ThetaTable
 from cosim.study.plan import Plan
 from cosim.study.records import RunResult

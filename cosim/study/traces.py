@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.evaluation.statistics import TD_WINDOW, td_error_mean
 from cosim.figures import (
     Portrait,
     plot_density,
@@ -22,6 +21,7 @@ from cosim.figures import (
 from cosim.files import write_atomically
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
+from cosim.statistics import TD_WINDOW, td_error_mean
 from cosim.study.document import TrajectoryTable
 from cosim.study.plan import Plan, Run
 from cosim.study.store import RunStore, safe

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import trim_mean
 
-from cosim.evaluation.statistics import (
+from cosim.statistics import (
     gain,
     gap_closed,
     interquartile_mean,

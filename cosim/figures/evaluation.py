@@ -1,4 +1,4 @@
-"""An evaluation at a glance: J with its intervals, and what it is made of."""
+"""An evaluation at a glance: J or regret with intervals, and economic cost against violation."""
 
 from __future__ import annotations
 
@@ -11,17 +11,26 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.pareto import FRONT, draw_pareto
-from cosim.figures.regret import percent, regret_axis
-from cosim.figures.style import REFERENCE, colors, figure, plain
 from cosim.statistics import Estimate, regret, regret_terms
 from cosim.statistics import mean as mean_of
+from cosim.figures.style import (
+    DASHED,
+    REFERENCE,
+    Look,
+    figure,
+    palette,
+    percent,
+    plain,
+    regret_axis,
+)
 
 Array = NDArray[np.float64]
 VIOLATION = 1e-3
 """Violation per sample below which its axis is linear."""
 DECADE = 10.0
 """Ratio of the costs from which their axis is logarithmic."""
+FLOOR = 0.1
+"""Regret in % of single seeds below which its axis is linear."""
 
 
 @dataclass(frozen=True)
@@ -40,40 +49,41 @@ def evaluation_figure(
 
     Small dots are seeds, the large ones means with 95 % t intervals. `optimal` is J* (S,) on the
     same seeds: the left panel then shows the regret (J − J*)/|J*| in %, paired over the seeds.
+    The grey line joins the controllers that no other one beats in both cost and violation.
     """
-    color = colors(list(controllers))
+    looks = palette(list(controllers))
     with figure(max(2.8, 0.27 * len(controllers) + 1.3)) as drawn:
         left, right = drawn.subplots(1, 2, width_ratios=(1.0, 1.05))
-        _rows(left, controllers, color, optimal)
-        points = {name: (c.mean_violation, c.economic_cost) for name, c in controllers.items()}
-        draw_pareto(right, points, color)
-        _violation_axis(right, np.concatenate([c.mean_violation for c in controllers.values()]))
-        named = [line for line in right.lines if line.get_label() == FRONT]
-        if named:
-            right.legend(handles=named, loc="best")
+        _rows(left, controllers, looks, optimal)
+        _pareto(right, controllers, looks)
         drawn.suptitle(plain(title), fontsize=8.5)
     return drawn
 
 
 def _rows(
-    axes: Axes, controllers: Mapping[str, Costs], color: Mapping[str, str], optimal: Array | None
+    axes: Axes, controllers: Mapping[str, Costs], looks: Mapping[str, Look], optimal: Array | None
 ) -> None:
     everything = []
     for row, (name, costs) in enumerate(controllers.items()):
-        values, estimate = _shown(costs.J, optimal)
+        color = looks[name].color
+        values, estimate, scale = costs.J, mean_of(costs.J), 1.0
+        if optimal is not None:
+            values, scale = 100 * regret_terms(costs.J, optimal), 100.0
+            estimate = regret(costs.J, optimal)
         everything.append(values)
         spread = np.linspace(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(1)
-        axes.plot(values, row + spread, ".", color=color[name], markersize=4, alpha=0.4, mew=0)
+        axes.plot(values, row + spread, ".", color=color, markersize=4, alpha=0.4, mew=0)
         if estimate.t is not None:
-            axes.hlines(row, *estimate.t, color=color[name], linewidth=1.6, zorder=3)
-        axes.plot(estimate.value, row, "o", color=color[name], markersize=5, zorder=4)
+            ends = (scale * end for end in estimate.t)
+            axes.hlines(row, *ends, color=color, linewidth=1.6, zorder=3)
+        axes.plot(scale * estimate.value, row, "o", color=color, markersize=5, zorder=4)
     axes.set_yticks(range(len(controllers)), [plain(name) for name in controllers])
     axes.set_ylim(len(controllers) - 0.5, -0.5)
     axes.grid(axis="y", visible=False)
     values = np.concatenate(everything)
     if optimal is not None:
-        axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1)
-        regret_axis(axes, "x", np.append(values, 0.0))
+        axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
+        regret_axis(axes, "x", np.append(values, 0.0), FLOOR)
         axes.set_xlabel("regret %, 95 % interval")
         return
     if float(values.min()) > 0 and float(values.max()) > DECADE * float(values.min()):
@@ -81,20 +91,43 @@ def _rows(
     axes.set_xlabel("J per sample, 95 % interval")
 
 
-def _violation_axis(axes: Axes, violation: Array) -> None:
-    """Logarithmic from a thousandth on, where some controllers violate much and others hardly."""
-    top = float(violation.max())
-    if top < DECADE * VIOLATION:
-        return
-    axes.set_xscale("symlog", linthresh=VIOLATION, linscale=0.5)
-    axes.set_xlim(-0.2 * VIOLATION, 1.6 * top)
-    axes.xaxis.set_major_formatter(FuncFormatter(percent))
+def _pareto(axes: Axes, controllers: Mapping[str, Costs], looks: Mapping[str, Look]) -> None:
+    means = {
+        name: (float(np.mean(c.mean_violation)), float(np.mean(c.economic_cost)))
+        for name, c in controllers.items()
+    }
+    kept = nondominated(np.array(list(means.values())))
+    front = sorted(mean for mean, best in zip(means.values(), kept, strict=True) if best)
+    if len(front) > 1:
+        text = "no other is better in both"
+        axes.plot(*np.array(front).T, color=REFERENCE, linewidth=0.9, linestyle=DASHED, label=text)
+        axes.legend(loc="best")
+    for name, costs in controllers.items():
+        color = looks[name].color
+        axes.plot(
+            costs.mean_violation, costs.economic_cost, ".", color=color, ms=3, alpha=0.35, mew=0
+        )
+        axes.errorbar(
+            *means[name], xerr=_half_width(mean_of(costs.mean_violation)),
+            yerr=_half_width(mean_of(costs.economic_cost)), fmt="o", color=color, markersize=5,
+            capsize=2, linewidth=1.0,
+        )  # fmt: skip
+    top = max(float(costs.mean_violation.max()) for costs in controllers.values())
+    if top >= DECADE * VIOLATION:
+        axes.set_xscale("symlog", linthresh=VIOLATION, linscale=0.5)
+        axes.set_xlim(-0.2 * VIOLATION, 1.6 * top)
+        axes.xaxis.set_major_formatter(FuncFormatter(percent))
+    axes.set_xlabel("mean violation per sample, in the states' units")
+    axes.set_ylabel("economic cost per sample")
 
 
-def _shown(cost: Array, optimal: Array | None) -> tuple[Array, Estimate]:
-    """What the left panel shows of each seed, and of their mean."""
-    if optimal is None:
-        return cost, mean_of(cost)
-    found = regret(cost, optimal)
-    interval = None if found.t is None else (100 * found.t[0], 100 * found.t[1])
-    return 100 * regret_terms(cost, optimal), Estimate(100 * found.value, interval)
+def _half_width(estimate: Estimate) -> float:
+    return 0.0 if estimate.t is None else (estimate.t[1] - estimate.t[0]) / 2
+
+
+def nondominated(points: Array) -> NDArray[np.bool_]:
+    """Points (K, d) that no other one beats: none is as low in all and lower in one."""
+    lower = np.all(points[None] <= points[:, None], axis=2)
+    strictly = np.any(points[None] < points[:, None], axis=2)
+    beaten: NDArray[np.bool_] = np.any(lower & strictly, axis=1)
+    return ~beaten

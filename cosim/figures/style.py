@@ -1,4 +1,4 @@
-"""The look of every figure, and writing it so that the same data give the same bytes."""
+"""The look of every figure: colours, axes, names at the ends of lines, and byte-stable files."""
 
 from __future__ import annotations
 
@@ -7,22 +7,31 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 from cosim.errors import FigureError
 from cosim.files import write_atomically
 
+Array = NDArray[np.float64]
+
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""
+FLOOR = 0.01
+"""Regret in % below which an axis is linear."""
 
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BOUND = "#B2182B"
 REFERENCE = "#5A6570"
+DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F",
     "tuned": "#E69F00",
@@ -30,6 +39,11 @@ _KNOWN = {
     "optimal": "#111111",
     "learned": "#0072B2",
 }
+_OTHERS = (
+    "#0072B2", "#D55E00", "#009E73", "#56B4E9", "#882255", "#332288", "#999933", "#44AA99",
+    "#AA4499", "#117733",
+)  # fmt: skip
+_LINES: Any = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 _STYLE: Any = {
     "font.family": "DejaVu Sans",
@@ -75,9 +89,7 @@ def _styled() -> Iterator[None]:
 def save(drawn: Figure, path: str | Path) -> Path:
     """Write a figure as PNG (200 dpi) or SVG, by the path's suffix; same figure, same bytes.
 
-    Raises
-    ------
-    FigureError : another suffix, or a folder that cannot be written.
+    Raises FigureError on another suffix and where the file cannot be written.
     """
     path = Path(path)
     kind = path.suffix.removeprefix(".")
@@ -96,15 +108,29 @@ def save(drawn: Figure, path: str | Path) -> Path:
     return path
 
 
-def colors(names: Sequence[str]) -> Mapping[str, str]:
-    """A colour for each controller: the known ones have their own, the others what is left.
+class Look(NamedTuple):
+    """Colour and line style of a case, the same in every figure of a set."""
 
-    A known one's colour goes to another only if it is absent, and after all colours of nobody.
+    color: str
+    line: Any
+
+
+def palette(names: Sequence[str]) -> dict[str, Look]:
+    """A look for each controller or case, in the order given.
+
+    Cases that differ in their settings only, `rule(start=naive)` and `rule(start=tuned)`, share a
+    colour and differ in their line style. Known controllers have colours of their own.
     """
-    taken = {_KNOWN.get(name) for name in names}
-    left = [color for color in SERIES if color not in taken]
-    others = cycle(sorted(left, key=lambda color: color in _KNOWN.values()))
-    return {name: _KNOWN.get(name) or next(others) for name in names}
+    heads = dict.fromkeys(name.partition("(")[0] for name in names)
+    others = cycle(_OTHERS)
+    color = {head: _KNOWN.get(head) or next(others) for head in heads}
+    used: dict[str, int] = {}
+    looks = {}
+    for name in names:
+        own = color[name.partition("(")[0]]
+        looks[name] = Look(own, _LINES[used.get(own, 0) % len(_LINES)])
+        used[own] = used.get(own, 0) + 1
+    return looks
 
 
 def plain(text: str) -> str:
@@ -128,39 +154,86 @@ def label(name: str, unit: str) -> str:
     """Axis label `name [unit]`; `X2` prints with its digits as a subscript."""
     head = name.rstrip("0123456789")
     digits = name[len(head) :]
-    symbol = (
-        f"${head}_{{{digits}}}$" if digits and head.isalpha() else plain(name.replace("_", " "))
-    )
+    text = f"${head}_{{{digits}}}$" if digits and head.isalpha() else plain(name.replace("_", " "))
     shown = plain({"degC": "°C", "1": ""}.get(unit, unit))
-    return f"{symbol} [{shown}]" if shown else symbol
+    return f"{text} [{shown}]" if shown else text
 
 
 def limit(axes: Axes, value: float, text: str = "") -> None:
     """Draw a bound across the axes, named right of them: within, the data would hide it."""
-    axes.axhline(value, color=BOUND, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3)
+    axes.axhline(value, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
     if text:
         axes.annotate(
-            text,
-            (1.0, value),
-            xycoords=("axes fraction", "data"),
-            xytext=(3, 0),
-            textcoords="offset points",
-            ha="left",
-            va="center",
-            fontsize=6.5,
-            color=BOUND,
-        )
+            text, (1.0, value), xycoords=("axes fraction", "data"), xytext=(3, 0),
+            textcoords="offset points", ha="left", va="center", fontsize=6.5, color=BOUND,
+        )  # fmt: skip
 
 
-def legend_above(axes: Axes, columns: int = 2, title: str = "") -> None:
-    """Put the legend over the axes, where it hides no data."""
-    axes.legend(
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        ncols=columns,
-        borderaxespad=0.2,
-        handlelength=1.4,
-        title=title,
-        title_fontsize=8.5,
-        alignment="left",
-    )
+def percent(value: float, _: object = None) -> str:
+    """A tick in plain digits."""
+    return f"{value:g}"
+
+
+def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: float = FLOOR) -> None:
+    """Scale an axis for regrets in %: logarithmic above `floor`, linear below, J* at zero."""
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, floor)
+    lowest = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
+    getattr(axes, f"set_{which}scale")("symlog", linthresh=floor, linscale=0.5)
+    getattr(axes, f"set_{which}lim")(lowest, 1.6 * max(high, floor))
+    (axes.xaxis if which == "x" else axes.yaxis).set_major_formatter(FuncFormatter(percent))
+
+
+def cost_axis(axes: Axes, values: Array, *, relative: bool) -> None:
+    """Scale the ordinate for costs: `regret_axis` where they are `relative`, else linear."""
+    if relative:
+        regret_axis(axes, "y", values)
+        return
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+    margin = 0.05 * (high - low) or 1.0
+    axes.set_ylim(low - margin, high + margin)
+
+
+class EndLabel(NamedTuple):
+    """A line's name as it is to be set, the ordinate at its end (data), and its colour."""
+
+    text: str
+    y: float
+    color: str
+
+
+def label_ends(axes: Axes, labels: Sequence[EndLabel], size: float = 6.5) -> None:
+    """Write names right of the axes, each at its line's end, pushed apart where they overlap.
+
+    The limits and the scale of the ordinate must be set before.
+    """
+    if not labels:
+        return
+    height = axes.get_window_extent().height * 72 / axes.figure.dpi
+    low, high = (axes.transData.transform((0, y))[1] for y in axes.get_ylim())
+    ends = np.array([axes.transData.transform((0, item.y))[1] for item in labels])
+    wanted = np.clip((ends - low) / (high - low), 0.0, 1.0)
+    order = np.argsort(-wanted, kind="stable")
+    placed = spread(wanted[order], 1.25 * size / height)
+    for position, index in zip(placed, order, strict=True):
+        item = labels[index]
+        arrow: Mapping[str, Any] = {
+            "arrowstyle": "-", "color": item.color, "linewidth": 0.5, "shrinkB": 0.0,
+            "shrinkA": 0.5, "relpos": (0.0, 0.5),
+        }  # fmt: skip
+        axes.annotate(
+            item.text, xy=(1.0, float(wanted[index])), xytext=(1.035, position),
+            xycoords="axes fraction", textcoords="axes fraction", fontsize=size, color=item.color,
+            va="center", ha="left", annotation_clip=False, arrowprops=dict(arrow),
+        )  # fmt: skip
+
+
+def spread(positions: Array, gap: float) -> Array:
+    """Descending positions (K,) in [0, 1], moved as little as need be to be `gap` apart.
+
+    They minimise the sum of the squared moves, within [0, 1]: an isotonic regression of
+    `positions[i] + i·gap`, clipped. Where K gaps do not fit, the lowest is at 0.
+    """
+    steps = gap * np.arange(len(positions))
+    placed: Array = isotonic_regression(positions + steps, increasing=False).x
+    return np.clip(placed, steps[-1], max(1.0, steps[-1])) - steps

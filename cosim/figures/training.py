@@ -1,20 +1,31 @@
-"""What a training leaves to look at: cost, violation, TD error and θ over its samples."""
+"""A training over its samples: cost, violations, TD error and θ; and the paper's figure of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.labels import EndLabel, label_ends
-from cosim.figures.regret import cost_axis, percent
-from cosim.figures.style import REFERENCE, SERIES, figure, plain, symbol
 from cosim.statistics import regrets
+from cosim.figures.style import (
+    DASHED,
+    REFERENCE,
+    SERIES,
+    EndLabel,
+    cost_axis,
+    figure,
+    label_ends,
+    percent,
+    plain,
+    symbol,
+)
 
 Array = NDArray[np.float64]
 GREEDY, TRAINING = SERIES[0], SERIES[1]
@@ -22,9 +33,9 @@ DECADES = 30.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""
 POINTS = 30
 """Fewer values than this are marked one by one."""
-_LINE: Any = {"markersize": 3, "linewidth": 1.2, "clip_on": False}
 BLOCKS = 4
 """Blocks of θ that are drawn, at most: those that moved most."""
+_LINE: Any = {"markersize": 3, "linewidth": 1.2, "clip_on": False}
 
 
 def training_figure(
@@ -46,30 +57,30 @@ def training_figure(
     shown as regret (J − J*)/|J*|.
     """
     best = baselines.get(optimum)
-    panels: list[tuple[str, Callable[[Axes], list[EndLabel]]]] = [
-        (
-            "regret %" if best is not None else "J per sample",
-            lambda a: _cost(a, log, start, baselines, best),
-        )
-    ]
-    if _measured(log, "greedy_violating_share"):
-        panels.append(("greedy: violating samples %", lambda a: _violation(a, log)))
-    # A single one says nothing of a course.
-    if _measured(log, "td_error", 2):
-        panels.append(("TD error (r.m.s.)", lambda a: _td_error(a, log)))
-    if moved := _most_moved(theta):
-        panels.append(("change of θ, by its scale", lambda a: _change(a, log, moved)))
+    norms = {name: np.linalg.norm(values, axis=1) for name, values in theta.items()}
+    order = sorted((n for n in norms if norms[n].any()), key=lambda n: -float(norms[n][-1]))
+    panels = ["regret %" if best is not None else "J per sample"]
+    panels += ["greedy: violating samples %"] * _measured(log, "greedy_violating_share", 1)
+    # A single TD error says nothing of a course.
+    panels += ["TD error (r.m.s.)"] * _measured(log, "td_error", 2)
+    panels += ["change of θ, by its scale"] * bool(order)
     columns = len(panels) if len(panels) < 4 else 2
     rows = -(-len(panels) // columns)
     with figure(2.15 * rows + 0.35) as drawn:
         grid = drawn.subplots(rows, columns, sharex=True, squeeze=False).ravel()
-        end = max(float(log["samples"][-1]), 1.0)
         named = []
-        for axes, (label, draw) in zip(grid, panels, strict=True):
-            named.append((axes, draw(axes)))
-            axes.set_title(label, loc="left", fontsize=8.0)
+        for axes, name in zip(grid, panels, strict=True):
+            if name.startswith("greedy"):
+                _violation(axes, log)
+            elif name.startswith("TD"):
+                _td_error(axes, log)
+            elif name.startswith("change"):
+                named.append((axes, _change(axes, log, {n: norms[n] for n in order[:BLOCKS]})))
+            else:
+                named.append((axes, _cost(axes, log, start, baselines, best)))
+            axes.set_title(name, loc="left", fontsize=8.0)
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.set_xlim(0.0, end)
+            axes.set_xlim(0.0, max(float(log["samples"][-1]), 1.0))
         for axes in grid[-columns:]:
             axes.set_xlabel("training samples")
         drawn.suptitle(plain(title), fontsize=8.5)
@@ -79,7 +90,7 @@ def training_figure(
     return drawn
 
 
-def _measured(log: Mapping[str, Array], name: str, least: int = 1) -> bool:
+def _measured(log: Mapping[str, Array], name: str, least: int) -> bool:
     return name in log and int(np.isfinite(log[name]).sum()) >= least
 
 
@@ -104,31 +115,27 @@ def _cost(
         samples, cost = _known(log, name)
         if name == "greedy_J" and np.isfinite(start):
             samples, cost = np.append(0.0, samples), np.append(start, cost)
-        if not cost.size:
-            continue
-        marker = "o" if name == "greedy_J" else ""
-        values = shown(cost)
-        axes.plot(samples, values, marker=marker, color=color, **_LINE)
-        labels.append(EndLabel(text, float(values[-1]), color))
-        everything.append(values)
+        if cost.size:
+            marker = "o" if name == "greedy_J" else ""
+            axes.plot(samples, shown(cost), marker=marker, color=color, **_LINE)
+            labels.append(EndLabel(text, float(shown(cost)[-1]), color))
+            everything.append(shown(cost))
     for name, level in baselines.items():
-        axes.axhline(float(shown(level)), color=REFERENCE, linewidth=0.8, linestyle=(0, (4, 2)))
+        axes.axhline(float(shown(level)), color=REFERENCE, linewidth=0.8, linestyle=DASHED)
         labels.append(EndLabel(plain(name), float(shown(level)), REFERENCE))
     values = np.concatenate([np.ravel(values) for values in everything])
     cost_axis(axes, values, relative=best is not None)
     return labels
 
 
-def _violation(axes: Axes, log: Mapping[str, Array]) -> list[EndLabel]:
+def _violation(axes: Axes, log: Mapping[str, Array]) -> None:
     samples, share = _known(log, "greedy_violating_share")
     axes.plot(samples, 100 * share, marker="o", color=GREEDY, **_LINE)
-    axes.set_ylim(
-        -0.04 * max(100 * float(share.max()), 1.0), 1.1 * max(100 * float(share.max()), 1)
-    )
-    return []
+    top = max(100 * float(share.max()), 1.0)
+    axes.set_ylim(-0.04 * top, 1.1 * top)
 
 
-def _td_error(axes: Axes, log: Mapping[str, Array]) -> list[EndLabel]:
+def _td_error(axes: Axes, log: Mapping[str, Array]) -> None:
     samples, error = _known(log, "td_error")
     axes.plot(samples, error, marker="." if len(error) < POINTS else "", color=TRAINING, **_LINE)
     axes.yaxis.set_major_formatter(EngFormatter(sep=""))
@@ -136,22 +143,13 @@ def _td_error(axes: Axes, log: Mapping[str, Array]) -> list[EndLabel]:
         axes.set_yscale("log")
     else:
         axes.set_ylim(0.0, 1.08 * max(float(error.max()), 1e-12))
-    return []
-
-
-def _most_moved(theta: Mapping[str, Array]) -> dict[str, Array]:
-    """Norm (K,) of the increments of the blocks that moved most, most first."""
-    norms = {name: np.linalg.norm(values, axis=1) for name, values in theta.items()}
-    moved = {name: norm for name, norm in norms.items() if norm.any()}
-    order = sorted(moved, key=lambda name: -float(moved[name][-1]))
-    return {name: moved[name] for name in order[:BLOCKS]}
 
 
 def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) -> list[EndLabel]:
-    samples = np.concatenate([[0.0], log["samples"]])
+    samples = np.append(0.0, log["samples"])
     labels = []
     for color, (name, norm) in zip(SERIES, moved.items(), strict=False):
-        axes.plot(samples, np.concatenate([[0.0], norm]), color=color, linewidth=1.2)
+        axes.plot(samples, np.append(0.0, norm), color=color, linewidth=1.2)
         labels.append(EndLabel(symbol(name), float(norm[-1]), color))
     top = max(float(norm.max()) for norm in moved.values())
     if top > DECADES:
@@ -159,3 +157,47 @@ def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) ->
         axes.yaxis.set_major_formatter(FuncFormatter(percent))
     axes.set_ylim(0.0, 1.05 * top)
     return labels
+
+
+def parameters_figure(
+    samples: Array, increments: Mapping[str, Array], td_error: Array, *, window: int = 10_000
+) -> Figure:
+    """The paper's figure of a training: increments of θ by block, and the TD error.
+
+    `increments` maps a block's name to θ − θ₀ (K, entries) at `samples` (K,); `td_error` (K,) is
+    the root mean square over the preceding `window` samples. Source: paper.tex, fig. nmpc_learn.
+    """
+    moving = {name: values for name, values in increments.items() if np.any(values)}
+    columns = 4
+    rows = -(-len(moving) // columns)
+    with figure(1.3 * rows + 2.2) as drawn:
+        grid = drawn.add_gridspec(rows + 1, columns, height_ratios=[*[1.0] * rows, 1.2])
+        first: Axes | None = None
+        for i, (name, values) in enumerate(moving.items()):
+            axes = drawn.add_subplot(grid[i // columns, i % columns], sharex=first)
+            first = first or axes
+            for entry, color in zip(values.T, cycle(SERIES), strict=False):
+                axes.plot(samples, entry, color=color, linewidth=0.8)
+            axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
+            axes.tick_params(labelbottom=i + columns >= len(moving))
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
+        axes = drawn.add_subplot(grid[rows, :], sharex=first)
+        axes.plot(samples, td_error, color=SERIES[1], linewidth=1.0)
+        axes.set_xlim(0.0, float(samples[-1]))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_xlabel("samples")
+        title = f"TD error, root mean square of the preceding {window} samples"
+        axes.set_title(title, loc="left", fontsize=8.0)
+        most = max((values.shape[1] for values in moving.values()), default=0)
+        drawn.legend(
+            handles=[Line2D([], [], color=color, linewidth=1.2) for color in SERIES[:most]],
+            labels=[
+                ", ".join(str(entry + 1) for entry in range(i, most, len(SERIES)))
+                for i in range(min(most, len(SERIES)))
+            ],
+            loc="outside lower center",
+            ncols=len(SERIES) + 1,
+            title="entry of its block",
+        )
+    return drawn

@@ -1,92 +1,161 @@
-"""A run over time: states and inputs with their bounds, disturbances, costs."""
+"""Runs over time: one in detail, several on the same disturbances, and a running episode."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cosim.figures.style import BOUND, REFERENCE, SERIES, figure, label, limit, plain, save
+from cosim.figures.style import (
+    BOUND,
+    DASHED,
+    REFERENCE,
+    SERIES,
+    figure,
+    label,
+    limit,
+    palette,
+    plain,
+)
 from cosim.scenario import Scenario
 from cosim.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 
-def plot_trajectory(
-    trajectory: Trajectory,
-    scenario: Scenario,
-    path: str | Path,
-    *,
-    beside: Sequence[Trajectory] = (),
-) -> Path:
-    """Draw a run to a PNG or SVG file; raises FigureError as `save` does."""
-    return save(trajectory_figure(trajectory, scenario, beside=beside), path)
-
-
 def trajectory_figure(
     trajectory: Trajectory, scenario: Scenario, *, beside: Sequence[Trajectory] = ()
 ) -> Figure:
-    """Left: states, then inputs, with bounds (red) and operating point (grey).
+    """States and inputs with bounds (red) and operating point (grey), disturbances and costs.
 
-    Right: disturbances and the cost per sample. Inputs, disturbances and costs hold from one
-    sample to the next. Violated bounds are shaded, fallback actions marked; a bound that is far
-    from the data is named in place of drawn. The axes span the runs `beside` this one too, so
-    that figures of a set can be compared.
+    Inputs, disturbances and costs hold from one sample to the next. Violated bounds are shaded,
+    fallback actions marked; a bound far from the data is named, not drawn. The axes span the runs
+    `beside` this one too, so that figures of a set can be compared.
     """
     plant, units = scenario.plant, {k: s.unit for k, s in trajectory.signals.items()}
     scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
     left = [*plant.states, *plant.actions]
     right = [*plant.disturbances, "stage_cost", "penalty"]
-    rows = np.lcm(len(left), len(right))
-    height = max(1.05 * max(len(left), len(right) * 0.8), 2.4)
-    with figure(height + 0.5) as drawn:
-        grid = drawn.add_gridspec(int(rows), 2, width_ratios=(1.35, 1.0))
+    rows = int(np.lcm(len(left), len(right)))
+    with figure(max(1.05 * max(len(left), len(right) * 0.8), 2.4) + 0.5) as drawn:
+        grid = drawn.add_gridspec(rows, 2, width_ratios=(1.35, 1.0))
         axes: dict[str, Axes] = {}
         for column, names in enumerate((left, right)):
-            span = int(rows) // len(names)
+            span = rows // len(names)
             for i, name in enumerate(names):
                 cell = grid[i * span : (i + 1) * span, column]
-                axes[name] = drawn.add_subplot(cell, sharex=next(iter(axes.values()), None))
-                axes[name].set_ylabel(label(name, units[name]), fontsize=7.0)
-                axes[name].tick_params(labelbottom=i == len(names) - 1)
+                own = drawn.add_subplot(cell, sharex=next(iter(axes.values()), None))
+                own.set_ylabel(label(name, units[name]), fontsize=7.0)
+                own.tick_params(labelbottom=i == len(names) - 1)
                 for run in beside:
-                    _span(axes[name], time, run[name])
+                    values = run[name]
+                    own.update_datalim([(time[0], np.min(values)), (time[0], np.max(values))])
+                    own.autoscale_view()
+                axes[name] = own
             axes[names[-1]].set_xlabel(f"time [{unit}]")
         for i, name in enumerate(plant.states):
             lower, upper = float(scenario.state_lower[i]), float(scenario.state_upper[i])
-            _state(axes[name], time, trajectory[name], lower, upper, SERIES[0])
+            axes[name].plot(time, trajectory[name], color=SERIES[0], linewidth=0.9)
+            _shade(axes[name], time, trajectory[name], lower, upper, BOUND)
+            _limits(axes[name], lower, upper)
             axes[name].axhline(scenario.reference_state[i], color=REFERENCE, linewidth=0.7)
+        failed = trajectory["failed"] > 0
         for i, name in enumerate(plant.actions):
-            axes[name].step(time, trajectory[name], where="post", color=SERIES[2], linewidth=0.9)
-            axes[name].axhline(scenario.reference_action[i], color=REFERENCE, linewidth=0.7)
-            limits(axes[name], scenario.action_lower[i], scenario.action_upper[i])
-            _failures(axes[name], time, trajectory[name], trajectory["failed"])
+            own = axes[name]
+            own.step(time, trajectory[name], where="post", color=SERIES[2], linewidth=0.9)
+            own.axhline(scenario.reference_action[i], color=REFERENCE, linewidth=0.7)
+            _limits(own, scenario.action_lower[i], scenario.action_upper[i])
+            if failed.any():
+                values = trajectory[name][failed]
+                own.plot(time[failed], values, "x", color=BOUND, ms=4, label="fallback")
+                own.legend(loc="upper right")
         for name in plant.disturbances:
             axes[name].step(time, trajectory[name], where="post", color=SERIES[3], linewidth=0.6)
-        _cost(axes["stage_cost"], time, trajectory["stage_cost"], SERIES[4])
-        _cost(axes["penalty"], time, trajectory["penalty"], SERIES[1])
+        for name, color in (("stage_cost", SERIES[4]), ("penalty", SERIES[1])):
+            _cost(axes[name], time, trajectory[name], color)
         axes["penalty"].set_ylim(bottom=0.0)
         axes[left[0]].set_xlim(time[0], time[-1] + (time[1] - time[0] if len(time) > 1 else 1.0))
         drawn.align_ylabels()
-        drawn.suptitle(_title(trajectory, scenario), fontsize=8.5)
+        summary = trajectory.summary()
+        seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
+        drawn.suptitle(
+            f"{plain(trajectory.controller or 'run')} on {plain(scenario.name)}{seed}:   "
+            f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
+            f"violating {100 * summary['violating_share']:.1f} % of samples",
+            fontsize=8.5,
+        )
     return drawn
 
 
-def _title(trajectory: Trajectory, scenario: Scenario) -> str:
-    summary = trajectory.summary()
-    name = plain(f"{trajectory.controller or 'run'} on {scenario.name}")
-    seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
-    return (
-        f"{name}{seed}:   "
-        f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
-        f"violating {100 * summary['violating_share']:.1f} % of samples"
-    )
+def overlay_figure(runs: Mapping[str, Trajectory]) -> Figure:
+    """States and inputs of runs of one scenario over time, a line for each controller.
+
+    Below a violated lower bound, and above an upper one, the area is shaded in the controller's
+    colour. The legend gives each J and the share of violating samples.
+    """
+    first = next(iter(runs.values()))
+    scenario, plant = first.scenario, first.scenario.plant
+    scale, unit = time_unit(first.time)
+    looks = palette(list(runs))
+    with figure(1.2 * len(scenario.limits) + 0.6) as drawn:
+        rows = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (name, (lower, upper)) in zip(rows, scenario.limits.items(), strict=True):
+            for controller, run in runs.items():
+                held = "steps-post" if name in plant.actions else "default"
+                color = looks[controller].color
+                axes.plot(
+                    run.time / scale, run[name], color=color, linewidth=1.1, drawstyle=held
+                )
+                _shade(axes, run.time / scale, run[name], lower, upper, color)
+            _limits(axes, lower, upper)
+            axes.set_ylabel(label(name, first.signals[name].unit))
+        rows[-1].set_xlabel(f"time [{unit}]")
+        rows[-1].set_xlim(first.time[0] / scale, (first.time[-1] + scenario.sampling_time) / scale)
+        drawn.align_ylabels()
+        for controller, run in runs.items():
+            summary = run.summary()
+            violating = f"{100 * summary['violating_share']:.0f} % of samples violate"
+            text = f"{plain(controller)}: J = {summary['J']:.0f}, {violating}"
+            rows[0].plot([], [], color=looks[controller].color, label=text)
+        rows[0].plot([], [], color=BOUND, linestyle=DASHED, label="bound")
+        rows[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.2)
+    return drawn
+
+
+def episode_image(
+    scenario: Scenario, units: dict[str, str], first: int, states: Array, actions: Array
+) -> NDArray[np.uint8]:
+    """An RGB image (height, width, 3) of an episode's last samples, from sample `first` on.
+
+    `states` (K+1, n), `actions` (K, m) between them; `units` maps variables' names to their units.
+    """
+    plant = scenario.plant
+    seconds: Array = scenario.sampling_time * np.arange(first, first + len(states), dtype=float)
+    scale, unit = time_unit(seconds)
+    time = seconds / scale
+    names = [*plant.states, *plant.actions]
+    with figure(1.3 * len(names), 6.0) as drawn:
+        panels = drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        for i in range(len(plant.states)):
+            panels[i].plot(time, states[:, i], color=SERIES[0])
+            _limits(panels[i], scenario.state_lower[i], scenario.state_upper[i])
+        for j, panel in enumerate(panels[len(plant.states) :]):
+            panel.stairs(actions[:, j], time, color=SERIES[2], baseline=None)
+            _limits(panel, scenario.action_lower[j], scenario.action_upper[j])
+        for panel, name in zip(panels, names, strict=True):
+            panel.set_ylabel(label(name, units[name]))
+        panels[-1].set_xlabel(f"time [{unit}]")
+        panels[-1].set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1.0)
+        drawn.align_ylabels()
+        canvas: Any = FigureCanvasAgg(drawn)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def time_unit(time: Array) -> tuple[float, str]:
@@ -97,23 +166,18 @@ def time_unit(time: Array) -> tuple[float, str]:
     return (60.0, "min") if duration <= 86400.0 else (3600.0, "h")
 
 
-def _span(axes: Axes, time: Array, values: Array) -> None:
-    """Make room for values that another figure shows."""
-    axes.update_datalim([(time[0], np.min(values)), (time[0], np.max(values))])
-    axes.autoscale_view()
-
-
-def _state(axes: Axes, time: Array, values: Array, lower: float, upper: float, color: str) -> None:
-    axes.plot(time, values, color=color, linewidth=0.9)
+def _shade(
+    axes: Axes, time: Array, values: Array, lower: float, upper: float, color: str
+) -> None:
     for bound, outside in ((lower, values < lower), (upper, values > upper)):
         if outside.any():
             axes.fill_between(
-                time, values, bound, where=list(outside), color=BOUND, alpha=0.35, linewidth=0
-            )
-    limits(axes, lower, upper)
+                time, values, bound, where=list(outside), color=color, alpha=0.3, linewidth=0,
+                interpolate=True,
+            )  # fmt: skip
 
 
-def limits(axes: Axes, lower: float, upper: float) -> None:
+def _limits(axes: Axes, lower: float, upper: float) -> None:
     """Draw a bound where it is no farther from the data than they are wide, else name it."""
     low, high = axes.dataLim.intervaly
     span = max(high - low, 1e-9)
@@ -125,21 +189,9 @@ def limits(axes: Axes, lower: float, upper: float) -> None:
             far.append(f"{name} {bound:g}")
     if far:
         axes.annotate(
-            f"bound {', '.join(far)}",
-            (1.0, 1.0),
-            xycoords="axes fraction",
-            ha="right",
-            va="bottom",
-            fontsize=6.5,
-            color=BOUND,
-        )
-
-
-def _failures(axes: Axes, time: Array, values: Array, failed: Array) -> None:
-    at = failed > 0
-    if at.any():
-        axes.plot(time[at], values[at], "x", color=BOUND, markersize=4, label="fallback")
-        axes.legend(loc="upper right")
+            f"bound {', '.join(far)}", (1.0, 1.0), xycoords="axes fraction", ha="right",
+            va="bottom", fontsize=6.5, color=BOUND,
+        )  # fmt: skip
 
 
 def _cost(axes: Axes, time: Array, values: Array, color: str) -> None:
@@ -148,10 +200,6 @@ def _cost(axes: Axes, time: Array, values: Array, color: str) -> None:
     axes.axhline(mean, color="#222222", linewidth=0.8, linestyle=(0, (1, 1)))
     axes.annotate(
         f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
-        (0.99, 0.95),
-        xycoords="axes fraction",
-        ha="right",
-        va="top",
-        fontsize=6.5,
+        (0.99, 0.95), xycoords="axes fraction", ha="right", va="top", fontsize=6.5,
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
-    )
+    )  # fmt: skip

@@ -101,7 +101,7 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         if self.render_mode is None:
             return None
         # Matplotlib is for those who look.
-        from cosim.figures.episode import episode_image  # noqa: PLC0415
+        from cosim.figures.trajectory import episode_image  # noqa: PLC0415
 
         first = self._plant.k - len(self._actions)
         states = np.array(self._states)

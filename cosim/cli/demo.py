@@ -40,7 +40,7 @@ def demo(
     parameters.toml and scenario.toml.
     """
     with output(json) as out_:
-        from cosim.figures import plot_overlay
+        from cosim.figures import overlay_figure, save
         from cosim.files import write_atomically
         from cosim.scenario import Scenario
 
@@ -54,7 +54,7 @@ def demo(
         rows = _table(runs, trained)
         _show(rows, scenario, steps, out_)
         shown = {name: runs[name][0] for name in ("naive", LEARNT, OPTIMAL)}
-        plot_overlay(shown, folder / "before-after.png")
+        save(overlay_figure(shown), folder / "before-after.png")
         learnt.save(folder)
         _record(folder / "demo.rrd", shown, learnt, rows)
         write_atomically(folder / "demo.csv", _csv(rows))

@@ -11,9 +11,17 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.labels import EndLabel, label_ends
-from cosim.figures.regret import cost_axis
-from cosim.figures.style import REFERENCE, SERIES, WIDTH, figure, plain, save
+from cosim.figures.style import (
+    REFERENCE,
+    SERIES,
+    WIDTH,
+    EndLabel,
+    cost_axis,
+    figure,
+    label_ends,
+    plain,
+    save,
+)
 
 Array = NDArray[np.float64]
 CURVES = 4

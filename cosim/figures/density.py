@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.figures.style import BOUND, colors, figure, label, legend_above, plain, save
+from cosim.figures.style import BOUND, figure, label, palette, plain, save
 from cosim.penalty import VIOLATING
 
 Array = NDArray[np.float64]
@@ -39,16 +39,16 @@ def plot_density(
     )
     with figure(2.9, 4.6) as drawn:
         axes = drawn.subplots()
-        color = colors(list(samples))
+        looks = palette(list(samples))
         for controller, values in samples.items():
             share = float(np.mean(bound - values > VIOLATING))
             counts, _ = np.histogram(values, edges)
             heights = counts / (len(values) * width)
-            axes.stairs(heights, edges, fill=True, alpha=0.12, color=color[controller])
+            axes.stairs(heights, edges, fill=True, alpha=0.12, color=looks[controller].color)
             axes.stairs(
                 heights,
                 edges,
-                color=color[controller],
+                color=looks[controller].color,
                 linewidth=1.2,
                 label=f"{plain(controller)}: {100 * share:.1f} % below",
             )
@@ -58,7 +58,10 @@ def plot_density(
         axes.set_xlabel(label(name, unit))
         inverse = f"1/({unit})" if "/" in unit else f"1/{unit}"
         axes.set_ylabel("density" if unit in ("", "1") else f"density [{inverse}]")
-        legend_above(axes)
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.2,
+            handlelength=1.4, alignment="left",
+        )  # fmt: skip
     return save(drawn, path)
 
 

@@ -11,8 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.statistics import Estimate, regret, regret_terms
-from cosim.statistics import mean as mean_of
 from cosim.figures.style import (
     DASHED,
     REFERENCE,
@@ -23,6 +21,8 @@ from cosim.figures.style import (
     plain,
     regret_axis,
 )
+from cosim.statistics import Estimate, regret, regret_terms
+from cosim.statistics import mean as mean_of
 
 Array = NDArray[np.float64]
 VIOLATION = 1e-3
@@ -74,8 +74,8 @@ def _rows(
         spread = np.linspace(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(1)
         axes.plot(values, row + spread, ".", color=color, markersize=4, alpha=0.4, mew=0)
         if estimate.t is not None:
-            ends = (scale * end for end in estimate.t)
-            axes.hlines(row, *ends, color=color, linewidth=1.6, zorder=3)
+            low, high = estimate.t
+            axes.hlines(row, scale * low, scale * high, color=color, linewidth=1.6, zorder=3)
         axes.plot(scale * estimate.value, row, "o", color=color, markersize=5, zorder=4)
     axes.set_yticks(range(len(controllers)), [plain(name) for name in controllers])
     axes.set_ylim(len(controllers) - 0.5, -0.5)

@@ -12,9 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.labels import EndLabel, label_ends
-from cosim.figures.regret import regret_axis
-from cosim.figures.style import REFERENCE, colors, figure, label, save
+from cosim.figures.style import (
+    REFERENCE,
+    EndLabel,
+    figure,
+    label,
+    label_ends,
+    palette,
+    regret_axis,
+    save,
+)
 
 Array = NDArray[np.float64]
 Signals = Mapping[str, Mapping[str, tuple[Array, Array]]]
@@ -70,13 +77,11 @@ def plot_online(
 
 
 def _looks(cases: list[str]) -> dict[str, dict[str, Any]]:
-    """Colour of each case; one that has another's colour is dashed."""
-    found: dict[str, dict[str, Any]] = {}
-    for case, color in colors(cases).items():
-        taken = any(look["color"] == color for look in found.values())
-        dashes = (0, (4, 1.5)) if taken else "-"
-        found[case] = {"color": color, "linestyle": dashes, "linewidth": 1.2}
-    return found
+    """Colour and line style of each case."""
+    return {
+        case: {"color": look.color, "linestyle": look.line, "linewidth": 1.2}
+        for case, look in palette(cases).items()
+    }
 
 
 def _signal(

@@ -5,20 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.figures.style import SERIES, WIDTH, figure, plain, save
+from cosim.figures.style import FLOOR, SERIES, WIDTH, figure, percent, plain, regret_axis, save
 
 Array = NDArray[np.float64]
-FLOOR = 0.1
-"""Regret in % below which an axis is linear."""
-FINE = 0.01
-"""The same where finished runs are told apart."""
+FINE = FLOOR
 
 
 @dataclass(frozen=True)
@@ -67,38 +63,6 @@ def plot_regret(cases: Mapping[str, Dots], path: str | Path) -> Path:
 def _jitter(count: int) -> Array:
     """Dots of a row are spread a little, the same way each time."""
     return np.linspace(-0.18, 0.18, count) if count > 1 else np.zeros(count)
-
-
-def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: float = FLOOR) -> None:
-    """Scale an axis for regrets in %: logarithmic above `floor`, for they span decades.
-
-    Below it is linear, with room below zero where values come near it: there J* is a line.
-    """
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, floor)
-    lowest = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
-    scale, limits, axis = (
-        (axes.set_xscale, axes.set_xlim, axes.xaxis)
-        if which == "x"
-        else (axes.set_yscale, axes.set_ylim, axes.yaxis)
-    )
-    scale("symlog", linthresh=floor, linscale=0.5)
-    limits(lowest, 1.6 * max(high, floor))
-    axis.set_major_formatter(FuncFormatter(percent))
-
-
-def cost_axis(axes: Axes, values: Array, *, relative: bool) -> None:
-    """Scale the ordinate for costs: `regret_axis` where they are `relative`, else linear."""
-    if relative:
-        regret_axis(axes, "y", values)
-        return
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
-    margin = 0.05 * (high - low) or 1.0
-    axes.set_ylim(low - margin, high + margin)
-
-
-def percent(value: float, _: object = None) -> str:
-    """A tick in plain digits."""
-    return f"{value:g}"
 
 
 @dataclass(frozen=True)

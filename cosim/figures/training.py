@@ -13,7 +13,6 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
 
-from cosim.statistics import regrets
 from cosim.figures.style import (
     DASHED,
     REFERENCE,
@@ -26,6 +25,7 @@ from cosim.figures.style import (
     plain,
     symbol,
 )
+from cosim.statistics import regrets
 
 Array = NDArray[np.float64]
 GREEDY, TRAINING = SERIES[0], SERIES[1]

@@ -109,9 +109,7 @@ def overlay_figure(runs: Mapping[str, Trajectory]) -> Figure:
             for controller, run in runs.items():
                 held = "steps-post" if name in plant.actions else "default"
                 color = looks[controller].color
-                axes.plot(
-                    run.time / scale, run[name], color=color, linewidth=1.1, drawstyle=held
-                )
+                axes.plot(run.time / scale, run[name], color=color, linewidth=1.1, drawstyle=held)
                 _shade(axes, run.time / scale, run[name], lower, upper, color)
             _limits(axes, lower, upper)
             axes.set_ylabel(label(name, first.signals[name].unit))
@@ -166,9 +164,7 @@ def time_unit(time: Array) -> tuple[float, str]:
     return (60.0, "min") if duration <= 86400.0 else (3600.0, "h")
 
 
-def _shade(
-    axes: Axes, time: Array, values: Array, lower: float, upper: float, color: str
-) -> None:
+def _shade(axes: Axes, time: Array, values: Array, lower: float, upper: float, color: str) -> None:
     for bound, outside in ((lower, values < lower), (upper, values > upper)):
         if outside.any():
             axes.fill_between(

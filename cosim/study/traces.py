@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from cosim.figures import (
     Portrait,
+    overlay_figure,
+    parameters_figure,
     plot_density,
-    plot_overlay,
-    plot_parameters_and_td_error,
     plot_phase_portraits,
-    plot_trajectory,
     policy_on_grid,
+    save,
+    trajectory_figure,
 )
 from cosim.files import write_atomically
 from cosim.protocols import Controller
@@ -114,12 +115,12 @@ def _draw(
             if figure == "trajectory":
                 for case, run in trajectories.items():
                     own = folder / f"{stem}-{safe(case)}.{suffix}"
-                    plot_trajectory(run, scenario, own, beside=list(trajectories.values()))
+                    save(trajectory_figure(run, scenario, beside=list(trajectories.values())), own)
                     drawn.append(own.stem)
                 continue
             drawn.append(stem)
             if figure == "overlay":
-                plot_overlay(trajectories, path)
+                save(overlay_figure(trajectories), path)
             elif figure == "density":
                 _density(trajectories, scenario, path)
             else:
@@ -179,15 +180,10 @@ def _draw_log(path: Path, folder: Path) -> list[str]:
     if not blocks:
         return []
     name = f"parameters-{path.stem}"
+    td_error = td_error_mean(log["samples"], log["td_error"], log["updates"])
+    drawn = parameters_figure(log["samples"], blocks, td_error, window=TD_WINDOW)
     for suffix in SUFFIXES:
-        plot_parameters_and_td_error(
-            log["samples"],
-            blocks,
-            log["samples"],
-            td_error_mean(log["samples"], log["td_error"], log["updates"]),
-            folder / f"{name}.{suffix}",
-            window=TD_WINDOW,
-        )
+        save(drawn, folder / f"{name}.{suffix}")
     return [name]
 
 

@@ -2,29 +2,28 @@
 
 import numpy as np
 import pytest
-from scipy.stats import t as student
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures import (
+    Costs,
     Dots,
     LearningCurve,
     Portrait,
     Profile,
+    evaluation_figure,
     overlay_figure,
+    parameters_figure,
     plot_curves,
     plot_density,
-    plot_overlay,
-    plot_parameters_and_td_error,
-    plot_pareto,
     plot_phase_portraits,
     plot_profiles,
     plot_regret,
-    plot_trajectory,
     policy_on_grid,
+    save,
     trajectory_figure,
 )
-from cosim.figures.labels import spread
-from cosim.figures.pareto import half_width, nondominated
+from cosim.figures.evaluation import nondominated
+from cosim.figures.style import spread
 from tests.helpers.loop import Failing, Proportional
 
 
@@ -96,8 +95,8 @@ def test_runs_side_by_side_have_the_same_axes(trajectory, paper):
 def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
     with FmuPlant(paper) as plant:
         run = simulate(plant, Proportional(paper), 1, 0)
-    assert plot_trajectory(run, paper, tmp_path / "a.png").stat().st_size > 10_000
-    assert plot_overlay({"one": run}, tmp_path / "b.png").stat().st_size > 10_000
+    assert save(trajectory_figure(run, paper), tmp_path / "a.png").stat().st_size > 10_000
+    assert save(overlay_figure({"one": run}), tmp_path / "b.png").stat().st_size > 10_000
 
 
 def figures(rng, paper):
@@ -114,8 +113,12 @@ def figures(rng, paper):
     dots["b"] = Dots("b", np.array([2.0, 30.0, np.inf]), finished, 16.0, None)
     shares = np.linspace(0.0, 1.0, 20)
     profile = Profile(np.geomspace(0.01, 10.0, 20), shares, 0.9 * shares, shares)
-    cost = {name: (rng.random(9), rng.random(9)) for name in ("naive", "$mine", "tuned")}
-    increments = {"B_l": rng.random((51, 10)), "c_lambda": rng.random(51), "x_u": np.zeros((51, 2))}
+    cost = {name: Costs(*rng.random((3, 9))) for name in ("naive", "$mine", "tuned")}
+    increments = {
+        "B_l": rng.random((51, 10)),
+        "c_lambda": rng.random((51, 1)),
+        "x_u": np.zeros((51, 2)),
+    }
     return {
         "phase": lambda path: plot_phase_portraits(portraits, x, y, paper, path),
         "density": lambda path: plot_density(
@@ -129,16 +132,16 @@ def figures(rng, paper):
         ),
         "regret": lambda path: plot_regret(dots, path),
         "profiles": lambda path: plot_profiles({"a": {"$x": profile}, "b": {"y": profile}}, path),
-        "parameters": lambda path: plot_parameters_and_td_error(
-            samples, increments, samples[10:], rng.random(41), path
+        "parameters": lambda path: save(
+            parameters_figure(samples, increments, rng.random(51)), path
         ),
-        "pareto": lambda path: plot_pareto(cost, path),
+        "evaluation": lambda path: save(evaluation_figure(cost, title="$t"), path),
     }
 
 
 @pytest.mark.parametrize(
     "name",
-    ["phase", "density", "curves", "curves of J", "regret", "profiles", "parameters", "pareto"],
+    ["phase", "density", "curves", "curves of J", "regret", "profiles", "parameters", "evaluation"],
 )
 def test_every_figure_repeats_its_bytes(name, tmp_path, paper):
     files = []
@@ -153,15 +156,6 @@ def test_a_policy_is_laid_out_with_rows_of_the_second_state():
     grid = policy_on_grid(lambda s: s, np.array([1.0, 2.0, 3.0]), np.array([5.0, 6.0]))
     assert grid.shape == (2, 3, 2)
     assert grid[1, 2].tolist() == [3.0, 6.0]
-
-
-def test_half_widths_are_students(rng):
-    values = rng.normal(size=12)
-    low, high = student.interval(
-        0.95, 11, loc=values.mean(), scale=values.std(ddof=1) / np.sqrt(12)
-    )
-    assert half_width(values) == pytest.approx((high - low) / 2, rel=1e-12)
-    assert half_width(np.array([1.0])) == 0.0
 
 
 def test_the_front_is_what_no_other_point_beats(rng):
@@ -194,7 +188,8 @@ def test_a_plant_at_rest_draws(tmp_path, paper):
     actions = np.tile(paper.reference_action, (3, 3, 1))
     plot_phase_portraits([Portrait("rest", rest, actions)], x, y, paper, tmp_path / "a.png")
     plot_density({"rest": rest[:, 0]}, 25.0, "X2", "%", tmp_path / "b.png")
-    plot_pareto({"rest": (np.zeros(5), np.full(5, 6210.0))}, tmp_path / "c.png")
+    rest = {"rest": Costs(np.full(5, 6210.0), np.full(5, 6210.0), np.zeros(5))}
+    save(evaluation_figure(rest, title="rest"), tmp_path / "c.png")
 
 
 def test_labels_at_line_ends_do_not_overlap_and_stay_within_the_axes(rng):

@@ -3,7 +3,7 @@ import pytest
 
 from cosim.errors import FigureError
 from cosim.figures import save
-from cosim.figures.style import colors, figure, label
+from cosim.figures.style import figure, label, palette
 
 
 def drawing():
@@ -49,13 +49,10 @@ def test_names_become_mathematics_with_units():
     assert label("price_$", "$") == r"price \$ [\$]"
 
 
-def test_controllers_have_colours_of_their_own():
-    chosen = colors(["naive", "mine", "optimal", "yours", "tuned"])
-    assert len(set(chosen.values())) == 5
-    assert colors(["tuned"])["tuned"] == chosen["tuned"]
-
-
-def test_colours_differ_and_that_of_an_absent_controller_goes_last():
-    names = ["naive", "tuned", "learned", "mpcrl", "sac", "ppo", "optimal"]
-    assert len(set(colors(names).values())) == 7
-    assert colors(["converged"])["converged"] not in colors(names[:-2]).values()
+def test_a_rule_has_its_colour_and_each_of_its_cases_a_line():
+    looks = palette(["naive", "q(start=naive)", "q(start=tuned)", "mine", "optimal"])
+    colors = [look.color for look in looks.values()]
+    assert len(set(colors)) == 4
+    assert looks["q(start=naive)"].color == looks["q(start=tuned)"].color
+    assert len(set(looks.values())) == len(looks)
+    assert palette(["tuned", "naive"])["naive"] == looks["naive"]

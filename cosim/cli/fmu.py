@@ -41,7 +41,7 @@ def _refusals(fmu: Path) -> list[str]:
     """Why no scenario can use the FMU as its plant."""
     from cosim.errors import PlantError
     from cosim.plant.archive import unpack
-    from cosim.plant.suitability import refusals
+    from cosim.plant.wiring import refusals
 
     try:
         return list(refusals(unpack(fmu)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cosim.plant.archive import unpack
-from cosim.plant.start_values import start_values
+from cosim.plant.wiring import start_values
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 from fmus.ssp import Component, Connection, write_ssp

@@ -22,7 +22,6 @@ class Run:
     seed: int
     out: Path
     record: bool
-    isolate: bool = False
 
 
 def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
@@ -34,13 +33,13 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     from cosim.cli.compose import announce, load_scenario
     from cosim.files import write_atomically
     from cosim.lookup import build_controller
-    from cosim.plant import FmuPlant, IsolatedPlant
+    from cosim.plant import FmuPlant
     from cosim.simulation import simulate
 
     scenario = load_scenario(run.scenario)
     folder = open_folder(run.out).absolute()  # an FMU may change the working directory
     announce(scenario, output)
-    with IsolatedPlant(scenario) if run.isolate else FmuPlant(scenario) as plant:
+    with FmuPlant(scenario) as plant:
         controller = build_controller(run.controller, scenario)
         recorder = None
         if run.record:

@@ -33,10 +33,6 @@ def simulate(
     seed: SeedOption = 0,
     out: OutOption = Path("cosim-run"),
     record: RecordOption = False,
-    isolate: Annotated[
-        bool,
-        typer.Option("--isolate", help="Run the FMU in a process of its own, in case it crashes."),
-    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Run a controller on a scenario's plant.
@@ -44,7 +40,7 @@ def simulate(
     Writes trajectory.csv, timing.csv, summary.json, scenario.toml and, with --record, run.rrd.
     """
     with output(json) as out_:
-        _, summary = execute(Run(scenario, controller, steps, seed, out, record, isolate), out_)
+        _, summary = execute(Run(scenario, controller, steps, seed, out, record), out_)
         show(summary, out_)
         out_.note(f"files are in {out.resolve()}")
         out_.json(summary)

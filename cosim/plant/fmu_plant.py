@@ -3,31 +3,93 @@
 from __future__ import annotations
 
 import ctypes
+import struct
 from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.errors import CapabilityError, PlantError
 from cosim.plant.archive import unpack
-from cosim.plant.fmi2 import Fmi2Instance
-from cosim.plant.fmi3 import Fmi3Instance
-from cosim.plant.instance import Instance
-from cosim.plant.resource import Resource
-from cosim.plant.snapshot import Memory, Snapshot, packed, unpacked
-from cosim.plant.suitability import check_step, refusals
-from cosim.plant.wiring import Wirer, seed_words
+from cosim.plant.fmi import Fmi2Instance, Fmi3Instance, Instance
+from cosim.plant.wiring import Wirer, check_step, refusals, seed_words
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
 _NOT_STARTED = -1
+_HEADER = struct.Struct("<8sq32s")
+_MAGIC = b"cosimfs1"
 
 
-class FmuPlant(Resource):
+class Snapshot:
+    """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
+
+    Its memory belongs to the FMU and is handed to a later snapshot when this one is dropped.
+    """
+
+    __slots__ = ("_plant", "handle", "k")
+
+    def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
+        self._plant = plant
+        self.handle = handle
+        self.k = k
+
+    def belongs_to(self, plant: FmuPlant) -> bool:
+        """Whether the plant made this snapshot."""
+        return self._plant is plant
+
+    def __del__(self) -> None:
+        """Give the memory back to the plant."""
+        self._plant.recycle(self.handle)
+
+
+class Memory:
+    """The FMU's memory of saved states, used again: what an FMU allocates leaks until freed."""
+
+    def __init__(self) -> None:
+        self._all: list[ctypes.c_void_p] = []
+        self._free: list[ctypes.c_void_p] = []
+
+    def take(self) -> ctypes.c_void_p:
+        """A dropped snapshot's memory, or none yet: the FMU allocates what it needs."""
+        if self._free:
+            return self._free.pop()
+        handle = ctypes.c_void_p()
+        self._all.append(handle)
+        return handle
+
+    def give(self, handle: ctypes.c_void_p) -> None:
+        """Keep a dropped snapshot's memory for the next one."""
+        self._free.append(handle)
+
+    def free(self, fmi: Instance) -> None:
+        """Hand all of it back to the FMU."""
+        for handle in self._all:
+            fmi.free(handle)
+
+
+def packed(k: int, sha256: str, state: bytes) -> bytes:
+    """Return an FMU's serialised state with its sample number and the FMU's hash before it."""
+    return _HEADER.pack(_MAGIC, k, bytes.fromhex(sha256)) + state
+
+
+def unpacked(data: bytes, sha256: str) -> tuple[int, bytes]:
+    """Return sample number and FMU state; raises PlantError unless `packed` made them so."""
+    if len(data) < _HEADER.size or data[:8] != _MAGIC:
+        raise PlantError("these bytes are not a serialised plant state")
+    _, k, digest = _HEADER.unpack_from(data)
+    if digest.hex() != sha256:
+        raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
+    if k < 0:
+        raise PlantError("these bytes are not a serialised plant state")
+    return k, data[_HEADER.size :]
+
+
+class FmuPlant:
     """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
 
     At sample k, time k·h: the action is written, ℓ(x_k, u_k, d_k) and d_k are read, the FMU steps
@@ -184,6 +246,14 @@ class FmuPlant(Resource):
         self._k = _NOT_STARTED
         self._memory.free(fmi)
         fmi.close()
+
+    def __enter__(self) -> Self:
+        """Return the plant itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the plant."""
+        self.close()
 
     def __del__(self) -> None:
         """Free the instance of a plant that nobody closed."""

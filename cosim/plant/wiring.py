@@ -1,16 +1,81 @@
-"""Finds a scenario's variables in an FMU and turns them into value references."""
+"""Whether an FMU can be a scenario's plant, and which of its variables are the scenario's."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from cosim.errors import PlantError
-from cosim.plant.archive import UnpackedFmu
-from cosim.plant.instance import Instance, StartValue, Wiring
+from cosim.plant.archive import UnpackedFmu, unpack
+from cosim.plant.fmi import Fmi2Instance, Instance, StartValue, Wiring, library_path
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
+
+_REAL = ("Real", "Float64")
+
+
+def refusals(fmu: UnpackedFmu) -> Iterator[str]:
+    """Every reason for which `FmuPlant` refuses the FMU, as its error message says it."""
+    description, name = fmu.description, f"FMU '{fmu.path}'"
+    simulation = description.coSimulation
+    if simulation is None:
+        others = [
+            words
+            for words, face in (
+                ("model exchange", description.modelExchange),
+                ("scheduled execution", description.scheduledExecution),
+            )
+            if face is not None
+        ]
+        yield f"{name} has no co-simulation interface (it has: {', '.join(others) or 'none'})"
+    else:
+        if simulation.needsExecutionTool:
+            yield (
+                f"{name} needs the tool that made it to run (needsExecutionTool); export it as an "
+                "FMU that stands alone"
+            )
+        try:
+            library_path(fmu)
+        except PlantError as error:
+            yield str(error)
+    scalars = [v for v in description.modelVariables if v.type in _REAL and not v.dimensions]
+    if not any(v.causality == "input" or v.variability == "tunable" for v in scalars):
+        yield (
+            f"{name} has no scalar real input and no tunable parameter: there is nothing for a "
+            "controller to act on"
+        )
+    if not any(v.causality in ("output", "local") for v in scalars):
+        yield f"{name} has no scalar real output: there is nothing for a controller to see"
+
+
+def check_step(fmu: UnpackedFmu, sampling_time: float) -> None:
+    """Raise PlantError where the FMU's communication step is fixed and not the sampling time [s].
+
+    Such an FMU steps by the step size of its default experiment (FMI 2.0), or by a multiple of
+    its fixed internal step (FMI 3.0).
+    """
+    simulation, name = fmu.description.coSimulation, f"FMU '{fmu.path}'"
+    internal = simulation.fixedInternalStepSize
+    if internal is not None and float(internal) > 0:
+        count = sampling_time / float(internal)
+        if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
+            raise PlantError(
+                f"{name} steps by multiples of {float(internal):g} s (fixedInternalStepSize), and "
+                f"the sampling time of {sampling_time:g} s is none"
+            )
+    if simulation.canHandleVariableCommunicationStepSize:
+        return
+    experiment = fmu.description.defaultExperiment
+    size = getattr(experiment, "stepSize", None)
+    if size is None or internal is not None:
+        return
+    if abs(float(size) - sampling_time) > 1e-9 * sampling_time:
+        raise PlantError(
+            f"{name} steps by {float(size):g} s alone (canHandleVariableCommunicationStepSize is "
+            f"false), but the sampling time is {sampling_time:g} s"
+        )
+
 
 _WIDE = ("Int64", "UInt64")
 
@@ -177,3 +242,24 @@ def seed_words(seed: int, variables: Sequence[SeedWord]) -> list[tuple[str, int,
         words.append((word.type, word.reference, number >> shift & (1 << word.bits) - 1))
         shift += word.bits
     return words
+
+
+def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, float]]:
+    """FMI 2.0 type and value of each parameter that differs by scenario, the seed's words too.
+
+    `plant_seed` is the first of `cosim.simulation.spawn_seeds`. Raises PlantError where the
+    scenario's FMU does not fit it.
+    """
+    fmu = unpack(scenario.plant.fmu)
+    wirer = Wirer(scenario, fmu, Fmi2Instance)
+    names = {
+        (int(variable.valueReference), variable.type): variable.name
+        for variable in fmu.description.modelVariables
+    }
+    found = {
+        names[start.reference, start.type]: (start.type, start.value)
+        for start in wirer.wiring().starts
+    }
+    for kind, reference, value in seed_words(plant_seed, wirer.seeds()):
+        found[names[reference, kind]] = (kind, value)
+    return found

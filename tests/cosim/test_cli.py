@@ -2,12 +2,10 @@ import json
 import resource
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from tests.helpers.command import run_cosim
-from tests.helpers.tank import build_tank, write_scenario
 
 
 @pytest.mark.slow
@@ -118,24 +116,6 @@ def test_a_foreign_fmu_is_announced_with_its_hash(cosim, tmp_path):
     assert hashlib.sha256(data).hexdigest() in err.replace("\n", "")
     assert "native code" in err
     assert "native code" not in cosim("simulate", "--steps", 5, "--out", "a")[2]
-
-
-def test_an_isolated_run_writes_the_same_bytes(cosim, tmp_path):
-    assert cosim("simulate", "--steps", 30, "--out", "a")[0] == 0
-    assert cosim("simulate", "--steps", 30, "--out", "b", "--isolate")[0] == 0
-    files = [(tmp_path / folder / "trajectory.csv").read_bytes() for folder in ("a", "b")]
-    assert files[0] == files[1]
-
-
-def test_a_crashing_fmu_ends_an_isolated_run_with_one_message(cosim, tmp_path, monkeypatch):
-    # A foreign FMU runs in a process of its own, which must find the helpers too.
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
-    scenario = write_scenario(tmp_path, build_tank(tmp_path, saves=False), fault=5)
-    arguments = ["-s", scenario, "-c", "tank_controller:make", "--steps", 5, "--isolate"]
-    (tmp_path / "tank_controller.py").write_text("from tests.helpers.loop import hold as make\n")
-    code, out, err = cosim("simulate", *arguments, "--json")
-    assert (code, out) == (2, "")
-    assert "died by SIGABRT at step 0" in err
 
 
 def test_view_prints_what_a_recording_holds(cosim):

@@ -9,8 +9,8 @@ import fmus
 from cosim import FmuPlant, Scenario
 from cosim.errors import CapabilityError, PlantError, ScenarioError
 from cosim.plant.archive import unpack
-from cosim.plant.library import library_path
-from cosim.plant.suitability import refusals
+from cosim.plant.fmi import library_path
+from cosim.plant.wiring import refusals
 from tests.helpers.kinds import REALS, build_kind, scenario_for, write_fmi1
 
 CS = 'CoSimulation modelIdentifier="kinds" '
@@ -274,7 +274,7 @@ def test_on_arm_the_folder_of_fmi3_or_of_x86_serves(tmp_path, monkeypatch, machi
     from fmus.build import PLATFORMS
 
     platform = next(p for p in PLATFORMS if p.tuple == machine)
-    monkeypatch.setattr("cosim.plant.library.present", lambda: platform)
+    monkeypatch.setattr("cosim.plant.fmi.present", lambda: platform)
     with zipfile.ZipFile(fmus.path()) as shipped:
         data = shipped.read(f"binaries/{library}")
     fmu = unpack(build_kind(tmp_path, 2, place=place, data=data))
@@ -286,6 +286,6 @@ def test_on_arm_a_library_for_x86_is_named(tmp_path, monkeypatch):
 
     platform = next(p for p in PLATFORMS if p.tuple == "aarch64-linux")
     fmu = unpack(build_kind(tmp_path, 2, place="linux64"))
-    monkeypatch.setattr("cosim.plant.library.present", lambda: platform)
+    monkeypatch.setattr("cosim.plant.fmi.present", lambda: platform)
     with pytest.raises(PlantError, match=r"no binary for aarch64-linux .*made for x86_64-linux"):
         library_path(fmu)

@@ -10,8 +10,7 @@ import pytest
 
 import fmus
 from cosim.cache import TAG, UNUSED_DAYS
-from cosim.plant import unpacking
-from cosim.plant.archive import unpack
+from cosim.plant.archive import place, unpack
 from tests.helpers.command import run_cosim
 
 DAY = 86400
@@ -42,23 +41,23 @@ def packed(archive):
 
 
 def test_the_folder_holds_the_archive_and_nothing_else_is_left(cache, archive):
-    folder = unpacking.place(archive, "0" * 64)
+    folder = place(archive, "0" * 64)
     assert contents(folder) == packed(archive)
     assert entries(cache) == [folder]
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
 
 
 def test_the_folder_is_used_again(cache, archive):
-    folder = unpacking.place(archive, "0" * 64)
+    folder = place(archive, "0" * 64)
     library = next(folder.glob("binaries/*/*"))
     before = library.stat()
-    assert unpacking.place(archive, "0" * 64) == folder
+    assert place(archive, "0" * 64) == folder
     assert library.stat().st_ino == before.st_ino
 
 
 @pytest.mark.parametrize("damage", ["changed", "cut", "missing", "link"])
 def test_a_damaged_folder_is_replaced(cache, archive, damage, tmp_path):
-    folder = unpacking.place(archive, "0" * 64)
+    folder = place(archive, "0" * 64)
     library = next(folder.glob("binaries/*/*"))
     data = library.read_bytes()
     library.unlink()
@@ -69,7 +68,7 @@ def test_a_damaged_folder_is_replaced(cache, archive, damage, tmp_path):
     elif damage == "link":
         (tmp_path / "elsewhere").write_bytes(data)
         library.symlink_to(tmp_path / "elsewhere")
-    assert contents(unpacking.place(archive, "0" * 64)) == packed(archive)
+    assert contents(place(archive, "0" * 64)) == packed(archive)
     assert entries(cache) == [folder]
     assert not library.is_symlink()
 
@@ -83,26 +82,26 @@ def test_a_cache_that_is_deleted_in_mid_run_is_filled_again(cache):
 
 
 def test_what_nobody_used_for_long_is_deleted(cache, archive):
-    unpacking.place(archive, "1" * 64)
+    place(archive, "1" * 64)
     old, recent = cache / ("a" * 64), cache / ("b" * 64)
     for folder, days in ((old, UNUSED_DAYS + 1), (recent, UNUSED_DAYS - 1)):
         (folder / "sources").mkdir(parents=True)
         then = folder.stat().st_mtime - days * DAY
         os.utime(folder, (then, then))
-    unpacking.place(archive, "0" * 64)
+    place(archive, "0" * 64)
     assert {path.name[0] for path in entries(cache)} == {"0", "1", "b"}
 
 
 def test_use_counts_even_where_nothing_is_unpacked(cache, archive):
-    folder = unpacking.place(archive, "0" * 64)
+    folder = place(archive, "0" * 64)
     os.utime(folder, (0, 0))
-    unpacking.place(archive, "0" * 64)
+    place(archive, "0" * 64)
     assert folder.stat().st_mtime > DAY
 
 
 RACE = """
 import sys, zipfile
-from cosim.plant.unpacking import place
+from cosim.plant.archive import place
 sys.stdin.readline()
 with zipfile.ZipFile(sys.argv[1]) as archive:
     for _ in range(20):
@@ -144,7 +143,6 @@ def test_without_a_cache_the_folder_ends_with_the_process(tmp_path):
     "words",
     [
         "simulate --steps 30 --record --out out",
-        "simulate --steps 30 --isolate --out out",
         "evaluate --seeds 2 --steps 30 --jobs 2 --out out",
         "train --algorithm q-learning --samples 100 --log-every 50 --evaluate-every 100 --out out",
         "demo --steps 30 --out out",

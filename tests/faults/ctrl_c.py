@@ -30,7 +30,7 @@ COMMANDS = (
     "evaluate --seeds 9999 -n 1000 --jobs 2",
     "study run study.toml --jobs 2",
     "evaluate --seeds 9999 -n 1000 --jobs 1",
-    "simulate --isolate -n 5000000",
+    "simulate -n 5000000",
     "train -a batch-q-learning -n 9999999",
 )
 

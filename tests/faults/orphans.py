@@ -71,7 +71,6 @@ class Job:
 # Training and study go on for longer than the samples after which functions are compiled.
 JOBS = (
     Job("simulate --record", "simulate -n 1500 --record --out out", "out/summary.json"),
-    Job("simulate --isolate", "simulate -n 1500 --isolate --out out", "out/summary.json"),
     Job(
         "train",
         "train -a q-learning -n 3000 --checkpoint-every 1000 --out out",

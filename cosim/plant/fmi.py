@@ -1,0 +1,489 @@
+"""Co-simulation by raw FMI 2.0 and 3.0 calls: the library, the instance, its buffers."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import sys
+import threading
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary
+
+import fmpy
+import numpy as np
+from fmpy import calloc, free
+from fmpy.fmi2 import (
+    FMU2Slave,
+    fmi2CallbackAllocateMemoryTYPE,
+    fmi2CallbackFreeMemoryTYPE,
+    fmi2CallbackFunctions,
+    fmi2CallbackLoggerTYPE,
+)
+from fmpy.fmi3 import FMU3Slave
+from fmpy.logging import addLoggerProxy
+from numpy.typing import NDArray
+
+from cosim.errors import CapabilityError, PlantError
+from cosim.plant.archive import UnpackedFmu
+from fmus import BuildError
+from fmus.build import platforms_of, present
+from fmus.model import C_IDENTIFIER
+
+# FMI 2.0's names are for x86, but exporters on ARM use them as well.
+_FALLBACKS = {"aarch64-linux": "linux64", "aarch64-darwin": "darwin64"}
+
+
+def library_path(fmu: UnpackedFmu) -> Path:
+    """The library to load; raises PlantError that says why there is none.
+
+    `modelIdentifier` must be a C identifier, the library an entry of the archive, and made for
+    this platform by its own first bytes.
+    """
+    identifier = str(fmu.description.coSimulation.modelIdentifier)
+    if not C_IDENTIFIER.fullmatch(identifier):
+        raise PlantError(
+            f"FMU '{fmu.path}' is refused: modelIdentifier {identifier!r} is not a C identifier"
+        )
+    wanted, folders = _wanted(str(fmu.description.fmiVersion))
+    others = []
+    for folder in folders:
+        entry = f"binaries/{folder}/{identifier}{fmpy.sharedLibraryExtension}"
+        if entry not in fmu.entries:
+            continue
+        path = fmu.folder / entry
+        if not path.resolve().is_relative_to(fmu.folder.resolve()):
+            raise PlantError(f"FMU '{fmu.path}' is refused: '{entry}' leads outside its folder")
+        made_for = platforms_of(path.read_bytes())
+        if wanted in made_for:
+            return path
+        what = f"made for {' and '.join(made_for)}" if made_for else "not a shared library"
+        others.append(f"its '{entry}' is {what}")
+    raise PlantError(
+        f"FMU '{fmu.path}' has no binary for {wanted} ({'; '.join(others) or _found(fmu)}); build "
+        "one from its sources, the shipped FMU's by `cosim fmu build --out DIR` with a C "
+        "compiler, and name that file"
+    )
+
+
+def _wanted(version: str) -> tuple[str, list[str]]:
+    """This platform's tuple, and the folders that its library may lie in, the best first."""
+    try:
+        platform = present()
+    except BuildError:
+        return str(fmpy.platform_tuple), [str(fmpy.platform_tuple), str(fmpy.platform)]
+    folders = [platform.folder(version)]
+    if version.startswith("2") and platform.tuple in _FALLBACKS:
+        folders.append(_FALLBACKS[platform.tuple])
+    return platform.tuple, folders
+
+
+def _found(fmu: UnpackedFmu) -> str:
+    folders = {name.split("/")[1] for name in fmu.entries if name.startswith("binaries/")}
+    return f"it has: {', '.join(sorted(folders)) or 'none'}"
+
+
+OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
+ACCEPTED = frozenset((OK, WARNING))
+_STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
+
+# fmpy changes the working directory while it loads a library.
+construction_lock = threading.Lock()
+_alive: Counter[str] = Counter()
+
+
+@dataclass(frozen=True)
+class StartValue:
+    """A start value to write at every reset: value reference and FMI type of its variable."""
+
+    reference: int
+    type: str
+    value: float
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """Value references of what a plant exchanges with its FMU."""
+
+    inputs: Sequence[int]
+    outputs: Sequence[int]
+    states: Sequence[int]
+    starts: Sequence[StartValue]
+
+
+class Instance:
+    """One co-simulation instance, called through raw function pointers and fixed buffers.
+
+    The pointers carry no argument types: ctypes then passes the ready-made C objects through,
+    at half the cost of a checked call. `inputs`, `outputs` and `states` are the buffers, each
+    with a NumPy view of the same memory (`…_view`).
+    """
+
+    prefix: ClassVar[str]
+    real: ClassVar[str]
+    state_suffix: ClassVar[str]
+    setters: ClassVar[dict[str, tuple[str, Any]]]
+
+    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
+        self.fmu = fmu
+        self.messages: deque[str] = deque(maxlen=8)
+        interface = fmu.description.coSimulation
+        self._can_save = bool(interface.canGetAndSetFMUstate)
+        self._can_serialise = bool(interface.canSerializeFMUstate)
+        self.fatal = False
+        if interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
+            raise CapabilityError(
+                f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
+            )
+        self._slave = self._load()
+        _alive[fmu.sha256] += 1
+        self._component = ctypes.c_void_p(self._slave.component)
+        self._free_instance = self._slave.dll[f"{self.prefix}FreeInstance"]
+        self._free_instance.restype = None
+        self._step_size = ctypes.c_double(step_size)
+        self._time = ctypes.c_double(0.0)
+        self.inputs, _, self._set_inputs = self._exchange(wiring.inputs)
+        self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs)
+        self.states, self.states_view, self._get_states = self._exchange(wiring.states)
+        self._starts: list[tuple[str, Any, tuple[Any, ...]]] = []
+        self._slots: dict[tuple[str, int], tuple[Any, int]] = {}
+        for kind in dict.fromkeys(start.type for start in wiring.starts):
+            self._add_starts([start for start in wiring.starts if start.type == kind])
+
+    def _load(self) -> Any:
+        library = str(library_path(self.fmu).resolve())
+        with construction_lock:
+            folder = Path.cwd()
+            try:
+                return self._instantiate(library)
+            # fmpy raises bare Exception when the library does not load or instantiate.
+            except Exception as error:
+                raise PlantError(
+                    f"FMU '{self.fmu.path}' cannot be instantiated: {error}{self._log()}"
+                ) from None
+            finally:
+                os.chdir(folder)
+
+    def initialise(self, started: bool) -> None:
+        """Reset (if started before), write the start values, initialise and read the states."""
+        raise NotImplementedError
+
+    def advance(self, time: float) -> None:
+        """Write the inputs, read the outputs at `time`, step, and read the states after it."""
+        raise NotImplementedError
+
+    def _instantiate(self, library: str) -> Any:
+        raise NotImplementedError
+
+    def _function(self, name: str) -> Any:
+        """A function pointer of our own, free of the argument types that fmpy attaches."""
+        pointer = self._slave.dll[self.prefix + name]
+        pointer.restype = ctypes.c_int
+        return pointer
+
+    def _exchange(
+        self, references: Sequence[int]
+    ) -> tuple[Any, NDArray[np.float64], tuple[Any, ...]]:
+        buffer = (ctypes.c_double * len(references))()
+        view: NDArray[np.float64] = np.frombuffer(memoryview(buffer), dtype=np.float64)
+        return buffer, view, self._arguments(references, buffer)
+
+    def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
+        raise NotImplementedError
+
+    def _add_starts(self, starts: list[StartValue]) -> None:
+        suffix, ctype = self.setters[starts[0].type]
+        convert = float if ctype in (ctypes.c_double, ctypes.c_float) else int
+        buffer = (ctype * len(starts))(*(convert(start.value) for start in starts))
+        arguments = self._arguments([start.reference for start in starts], buffer)
+        name = f"Set{suffix}"
+        self._starts.append((name, self._function(name), arguments))
+        # FMI 2 counts value references anew for each type.
+        self._slots |= {(s.type, s.reference): (buffer, i) for i, s in enumerate(starts)}
+
+    def change_start(self, type_: str, reference: int, value: float) -> None:
+        """Replace the start value of a variable, by type and reference, for the next reset."""
+        buffer, index = self._slots[type_, reference]
+        buffer[index] = value
+
+    def _write_starts(self) -> None:
+        for name, function, arguments in self._starts:
+            if (status := function(*arguments)) not in ACCEPTED:
+                self.fail(name, status)
+
+    def save(self, handle: ctypes.c_void_p) -> None:
+        """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
+        if not self._can_save:
+            self._lacks("save and restore its state", "canGetAndSetFMUstate")
+        if (status := self._get_state(self._component, ctypes.byref(handle))) not in ACCEPTED:
+            self.fail(f"Get{self.state_suffix}", status)
+
+    def load(self, handle: ctypes.c_void_p) -> None:
+        """Set the FMU's state from a handle and read the plant's states."""
+        if (status := self._set_state(self._component, handle)) not in ACCEPTED:
+            self.fail(f"Set{self.state_suffix}", status)
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
+            self.fail("Get", status)
+
+    def free(self, handle: ctypes.c_void_p) -> None:
+        """Free a handle's memory."""
+        if handle.value is not None and not self.fatal:
+            self._free_state(self._component, ctypes.byref(handle))
+
+    def serialise(self, handle: ctypes.c_void_p) -> bytes:
+        """Return a saved state as bytes that any instance of this FMU can read."""
+        if not self._can_serialise:
+            self._lacks("serialise its state", "canSerializeFMUstate")
+        size = ctypes.c_size_t()
+        name = f"Serialized{self.state_suffix}Size"
+        if (
+            status := self._function(name)(self._component, handle, ctypes.byref(size))
+        ) not in ACCEPTED:
+            self.fail(name, status)
+        buffer = ctypes.create_string_buffer(size.value)
+        name = f"Serialize{self.state_suffix}"
+        if (status := self._function(name)(self._component, handle, buffer, size)) not in ACCEPTED:
+            self.fail(name, status)
+        return buffer.raw
+
+    def deserialise(self, data: bytes, handle: ctypes.c_void_p) -> None:
+        """Fill a handle from bytes; raises PlantError if the FMU refuses them."""
+        if not self._can_serialise:
+            self._lacks("serialise its state", "canSerializeFMUstate")
+        buffer = ctypes.create_string_buffer(data, len(data))
+        size = ctypes.c_size_t(len(data))
+        name = self._deserialise_name
+        pointer = ctypes.byref(handle)
+        if (status := self._function(name)(self._component, buffer, size, pointer)) not in ACCEPTED:
+            self.fail(name, status)
+
+    _deserialise_name: ClassVar[str]
+
+    def _bind(self, setter: str) -> None:
+        self._set_values = self._function(f"Set{setter}")
+        self._get_values = self._function(f"Get{setter}")
+        self._do_step = self._function("DoStep")
+        if self._can_save:
+            self._get_state = self._function(f"Get{self.state_suffix}")
+            self._set_state = self._function(f"Set{self.state_suffix}")
+            self._free_state = self._function(f"Free{self.state_suffix}")
+
+    def _lacks(self, ability: str, flag: str) -> None:
+        raise CapabilityError(
+            f"FMU '{self.fmu.path}' cannot {ability}: its model description lacks {flag}"
+        )
+
+    def fail(self, function: str, status: int) -> None:
+        """Raise PlantError for a failed call, with what the FMU logged about it."""
+        self.fatal |= status == FATAL
+        label = _STATUS.get(status, f"status {status}, which FMI does not have")
+        raise PlantError(
+            f"FMU '{self.fmu.path.name}': {self.prefix}{function} returned {label}{self._log()}"
+        )
+
+    def _log(self) -> str:
+        text = "; ".join(dict.fromkeys(self.messages))
+        self.messages.clear()
+        return f": {text}" if text else ""
+
+    def close(self) -> None:
+        """Free the instance; after a fatal error FMI forbids every call, this one too.
+
+        The library stays loaded, as fmpy would not leave it: the FMU may have started threads.
+        """
+        _alive[self.fmu.sha256] -= 1
+        if not self.fatal:
+            self._free_instance(self._component)
+
+
+_numbers = itertools.count()
+_logs: WeakValueDictionary[bytes, deque[str]] = WeakValueDictionary()
+
+
+def _log(_: Any, instance: bytes, status: int, category: bytes, message: bytes) -> None:
+    text = message.decode("utf-8", "replace")
+    if (log := _logs.get(instance)) is not None:
+        log.append(text)
+    elif status > WARNING:
+        print(f"{instance.decode('utf-8', 'replace')}: {text}", file=sys.stderr)
+
+
+# fmpy's proxy, which formats the variadic message, knows one Python logger per process.
+_callbacks = fmi2CallbackFunctions()
+_callbacks.logger = fmi2CallbackLoggerTYPE(_log)
+_callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
+_callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
+addLoggerProxy(ctypes.byref(_callbacks))
+
+_FALSE = ctypes.c_int(0)
+_ZERO = ctypes.c_double(0.0)
+
+
+class Fmi2Instance(Instance):
+    """An FMI 2.0 co-simulation instance."""
+
+    prefix = "fmi2"
+    state_suffix = "FMUstate"
+    _deserialise_name = "DeSerializeFMUstate"
+    real = "Real"
+    setters: ClassVar[dict[str, tuple[str, Any]]] = {
+        "Real": ("Real", ctypes.c_double),
+        "Integer": ("Integer", ctypes.c_int),
+        "Enumeration": ("Integer", ctypes.c_int),
+        "Boolean": ("Boolean", ctypes.c_int),
+    }
+
+    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
+        super().__init__(fmu, wiring, step_size)
+        self._bind("Real")
+        self._reset = self._function("Reset")
+        self._setup = self._function("SetupExperiment")
+        self._enter = self._function("EnterInitializationMode")
+        self._exit = self._function("ExitInitializationMode")
+
+    def _instantiate(self, library: str) -> FMU2Slave:
+        name = f"cosim-{next(_numbers)}"
+        _logs[name.encode()] = self.messages
+        slave = FMU2Slave(
+            guid=self.fmu.description.guid,
+            modelIdentifier=self.fmu.description.coSimulation.modelIdentifier,
+            unzipDirectory=str(self.fmu.folder),
+            libraryPath=library,
+            instanceName=name,
+        )
+        slave.instantiate(callbacks=_callbacks, loggingOn=True)
+        return slave
+
+    def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
+        count = len(references)
+        pointers = (ctypes.c_uint * count)(*references)
+        return (self._component, pointers, ctypes.c_size_t(count), values)
+
+    def initialise(self, started: bool) -> None:
+        """Reset (if started before), write the start values, initialise and read the states."""
+        component = self._component
+        if started and (status := self._reset(component)) not in ACCEPTED:
+            self.fail("Reset", status)
+        self._write_starts()
+        if (status := self._setup(component, _FALSE, _ZERO, _ZERO, _FALSE, _ZERO)) not in ACCEPTED:
+            self.fail("SetupExperiment", status)
+        if (status := self._enter(component)) not in ACCEPTED:
+            self.fail("EnterInitializationMode", status)
+        if (status := self._exit(component)) not in ACCEPTED:
+            self.fail("ExitInitializationMode", status)
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
+            self.fail("GetReal", status)
+
+    def advance(self, time: float) -> None:
+        """Write the inputs, read the outputs at `time`, step, and read the states after it."""
+        self._time.value = time
+        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
+            self.fail("SetReal", status)
+        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
+            self.fail("GetReal", status)
+        # The last argument is false: a snapshot may take the FMU back before this step.
+        if (
+            status := self._do_step(self._component, self._time, self._step_size, _FALSE)
+        ) not in ACCEPTED:
+            self.fail("DoStep", status)
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
+            self.fail("GetReal", status)
+
+
+_NO = ctypes.c_bool(False)
+
+
+class Fmi3Instance(Instance):
+    """An FMI 3.0 co-simulation instance, without event mode and early return."""
+
+    prefix = "fmi3"
+    state_suffix = "FMUState"
+    _deserialise_name = "DeserializeFMUState"
+    real = "Float64"
+    setters: ClassVar[dict[str, tuple[str, Any]]] = {
+        "Float64": ("Float64", ctypes.c_double),
+        "Float32": ("Float32", ctypes.c_float),
+        "Int8": ("Int8", ctypes.c_int8),
+        "UInt8": ("UInt8", ctypes.c_uint8),
+        "Int16": ("Int16", ctypes.c_int16),
+        "UInt16": ("UInt16", ctypes.c_uint16),
+        "Int32": ("Int32", ctypes.c_int32),
+        "UInt32": ("UInt32", ctypes.c_uint32),
+        "Int64": ("Int64", ctypes.c_int64),
+        "UInt64": ("UInt64", ctypes.c_uint64),
+        "Enumeration": ("Int64", ctypes.c_int64),
+        "Boolean": ("Boolean", ctypes.c_bool),
+    }
+
+    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
+        super().__init__(fmu, wiring, step_size)
+        self._bind("Float64")
+        self._reset = self._function("Reset")
+        self._enter = self._function("EnterInitializationMode")
+        self._exit = self._function("ExitInitializationMode")
+        self._event = ctypes.c_bool()
+        self._terminate = ctypes.c_bool()
+        self._early = ctypes.c_bool()
+        self._last_time = ctypes.c_double()
+        self._step_arguments = (
+            self._component,
+            self._time,
+            self._step_size,
+            _NO,  # a snapshot may take the FMU back before this step
+            ctypes.byref(self._event),
+            ctypes.byref(self._terminate),
+            ctypes.byref(self._early),
+            ctypes.byref(self._last_time),
+        )
+
+    def _instantiate(self, library: str) -> FMU3Slave:
+        slave = FMU3Slave(
+            guid=self.fmu.description.guid,
+            modelIdentifier=self.fmu.description.coSimulation.modelIdentifier,
+            unzipDirectory=str(self.fmu.folder),
+            libraryPath=library,
+        )
+        messages = self.messages
+
+        def log(_: Any, status: int, category: bytes, message: bytes) -> None:
+            messages.append(message.decode("utf-8", "replace"))
+
+        slave.instantiate(loggingOn=True, logMessage=log)
+        return slave
+
+    def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
+        count = ctypes.c_size_t(len(references))
+        pointers = (ctypes.c_uint * len(references))(*references)
+        return (self._component, pointers, count, values, count)
+
+    def initialise(self, started: bool) -> None:
+        """Reset (if started before), write the start values, initialise and read the states."""
+        component = self._component
+        if started and (status := self._reset(component)) not in ACCEPTED:
+            self.fail("Reset", status)
+        self._write_starts()
+        if (status := self._enter(component, _NO, _ZERO, _ZERO, _NO, _ZERO)) not in ACCEPTED:
+            self.fail("EnterInitializationMode", status)
+        if (status := self._exit(component)) not in ACCEPTED:
+            self.fail("ExitInitializationMode", status)
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
+            self.fail("GetFloat64", status)
+
+    def advance(self, time: float) -> None:
+        """Write the inputs, read the outputs at `time`, step, and read the states after it."""
+        self._time.value = time
+        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
+            self.fail("SetFloat64", status)
+        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
+            self.fail("GetFloat64", status)
+        if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
+            self.fail("DoStep", status)
+        if self._terminate.value or self._early.value:
+            self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
+            self.fail("DoStep", DISCARD)
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
+            self.fail("GetFloat64", status)

@@ -1,49 +1,82 @@
-"""Compares two runs sample by sample, each signal within a tolerance in its own unit."""
+"""Compares two runs sample by sample: names, units, order, and each value within a tolerance."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cosim.errors import ComparisonError
-from cosim.trajectory import Signal
+from cosim.errors import ComparisonError, ScenarioError
+from cosim.protocols import Array
+from cosim.scenario import Scenario
+from cosim.signals import clocked
+from cosim.trajectory import Signal, read_signals
 from cosim.validation import suggestion
 
-Array = NDArray[np.float64]
 # Itself an error, of the size of rounding: no share of it is a tolerance.
 _ERROR = "residual"
-STEMS = ("trajectory", "run")
-"""Names of a run's files that say nothing of the run."""
 
 
 @dataclass(frozen=True)
 class RunSignals:
     """A run's `signals` by name, all of K samples, and the status of each ([] if not known).
 
-    `name` is where it was read, `label` what figures call it; `bounds` are (lower, upper) of the
-    signals that have any, as far as the run says.
+    `name` is where it was read; `bounds` are (lower, upper) of the signals whose bounds are known;
+    `ordered` says that the order of the signals is that of a file's columns.
     """
 
     name: str
     signals: Mapping[str, Signal]
     status: Sequence[str] = ()
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    ordered: bool = True
 
     @property
     def label(self) -> str:
-        """The run's folder, or the file where it has another name than a folder's."""
+        """The run's folder, or the file where its name says more than `trajectory` or `run`."""
         path = Path(self.name)
-        return path.parent.name or path.stem if path.stem in STEMS else path.stem
+        return path.parent.name or path.stem if path.stem in ("trajectory", "run") else path.stem
 
     def __len__(self) -> int:
         """Return the number of samples K."""
         return max((len(signal.values) for signal in self.signals.values()), default=0)
+
+
+def load_run(path: str | Path) -> RunSignals:
+    """Load a run from a folder that holds trajectory.csv, from such a CSV, or from a `.rrd` file.
+
+    Raises
+    ------
+    ComparisonError : no run there; TrajectoryError, RecordingError : not readable.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "trajectory.csv"
+    if not path.is_file():
+        raise ComparisonError(f"there is no run at '{path}'; give a run's folder, CSV or .rrd")
+    if path.suffix != ".rrd":
+        return RunSignals(str(path), *read_signals(path), _bounds(path.parent / "scenario.toml"))
+    from cosim.recording.read import read_recording  # noqa: PLC0415 - half a second, for .rrd only
+
+    recording = read_recording(path)
+    signals = {
+        name: Signal(name, recording.units[name], values)
+        for name, values in recording.signals.items()
+        if values.ndim == 1 and name not in clocked()
+    }
+    return RunSignals(str(path), signals, recording.status, ordered=False)
+
+
+def _bounds(path: Path) -> dict[str, tuple[float, float]]:
+    """Bounds of states and actions by name; none where no readable scenario lies beside a run."""
+    try:
+        return Scenario.load(path).limits if path.is_file() else {}
+    except ScenarioError:
+        return {}
 
 
 @dataclass(frozen=True)
@@ -52,11 +85,12 @@ class Difference:
 
     `maximum` is max |a − b| (infinite where only one is NaN) at sample `at`, with the values `a`
     and `b` there; `first` is the first sample with |a − b| > `tolerance`, None if there is none.
+    Without a tolerance, None, `first` is the first sample whose bits differ.
     """
 
     name: str
     unit: str
-    tolerance: float
+    tolerance: float | None
     maximum: float
     at: int
     a: float
@@ -65,37 +99,38 @@ class Difference:
 
     def text(self) -> str:
         """Largest difference and tolerance, with units and both values."""
+        beyond = "" if self.tolerance is None else f", tolerance {self._shown(self.tolerance)}"
         return (
-            f"{self.name} differs by up to {_with_unit(self.maximum, self.unit)} "
-            f"(sample {self.at}: {self.a!r} against {self.b!r}), "
-            f"tolerance {_with_unit(self.tolerance, self.unit)}"
+            f"{self.name} differs by up to {self._shown(self.maximum)} "
+            f"(sample {self.at}: {self.a!r} against {self.b!r}){beyond}"
         )
+
+    def _shown(self, value: float) -> str:
+        return f"{value:.6g} {self.unit}".rstrip() if self.unit != "1" else f"{value:.6g}"
 
 
 @dataclass(frozen=True)
 class Comparison:
     """The `differences` by signal, and what else sets two runs apart.
 
-    `samples` are the two lengths; `only_a` and `only_b` signals that one run has; `status` is the
-    first sample whose status differs, None if there is none; `times` (K,) in s are those of A.
+    `samples` are the two lengths; `only_a` and `only_b` signals that one run has; `units` those
+    whose units differ, with both; `order` the first position at which files order their signals
+    differently; `status` the first sample whose status differs; `times` (K,) in s are those of A.
     """
 
     samples: tuple[int, int]
     differences: Sequence[Difference]
     only_a: Sequence[str] = ()
     only_b: Sequence[str] = ()
+    units: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    order: int | None = None
     status: int | None = None
     times: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def equal(self) -> bool:
         """Whether the runs have the same samples, signals and status, all within tolerance."""
-        return (
-            self.first is None
-            and not self.only_a
-            and not self.only_b
-            and len(set(self.samples)) == 1
-        )
+        return not self.lines()
 
     @property
     def first(self) -> int | None:
@@ -104,7 +139,7 @@ class Comparison:
         return min((*steps, *([] if self.status is None else [self.status])), default=None)
 
     def lines(self) -> list[str]:
-        """What differs, in words: the first difference, then what is missing; [] if nothing."""
+        """What differs, in words: the first difference, then names, units and order."""
         text = []
         if (step := self.first) is not None:
             at = f" (time {self.times[step]:g} s)" if len(self.times) > step else ""
@@ -116,6 +151,9 @@ class Comparison:
         for missing, side in ((self.only_a, "first"), (self.only_b, "second")):
             if missing:
                 text.append(f"only the {side} has {', '.join(missing)}")
+        text += [f"{name} is in '{a}' against '{b}'" for name, (a, b) in self.units.items()]
+        if self.order is not None:
+            text.append(f"the columns stand in another order from column {self.order + 1} on")
         return text
 
 
@@ -129,8 +167,8 @@ def compare(
     """Compare two runs; two NaN are equal.
 
     A signal's tolerance is `tolerances[name]`, in its unit, else `relative` times its largest
-    magnitude in A; without either every bit counts. The solver's `residual` is left out of
-    `relative`: it counts with a tolerance of its own, or to the bit.
+    magnitude in A; without either every bit counts, so that −0.0 is not 0.0. The solver's
+    `residual` is left out of `relative`: it counts with a tolerance of its own, or to the bit.
 
     Raises
     ------
@@ -151,42 +189,50 @@ def compare(
     both = [name for name in a.signals if name in b.signals]
     differences = []
     for name in both:
-        values = a.signals[name].values
-        finite = np.abs(values[np.isfinite(values)])
-        share = np.inf if name == _ERROR and relative else relative * finite.max(initial=0.0)
-        tolerance = float(tolerances.get(name, share))
+        tolerance = tolerances.get(name)
+        if tolerance is None and relative:
+            values = a.signals[name].values
+            largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
+            tolerance = inf if name == _ERROR else float(relative * largest)
         differences.append(_difference(a.signals[name], b.signals[name], tolerance))
     time = a.signals.get("time")
+    order = [name for name in b.signals if name in a.signals] if a.ordered and b.ordered else both
     return Comparison(
         samples=(len(a), len(b)),
         differences=differences,
         only_a=[name for name in a.signals if name not in b.signals],
         only_b=[name for name in b.signals if name not in a.signals],
+        units={
+            name: units
+            for name in both
+            if len(set(units := (a.signals[name].unit, b.signals[name].unit))) > 1
+        },
+        order=_first([x != y for x, y in zip(both, order, strict=True)]),
         status=_first([x != y for x, y in zip(a.status, b.status, strict=False)]),
         times=np.empty(0) if time is None else time.values,
     )
 
 
-def _difference(a: Signal, b: Signal, tolerance: float) -> Difference:
+def _difference(a: Signal, b: Signal, tolerance: float | None) -> Difference:
     common = min(len(a.values), len(b.values))
     x, y = a.values[:common], b.values[:common]
     with np.errstate(invalid="ignore"):
         distance = np.abs(x - y)
-    same = (x == y) | (np.isnan(x) & np.isnan(y))
-    distance = np.where(same, 0.0, np.where(np.isnan(distance), np.inf, distance))
-    at = int(np.argmax(distance)) if common else 0
+    missing = np.isnan(x) & np.isnan(y)
+    distance = np.where((x == y) | missing, 0.0, np.where(np.isnan(distance), inf, distance))
+    if tolerance is None:
+        beyond = (x.view(np.int64) != y.view(np.int64)) & ~missing
+    else:
+        beyond = distance > tolerance
+    first = _first(beyond)
+    at = int(np.argmax(distance)) if common and distance.max() > 0 else first or 0
     here = (float(x[at]), float(y[at]), float(distance[at])) if common else (np.nan, np.nan, 0.0)
-    first = _first(distance > tolerance)
     return Difference(a.name, a.unit, tolerance, here[2], at, here[0], here[1], first)
 
 
-def _first(differs: Sequence[bool] | NDArray[np.bool_]) -> int | None:
+def _first(differs: Sequence[bool] | np.ndarray) -> int | None:
     rows = np.flatnonzero(differs)
     return int(rows[0]) if rows.size else None
-
-
-def _with_unit(value: float, unit: str) -> str:
-    return f"{value:.6g} {unit}".rstrip() if unit != "1" else f"{value:.6g}"
 
 
 def as_document(comparison: Comparison) -> dict[str, Any]:
@@ -197,14 +243,13 @@ def as_document(comparison: Comparison) -> dict[str, Any]:
         "samples": list(comparison.samples),
         "only_first": list(comparison.only_a),
         "only_second": list(comparison.only_b),
-        "signals": {
-            d.name: {
-                "unit": d.unit,
-                "maximum": d.maximum,
-                "at": d.at,
-                "tolerance": d.tolerance,
-                "first": d.first,
-            }
-            for d in comparison.differences
-        },
+        "units": {name: list(units) for name, units in comparison.units.items()},
+        "order": comparison.order,
+        "signals": {d.name: _row(d) for d in comparison.differences},
+    }
+
+
+def _row(difference: Difference) -> dict[str, Any]:
+    return {
+        key: value for key, value in asdict(difference).items() if key not in ("name", "a", "b")
     }

@@ -192,5 +192,7 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
     signals = {}
     for title, column in zip(header, values.T, strict=False):
         name, _, unit = title.partition(" [")
+        if name in signals:
+            raise TrajectoryError(f"'{path}' has two columns '{name}'")
         signals[name] = Signal(name, unit.removesuffix("]"), column.copy())
     return signals, [row[-1] for row in body]

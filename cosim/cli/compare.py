@@ -41,14 +41,16 @@ def compare(
     """
     with output(json) as out_:
         from cosim import comparison
-        from cosim.stored_run import load_run
 
-        runs = load_run(a), load_run(b)
+        runs = comparison.load_run(a), comparison.load_run(b)
         result = comparison.compare(*runs, _tolerances(tolerance or []), relative=relative)
+        found = result.lines() or ["no signal differs by more than its tolerance"]
         if record is not None:
-            from cosim.recording import record_comparison
+            from cosim.recording import record_overlay
 
-            record_comparison(record, *runs, result)
+            about = "\n".join(["# A against B", "", *(f"- {text}" for text in found)])
+            sides = (f"{side}: {run.label}" for side, run in zip("AB", runs, strict=True))
+            record_overlay(record, dict(zip(sides, runs, strict=True)), about)
             out_.note(f"both runs are overlaid in {record.resolve()}")
         rows = [
             (
@@ -56,14 +58,14 @@ def compare(
                 d.unit,
                 f"{d.maximum:.6g}",
                 str(d.at) if d.maximum > 0 else "",
-                f"{d.tolerance:.6g}",
+                "every bit" if d.tolerance is None else f"{d.tolerance:.6g}",
                 "" if d.first is None else str(d.first),
             )
             for d in result.differences
         ]
         header = ("signal", "unit", "largest difference", "at sample", "tolerance", "first beyond")
         out_.table(f"{a} against {b}, {min(result.samples)} samples", header, rows)
-        out_.note("\n".join(result.lines()) or "no signal differs by more than its tolerance")
+        out_.note("\n".join(found))
         out_.json(comparison.as_document(result))
     if not result.equal:
         raise typer.Exit(DIFFERENT)

@@ -37,7 +37,7 @@ def demo(
 
     The condenser of the evaporator is fouled and no controller is told. Writes demo.csv,
     before-after.png, demo.rrd, summary.json, and of the training learning.csv, learning.png,
-    parameters.toml and scenario.toml.
+    training.rrd, parameters.toml and scenario.toml.
     """
     with output(json) as out_:
         from cosim.figures import overlay_figure, save
@@ -56,7 +56,7 @@ def demo(
         shown = {name: runs[name][0] for name in ("naive", LEARNT, OPTIMAL)}
         save(overlay_figure(shown), folder / "before-after.png")
         learnt.save(folder)
-        _record(folder / "demo.rrd", shown, learnt, rows)
+        _record(folder, shown, learnt, rows)
         write_atomically(folder / "demo.csv", _csv(rows))
         summary: dict[str, Any] = {
             "scenario": scenario.name,
@@ -198,17 +198,13 @@ def _csv(rows: list[dict[str, Any]]) -> str:
 
 
 def _record(
-    path: Path, runs: Mapping[str, Trajectory], learnt: Training, rows: list[dict[str, Any]]
+    folder: Path, runs: Mapping[str, Trajectory], learnt: Training, rows: list[dict[str, Any]]
 ) -> None:
-    from cosim.recording.showcase import TrainingHistory, record_showcase
+    from cosim.cli.train import record_training
+    from cosim.comparison import RunSignals
+    from cosim.recording import record_overlay
 
-    log, blocks = learnt.log(), learnt.parameters.blocks
-    history = TrainingHistory(
-        samples=log["samples"],
-        curves={"regret %": 100 * log["regret"], "J of the training samples": log["J"]},
-        theta=learnt.theta(),
-        labels={name: tuple(blocks.labels[where]) for name, where in blocks.slices.items()},
-    )
+    scenario = learnt.run.scenario
     lines = [
         f"| {row['controller']} | {row['J']:.1f} | {100 * row['regret']:.2f} | "
         f"{100 * row['violating_share']:.1f} |"
@@ -216,13 +212,18 @@ def _record(
     ]
     about = "\n".join(
         [
-            f"# {learnt.run.algorithm} on {learnt.run.scenario.name}",
+            f"# {learnt.run.algorithm} on {scenario.name}",
             "",
-            learnt.run.scenario.description,
+            scenario.description,
             "",
             "| controller | J | regret % | violating % |",
             "|---|---|---|---|",
             *lines,
         ]
     )
-    record_showcase(path, runs, history, about)
+    signals = {
+        name: RunSignals(name, run.signals, run.status, scenario.limits)
+        for name, run in runs.items()
+    }
+    record_overlay(folder / "demo.rrd", signals, about)
+    record_training(folder / "training.rrd", learnt)

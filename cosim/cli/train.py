@@ -196,11 +196,6 @@ def _execute(
     from learning.training import carry_out
     from learning.training_loop import CHECKPOINT
 
-    recorder: Any = None
-    if record:
-        from cosim.recording import TrainingRecorder
-
-        recorder = TrainingRecorder(folder / "training.rrd")
     announce(run.scenario, output)
     checkpoint = folder / CHECKPOINT
 
@@ -214,12 +209,35 @@ def _execute(
             out=folder,
             resume=resume,
             optimum=optimum,
-            recorder=recorder,
             progress=_remark(progress),
         )
+    if record:
+        record_training(folder / "training.rrd", training)
     if reason := training.result.without_checkpoint:
         output.note(f"left no checkpoint, --resume is not possible: {reason}")
     return training
+
+
+def record_training(path: Path, training: Training) -> None:
+    """Write a Rerun recording of a training."""
+    from cosim import recording
+
+    run, blocks = training.run, training.parameters.blocks
+    recording.record_training(
+        path,
+        f"{run.algorithm} on {run.scenario.name}",
+        training.log(),
+        training.theta(),
+        {name: blocks.labels[where] for name, where in blocks.slices.items()},
+        {
+            "algorithm": run.algorithm,
+            "scenario": run.scenario.name,
+            "scenario_hash": run.scenario.hash,
+            "samples": run.samples,
+            "seed": run.seed,
+            **run.configuration.model_dump(mode="json"),
+        },
+    )
 
 
 def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:

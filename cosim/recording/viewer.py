@@ -17,7 +17,7 @@ from rerun.experimental import ViewerClient
 from cosim.errors import RecordingError
 from cosim.files import write_atomically
 from cosim.guarded import end_guarded, start_guarded
-from cosim.recording.moment import telling_moment
+from cosim.recording.read import telling_moment
 from cosim.recording.stream import SAMPLE, TIME
 
 LOOPBACK = "127.0.0.1"

@@ -29,17 +29,18 @@ def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_pat
         "parameters.toml",
         "scenario.toml",
         "summary.json",
+        "training.rrd",
     }
-    for name in names - {"demo.rrd"}:
+    for name in names - {"demo.rrd", "training.rrd"}:
         assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes(), name
 
 
 def test_the_recording_of_a_run_holds_the_csvs_bits(cosim, tmp_path, paper):
-    from cosim.recording import read_signals
+    from cosim.recording import read_recording
     from cosim.trajectory import read_csv
 
     assert cosim("simulate", "--steps", 40, "--out", "r", "--record")[0] == 0
-    recorded = read_signals(tmp_path / "r" / "run.rrd")
+    recorded = read_recording(tmp_path / "r" / "run.rrd").signals
     trajectory = read_csv(tmp_path / "r" / "trajectory.csv", paper)
     common = [name for name in trajectory.signals if name in recorded]
     assert {"X2", "P2", "P100", "F200", "X1", "stage_cost", "penalty"} <= set(common)

@@ -3,11 +3,10 @@ import pytest
 
 import cosim.signals
 from cosim import FmuPlant, simulate
-from cosim.comparison import compare
+from cosim.comparison import compare, load_run
 from cosim.errors import TrajectoryError
 from cosim.recording import RerunRecorder, read_recording
 from cosim.signals import SIGNALS, SignalKind, signal_names
-from cosim.stored_run import load_run
 from cosim.trajectory import read_csv
 from tests.helpers.loop import Failing, Proportional
 

@@ -32,8 +32,6 @@ from numpy.typing import NDArray
 
 from cosim import FmuPlant, Scenario, evaluate
 from cosim.lookup import build_controller
-from cosim.recording import TrainingRecorder
-from cosim.recording.reader import read_recording
 from learning.q_learning import QLearning
 from learning.training_loop import TrainingLoop
 from learning.training_run import TrainingRun
@@ -85,14 +83,10 @@ def endure(
     # asks for when learning no longer pays.
     build_controller("naive", scenario).feedback(scenario.initial_state).policy_jacobian  # noqa: B018
     with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        recorder = TrainingRecorder(folder / "training.rrd") if record else None
-        training = TrainingLoop(run, QLearning, plant, other, out=folder, recorder=recorder)
+        training = TrainingLoop(run, QLearning, plant, other, out=folder)
         look(0, None)
         result = training.go(progress=look)
     held = [row for row in result.rows if row["samples"] % tenth == 0]
-    if record:
-        recording = read_recording(folder / "training.rrd")
-        assert len(recording.samples) == len(result.rows) == 100 * TENTHS
     per_sample = [1e6 * (b - a) / tenth for a, b in pairwise(cpu)]
     per_wall = [1e6 * (b - a) / tenth for a, b in pairwise(wall)]
     return {

@@ -29,7 +29,7 @@ from controllers import Parameters, Problem
 from cosim import Scenario
 from cosim.errors import RecordingError
 from cosim.evaluation.store import FILE
-from cosim.recording.reader import read_recording
+from cosim.recording import read_recording
 from learning.checkpoint import load as load_checkpoint
 from tests.helpers.campaigns import Trial, finish, main, start, trials
 

@@ -18,7 +18,7 @@ from controllers.qp.daqp_backend import DaqpBackend
 from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.cli import locking
 from cosim.errors import RecordingError
-from cosim.recording.reader import read_recording
+from cosim.recording import read_recording
 from tests.faults.kill import JOBS, campaign
 from tests.helpers.command import run_cosim
 from tests.helpers.tank import build_tank, write_scenario

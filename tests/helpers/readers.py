@@ -16,8 +16,7 @@ from cosim.errors import EvaluationError, PlantError, RecordingError, ScenarioEr
 from cosim.evaluation.store import FILE, Store
 from cosim.evaluation.unit import UnitResult
 from cosim.plant.archive import unpack
-from cosim.recording import RerunRecorder
-from cosim.recording.reader import read_recording
+from cosim.recording import RerunRecorder, read_recording
 from cosim.trajectory import read_csv
 from fmus import path as shipped
 from learning.checkpoint import Checkpoint

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+import rerun.blueprint as rrb
 
 from cosim.cli import locking
 from cosim.cli.output import open_folder, output
@@ -116,8 +117,9 @@ def test_a_training_is_neither_overwritten_nor_mixed_unless_asked(tmp_path):
 
 
 def test_two_recordings_of_one_name_do_not_share_a_partial_file(tmp_path):
-    first, second = Stream(tmp_path / "run.rrd", "a"), Stream(tmp_path / "run.rrd", "b")
+    empty = rrb.Blueprint()
+    first, second = (Stream(tmp_path / "run.rrd", name, empty) for name in "ab")
     assert len(list(tmp_path.glob(".run.*.partial.rrd"))) == 2
-    first.close()
-    second.close()
+    first.discard()
+    second.discard()
     assert list(tmp_path.iterdir()) == []

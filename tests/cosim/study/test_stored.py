@@ -7,8 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli.main import app
+from cosim.comparison import load_run
 from cosim.errors import ResultsError
-from cosim.stored_run import load_run
 from cosim.study.check import compared_tables
 from cosim.study.document import read
 from cosim.study.keyed import rounded_csv

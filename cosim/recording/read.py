@@ -19,6 +19,7 @@ from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
 from cosim.errors import RecordingError
+from cosim.penalty import VIOLATING
 from cosim.recording.stream import SAMPLE, SIGNAL, TIME
 
 _SCALARS = rr.Scalars.descriptor_scalars().component
@@ -38,9 +39,9 @@ class Recording:
     """Content of a recording.
 
     `signals` maps a signal's name to its values, (K,) float64, or (K, N) for a prediction
-    (`prediction/<name>`); `samples` (K,) are the numbers of their rows and `time` (K,) the plant's
-    time in s (NaN where there is none); `units` and `properties` are text; `status` (K,) is the
-    solver's status of each sample, empty if it was not recorded.
+    (`prediction/<name>`) and a block of θ (`increment/<block>`); `samples` (K,) are the numbers of
+    their rows and `time` (K,) the plant's time in s (NaN where there is none); `units` and
+    `properties` are text; `status` (K,) is the solver's status, empty if it was not recorded.
     """
 
     signals: dict[str, NDArray[np.float64]]
@@ -49,11 +50,6 @@ class Recording:
     units: dict[str, str]
     properties: dict[str, str]
     status: list[str]
-
-
-def read_signals(path: str | Path) -> dict[str, NDArray[np.float64]]:
-    """Signals of a recording by name; raises RecordingError as `read_recording` does."""
-    return read_recording(path).signals
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -92,6 +88,20 @@ def read_recording(path: str | Path) -> Recording:
     properties.pop("rerun.controls.RowId", None)
     status = _status(rows.get("/solver/status", []), samples)
     return Recording(dict(sorted(signals.items())), samples, time, units, properties, status)
+
+
+def telling_moment(path: str | Path) -> float | None:
+    """Time in s (training: sample) of the worst violation, or of the end; None if unreadable."""
+    try:
+        recording = read_recording(path)
+    except RecordingError:
+        return None
+    if not len(recording.samples):
+        return None
+    where = np.where(np.isfinite(recording.time), recording.time, recording.samples)
+    violation = recording.signals.get("violation", np.zeros(1))
+    violates = np.nanmax(violation, initial=0.0) > VIOLATING
+    return float(where[int(np.nanargmax(violation)) if violates else -1])
 
 
 def summarise(path: str | Path) -> dict[str, Any]:

@@ -1,0 +1,285 @@
+"""What a recording holds, read back: runs, trainings, overlays; files of other kinds."""
+
+import hashlib
+from collections import Counter
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rerun as rr
+from hypothesis import given
+from hypothesis import strategies as st
+from rerun.chunk import RrdReader
+
+from controllers.factories import naive
+from cosim import FmuPlant, simulate
+from cosim.comparison import RunSignals
+from cosim.errors import RecordingError
+from cosim.recording import (
+    RerunRecorder,
+    read_recording,
+    record_overlay,
+    record_training,
+    summarise,
+)
+from cosim.recording.read import telling_moment
+from cosim.recording.stream import Channel, Stream, drawable
+from cosim.trajectory import Signal, read_csv
+from tests.helpers.blocks import random_block
+from tests.helpers.loop import Failing, Proportional
+
+CONTROLLER = SimpleNamespace(name="mine", parameters=SimpleNamespace(hash="0123456789abcdef"))
+numbers = st.floats(-1e6, 1e6)
+
+
+def recorded(path, scenario, blocks, units=None, steps=100):
+    recorder = RerunRecorder(path)
+    recorder.start(scenario, CONTROLLER, 5, steps, units or {})
+    for block in blocks:
+        recorder.record(block)
+    recorder.close()
+    return read_recording(path)
+
+
+def test_signals_equal_the_csv_bit_for_bit(tmp_path, paper):
+    with FmuPlant(paper) as plant:
+        recorder = RerunRecorder(tmp_path / "run.rrd")
+        simulate(plant, naive(paper), 1200, 3, recorder=recorder).write_csv(tmp_path / "run.csv")
+    csv = read_csv(tmp_path / "run.csv", paper)
+    recording = read_recording(tmp_path / "run.rrd")
+    for name, signal in csv.signals.items():
+        assert recording.signals[name].tobytes() == signal.values.tobytes(), name
+        assert recording.units[name] == signal.unit, name
+    assert recording.status == csv.status
+    assert recording.samples.tolist() == list(range(1200))
+    assert np.array_equal(recording.time, csv.time)
+
+
+def test_times_are_those_of_the_loop_and_predictions_those_of_the_controller(
+    tmp_path, paper, rng, units
+):
+    blocks = [random_block(paper, rng, first, 700) for first in range(0, 4900, 700)]
+    recording = recorded(tmp_path / "run.rrd", paper, blocks, units, 4900)
+    for name in ("prepare_time", "feedback_time"):
+        expected = np.concatenate([block[name] for block in blocks])
+        assert recording.signals[name].tobytes() == expected.tobytes()
+    states = np.concatenate([block.predicted_states for block in blocks])
+    actions = np.concatenate([block.predicted_actions for block in blocks])
+    for i, name in enumerate(paper.plant.states):
+        assert np.array_equal(recording.signals[f"prediction/{name}"], states[:, :, i])
+    for i, name in enumerate(paper.plant.actions):
+        assert np.array_equal(recording.signals[f"prediction/{name}"], actions[:, :, i])
+
+
+def test_a_block_that_the_loop_overwrites_is_recorded_as_it_was(tmp_path, paper, rng):
+    block = random_block(paper, rng)
+    before = {name: np.array(values) for name, values in block.columns.items()}
+    predicted = block.predicted_states.copy()
+    recorder = RerunRecorder(tmp_path / "run.rrd")
+    recorder.start(paper, CONTROLLER, 0, 10, {})
+    recorder.record(block)
+    for values in (*block.columns.values(), block.predicted_states):
+        values[:] = 0.0
+    recorder.close()
+    recording = read_recording(tmp_path / "run.rrd")
+    assert np.array_equal(recording.signals["X2"], before["states"][:, 0])
+    assert np.array_equal(recording.signals["violation"], before["violation"])
+    assert np.array_equal(recording.signals["prediction/X2"], predicted[:, :, 0])
+
+
+def test_a_controller_without_predictions_is_recorded(tmp_path, paper, rng):
+    recording = recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng, predicts=False)])
+    assert len(recording.samples) == 10
+    assert not [name for name in recording.signals if name.startswith("prediction/")]
+
+
+def test_status_is_recorded_sample_by_sample(tmp_path, paper):
+    with FmuPlant(paper) as plant:
+        recorder = RerunRecorder(tmp_path / "run.rrd")
+        trajectory = simulate(plant, Failing(paper, [3, 4, 9]), 12, 0, recorder=recorder)
+    assert read_recording(tmp_path / "run.rrd").status == trajectory.status
+
+
+def test_a_run_that_breaks_off_leaves_the_samples_it_made(tmp_path, paper):
+    class Breaking(Proportional):
+        def prepare(self):
+            self.k = getattr(self, "k", -1) + 1
+            if self.k == 700:
+                raise RuntimeError("sensor lost")
+
+    with FmuPlant(paper) as plant, pytest.raises(RuntimeError):
+        simulate(plant, Breaking(paper), 900, 0, recorder=RerunRecorder(tmp_path / "run.rrd"))
+    assert len(read_recording(tmp_path / "run.rrd").samples) == 500
+
+
+def test_properties_say_what_was_run(tmp_path, paper, rng):
+    properties = recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng)]).properties
+    assert properties["scenario_hash"] == paper.hash
+    assert properties["seed"] == "5"
+    assert properties["theta_hash"] == "0123456789abcdef"
+    assert properties["controller"] == "mine"
+
+
+def test_names_and_units_of_any_spelling_come_back(tmp_path, foreign, rng):
+    block = random_block(foreign, rng)
+    units = {"tank[1].level": "m³", "der(x)/dt": "∇"}
+    recording = recorded(tmp_path / "run.rrd", foreign, [block], units)
+    assert np.array_equal(recording.signals["tank[1].level"], block["states"][:, 0])
+    assert np.array_equal(recording.signals["der(x)/dt"], block["actions"][:, 0])
+    assert recording.units["tank[1].level"] == "m³"
+    assert recording.units["der(x)/dt"] == "∇"
+    assert drawable("X2 [kg/min] θ µ °C\n∇水") == "X2 [kg/min] θ µ °C\n??"
+
+
+def test_the_layout_comes_before_the_data(tmp_path, paper, rng):
+    recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng)])
+    reader = RrdReader(tmp_path / "run.rrd")
+    layout, recording = reader.blueprints()[0], reader.recordings()[0]
+    assert layout.application_id == recording.application_id
+    content = (tmp_path / "run.rrd").read_bytes()
+    assert content.find(layout.recording_id.encode()) > 0
+    assert content.find(layout.recording_id.encode()) < content.find(
+        recording.recording_id.encode()
+    )
+
+
+def test_the_file_is_whole_or_not_there(tmp_path, paper, rng):
+    path = tmp_path / "run.rrd"
+    recorder = RerunRecorder(path)
+    recorder.start(paper, CONTROLLER, 0, 10, {})
+    recorder.record(random_block(paper, rng))
+    assert not path.exists()
+    recorder.close()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.rrd"]
+    assert len(RrdReader(path).store()) > 0  # only a file with a footer can be opened so
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    recorder.close()
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == digest
+
+
+def test_a_run_without_a_sample_leaves_no_file(tmp_path, paper):
+    recorder = RerunRecorder(tmp_path / "run.rrd")
+    recorder.start(paper, CONTROLLER, 0, 10, {})
+    recorder.close()
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unwritable_folder_is_refused(tmp_path, paper):
+    with pytest.raises(RecordingError, match=r"none/run\.rrd"):
+        RerunRecorder(tmp_path / "none" / "run.rrd").start(paper, CONTROLLER, 0, 10, {})
+
+
+def test_samples_are_sent_block_by_block(tmp_path, paper, monkeypatch):
+    """A call to Rerun takes 30 µs, whatever it sends: one a sample would double the step."""
+    sent = []
+    columns = Stream.columns
+    monkeypatch.setattr(
+        Stream,
+        "columns",
+        lambda self, entity, *rest: sent.append(entity) or columns(self, entity, *rest),
+    )
+    with FmuPlant(paper) as plant:
+        recorder = RerunRecorder(tmp_path / "run.rrd")
+        simulate(plant, Proportional(paper), 2000, 0, recorder=recorder)
+    assert max(Counter(sent).values()) == 4
+
+
+@given(st.lists(numbers, min_size=1), numbers, st.floats(1e-3, 1e6))
+def test_the_window_holds_all_values_seen(values, lower, width):
+    channel = Channel("x", "x", bounds=(lower, lower + width)).see(np.array(values))
+    low, high = channel.window()
+    assert low < min(values)
+    assert max(values) < high
+
+
+def test_the_window_shows_a_bound_that_is_near_and_not_one_that_is_far():
+    low, high = Channel("x", "x", bounds=(25.0, 100.0)).see(np.array([26.0, 28.0, np.nan])).window()
+    assert low < 25.0
+    assert 28.0 < high < 30.0
+    low, _ = Channel("x", "x", bounds=(25.0, 100.0)).see(np.array([56.0, 58.0])).window()
+    assert low > 50.0
+
+
+def test_a_training_comes_back_as_its_log_and_the_change_of_each_block(tmp_path, rng):
+    moved = rng.normal(size=(150, 6))
+    log = {"samples": 10.0 * np.arange(150), "td_error": rng.random(150)}
+    log["greedy_J"] = np.where(np.arange(150) % 10, np.nan, 7.0)
+    increments = {"b": moved[:, :2], "c": moved[:, 2:3], "B": moved[:, 3:]}
+    labels = {"b": ("b[0]", "b[1]"), "c": ("c",), "B": ("B[0,0]", "B[0,1]", "B[1,1]")}
+    path = tmp_path / "t.rrd"
+    record_training(path, "q on paper", log, increments, labels, {"seed": 9, "gain": 0.3})
+    recording = read_recording(path)
+    assert np.array_equal(recording.signals["increment/b"], moved[:, :2])
+    assert np.array_equal(recording.signals["increment/c"], moved[:, 2])
+    assert np.array_equal(recording.signals["increment/B"], moved[:, 3:])
+    for name, values in log.items():
+        assert np.array_equal(recording.signals[name], values, equal_nan=True)
+    assert recording.samples.tolist() == list(range(0, 1500, 10))
+    assert recording.properties["gain"] == "0.3"
+    assert telling_moment(path) == 1490
+
+
+def run(name, **signals):
+    return RunSignals(name, {key: Signal(key, "kPa", np.array(v)) for key, v in signals.items()})
+
+
+def test_two_runs_are_overlaid_with_their_difference(tmp_path):
+    a = run("a", time=[0.0, 60.0, 120.0], P2=[1.0, 2.0, 3.0], T=[0.0] * 3)
+    b = run("b", time=[0.0, 60.0], P2=[1.0, 2.5])
+    record_overlay(tmp_path / "c.rrd", {"A: a": a, "B: b": b}, "# A against B")
+    signals = read_recording(tmp_path / "c.rrd").signals
+    assert {name: values.tolist() for name, values in signals.items()} == {
+        "A: a/P2": [1.0, 2.0, 3.0],
+        "B: b/P2": [1.0, 2.5],
+        "difference/P2": [0.0, -0.5],
+    }
+
+
+def test_three_runs_are_overlaid_without_differences(tmp_path):
+    runs = {name: run(name, P2=[1.0, 2.0]) for name in "abc"}
+    record_overlay(tmp_path / "c.rrd", runs, "")
+    assert list(read_recording(tmp_path / "c.rrd").signals) == ["a/P2", "b/P2", "c/P2"]
+
+
+def test_the_summary_has_units_and_ranges(tmp_path, paper, rng, units):
+    block = random_block(paper, rng)
+    recorded(tmp_path / "run.rrd", paper, [block], units)
+    summary = summarise(tmp_path / "run.rrd")
+    assert summary["samples"] == 10
+    assert summary["statuses"] == {"solved": 10}
+    assert summary["signals"]["X2"] == {
+        "unit": "%",
+        "minimum": block["states"][:, 0].min(),
+        "maximum": block["states"][:, 0].max(),
+    }
+    assert summary["signals"]["residual"]["minimum"] is None
+
+
+@pytest.mark.parametrize(("violation", "sample"), [(0.0, 9), (1e-9, 9), (0.5, 4)])
+def test_a_run_is_shown_at_its_worst_violation_or_at_its_end(
+    tmp_path, paper, rng, violation, sample
+):
+    block = random_block(paper, rng)
+    block["violation"][:] = 0.0
+    block["violation"][4] = violation
+    recorded(tmp_path / "run.rrd", paper, [block])
+    assert telling_moment(tmp_path / "run.rrd") == pytest.approx(sample * paper.sampling_time)
+
+
+def _text(path):
+    path.write_text("not a recording " * 100)
+
+
+def _foreign(path):
+    stream = rr.RecordingStream("other")
+    stream.save(path)
+    stream.log("a", rr.Scalars(1.0))
+    stream.disconnect()
+
+
+@pytest.mark.parametrize("make", [lambda path: None, _text, _foreign])
+def test_what_is_no_recording_of_ours_is_refused(tmp_path, make):
+    make(tmp_path / "x.rrd")
+    with pytest.raises(RecordingError, match=r"x\.rrd"):
+        read_recording(tmp_path / "x.rrd")
+    assert telling_moment(tmp_path / "x.rrd") is None

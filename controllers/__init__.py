@@ -5,12 +5,10 @@ from typing import TYPE_CHECKING, Any
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
 from controllers.model import Model, Quantity
-from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.rti.prepared import LinearisationPoint
-from controllers.rti.solution import RtiSolution
-from controllers.theta import ThetaBlocks
+from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.theta import Parameters, ThetaBlocks
 
 if TYPE_CHECKING:
     from controllers.optimum import OptimalPolicy

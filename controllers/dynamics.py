@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import casadi as ca
 
 from controllers.problem import Problem
-from controllers.symbolic_theta import SymbolicTheta
-from controllers.theta import ThetaBlocks
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
 def sampled_jacobian(

@@ -11,19 +11,18 @@ from typing import TYPE_CHECKING
 
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError
-from controllers.parameters import Parameters
-from controllers.problem import Problem, ScenarioLike
+from controllers.problem import Problem
 from controllers.rti import IteratedNmpc, RtiNmpc
+from controllers.theta import Parameters
+from cosim.scenario import Scenario
 
 if TYPE_CHECKING:
-    from controllers.dynamic_programming.plant import StochasticScenario
-    from controllers.optimum import OptimalPolicy
-    from controllers.quasi_static import QuasiStaticPolicy
+    from controllers.optimum import OptimalPolicy, QuasiStaticPolicy
 
 # Imported where it is needed: who simulates an RTI-NMPC shall not pay for SciPy and Clarabel.
 
 
-def nmpc(scenario: ScenarioLike, parameters: Parameters, kind: str = "rti") -> RtiNmpc:
+def nmpc(scenario: Scenario, parameters: Parameters, kind: str = "rti") -> RtiNmpc:
     """NMPC for a scenario with given θ, `rti` or `converged`; ControllerError on another `kind`.
 
     The RTI-NMPC solves as many QPs a sample as the scenario says.
@@ -39,28 +38,28 @@ def nmpc(scenario: ScenarioLike, parameters: Parameters, kind: str = "rti") -> R
     )
 
 
-def value_offset(scenario: ScenarioLike, problem: Problem) -> float:
+def value_offset(scenario: Scenario, problem: Problem) -> float:
     """c_λ at the start, as the scenario says: ℓ_s or ℓ_s/(1−γ)."""
     discounted = scenario.controller.value_offset == "discounted"
     return problem.value_level() if discounted else problem.reference_cost
 
 
-def naive_parameters(scenario: ScenarioLike, problem: Problem) -> Parameters:
+def naive_parameters(scenario: Scenario, problem: Problem) -> Parameters:
     """The paper's naive θ, with c_λ as the scenario says."""
     return Parameters.naive(problem, value_offset=value_offset(scenario, problem))
 
 
-def naive(scenario: ScenarioLike) -> RtiNmpc:
+def naive(scenario: Scenario) -> RtiNmpc:
     """RTI-NMPC with the paper's naive guess: baseline (a)."""
     return nmpc(scenario, naive_parameters(scenario, Problem.from_scenario(scenario)))
 
 
-def from_file(scenario: ScenarioLike, path: str | Path) -> RtiNmpc:
+def from_file(scenario: Scenario, path: str | Path) -> RtiNmpc:
     """RTI-NMPC with θ from a parameters file."""
     return nmpc(scenario, Parameters.load(path, Problem.from_scenario(scenario)))
 
 
-def tuned(scenario: ScenarioLike) -> RtiNmpc:
+def tuned(scenario: Scenario) -> RtiNmpc:
     """RTI-NMPC with the cost tuned by economics: baseline (b)."""
     from controllers.economic import tune  # noqa: PLC0415
 
@@ -68,17 +67,17 @@ def tuned(scenario: ScenarioLike) -> RtiNmpc:
     return nmpc(scenario, tune(problem, value_offset=value_offset(scenario, problem)).parameters)
 
 
-def converged(scenario: ScenarioLike) -> RtiNmpc:
+def converged(scenario: Scenario) -> RtiNmpc:
     """NMPC solved to convergence with the paper's naive guess."""
     parameters = naive_parameters(scenario, Problem.from_scenario(scenario))
     return nmpc(scenario, parameters, "converged")
 
 
-def optimal(scenario: StochasticScenario) -> OptimalPolicy | QuasiStaticPolicy:
+def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
     """Policy of least mean cost on the scenario's stochastic plant, solved once and then stored.
 
     Where the plant's condenser fouls, the quasi-static one.
     """
-    from controllers.yardstick import optimal as yardsticks_own  # noqa: PLC0415
+    from controllers.optimum import optimal as yardsticks_own  # noqa: PLC0415
 
     return yardsticks_own(scenario)

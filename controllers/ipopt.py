@@ -10,10 +10,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.ocp import Ocp
-from controllers.parameters import Parameters
+from controllers.converged import Ocp
 from controllers.problem import Problem
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 
 Vector = NDArray[np.float64]
 

@@ -1,25 +1,167 @@
-"""The optimal policy of the stochastic plant, by dynamic programming: the benchmark's yardstick."""
+"""The optimal policy of a scenario's stochastic plant: the benchmark's yardstick."""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import itertools
+import json
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import isfinite
+from pathlib import Path
+from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
 
-from controllers.dynamic_programming import archive
-from controllers.dynamic_programming.bellman import BellmanOperator
-from controllers.dynamic_programming.plant import PlantProblem, StochasticScenario
-from controllers.dynamic_programming.settings import Settings
-from controllers.dynamic_programming.solution import Optimum, Progress, solve
+from controllers.dynamic_programming.bellman import (
+    Accuracy,
+    BellmanOperator,
+    PlantProblem,
+)
+from controllers.dynamic_programming.grid import Grid
+from controllers.dynamic_programming.policy_iteration import (
+    Certificate,
+    Optimum,
+    Progress,
+    Settings,
+    solve,
+)
 from controllers.errors import ModelError, OptimumError, QpError
+from controllers.problem import load_model
+from cosim.cache import trusted_folder
+from cosim.files import read_arrays, write_atomically
+from cosim.scenario import Scenario
 
 Vector = NDArray[np.float64]
+
+
+VERSION = 2
+"""Part of every key: raise it when the solver changes what it finds."""
+SHIPPED = Path(__file__).parent / "optima"
+DAY = 86400.0
+NODES = 6
+"""Values of the fouled parameter whose optima make the quasi-static reference."""
+FOULING = ("fouling_rate", "fouling_floor", "cleaning_period")
+"""The plant's parameters of the law of fouling; the model has none of them."""
+
+
+# solved problems as files ---------------------------------------------------------------------
+
+
+def optimum_key(plant: PlantProblem, settings: Settings) -> str:
+    """First 16 hexadecimal digits of the SHA-256 of all that the solution depends on.
+
+    That is: the model's equations, physical parameters, sampling, bounds, penalty, reference,
+    the disturbance's law, the solver's settings and, for the discounted criterion, γ.
+    """
+    problem, law, parameters = plant.problem, plant.law, plant.parameters
+    symbols = problem.model.symbols()
+    content: dict[str, Any] = {
+        "version": VERSION,
+        "ode": _operations(problem.model.ode(*symbols), symbols),
+        "cost": _operations(problem.model.economic_cost(*symbols), symbols),
+        "time_unit": problem.model.time_unit,
+        "sampling_time": problem.sampling_time,
+        "discount": 1.0 if settings.criterion == "average" else problem.discount,
+        "parameters": parameters.tolist(),
+        "law": [law.kind, law.nominal.tolist(), law.ranges.tolist()],
+        "settings": asdict(settings),
+    }
+    for kind in ("state", "action"):
+        for name in (f"{kind}_lower", f"{kind}_upper", f"reference_{kind}"):
+            content[name] = getattr(problem, name).tolist()
+    for name in ("penalty_linear", "penalty_quadratic"):
+        content[name] = getattr(problem, name).tolist()
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
+    """An expression's elementary operations, one a line."""
+    function = ca.Function("e", list(symbols), [expression])
+    lines = []
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        constant = float(function.instruction_constant(k)).hex() if code == ca.OP_CONST else ""
+        lines.append(
+            f"{code} {function.instruction_input(k)} {function.instruction_output(k)} {constant}"
+        )
+    return lines
+
+
+def stored_file(key: str) -> Path | None:
+    """File of a solved problem by its key: the package's own, else the user's, else None."""
+    for path in (SHIPPED / f"{key}.npz", trusted_folder("optima") / f"{key}.npz"):
+        if path.is_file():
+            return path
+    return None
+
+
+def keep(key: str, optimum: Optimum) -> Path:
+    """Keep a solved problem in the user's cache, or for this process where others can write it."""
+    return write_optimum(trusted_folder("optima") / f"{key}.npz", optimum, key)
+
+
+def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
+    """Write a solved problem as a compressed .npz; equal content gives equal bytes."""
+    certificate = optimum.certificate
+    document = {
+        "key": key,
+        "gain": optimum.gain,
+        "lower": optimum.lower,
+        "upper": optimum.upper,
+        "discount": optimum.discount,
+        "accuracy": asdict(optimum.accuracy),
+        "smooth": optimum.grid.smooth,
+        "certificate": None if certificate is None else certificate.to_list(),
+    }
+    arrays: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(optimum.grid.axes)}
+    arrays |= {name: getattr(optimum, name) for name in ("actions", "W", "distribution")}
+    arrays["document"] = np.array(json.dumps(document, sort_keys=True))
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return write_atomically(path, buffer.getvalue())
+
+
+def read_optimum(path: Path, key: str) -> Optimum:
+    """Read a solved problem; OptimumError where the file is damaged or another problem's."""
+    try:
+        arrays = read_arrays(path)
+        document = json.loads(str(arrays.pop("document")))
+        axes = [arrays[f"axis_{i}"] for i in range(sum(e.startswith("axis_") for e in arrays))]
+        smooth, figures, accuracy = (document[k] for k in ("smooth", "certificate", "accuracy"))
+        if document["key"] != key:
+            raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
+        return Optimum(
+            Grid(tuple(axes), smooth and tuple((float(a), float(b)) for a, b in smooth)),
+            arrays["actions"],
+            arrays["W"],
+            float(document["gain"]),
+            float(document["lower"]),
+            float(document["upper"]),
+            arrays["distribution"],
+            float(document["discount"]),
+            Accuracy(
+                int(accuracy["substeps"]),
+                tuple(accuracy["nodes"]),
+                tuple(accuracy["penalty_nodes"]),
+            ),
+            None if figures is None else Certificate.from_list(figures),
+        )
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
+        raise OptimumError(
+            f"{path}: not a readable optimal policy ({error}); delete it to have the policy "
+            "computed anew"
+        ) from error
+
+
+# the optimal policy ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -67,7 +209,7 @@ class OptimalPolicy:
     @classmethod
     def from_scenario(
         cls,
-        scenario: StochasticScenario,
+        scenario: Scenario,
         settings: Settings | None = None,
         *,
         overrides: Mapping[str, float | None] | None = None,
@@ -81,16 +223,18 @@ class OptimalPolicy:
         """
         plant = PlantProblem.from_scenario(scenario, overrides)
         settings = settings or Settings()
-        optimum = archive.obtain(
-            archive.key(plant, settings),
-            plant.problem,
-            lambda: solve(plant, settings, progress=progress),
-        )
+        key = optimum_key(plant, settings)
+        path = stored_file(key)
+        if path is None:
+            optimum = solve(plant, settings, progress=progress)
+            keep(key, optimum)
+        else:
+            optimum = read_optimum(path, key)
         return cls(plant, optimum)
 
     @classmethod
     def stored(
-        cls, scenario: StochasticScenario, *, overrides: Mapping[str, float | None] | None = None
+        cls, scenario: Scenario, *, overrides: Mapping[str, float | None] | None = None
     ) -> OptimalPolicy | None:
         """Optimal policy of a scenario if its solution is shipped or cached, else None.
 
@@ -101,11 +245,9 @@ class OptimalPolicy:
             plant = PlantProblem.from_scenario(scenario, overrides)
         except (ModelError, OptimumError):
             return None
-        name = archive.key(plant, Settings())
-        path = archive.stored(name)
-        if path is None:
-            return None
-        return cls(plant, archive.read(path, name, plant.problem))
+        key = optimum_key(plant, Settings())
+        path = stored_file(key)
+        return None if path is None else cls(plant, read_optimum(path, key))
 
     @property
     def gain(self) -> float:
@@ -183,3 +325,192 @@ class OptimalPolicy:
                 for i, entry in enumerate(self._table[base + offset]):
                     row[i] += weight * entry
         return row, clamped
+
+
+# a plant that fouls --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Fouling:
+    """p(τ) = p_clean (floor + (1 − floor) e^(−rate·τ)), τ days since the last cleaning.
+
+    `parameter` names p, the one that the plant's model calls uncertain (the evaporator's heat
+    transfer); `clean` is its value after a cleaning, `rate` in 1/d, `floor` the share of p that
+    fouling leaves in the end, `period` of the cleaning in d.
+    """
+
+    parameter: str
+    clean: float
+    rate: float
+    floor: float
+    period: float
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Fouling | None:
+        """The law by which a scenario's condenser fouls, None where it does not."""
+        given = scenario.plant.parameters
+        rate, floor, period = (
+            float(given.get(name, default))
+            for name, default in zip(FOULING, (0.0, 0.7, 0.0), strict=True)
+        )
+        if rate == 0.0 or floor == 1.0:
+            return None
+        if not period > 0.0:
+            raise OptimumError(
+                "the quasi-static optimum needs a condenser that is cleaned: set "
+                "plant.parameters.cleaning_period above 0"
+            )
+        model = load_model(scenario.plant.model or scenario.controller.model)
+        if not model.uncertain:
+            raise OptimumError(f"model '{model.name}' names no uncertain parameter that could foul")
+        name = model.uncertain[0]
+        nominal = model.nominal_parameters[model.parameter_indices((name,))[0]]
+        return cls(name, float(given.get(name, nominal)), rate, floor, period)
+
+    def heat_transfer(self, days: ArrayLike) -> Vector:
+        """The fouled parameter at a number of days since the start, clean at 0."""
+        since = np.mod(days, self.period)
+        return self.clean * (self.floor + (1.0 - self.floor) * np.exp(-self.rate * since))
+
+    @property
+    def nodes(self) -> list[float]:
+        """The parameter's values whose optima the reference is made of, increasing."""
+        fouled = self.clean * (self.floor + (1 - self.floor) * np.exp(-self.rate * self.period))
+        values: list[float] = np.linspace(fouled, self.clean, NODES).round(6).tolist()
+        return values
+
+    def held(self, value: float) -> dict[str, float | None]:
+        """Plant parameters of a condenser that stays as it is at a value of p."""
+        return {self.parameter: value, **dict.fromkeys(FOULING)}
+
+
+class QuasiStaticPolicy:
+    """π*(s; p(t)): linear in p between the optimal policies of fixed values of the fouled p.
+
+    It knows the law of fouling and the clock, which starts at a clean condenser with each `reset`
+    and goes on by one sample with each `prepare`. A reference, not a bound: it looks at no
+    change to come, and for a condenser that fouled infinitely slowly it would be the optimum.
+    """
+
+    name = "optimal"
+
+    def __init__(
+        self, fouling: Fouling, policies: Sequence[OptimalPolicy], sampling_time: float
+    ) -> None:
+        self.fouling = fouling
+        self.policies = tuple(policies)
+        self._nodes = fouling.nodes
+        self._days_per_sample = sampling_time / DAY
+        self._sample = -1
+
+    @classmethod
+    def from_scenario(
+        cls,
+        scenario: Scenario,
+        *,
+        progress: Callable[[Progress], None] | None = None,
+    ) -> QuasiStaticPolicy:
+        """The policy of a scenario that fouls; solves what is not stored. Raises OptimumError."""
+        fouling = _fouling(scenario)
+        policies = [
+            OptimalPolicy.from_scenario(scenario, overrides=fouling.held(value), progress=progress)
+            for value in fouling.nodes
+        ]
+        return cls(fouling, policies, scenario.sampling_time)
+
+    @classmethod
+    def stored(cls, scenario: Scenario) -> QuasiStaticPolicy | None:
+        """The policy of a scenario that fouls where all of its optima are stored, else None."""
+        fouling = _fouling(scenario)
+        policies = []
+        for value in fouling.nodes:
+            policy = OptimalPolicy.stored(scenario, overrides=fouling.held(value))
+            if policy is None:
+                return None
+            policies.append(policy)
+        return cls(fouling, policies, scenario.sampling_time)
+
+    @property
+    def gains(self) -> list[tuple[float, float]]:
+        """(p, J* at that p), by increasing p."""
+        return list(zip(self._nodes, (policy.gain for policy in self.policies), strict=True))
+
+    @property
+    def gain(self) -> float:
+        """Mean of J*(p(t)) over one cycle, J* between the nodes by monotone cubics."""
+        x, weights = np.polynomial.legendre.leggauss(40)
+        values = self.fouling.heat_transfer(0.5 * self.fouling.period * (x + 1.0))
+        return float(self.gain_at(values) @ weights / 2.0)
+
+    def gain_at(self, heat_transfer: ArrayLike) -> Vector:
+        """J* of a condenser that stays at values of p, of any shape."""
+        curve = PchipInterpolator(self._nodes, [policy.gain for policy in self.policies])
+        found: Vector = curve(np.clip(heat_transfer, self._nodes[0], self._nodes[-1]))
+        return found
+
+    def reset(self) -> None:
+        """Start the clock at a clean condenser."""
+        self._sample = -1
+
+    def prepare(self) -> None:
+        """Advance the clock by one sample."""
+        self._sample += 1
+
+    def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> OptimalSolution:
+        """Action and value at s (n,) for the present heat transfer; raises QpError as each does."""
+        present = float(self.fouling.heat_transfer(max(self._sample, 0) * self._days_per_sample))
+        upper = min(max(bisect_right(self._nodes, present), 1), len(self._nodes) - 1)
+        low, high = self._nodes[upper - 1], self._nodes[upper]
+        share = min(max((present - low) / (high - low), 0.0), 1.0)
+        first, second = (self.policies[i].feedback(s, a) for i in (upper - 1, upper))
+        return OptimalSolution(
+            (1.0 - share) * first.action + share * second.action,
+            (1.0 - share) * first.value + share * second.value,
+            "clamped" if "clamped" in (first.status, second.status) else "solved",
+        )
+
+
+def _fouling(scenario: Scenario) -> Fouling:
+    fouling = Fouling.of(scenario)
+    if fouling is None:
+        raise OptimumError("the scenario's condenser does not foul: its optimum is OptimalPolicy's")
+    return fouling
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """What regret is measured against: `value`, a mean cost per sample, and its `kind`.
+
+    The kind `optimum` is J*; `reference` is a figure that a better controller may beat, and `note`
+    says why. `controller` is the one of that cost.
+    """
+
+    value: float
+    kind: Literal["optimum", "reference"]
+    controller: OptimalPolicy | QuasiStaticPolicy
+    note: str = ""
+
+
+def optimal(
+    scenario: Scenario, progress: Callable[[Progress], None] | None = None
+) -> OptimalPolicy | QuasiStaticPolicy:
+    """The optimal policy of a scenario, or the quasi-static one of a condenser that fouls."""
+    if Fouling.of(scenario) is None:
+        return OptimalPolicy.from_scenario(scenario, progress=progress)
+    return QuasiStaticPolicy.from_scenario(scenario, progress=progress)
+
+
+def yardstick(scenario: Scenario) -> Yardstick | None:
+    """What is stored for a scenario, None where nothing is; solves nothing."""
+    if Fouling.of(scenario) is not None:
+        found = QuasiStaticPolicy.stored(scenario)
+        note = f"quasi-static: J* along {found.fouling.parameter}(t), no bound" if found else ""
+        return None if found is None else Yardstick(found.gain, "reference", found, note)
+    policy = OptimalPolicy.stored(scenario)
+    if policy is None:
+        return None
+    certificate = policy.optimum.certificate
+    objection = "not certified" if certificate is None else certificate.objection()
+    if objection is None:
+        return Yardstick(policy.gain, "optimum", policy)
+    return Yardstick(policy.gain, "reference", policy, objection)

@@ -14,14 +14,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.buffered import StackedFunction, stacked
 from controllers.dynamics import stage_parameter_gradient
+from controllers.functions import StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.qp.active_set import kkt_solve
+from controllers.qp.active_set import LEAST_CONTROLS, StageMatrices, kkt_solve, kkt_solve_by_stages
 from controllers.qp.problem import QpSolution, SoftQp
-from controllers.qp.stagewise import LEAST_CONTROLS, StageMatrices, kkt_solve_by_stages
-from controllers.symbolic_theta import SymbolicTheta
-from controllers.theta import ThetaBlocks
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Matrix = NDArray[np.float64]
 SOLUTION = ("xi", "t", "chi", "v", "lam")

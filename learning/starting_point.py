@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.economic.tuning import tune
+from controllers.economic import tune
 from controllers.factories import nmpc
 from controllers.parameters import Parameters
 from controllers.problem import Problem

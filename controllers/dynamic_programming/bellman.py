@@ -1,24 +1,347 @@
-"""The Bellman operator of the stochastic plant on a state grid."""
+"""The Bellman operator of a scenario's stochastic plant on a state grid."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
+import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from controllers.dynamic_programming.elementwise import Elementwise
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.plant import PlantProblem
-from controllers.dynamic_programming.quadrature import Refinement
+from controllers.errors import ModelError, OptimumError
 from controllers.model import discretise, economic_cost
+from controllers.problem import Problem, load_model
+from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DisturbanceLaw:
+    """Independent disturbances, drawn anew each sample and held over it.
+
+    `uniform`: `nominal` ± `ranges`; `normal`: mean `nominal`, standard deviations `ranges`; `none`:
+    always nominal. Both arrays have shape (n_d,). Raises OptimumError where they do not fit.
+    """
+
+    kind: Literal["uniform", "normal", "none"]
+    nominal: Array
+    ranges: Array
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays and check them."""
+        for name in ("nominal", "ranges"):
+            array = np.array(getattr(self, name), dtype=np.float64).reshape(-1)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if self.kind not in {"uniform", "normal", "none"}:
+            raise OptimumError(
+                f"disturbance law '{self.kind}' is not known; use uniform, normal or none"
+            )
+        finite = np.isfinite(self.nominal).all() and np.isfinite(self.ranges).all()
+        if self.nominal.shape != self.ranges.shape or not finite or (self.ranges < 0).any():
+            raise OptimumError(
+                f"disturbance law: nominal {self.nominal} and ranges {self.ranges} must be finite, "
+                "of one length, and no range negative"
+            )
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether the disturbances never leave their nominal values."""
+        return self.kind == "none" or not self.ranges.any()
+
+    def draw(self, generator: np.random.Generator, count: int) -> Array:
+        """Draw `count` independent disturbances, shape (count, n_d)."""
+        size = (count, len(self.nominal))
+        if self.kind == "uniform":
+            return self.nominal + self.ranges * generator.uniform(-1.0, 1.0, size)
+        if self.kind == "normal":
+            return self.nominal + self.ranges * generator.standard_normal(size)
+        return np.tile(self.nominal, (count, 1))
+
+    def rule(self, counts: tuple[int, ...]) -> ProductRule:
+        """Gauss rule with the given number of nodes per disturbance.
+
+        Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one; a disturbance that
+        does not vary takes one node. Exact for polynomials of degree 2·count−1 in each.
+        """
+        if len(counts) != len(self.nominal) or any(count < 1 for count in counts):
+            raise OptimumError(
+                f"quadrature: {len(self.nominal)} disturbances need as many positive numbers of "
+                f"nodes, not {counts}"
+            )
+        points, weights = [], []
+        for count, nominal, spread in zip(counts, self.nominal, self.ranges, strict=True):
+            if self.kind == "none" or spread == 0:
+                x, w = np.zeros(1), np.ones(1)
+            elif self.kind == "uniform":
+                x, w = np.polynomial.legendre.leggauss(count)
+            else:
+                x, w = np.polynomial.hermite_e.hermegauss(count)
+            points.append(nominal + spread * x)
+            weights.append(w / w.sum())
+        return ProductRule(tuple(points), tuple(weights))
+
+
+@dataclass(frozen=True)
+class ProductRule:
+    """A product quadrature rule: E[g(d)] ≈ Σ_i weights_i g(nodes_i).
+
+    `axis_nodes` and `axis_weights` hold one array per disturbance.
+    """
+
+    axis_nodes: tuple[Array, ...]
+    axis_weights: tuple[Array, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of nodes per disturbance."""
+        return tuple(len(nodes) for nodes in self.axis_nodes)
+
+    @cached_property
+    def nodes(self) -> Array:
+        """All nodes, shape (q, n_d), the last disturbance running fastest."""
+        if not self.axis_nodes:
+            return np.zeros((1, 0))
+        mesh = np.meshgrid(*self.axis_nodes, indexing="ij")
+        return np.stack([axis.reshape(-1) for axis in mesh], axis=1)
+
+    @cached_property
+    def weights(self) -> Array:
+        """Weights of `nodes`, shape (q,), with sum 1."""
+        weights = np.ones(1)
+        for axis in self.axis_weights:
+            weights = np.multiply.outer(weights, axis).reshape(-1)
+        return weights
+
+
+class Refinement:
+    """Values at one product rule's nodes carried to another's by polynomial interpolation.
+
+    A smooth function known at few Gauss nodes is known everywhere to spectral accuracy; what is
+    not smooth is then applied on the finer rule without evaluating the function anew.
+    """
+
+    def __init__(self, coarse: ProductRule, fine: ProductRule) -> None:
+        self.weights = fine.weights
+        self._matrices: list[Array] = []
+        for nodes, targets in zip(coarse.axis_nodes, fine.axis_nodes, strict=True):
+            self._matrices.append(lagrange_matrix(nodes, targets))
+        # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
+        while len(self._matrices) > 1 and self._matrices[-1].shape[1] < 4:
+            last = self._matrices.pop()
+            self._matrices[-1] = np.kron(self._matrices[-1], last).astype(np.float64)
+
+    def __call__(self, values: Array) -> Array:
+        """Carry values (B, q_coarse) to (B, q_fine)."""
+        count, right = len(values), 1
+        for matrix in reversed(self._matrices):
+            fine, coarse = matrix.shape
+            if right == 1:
+                values = values.reshape(count, -1, coarse) @ matrix.T
+            else:
+                values = matrix @ values.reshape(-1, coarse, right)
+            right *= fine
+        return values.reshape(count, -1)
+
+
+def lagrange_matrix(nodes: ArrayLike, targets: ArrayLike) -> Array:
+    """Matrix (len(targets), len(nodes)) of the Lagrange polynomials of `nodes` at `targets`."""
+    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(targets, dtype=np.float64)
+    matrix = np.ones((len(t), len(x)))
+    for j in range(len(x)):
+        for k in range(len(x)):
+            if k != j:
+                matrix[:, j] *= (t - x[k]) / (x[j] - x[k])
+    return matrix
+
+
+MEND = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
+
+
+@dataclass(frozen=True)
+class PlantProblem:
+    """The control problem with the plant's own model, and what is random in it.
+
+    `parameters` (n_p,) are the plant's physical ones.
+    """
+
+    problem: Problem
+    law: DisturbanceLaw
+    parameters: Vector
+
+    def __post_init__(self) -> None:
+        """Raise OptimumError where the law has not the model's disturbances."""
+        model = self.problem.model
+        if len(self.law.nominal) != len(model.disturbances):
+            raise OptimumError(
+                f"the law has {len(self.law.nominal)} disturbances, model '{model.name}' "
+                f"{len(model.disturbances)}"
+            )
+
+    @classmethod
+    def nominal(cls, problem: Problem, law: DisturbanceLaw) -> PlantProblem:
+        """A plant that has the model's nominal parameters."""
+        return cls(problem, law, problem.model.nominal_parameters)
+
+    @classmethod
+    def from_scenario(
+        cls,
+        scenario: Scenario,
+        overrides: Mapping[str, float | None] | None = None,
+    ) -> PlantProblem:
+        """What a scenario says of its plant; `overrides` replaces plant parameters by name.
+
+        One that is overridden by None is left out. The plant's model is `plant.model`, where the
+        scenario names one, else the controller's. Raises OptimumError where it does not fit the
+        plant, ModelError where it cannot be loaded.
+        """
+        named = scenario.plant.model
+        problem = Problem.from_scenario(scenario)
+        if named is not None:
+            problem = replace(problem, model=load_model(named))
+        merged = {**scenario.plant.parameters, **(overrides or {})}
+        given = {name: value for name, value in merged.items() if value is not None}
+        return cls(problem, plant_law(scenario, problem), plant_parameters(given, problem))
+
+
+def plant_law(scenario: Scenario, problem: Problem) -> DisturbanceLaw:
+    """The scenario's disturbance law in the order of the model's disturbances."""
+    table = scenario.disturbance
+    model = problem.model
+    names = tuple(quantity.name for quantity in model.disturbances)
+    for kind, ours, theirs in (
+        ("states", tuple(q.name for q in model.states), tuple(scenario.plant.states)),
+        ("actions", tuple(q.name for q in model.actions), tuple(scenario.plant.actions)),
+        ("disturbances", names, tuple(scenario.plant.disturbances)),
+    ):
+        if ours != theirs:
+            raise OptimumError(
+                f"the optimum needs a model of the plant: model '{model.name}' has the {kind} "
+                f"{', '.join(ours)}, the plant {', '.join(theirs)}; {MEND}"
+            )
+    nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
+    ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(names)))
+    return DisturbanceLaw(table.law, nominal, ranges)
+
+
+def plant_parameters(given: Mapping[str, float], problem: Problem) -> Vector:
+    """Physical parameters (n_p,): the model's nominal ones with those that the plant is given."""
+    model = problem.model
+    parameters = model.nominal_parameters
+    known = [quantity.name for quantity in model.parameters]
+    for name, value in given.items():
+        if name not in known:
+            raise OptimumError(
+                f"the optimum needs a model of the plant: plant.parameters sets '{name}', which "
+                f"model '{model.name}' does not have: give the model that parameter, {MEND}, or, "
+                "where it only shapes the noise, name it in plant.mapping.ranges and set "
+                "disturbance.ranges"
+            )
+        parameters[known.index(name)] = value
+    return parameters
+
+
+_OPERATIONS: dict[int, Callable[..., Any]] = {
+    ca.OP_ASSIGN: lambda a: a,
+    ca.OP_ADD: operator.add,
+    ca.OP_SUB: operator.sub,
+    ca.OP_MUL: operator.mul,
+    ca.OP_DIV: operator.truediv,
+    ca.OP_NEG: operator.neg,
+    ca.OP_TWICE: lambda a: a + a,
+    ca.OP_SQ: lambda a: a * a,
+    ca.OP_INV: lambda a: 1.0 / a,
+    ca.OP_EXP: np.exp,
+    ca.OP_LOG: np.log,
+    ca.OP_LOG1P: np.log1p,
+    ca.OP_EXPM1: np.expm1,
+    ca.OP_POW: np.power,
+    ca.OP_CONSTPOW: np.power,
+    ca.OP_SQRT: np.sqrt,
+    ca.OP_HYPOT: np.hypot,
+    ca.OP_SIN: np.sin,
+    ca.OP_COS: np.cos,
+    ca.OP_TAN: np.tan,
+    ca.OP_ASIN: np.arcsin,
+    ca.OP_ACOS: np.arccos,
+    ca.OP_ATAN: np.arctan,
+    ca.OP_ATAN2: np.arctan2,
+    ca.OP_SINH: np.sinh,
+    ca.OP_COSH: np.cosh,
+    ca.OP_TANH: np.tanh,
+    ca.OP_FABS: np.abs,
+    ca.OP_SIGN: np.sign,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
+    ca.OP_FMIN: np.fmin,
+    ca.OP_FMAX: np.fmax,
+    ca.OP_LT: lambda a, b: np.where(a < b, 1.0, 0.0),
+    ca.OP_LE: lambda a, b: np.where(a <= b, 1.0, 0.0),
+    ca.OP_EQ: lambda a, b: np.where(a == b, 1.0, 0.0),
+    ca.OP_NE: lambda a, b: np.where(a != b, 1.0, 0.0),
+    ca.OP_NOT: lambda a: np.where(a == 0, 1.0, 0.0),
+    ca.OP_AND: lambda a, b: np.where((a != 0) & (b != 0), 1.0, 0.0),
+    ca.OP_OR: lambda a, b: np.where((a != 0) | (b != 0), 1.0, 0.0),
+    ca.OP_IF_ELSE_ZERO: lambda a, b: np.where(a != 0, b, 0.0),
+}
+
+
+class Elementwise:
+    """An SX function f(x, u, …) → y that takes and returns lists of arrays, broadcast as usual.
+
+    Each argument is a sequence with one array per scalar entry; the result is the list of the
+    first output's entries. CasADi's own `map` runs one interpreter pass per point; here each
+    operation runs over all points, five to ten times faster on large arrays. Raises ModelError
+    on an operation that has no NumPy counterpart here.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        self._n_work = function.sz_w()
+        self._n_out = function.size1_out(0)
+        self._out_rows = list(function.sparsity_out(0).row())
+        self._program: list[tuple[int, Callable[..., Any] | None, tuple[Any, ...], Any]] = []
+        for k in range(function.n_instructions()):
+            code = function.instruction_id(k)
+            inputs = tuple(function.instruction_input(k))
+            outputs = function.instruction_output(k)
+            if code == ca.OP_CONST:
+                self._program.append((code, None, (function.instruction_constant(k),), outputs[0]))
+            elif code in {ca.OP_INPUT, ca.OP_OUTPUT}:
+                self._program.append((code, None, inputs, tuple(outputs)))
+            elif code in _OPERATIONS:
+                self._program.append((code, _OPERATIONS[code], inputs, outputs[0]))
+            else:
+                raise ModelError(
+                    f"function '{function.name()}': operation {code} of CasADi cannot be "
+                    "evaluated over arrays; write the model without it"
+                )
+
+    def __call__(self, *arguments: Any) -> list[Any]:
+        """Evaluate; `arguments[i][j]` is entry j of argument i."""
+        work: list[Any] = [0.0] * self._n_work
+        result: list[Any] = [0.0] * self._n_out
+        for code, operation, inputs, output in self._program:
+            if operation is not None:
+                work[output] = operation(*[work[i] for i in inputs])
+            elif code == ca.OP_CONST:
+                work[output] = inputs[0]
+            elif code == ca.OP_INPUT:
+                work[output[0]] = arguments[inputs[0]][inputs[1]]
+            elif output[0] == 0:
+                result[self._out_rows[output[1]]] = work[inputs[0]]
+        return result
+
+
 T = TypeVar("T")
 # Entries of an array, states × quadrature nodes, worked on at once: fewer leave two threads
 # waiting for the interpreter's lock between short operations, more leave the cores' caches.

@@ -2,94 +2,145 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
-from controllers.errors import OptimumError
+import numpy as np
+from numpy.typing import NDArray
 
-TOLERANCE = 5e-4
-AGREEING = ("solution", "refinement", "simulation")
-SEARCH = "policy search"
+from controllers.dynamic_programming.bellman import Elementwise, PlantProblem
+from controllers.dynamic_programming.grid import Grid
+from controllers.dynamic_programming.policy_iteration import (
+    Certificate,
+    Figure,
+    Optimum,
+    Progress,
+    Settings,
+    refine,
+)
+from controllers.model import discretise, economic_cost
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Figure:
-    """One way to J*: its value and the interval that it is known to."""
+class SimulatedCost:
+    """Mean cost per sample over independent paths, with the half width of its 95 % interval."""
+
+    mean: float
+    half_width: float
+    paths: int
+    steps: int
+
+
+def simulate_policy(
+    plant: PlantProblem,
+    optimum: Optimum,
+    *,
+    paths: int = 2000,
+    steps: int = 5000,
+    burn_in: int = 300,
+    seed: int = 0,
+) -> SimulatedCost:
+    """Run the policy of a solution on the plant's model, interpolated as the controller does it.
+
+    Each path starts in a state drawn from the solution's stationary distribution, and its first
+    `burn_in` samples are left out. The interval is that of the mean of independent paths.
+    """
+    generator = np.random.default_rng(seed)
+    problem = plant.problem
+    step = Elementwise(discretise(problem.model, problem.sampling_time, optimum.accuracy.substeps))
+    cost = Elementwise(economic_cost(problem.model))
+    table = Grid(optimum.grid.axes)
+    policy = [table.interpolant(column) for column in optimum.actions.T]
+    share = optimum.distribution / optimum.distribution.sum()
+    x = list(table.points[generator.choice(table.size, paths, p=share)].T)
+    total = np.zeros(paths)
+    for k in range(burn_in + steps):
+        u = [entry(x) for entry in policy]
+        d = list(plant.law.draw(generator, paths).T)
+        if k >= burn_in:
+            total += cost(x, u, d, plant.parameters)[0]
+            for i, entry in enumerate(x):
+                violation = np.maximum(
+                    np.maximum(problem.state_lower[i] - entry, entry - problem.state_upper[i]), 0.0
+                )
+                total += (
+                    problem.penalty_linear[i] + problem.penalty_quadratic[i] * violation
+                ) * violation
+        x = [np.broadcast_to(entry, paths) for entry in step(x, u, d, plant.parameters)]
+    means = total / steps
+    half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
+    return SimulatedCost(float(means.mean()), float(half_width), paths, steps)
+
+
+STABLE = 1e-3
+_MOST_GRIDS = 3
+
+
+@dataclass(frozen=True)
+class Row:
+    """A solution of the study; `change` is that of J* against what it refines, relative."""
 
     name: str
-    value: float
-    lower: float
-    upper: float
-
-    def __post_init__(self) -> None:
-        """Check that the interval holds the value, up to rounding."""
-        slack = 1e-9 * abs(self.value)
-        if not self.lower - slack <= self.value <= self.upper + slack:
-            raise OptimumError(
-                f"certificate: {self.name} = {self.value} is not between {self.lower} and "
-                f"{self.upper}"
-            )
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """The figures that were made for one solution.
-
-    `solution`: the gain and its bounds on the grid; `refinement`: the same on the grid of the next
-    level, which is what is kept; `simulation`: the mean cost of the refinement's policy on the
-    plant's model, 95 %; `policy search`: the best θ that a search found, compared with that policy
-    on the same noise.
-    """
-
-    figures: tuple[Figure, ...]
-
-    def __getitem__(self, name: str) -> Figure | None:
-        """Figure of this name, None where it was not made."""
-        return next((figure for figure in self.figures if figure.name == name), None)
+    optimum: Optimum
+    change: float | None = None
 
     @property
-    def spread(self) -> float:
-        """Distance of the farthest two values among solution, refinement, simulation; relative."""
-        values = [figure.value for figure in self.figures if figure.name in AGREEING]
-        return (max(values) - min(values)) / abs(min(values))
+    def sizes(self) -> tuple[tuple[int, ...], ...]:
+        """Grid points a state, quadrature nodes and those of the penalty a disturbance."""
+        accuracy = self.optimum.accuracy
+        return self.optimum.grid.shape, accuracy.nodes, accuracy.penalty_nodes
 
-    def objection(self) -> str | None:
-        """Why the solution is not to be called J*; None where there is nothing against it."""
-        if missing := [name for name in AGREEING if self[name] is None]:
-            return f"not made: {', '.join(missing)}"
-        if self.spread > TOLERANCE:
-            return (
-                f"solution, refinement and simulation are {100 * self.spread:.3f} % apart, more "
-                f"than {100 * TOLERANCE:g} %"
-            )
-        allowed = TOLERANCE * abs(self.figures[0].value)
-        for figure in self.figures:
-            if figure.name in AGREEING and figure.upper - figure.lower > 2 * allowed:
-                return f"the interval of the {figure.name} is wider than {2 * allowed:.3g}"
-        search, refinement = self[SEARCH], self["refinement"]
-        if search is not None and refinement and search.upper < refinement.value - allowed:
-            return (
-                f"a policy search found {search.value:.2f}, more than {100 * TOLERANCE:g} % below "
-                "the refinement"
-            )
-        return None
+    @property
+    def stable(self) -> bool:
+        """Whether refining changed J* by no more than 0.1 %."""
+        return self.change is None or self.change <= STABLE
 
-    def to_list(self) -> list[dict[str, Any]]:
-        """The figures as JSON has them."""
-        return [asdict(figure) for figure in self.figures]
 
-    @classmethod
-    def from_list(cls, figures: Sequence[dict[str, Any]]) -> Certificate:
-        """Read back what `to_list` gave; raises OptimumError, KeyError or ValueError."""
-        return cls(
-            tuple(
-                Figure(
-                    str(figure["name"]),
-                    float(figure["value"]),
-                    float(figure["lower"]),
-                    float(figure["upper"]),
-                )
-                for figure in figures
-            )
-        )
+def study(
+    plant: PlantProblem,
+    settings: Settings,
+    optimum: Optimum,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> list[Row]:
+    """Refine a solution of `settings` until J* is stable to 0.1 %, then its quadrature once.
+
+    The grid is halved at least once and at most three times; the last row has the finer
+    quadrature and integrator on the first grid. `stable` of the last two rows is the verdict.
+    """
+    rows = [Row("solution", optimum)]
+    for level in range(settings.level + 1, settings.level + 1 + _MOST_GRIDS):
+        before = rows[-1].optimum
+        after = refine(plant, settings, before, level=level, progress=progress)
+        rows.append(Row("grid twice as fine", after, _change(before, after)))
+        if rows[-1].stable:
+            break
+    finer = optimum.accuracy.finer()
+    after = refine(plant, settings, optimum, accuracy=finer, progress=progress)
+    return [*rows, Row("quadrature finer", after, _change(optimum, after))]
+
+
+def certify(
+    plant: PlantProblem, rows: Sequence[Row], *, paths: int = 2000, steps: int = 5000
+) -> Optimum:
+    """The first refinement of a study, with its certificate.
+
+    It is what is kept, since it is nearer to J* than the solution that the study began with. The
+    simulation is that of its policy, by `simulate_policy`.
+    """
+    solution, refinement = rows[0].optimum, rows[1].optimum
+    found = simulate_policy(plant, refinement, paths=paths, steps=steps)
+    figures = (
+        Figure("solution", solution.gain, solution.lower, solution.upper),
+        Figure("refinement", refinement.gain, refinement.lower, refinement.upper),
+        Figure(
+            "simulation", found.mean, found.mean - found.half_width, found.mean + found.half_width
+        ),
+    )
+    return replace(refinement, certificate=Certificate(figures))
+
+
+def _change(before: Optimum, after: Optimum) -> float:
+    return abs(after.gain - before.gain) / abs(after.gain)

@@ -1,6 +1,5 @@
 """The RTI-NMPC as C code that needs no Python: what an FMU of the controller is made of."""
 
-from controllers.export.core import STATUSES, Core, core
-from controllers.export.table import Entry, Table, table
+from controllers.export.core import STATUSES, Core, Entry, Table, core, table
 
 __all__ = ["STATUSES", "Core", "Entry", "Table", "core", "table"]

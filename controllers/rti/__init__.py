@@ -2,7 +2,6 @@
 
 from controllers.rti.iterated import IteratedNmpc
 from controllers.rti.nmpc import RtiNmpc
-from controllers.rti.prepared import LinearisationPoint
-from controllers.rti.solution import RtiSolution
+from controllers.rti.solution import LinearisationPoint, RtiSolution
 
 __all__ = ["IteratedNmpc", "LinearisationPoint", "RtiNmpc", "RtiSolution"]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import casadi as ca
 
-from controllers.buffered import StackedFunction, stacked
+from controllers.functions import StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.symbolic_theta import SymbolicTheta
-from controllers.theta import ThetaBlocks
+from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
 def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
@@ -57,7 +56,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     L, q = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("q", n + m, horizon)
     L_N, q_N, constant = ca.SX.sym("L_N", n, n), ca.SX.sym("q_N", n), ca.SX.sym("constant")
 
-    known = problem.penalty.symbolic(s)
+    known = problem.symbolic_penalty(s)
     xi = [s - x_s]
     value = constant + known + symbols["c_lambda"]
     value += ca.bilin(symbols["B_lambda"], xi[0]) + ca.dot(symbols["b_lambda"], xi[0])

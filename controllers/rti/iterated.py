@@ -7,11 +7,11 @@ from collections.abc import Callable
 from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
-from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.qp import QpBackend
 from controllers.rti.nmpc import RtiNmpc
 from controllers.rti.solution import RtiSolution
+from controllers.theta import Parameters
 
 
 class IteratedNmpc(RtiNmpc):

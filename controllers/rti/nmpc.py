@@ -9,20 +9,23 @@ from math import isfinite
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.buffered import BufferedFunction
-from controllers.compilation import Compilation
 from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.parameters import Parameters
+from controllers.functions import BufferedFunction, Compilation
 from controllers.problem import Problem
 from controllers.qp import QpBackend, make_backend
-from controllers.qp.enforced_action import multipliers_at_kink
+from controllers.qp.problem import multipliers_at_kink
 from controllers.rti.feedback import embedding, readout
-from controllers.rti.hessian import make_hessian
-from controllers.rti.preparation import preparation, qp_in_memory
-from controllers.rti.prepared import Functions, LinearisationPoint, Prepared
-from controllers.rti.riccati import LEAST_CONTROLS, limits_of, riccati
-from controllers.rti.solution import RtiSolution
+from controllers.rti.preparation import (
+    LEAST_CONTROLS,
+    limits_of,
+    make_hessian,
+    preparation,
+    qp_in_memory,
+    riccati,
+)
+from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 from controllers.sensitivities import sensitivities
+from controllers.theta import Parameters
 
 Vector = NDArray[np.float64]
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
-from enum import StrEnum
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,34 +14,17 @@ from cosim.cli.options import JsonOption, ScenarioOption
 from cosim.cli.output import Output, output
 
 if TYPE_CHECKING:
-    from controllers.dynamic_programming.certificate import Certificate, Figure
-    from controllers.dynamic_programming.solution import Optimum, Progress
-    from controllers.dynamic_programming.study import Row
+    from controllers.dynamic_programming.policy_iteration import Figure, Optimum, Progress
+    from controllers.optimum import QuasiStaticPolicy
     from cosim.scenario import Scenario
 
 UNSTABLE = 1
-
-
-class Criterion(StrEnum):
-    """What the policy minimises."""
-
-    AVERAGE = "average"
-    DISCOUNTED = "discounted"
-
-
-# Bounds of J* itself, or of how far the optimal value may lie from the one found.
-_BOUNDS = {
-    Criterion.AVERAGE: ("J* ≥", "J* ≤"),
-    Criterion.DISCOUNTED: ("(1-γ)(V*-V) ≥", "(1-γ)(V*-V) ≤"),
-}
+SEEDS, STEPS = range(900_000, 900_010), 10_000
+"""Runs on which a searched θ is compared with the policy."""
 
 
 def optimum(
     scenario: ScenarioOption = "paper",
-    criterion: Annotated[
-        Criterion,
-        typer.Option("--criterion", help="Mean cost per sample, or cost discounted by γ."),
-    ] = Criterion.AVERAGE,
     refine: Annotated[
         bool,
         typer.Option(
@@ -71,107 +53,99 @@ def optimum(
     it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
     A plant that fouls has the quasi-static reference: J* along its heat transfer.
     """
-    from controllers.quasi_static import Fouling
+    from controllers.optimum import Fouling, QuasiStaticPolicy
     from cosim.cli.compose import load_scenario
 
     with output(json) as out_:
         task = load_scenario(scenario)
         if Fouling.of(task) is not None:
-            _quasi_static(task, out_)
+            with _progress(out_) as show:
+                _show_quasi_static(QuasiStaticPolicy.from_scenario(task, progress=show), task, out_)
             return
-        rows, certificate, document = _solve(
-            task, scenario, criterion, refine, against, recompute, out_
-        )
-        header = ("", "J", *_BOUNDS[criterion], "states", "nodes", "penalty nodes", "change")
-        cells = [_cells(row) for row in rows]
-        out_.table(f"{document['kind']} of {scenario}, {criterion} criterion", header, cells)
-        if certificate is not None:
-            figures = [_figure_cells(figure) for figure in certificate.figures]
-            out_.table("certificate", ("", "J", "from", "to"), figures)
-        if document["objection"] is not None:
-            out_.note(f"not called J*: {document['objection']}")
+        document = _solve(task, refine, against, recompute, out_)
         out_.json(document)
     if refine and not document["stable"]:
         raise typer.Exit(UNSTABLE)
 
 
-def _quasi_static(task: Scenario, out_: Output) -> None:
-    from controllers.quasi_static import QuasiStaticPolicy
-
-    with _progress(out_) as show:
-        policy = QuasiStaticPolicy.from_scenario(task, progress=show)
+def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: Output) -> None:
+    name = policy.fouling.parameter
+    rows = [(f"{value:.4f}", f"{gain:.4f}") for value, gain in policy.gains]
+    rows.append(("mean over a cycle", f"{policy.gain:.4f}"))
     out_.table(
-        f"quasi-static reference of {task.name}: a reference, not a bound",
-        ("UA2", "J*"),
-        [(f"{value:.4f}", f"{gain:.4f}") for value, gain in policy.gains]
-        + [("mean over a cycle", f"{policy.gain:.4f}")],
+        f"quasi-static reference of {task.name}: a reference, not a bound", (name, "J*"), rows
     )
     out_.json(
         {
             "scenario": task.name,
-            "criterion": "average",
             "kind": "reference",
-            "objection": "quasi-static: J* along UA2(t), no bound",
+            "objection": f"quasi-static: J* along {name}(t), no bound",
             "J": policy.gain,
-            "table": [{"UA2": value, "J": gain} for value, gain in policy.gains],
+            "table": [{name: value, "J": gain} for value, gain in policy.gains],
         }
     )
 
 
 def _solve(
-    task: Scenario,
-    name: str,
-    criterion: Criterion,
-    refine: bool,
-    against: Path | None,
-    recompute: bool,
-    out_: Output,
-) -> tuple[list[Row], Certificate | None, dict[str, Any]]:
-    from controllers.dynamic_programming import archive
-    from controllers.dynamic_programming.plant import PlantProblem
-    from controllers.dynamic_programming.settings import Settings
-    from controllers.dynamic_programming.solution import solve
-    from controllers.dynamic_programming.study import Row
-    from cosim.cli.optimum_study import held_against, refined
+    task: Scenario, refine: bool, against: Path | None, recompute: bool, out_: Output
+) -> dict[str, Any]:
+    """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
+    from controllers import optimum as store
+    from controllers.dynamic_programming.bellman import PlantProblem
+    from controllers.dynamic_programming.certificate import Row, certify, study
+    from controllers.dynamic_programming.policy_iteration import Certificate, Settings, solve
 
-    plant = PlantProblem.from_scenario(task)
-    settings = Settings(criterion=criterion.value)
-    key = archive.key(plant, settings)
+    plant, settings = PlantProblem.from_scenario(task), Settings()
+    key = store.optimum_key(plant, settings)
+    path = None if refine or recompute else store.stored_file(key)
     with _progress(out_) as show:
-
-        def make() -> Optimum:
-            return solve(plant, settings, progress=show)
-
-        if refine:
-            archive.require_cache()
-            rows, solved = refined(plant, settings, make(), show)
-            if against is not None:
-                solved = held_against(against, solved, plant, task)
-            archive.keep(key, lambda: solved)
+        if path is not None:
+            found = store.read_optimum(path, key)
         else:
-            solved = (
-                archive.keep(key, make) if recompute else archive.obtain(key, plant.problem, make)
-            )
-            rows = [Row("stored" if solved.certificate else "solution", solved)]
-    certificate = solved.certificate
-    objection = "no certificate; make one with --refine"
-    if criterion is Criterion.DISCOUNTED:
-        objection = "its mean cost need not be the least"
-    document = {
-        "scenario": name,
-        "criterion": criterion.value,
-        "kind": "",
-        "objection": certificate.objection() if certificate else objection,
-        "J": solved.gain,
-        "lower": solved.lower,
-        "upper": solved.upper,
-        "edge_mass": solved.edge_mass,
-        "file": str(archive.stored(key)),
-        "stable": all(row.stable for row in rows[-2:]),
+            found = solve(plant, settings, progress=show)
+        rows = [Row("stored" if found.certificate else "solution", found)]
+        if refine:
+            rows = study(plant, settings, found, progress=show)
+            found = certify(plant, rows)
+            if against is not None:
+                searched = _search_figure(against, found, plant, task)
+                assert found.certificate is not None
+                figures = (*found.certificate.figures, searched)
+                found = replace(found, certificate=Certificate(figures))
+        path = path or store.keep(key, found)
+    certificate = found.certificate
+    objection = certificate.objection() if certificate else "no certificate; make one with --refine"
+    kind = "reference" if objection else "optimum"
+    cells = [
+        (
+            row.name,
+            *(f"{value:.4f}" for value in (row.optimum.gain, row.optimum.lower, row.optimum.upper)),
+            *("×".join(map(str, counts)) for counts in row.sizes),
+            "" if row.change is None else f"{100 * row.change:.5f} %",
+        )
+        for row in rows
+    ]
+    header = ("", "J", "J* ≥", "J* ≤", "states", "nodes", "penalty nodes", "change")
+    out_.table(f"{kind} of {task.name}", header, cells)
+    if certificate is not None:
+        shown = [(f.name, *(f"{x:.2f}" for x in f[1:])) for f in certificate.figures]
+        out_.table("certificate", ("", "J", "from", "to"), shown)
+    if objection is not None:
+        out_.note(f"not called J*: {objection}")
+    return {
+        "scenario": task.name,
+        "kind": kind,
+        "objection": objection,
+        "J": found.gain,
+        "lower": found.lower,
+        "upper": found.upper,
+        "edge_mass": found.edge_mass,
+        "file": str(path),
+        "stable": objection is None and all(row.stable for row in rows[-2:]),
         "certificate": certificate.to_list() if certificate else None,
         "rows": [
             {
-                "what": row.what,
+                "name": row.name,
                 "J": row.optimum.gain,
                 "lower": row.optimum.lower,
                 "upper": row.optimum.upper,
@@ -182,49 +156,45 @@ def _solve(
             for row in rows
         ],
     }
-    called = document["objection"] is None
-    document["kind"] = "optimum" if called else "reference"
-    document["stable"] = document["stable"] and (called or criterion is Criterion.DISCOUNTED)
-    return rows, certificate, document
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    found = row.optimum
-    return (
-        row.what,
-        f"{found.gain:.4f}",
-        f"{found.lower:.4f}",
-        f"{found.upper:.4f}",
-        "×".join(map(str, found.grid.shape)),
-        "×".join(map(str, found.accuracy.nodes)),
-        "×".join(map(str, found.accuracy.penalty_nodes)),
-        "" if row.change is None else f"{100 * row.change:.5f} %",
-    )
+def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) -> Figure:
+    """J of a parameters file: the policy's simulated J and the difference, paired on `SEEDS`."""
+    import numpy as np
 
+    from controllers import factories
+    from controllers.dynamic_programming.policy_iteration import SEARCH, Figure
+    from controllers.optimum import OptimalPolicy
+    from cosim.evaluation.statistics import mean
+    from cosim.plant import FmuPlant
+    from cosim.simulation import simulate
 
-def _figure_cells(figure: Figure) -> tuple[str, ...]:
-    return (figure.name, f"{figure.value:.2f}", f"{figure.lower:.2f}", f"{figure.upper:.2f}")
+    def costs(controller: Any, fmu: FmuPlant) -> Any:
+        runs = (simulate(fmu, controller, STEPS, seed, residuals=False) for seed in SEEDS)
+        return np.array([run.summary()["J"] for run in runs])
+
+    assert found.certificate is not None
+    base = found.certificate["simulation"]
+    assert base is not None
+    with FmuPlant(scenario) as fmu:
+        searched = costs(factories.from_file(scenario, theta), fmu)
+        difference = mean(searched - costs(OptimalPolicy(plant, found), fmu))
+    assert difference.t is not None
+    value = base.value + difference.value
+    spread = 0.5 * (difference.t[1] - difference.t[0])
+    half_width = float(np.hypot(spread, 0.5 * (base.upper - base.lower)))
+    return Figure(SEARCH, value, value - half_width, value + half_width)
 
 
 @contextmanager
 def _progress(out_: Output) -> Iterator[Callable[[Progress], None]]:
     """Show the round and the closing bounds on standard error."""
-    from rich.progress import Progress as Bar
-    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
-
     console = out_.console()
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    hidden = out_.as_json or not console.is_terminal
-    with Bar(*columns, console=console, disable=hidden) as bar:
-        task = bar.add_task("dynamic programming", total=None)
-
-        def show(progress: Progress) -> None:
-            bar.update(
-                task,
-                description=(
-                    f"grid {progress.level} ({progress.states} states), round {progress.round}: "
-                    f"{progress.lower:.1f} ≤ J* ≤ {progress.upper:.1f}"
-                ),
-            )
-
-        yield show
+    if out_.as_json or not console.is_terminal:
+        yield lambda _: None
+        return
+    with console.status("dynamic programming") as status:
+        yield lambda p: status.update(
+            f"grid {p.level} ({p.states} states), round {p.round}: "
+            f"{p.lower:.1f} ≤ J* ≤ {p.upper:.1f}"
+        )

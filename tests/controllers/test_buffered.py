@@ -2,7 +2,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from controllers.buffered import BufferedFunction, stacked
+from controllers.functions import BufferedFunction, stacked
 
 
 def matrix_product():

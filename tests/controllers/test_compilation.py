@@ -12,10 +12,9 @@ from controllers import (
     Problem,
     RtiNmpc,
     ThetaBlocks,
-    compilation,
 )
-from controllers.buffered import BufferedFunction
-from controllers.compilation import Compilation, description
+from controllers import functions as compilation
+from controllers.functions import BufferedFunction, Compilation, description
 from controllers.shared_library import find, find_compiler
 from cosim.cache import TAG
 from cosim.scenario import Scenario

@@ -7,13 +7,12 @@ import pytest
 import scipy.stats
 
 from controllers import OptimalPolicy, QpError, Quantity, evaporator, factories
-from controllers.dynamic_programming import archive
+from controllers.dynamic_programming.bellman import PlantProblem
+from controllers.dynamic_programming.certificate import study
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.plant import PlantProblem
-from controllers.dynamic_programming.settings import Settings
-from controllers.dynamic_programming.solution import solve
-from controllers.dynamic_programming.study import study
+from controllers.dynamic_programming.policy_iteration import Settings, solve
 from controllers.errors import OptimumError
+from controllers.optimum import SHIPPED, optimum_key, read_optimum
 from controllers.problem import Problem
 from cosim import FmuPlant, Scenario, simulate
 
@@ -36,11 +35,11 @@ def policy(policies):
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_policies_are_shipped(name):
     plant = PlantProblem.from_scenario(Scenario.load(name))
-    key = archive.key(plant, Settings())
-    path = archive.SHIPPED / f"{key}.npz"
+    key = optimum_key(plant, Settings())
+    path = SHIPPED / f"{key}.npz"
     assert path.is_file(), "equations or solver changed: solve anew with `cosim optimum`"
     assert path.stat().st_size < 300_000
-    certificate = archive.read(path, key, plant.problem).certificate
+    certificate = read_optimum(path, key).certificate
     assert certificate is not None
     assert certificate.objection() is None
 

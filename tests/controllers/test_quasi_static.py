@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controllers.dynamic_programming import archive
+from controllers import optimum as store
+from controllers.dynamic_programming.policy_iteration import Settings
 from controllers.errors import OptimumError
-from controllers.optimum import OptimalPolicy
-from controllers.quasi_static import Fouling, QuasiStaticPolicy
-from controllers.yardstick import yardstick
+from controllers.optimum import Fouling, OptimalPolicy, QuasiStaticPolicy, yardstick
 from cosim import FmuPlant, Scenario
 
 
@@ -103,15 +102,9 @@ def test_what_is_not_stored_has_no_yardstick(tmp_path, monkeypatch):
 
 def test_without_its_certificate_an_optimum_is_a_reference(tmp_path, monkeypatch):
     known = OptimalPolicy.stored(Scenario.load("paper"))
-    path = next(
-        path
-        for path in archive.SHIPPED.glob("*.npz")
-        if abs(np.load(path)["W"]).sum() == abs(known.optimum.W).sum()
-    )
-    archive.write(
-        tmp_path / "optima" / path.name, replace(known.optimum, certificate=None), path.stem
-    )
+    key = store.optimum_key(known._plant, Settings())
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    monkeypatch.setattr(archive, "SHIPPED", tmp_path / "none")
+    store.keep(key, replace(known.optimum, certificate=None))
+    monkeypatch.setattr(store, "SHIPPED", tmp_path / "none")
     found = yardstick(Scenario.load("paper"))
     assert (found.kind, found.note) == ("reference", "not certified")

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from controllers.economic.steady_state import optimal_steady_state
-from controllers.problem import Problem
+from controllers.economic import optimal_steady_state
+from controllers.problem import Problem, multipliers
 from controllers.theta import ThetaBlocks
-from controllers.units import multipliers
 from cosim.scenario import Scenario
 from tests.helpers import linear_plant
 from tests.helpers.other_units import ACTION, COST, STATE, factors, problems

@@ -7,8 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from controllers import Model, Problem, Quantity
-from controllers.dynamic_programming.plant import PlantProblem
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
+from controllers.dynamic_programming.bellman import DisturbanceLaw, PlantProblem
 
 
 class LinearPlant:

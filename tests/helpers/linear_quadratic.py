@@ -5,8 +5,8 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from controllers.model import Model, Quantity, discretise
-from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Parameters
 from cosim.protocols import Step
 from cosim.scenario import Scenario
 

@@ -2,11 +2,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from controllers.dynamic_programming.bellman import Accuracy, BellmanOperator
+from controllers.dynamic_programming.bellman import (
+    Accuracy,
+    BellmanOperator,
+    DisturbanceLaw,
+    PlantProblem,
+)
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.plant import PlantProblem
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
-from controllers.dynamic_programming.settings import Settings, accurate_substeps
+from controllers.dynamic_programming.policy_iteration import Settings, accurate_substeps
 from controllers.errors import OptimumError
 from controllers.model import discretise, economic_cost
 from tests.helpers.sampling import evaporator_problem

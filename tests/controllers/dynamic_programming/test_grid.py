@@ -3,8 +3,8 @@ import itertools
 import numpy as np
 import pytest
 
-from controllers.dynamic_programming.axes import Feature, graded_axis, support
 from controllers.dynamic_programming.grid import Grid
+from controllers.dynamic_programming.policy_iteration import Feature, graded_axis, support
 from controllers.errors import OptimumError
 
 GRID = Grid((np.array([0.0, 0.5, 2.0]), np.array([-1.0, 1.0, 1.5, 4.0]), np.array([0.0, 1.0])))

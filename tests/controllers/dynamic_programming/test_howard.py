@@ -5,7 +5,7 @@ import pytest
 from scipy import sparse
 
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.howard import evaluate
+from controllers.dynamic_programming.policy_iteration import evaluate
 
 STATES = 12
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from controllers.dynamic_programming.quadrature import DisturbanceLaw, Refinement, lagrange_matrix
+from controllers.dynamic_programming.bellman import DisturbanceLaw, Refinement, lagrange_matrix
 from controllers.errors import OptimumError
 
 LAWS = {

@@ -1,9 +1,7 @@
 import pytest
 
-from controllers.dynamic_programming.settings import Settings
-from controllers.dynamic_programming.simulation import simulate_policy
-from controllers.dynamic_programming.solution import solve
-from controllers.dynamic_programming.study import certify, study
+from controllers.dynamic_programming.certificate import certify, simulate_policy, study
+from controllers.dynamic_programming.policy_iteration import Settings, solve
 from tests.helpers.linear_plant import SCALAR
 
 PLANT = SCALAR.plant

@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
 
-from controllers.dynamic_programming.plant import PlantProblem
-from controllers.dynamic_programming.quadrature import DisturbanceLaw
-from controllers.dynamic_programming.settings import Settings
-from controllers.dynamic_programming.solution import refine, solve
+from controllers.dynamic_programming.bellman import DisturbanceLaw, PlantProblem
+from controllers.dynamic_programming.policy_iteration import Settings, refine, solve
 from controllers.errors import OptimumError
 from tests.helpers.linear_plant import PLANE, SCALAR, LinearPlant
 

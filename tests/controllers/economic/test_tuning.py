@@ -6,10 +6,7 @@ import pytest
 import scipy.linalg
 
 from controllers import LinearisationPoint, Model, Quantity, RtiNmpc, ThetaBlocks
-from controllers.economic import tune
-from controllers.economic.convexification import convexify, rotation
-from controllers.economic.local_feedback import local_feedback
-from controllers.economic.steady_state import optimal_steady_state
+from controllers.economic import convexify, local_feedback, optimal_steady_state, rotation, tune
 from controllers.errors import TuningError
 from controllers.model import discretise, economic_cost
 from tests.helpers.sampling import evaporator_problem

@@ -5,8 +5,7 @@ import pytest
 from controllers import ThetaBlocks
 from controllers.errors import ControllerError
 from controllers.model import discretise
-from controllers.rti.hessian import Exact, Spectrum, make_hessian
-from controllers.rti.preparation import preparation
+from controllers.rti.preparation import Exact, Spectrum, make_hessian, preparation
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point
 
 N, n, m = 10, 2, 2

@@ -9,7 +9,7 @@ from controllers.dynamics import sampled_jacobian
 from controllers.model import discretise
 from controllers.rti.feedback import embedding
 from controllers.rti.preparation import preparation
-from controllers.symbolic_theta import SymbolicTheta, symmetric
+from controllers.theta import SymbolicTheta, symmetric
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 
 N, n, m = 10, 2, 2

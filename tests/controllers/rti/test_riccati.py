@@ -5,8 +5,7 @@ import pytest
 
 from controllers import Parameters, QpError, RtiNmpc, ThetaBlocks
 from controllers.qp.daqp_backend import DaqpBackend
-from controllers.rti.preparation import preparation
-from controllers.rti.riccati import LEAST_CONTROLS, limits_of, riccati
+from controllers.rti.preparation import LEAST_CONTROLS, limits_of, preparation, riccati
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 
 N, n, m = 7, 2, 2

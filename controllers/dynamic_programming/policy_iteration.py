@@ -1,0 +1,704 @@
+"""The stochastic control problem solved by policy iteration, from a coarse grid to a fine one."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from controllers.dynamic_programming.bellman import (
+    Accuracy,
+    BellmanOperator,
+    Elementwise,
+    PlantProblem,
+)
+from controllers.dynamic_programming.grid import Grid
+from controllers.errors import OptimumError
+from controllers.model import discretise
+from controllers.problem import Problem
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the problem is solved.
+
+    `criterion`: mean cost per sample, or cost discounted by the problem's γ. `level` 0 is a first
+    grid over all states, each further level resolves the closed loop's support (all but `tail` of
+    the samples at each end) with `cells`·2^level cells a state; cells beyond it grow by `growth`
+    each. `nodes` and `penalty_nodes` per disturbance, the influential ones first; empty: 7 and
+    20 for the first two, 2 and 4 for the third, 2 and 2 for the others. `integration_tolerance` on
+    the sampled model, relative; `tolerance` on the distance of the gain's bounds, relative, to
+    be met within `rounds` policy iterations a grid.
+    """
+
+    criterion: Literal["average", "discounted"] = "average"
+    level: int = 1
+    cells: int = 12
+    growth: float = 1.35
+    tail: float = 1e-7
+    nodes: tuple[int, ...] = ()
+    penalty_nodes: tuple[int, ...] = ()
+    integration_tolerance: float = 1e-6
+    tolerance: float = 1e-4
+    rounds: int = 40
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        positive = (self.tail, self.integration_tolerance, self.tolerance)
+        if (
+            self.criterion not in {"average", "discounted"}
+            or not 0 <= self.level <= 6
+            or min(self.cells, self.rounds) < 1
+            or not self.growth > 1
+            or min(positive) <= 0
+        ):
+            raise OptimumError(
+                f"{self}: criterion must be average or discounted, level 0 to 6, growth above 1 "
+                "and the other numbers positive"
+            )
+
+    def accuracy(self, plant: PlantProblem) -> Accuracy:
+        """Integrator and quadrature for a problem."""
+        count = len(plant.law.nominal)
+        return Accuracy(
+            accurate_substeps(plant, self.integration_tolerance),
+            self.nodes or (7, 7, *(2,) * count)[:count],
+            self.penalty_nodes or (20, 20, 4, *(2,) * count)[:count],
+        )
+
+
+def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
+    """Least power of two of RK4 substeps whose doubling moves no next state by more than allowed.
+
+    Allowed is `tolerance`·(1 + |x|), tried at 2000 points: states within the first quarter of the
+    bounds' box around the reference, actions in their box, disturbances of the law. Raises
+    OptimumError where 128 substeps do not do.
+    """
+    problem, generator = plant.problem, np.random.default_rng(0)
+    reach = 0.25 * (problem.state_upper - problem.state_lower)
+    x = generator.uniform(
+        np.maximum(problem.state_lower, problem.reference_state - reach),
+        np.minimum(problem.state_upper, problem.reference_state + reach),
+        (2000, problem.n_states),
+    )
+    u = generator.uniform(problem.action_lower, problem.action_upper, (2000, problem.n_actions))
+    d = plant.law.draw(generator, 2000)
+    before: Array | None = None
+    for substeps in 2 ** np.arange(8):
+        step = Elementwise(discretise(problem.model, problem.sampling_time, int(substeps)))
+        # A step that is too long may overflow; then the next one is tried.
+        with np.errstate(all="ignore"):
+            entries = step(x.T, u.T, d.T, plant.parameters)
+            x_next = np.stack([np.broadcast_to(entry, 2000) for entry in entries], axis=1)
+            moved = np.inf if before is None else np.abs(x_next - before)
+        if np.all(moved <= tolerance * (1 + np.abs(x))):
+            return int(substeps)
+        before = x_next
+    raise OptimumError(
+        f"model '{problem.model.name}': 128 RK4 substeps a sample do not integrate it to "
+        f"{tolerance:g}; shorten the sampling time"
+    )
+
+
+@dataclass(frozen=True)
+class Feature:
+    """An interval of an axis whose cells shall be no wider than `spacing`."""
+
+    first: float
+    last: float
+    spacing: float
+
+
+def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) -> Grid:
+    """Grid over all states within the bounds and a tenth beyond.
+
+    Its cells are half a standard deviation of one sample's disturbance wide at the reference and
+    at the bounds, where the optimal closed loop may live.
+    """
+    deviation = operator.deviation(problem.reference_state, problem.reference_action)
+    axes = []
+    for low, high, centre, sigma in zip(
+        problem.state_lower, problem.state_upper, problem.reference_state, deviation, strict=True
+    ):
+        span = high - low
+        spacing = max(0.5 * sigma, 1e-3 * span)
+        features = [Feature(x - spacing, x + spacing, spacing) for x in (low, centre, high)]
+        lower, upper = low - 0.1 * span, high + 0.1 * span
+        marks = sorted({lower, low, centre, high, upper})
+        axes.append(graded_axis(marks, features, settings.growth**2))
+    return Grid(tuple(axes))
+
+
+def finer_grid(
+    operator: BellmanOperator,
+    grid: Grid,
+    actions: Array,
+    distribution: Array,
+    settings: Settings,
+    level: int,
+    *,
+    smooth: bool = True,
+) -> Grid:
+    """Grid that resolves the support of a distribution with cells·2^level cells a state.
+
+    At a bound that the closed loop of `actions` (G, m) touches, whose stationary `distribution`
+    is (G,), the cells are 2^-level of the standard deviation of one sample's disturbance: the
+    penalty's kink reaches the value of a slow state smoothed by no more than that. It extends as
+    far again beyond the support on either side, and at least a twentieth of the bounds' span:
+    farther states are so rare that the policy at the box's edge serves them. Without disturbance
+    the support is a point, which says nothing of that, and the box stays. `smooth`: cubic
+    interpolation within the support, else linear everywhere.
+    """
+    problem = operator.problem
+    span = problem.state_upper - problem.state_lower
+    mass = np.maximum(distribution, 0.0)
+    mean = mass @ np.column_stack([grid.points, actions]) / mass.sum()
+    deviation = operator.deviation(mean[: problem.n_states], mean[problem.n_states :])
+    mass = mass.reshape(grid.shape)
+    axes, intervals = [], []
+    for i, axis in enumerate(grid.axes):
+        others = tuple(j for j in range(mass.ndim) if j != i)
+        first, last = support(axis, mass.sum(axis=others), settings.tail)
+        reference, width = problem.reference_state[i], last - first
+        features = [Feature(first, last, width / (settings.cells * 2**level))]
+        bounds = [
+            bound
+            for bound in (problem.state_lower[i], problem.state_upper[i])
+            if first - deviation[i] <= bound <= last + deviation[i]
+        ]
+        near = max(deviation[i], 1e-3 * span[i])
+        features += [Feature(b - near, b + near, near / 2**level) for b in bounds]
+        beyond = max(width, (1.0 if operator.deterministic else 0.05) * span[i])
+        low = max(axis[0], min(first, reference) - beyond)
+        high = min(axis[-1], max(last, reference) + beyond)
+        marks = [low, *(x for x in sorted({*bounds, reference}) if low < x < high), high]
+        axes.append(graded_axis(marks, features, settings.growth))
+        # Beyond a bound the value has kinks wherever one more sample is needed to return.
+        intervals.append((max(first, problem.state_lower[i]), min(last, problem.state_upper[i])))
+    return Grid(tuple(axes), tuple(intervals) if smooth else None)
+
+
+def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: float) -> Array:
+    """Axis through all `marks`, dense at features, each cell outwards about `growth` times wider.
+
+    The width of a cell at x is the least over the features of spacing + (growth − 1)·distance.
+    """
+    parts = []
+    for lower, upper in pairwise(marks):
+        fine = np.linspace(lower, upper, 4001)
+        middle = 0.5 * (fine[1:] + fine[:-1])
+        width = np.full(len(middle), upper - lower)
+        for feature in features:
+            distance = np.maximum(np.maximum(feature.first - middle, middle - feature.last), 0.0)
+            np.minimum(width, feature.spacing + (growth - 1.0) * distance, out=width)
+        count = np.append(0.0, np.cumsum(np.diff(fine) / width))
+        cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
+        inner = np.interp(np.arange(1, cells) * (count[-1] / cells), count, fine)
+        parts.append(np.concatenate([[lower], inner]))
+    return np.concatenate([*parts, [marks[-1]]])
+
+
+def support(axis: Array, mass: Array, tail: float) -> tuple[float, float]:
+    """Interval of an axis that holds all but `tail` of the mass (per axis point) at each end.
+
+    One more cell on either side is included.
+    """
+    cumulative = np.cumsum(mass) / mass.sum()
+    low = int(np.searchsorted(cumulative, tail))
+    high = int(np.searchsorted(cumulative, 1.0 - tail))
+    return float(axis[max(low - 1, 0)]), float(axis[min(high + 1, len(axis) - 1)])
+
+
+Rows = NDArray[np.intp]
+Objective = Callable[[Rows, Array], Array]
+
+
+def nelder_mead(
+    objective: Objective,
+    start: Array,
+    size: Array,
+    lower: Array,
+    upper: Array,
+    *,
+    iterations: int,
+    precision: float,
+) -> tuple[Array, Array]:
+    """Minimise B functions of m variables in a box, each from its own start.
+
+    `objective(rows, points)` evaluates functions `rows` (r,) at points (r, m); `start` (B, m);
+    `size` (B, m) is the first simplex's edge; a function is done when its simplex's values lie
+    within `precision` of each other. Returns minimisers (B, m) and values (B,), never worse than
+    the start. The simplex method of Nelder and Mead (1965) with its standard
+    coefficients and projection on the box: it needs no derivative, which the expected penalty
+    of a nearly deterministic plant lacks, and it follows the penalty's narrow, skew valley, where
+    a search along the coordinates stalls. SciPy's one runs one problem at a time.
+    """
+    count, m = start.shape
+    everyone = np.arange(count)
+    vertices = np.repeat(np.clip(start, lower, upper)[:, None], m + 1, axis=1)
+    for i in range(m):
+        moved = vertices[:, i + 1, i] + size[:, i]
+        inward = np.where(moved > upper[i], vertices[:, i + 1, i] - size[:, i], moved)
+        vertices[:, i + 1, i] = np.clip(inward, lower[i], upper[i])
+    values = np.stack([objective(everyone, vertices[:, i]) for i in range(m + 1)], axis=1)
+    for _ in range(iterations):
+        order = np.argsort(values, axis=1, kind="stable")
+        values = np.take_along_axis(values, order, axis=1)
+        vertices = np.take_along_axis(vertices, order[:, :, None], axis=1)
+        rows = np.flatnonzero(values[:, -1] - values[:, 0] > precision)
+        if not len(rows):
+            break
+        vertices[rows], values[rows] = _replace_worst(
+            objective, rows, vertices[rows], values[rows], lower, upper
+        )
+    best = values.argmin(axis=1)
+    return vertices[everyone, best], values[everyone, best]
+
+
+def _replace_worst(
+    objective: Objective, rows: Rows, vertices: Array, values: Array, lower: Array, upper: Array
+) -> tuple[Array, Array]:
+    """One step of the simplex method on the sorted simplices of functions `rows`."""
+    centre = vertices[:, :-1].mean(axis=1)
+    worst = vertices[:, -1].copy()
+    candidate = np.clip(2.0 * centre - worst, lower, upper)
+    reflected = objective(rows, candidate)
+    best = reflected < values[:, 0]
+    accepted = reflected < values[:, -2]
+    # Expansion, outside contraction and inside contraction as multiples of centre − worst.
+    factor = np.where(best, 2.0, np.where(reflected < values[:, -1], 0.5, -0.5))
+    trial = np.clip(centre + factor[:, None] * (centre - worst), lower, upper)
+    tried = np.flatnonzero(best | ~accepted)
+    outcome = np.full(len(values), np.inf)
+    if len(tried):
+        outcome[tried] = objective(rows[tried], trial[tried])
+    candidate = np.where((outcome < reflected)[:, None], trial, candidate)
+    outcome = np.minimum(outcome, reflected)
+    improved = outcome < values[:, -1]
+    vertices[:, -1] = np.where(improved[:, None], candidate, worst)
+    values[:, -1] = np.where(improved, outcome, values[:, -1])
+    shrinking = np.flatnonzero(~improved)
+    for i in range(1, vertices.shape[1]):
+        if len(shrinking):
+            vertices[shrinking, i] = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
+            values[shrinking, i] = objective(rows[shrinking], vertices[shrinking, i])
+    return vertices, values
+
+
+def scan(
+    objective: Objective, start: Array, lower: Array, upper: Array, points: int
+) -> tuple[Array, Array]:
+    """Best of `start` (B, m) and a grid of `points` per variable over the box, with its value."""
+    everyone = np.arange(len(start))
+    best, values = start.copy(), objective(everyone, start)
+    axes = [np.linspace(low, high, points) for low, high in zip(lower, upper, strict=True)]
+    for point in itertools.product(*axes):
+        candidate = np.broadcast_to(point, start.shape)
+        found = objective(everyone, candidate)
+        better = found < values
+        best[better], values[better] = np.array(point), found[better]
+    return best, values
+
+
+# Each sample starts anew at the anchor with this probability, so that a plant without disturbance,
+# which may come to rest in several places, still has one gain; it shifts J* by 1e-10 of itself.
+_RESTART = 1e-9
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A policy on a grid with its value, and what one more improvement found.
+
+    `actions` (G, m); `W` (G,) smooth part of the value, V = penalty + W, zero at the grid's anchor
+    for γ = 1; `gain` mean cost per sample of the policy; `lower` and `upper` are min and
+    max over the grid of TW − W. For γ = 1 they enclose the optimal gain (Odoni, 1969); for γ < 1
+    they enclose (1−γ)(V* − V) (MacQueen, 1966). `distribution` (G,) is the stationary one, `step`
+    (G, m) the last change of the actions.
+    """
+
+    grid: Grid
+    actions: Array
+    W: Array
+    gain: float
+    distribution: Array
+    step: Array
+    lower: float = -np.inf
+    upper: float = np.inf
+
+    @property
+    def spread(self) -> float:
+        """Width of the enclosure, upper − lower."""
+        return self.upper - self.lower
+
+
+def evaluate(
+    operator: BellmanOperator, grid: Grid, actions: Array, anchor: int
+) -> tuple[Array, float, Array]:
+    """Value W (G,), gain and stationary distribution (G,) of a policy (G, m).
+
+    For γ = 1: W + g = c + P W with W[anchor] = 0; for γ < 1: W = c + γ P W, and the gain from the
+    stationary distribution. One sparse factorisation each. Raises OptimumError where the chain
+    cannot be evaluated.
+    """
+    matrix, cost = operator.chain(actions, grid)
+    size = grid.size
+    unit = sparse.csr_array(([1.0], ([0], [anchor])), shape=(1, size))
+    flow = sparse.eye_array(size) - (1.0 - _RESTART) * matrix
+    bordered = sparse.block_array([[flow, np.ones((size, 1))], [unit, None]], format="csc")
+    try:
+        factors = splu(bordered)
+    except RuntimeError as error:
+        raise OptimumError(f"policy evaluation on a grid of {size} states: {error}") from error
+    stationary = factors.solve(np.append(np.zeros(size), 1.0), trans="T")
+    # The transposed system's last row makes the multipliers a distribution: they sum to 1.
+    distribution = stationary[:size]
+    if operator.discount == 1.0:
+        solution = factors.solve(np.append(cost, 0.0))
+        return solution[:size], float(solution[size]), distribution
+    W = splu((sparse.eye_array(size) - operator.discount * matrix).tocsc()).solve(cost)
+    return W, float(distribution @ cost), distribution
+
+
+def begin(operator: BellmanOperator, grid: Grid, actions: Array) -> Iterate:
+    """Evaluate a first policy (G, m); its `step` is a tenth of the action box."""
+    problem = operator.problem
+    anchor = grid.nearest(problem.reference_state)
+    width = problem.action_upper - problem.action_lower
+    W, gain, distribution = evaluate(operator, grid, actions, anchor)
+    return Iterate(grid, actions, W, gain, distribution, np.tile(0.1 * width, (grid.size, 1)))
+
+
+def improve(
+    operator: BellmanOperator, iterate: Iterate, scan_points: int, *, iterations: int = 30
+) -> Iterate:
+    """Improve the policy once and bound what is left to gain.
+
+    A local search in each state from its present action or, where one is better, from one of
+    `scan_points` actions per dimension over the box: `lower` is a bound as far as these find the
+    global minimum. Returns the improved actions with the value of the former ones and its bounds.
+    """
+    problem, grid = operator.problem, iterate.grid
+    lower, upper = problem.action_lower, problem.action_upper
+
+    def objective(rows: NDArray[np.intp], actions: Array) -> Array:
+        return operator.values(grid.points[rows], actions, grid, iterate.W)
+
+    start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
+    width = upper - lower
+    size = np.clip(2.0 * np.abs(iterate.step), 2e-3 * width, 0.1 * width)
+    actions, values = nelder_mead(
+        objective,
+        start,
+        size,
+        lower,
+        upper,
+        iterations=iterations,
+        precision=1e-8 * abs(iterate.gain),
+    )
+    residual = values - iterate.W
+    return replace(
+        iterate,
+        actions=actions,
+        step=actions - iterate.actions,
+        lower=float(residual.min()),
+        upper=float(residual.max()),
+    )
+
+
+def iterate_policy(
+    operator: BellmanOperator,
+    start: Iterate,
+    *,
+    rounds: int,
+    scan_points: int,
+    enough: Callable[[Iterate, Iterate], bool],
+    report: Callable[[Iterate, int], None],
+) -> Iterate:
+    """Howard's policy iteration until `enough(before, after)`, at most `rounds` rounds.
+
+    Each round scans `scan_points` actions per dimension and ends with a call of `report`.
+    """
+    iterate = start
+    anchor = start.grid.nearest(operator.problem.reference_state)
+    for k in range(rounds):
+        before = iterate
+        improved = improve(operator, before, scan_points)
+        W, gain, distribution = evaluate(operator, improved.grid, improved.actions, anchor)
+        iterate = replace(improved, W=W, gain=gain, distribution=distribution)
+        report(iterate, k)
+        if enough(before, iterate):
+            break
+    return iterate
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where the solver is: grid level, round on it, size of the grid, gain and its bounds."""
+
+    level: int
+    round: int
+    states: int
+    gain: float
+    lower: float
+    upper: float
+
+
+TOLERANCE = 5e-4
+"""Relative distance within which the figures of a certificate must agree."""
+AGREEING = ("solution", "refinement", "simulation")
+SEARCH = "policy search"
+
+
+class Figure(NamedTuple):
+    """One way to J*: its value and the interval [lower, upper] that it is known to."""
+
+    name: str
+    value: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The figures that were made for one solution.
+
+    `solution`: the gain and its bounds on the grid; `refinement`: the same on the grid of the next
+    level, which is kept; `simulation`: the mean cost of the refinement's policy on the plant's
+    model, 95 %; `policy search`: the best θ that a search found, compared with that policy on the
+    same noise.
+    """
+
+    figures: tuple[Figure, ...]
+
+    def __getitem__(self, name: str) -> Figure | None:
+        """Figure of this name, None where it was not made."""
+        return next((figure for figure in self.figures if figure.name == name), None)
+
+    def objection(self) -> str | None:
+        """Why the solution is not to be called J*; None where there is nothing against it."""
+        agreeing = [figure for name in AGREEING if (figure := self[name])]
+        if len(agreeing) < len(AGREEING):
+            missing = [name for name in AGREEING if self[name] is None]
+            return f"not made: {', '.join(missing)}"
+        values = [figure.value for figure in agreeing]
+        spread = (max(values) - min(values)) / abs(min(values))
+        if spread > TOLERANCE:
+            return (
+                f"solution, refinement and simulation are {100 * spread:.3f} % apart, more "
+                f"than {100 * TOLERANCE:g} %"
+            )
+        allowed = TOLERANCE * abs(self.figures[0].value)
+        for figure in agreeing:
+            if figure.upper - figure.lower > 2 * allowed:
+                return f"the interval of the {figure.name} is wider than {2 * allowed:.3g}"
+        search, refinement = self[SEARCH], agreeing[1]
+        if search is not None and search.upper < refinement.value - allowed:
+            return (
+                f"a policy search found {search.value:.2f}, more than {100 * TOLERANCE:g} % below "
+                "the refinement"
+            )
+        return None
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """The figures as JSON has them."""
+        return [figure._asdict() for figure in self.figures]
+
+    @classmethod
+    def from_list(cls, figures: Sequence[Mapping[str, Any]]) -> Certificate:
+        """Read back what `to_list` gave; raises KeyError or ValueError."""
+        numbers = ("value", "lower", "upper")
+        return cls(tuple(Figure(f["name"], *(float(f[n]) for n in numbers)) for f in figures))
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """A solved problem: the policy and smooth value on the grid, and what certifies them.
+
+    `actions` (G, m), `W` (G,) with V = penalty + W; `gain` J*, the mean cost per sample;
+    `lower` and `upper` as in `Iterate`; `distribution` (G,) the stationary one; `certificate` what
+    was compared with the gain, if anything.
+    """
+
+    grid: Grid
+    actions: Array
+    W: Array
+    gain: float
+    lower: float
+    upper: float
+    distribution: Array
+    discount: float
+    accuracy: Accuracy
+    certificate: Certificate | None = None
+
+    @property
+    def edge_mass(self) -> float:
+        """Share of samples that the closed loop spends on the edge of the grid's box."""
+        return float(self.distribution[self.grid.boundary].sum())
+
+
+def solve(
+    plant: PlantProblem,
+    settings: Settings | None = None,
+    *,
+    workers: int = 2,
+    progress: Callable[[Progress], None] | None = None,
+) -> Optimum:
+    """Solve for the optimal policy of the stochastic plant by Howard's policy iteration.
+
+    Raises OptimumError where the bounds do not close to 1 % of the gain, or where the closed loop
+    leaves the grid's box in more than one of 10⁴ samples.
+    """
+    problem, settings = plant.problem, settings or Settings()
+    accuracy = settings.accuracy(plant)
+    discount = 1.0 if settings.criterion == "average" else problem.discount
+    draft, operator = (
+        BellmanOperator(plant, how, discount=discount, workers=workers)
+        for how in (accuracy.draft(), accuracy)
+    )
+    grid = first_grid(problem, draft, settings)
+    actions = np.tile(problem.reference_action, (grid.size, 1))
+    iterate = begin(draft, grid, actions)
+    report = _Reporter(progress)
+    # Linear interpolation is monotone, so that it finds its way from anywhere, and it smears the
+    # closed loop over its cells, so that the support is known only once these are fine.
+    for level, smooth in ((1, False), *((k + 1, True) for k in range(settings.level))):
+        if settings.level:
+            iterate = _approach(draft, iterate, settings, report)
+            grid = _finer(draft, iterate, settings, level, smooth=smooth)
+            iterate = _transfer(draft, iterate, grid)
+            report.level = level
+    iterate = _scan(draft, _approach(draft, iterate, settings, report), report)
+    return _optimum(_converge(operator, iterate, settings, report), operator, accuracy)
+
+
+def refine(
+    plant: PlantProblem,
+    settings: Settings,
+    optimum: Optimum,
+    *,
+    level: int | None = None,
+    accuracy: Accuracy | None = None,
+    workers: int = 2,
+    progress: Callable[[Progress], None] | None = None,
+) -> Optimum:
+    """Solve again from a solution, on the grid of another level or with another accuracy.
+
+    Raises OptimumError as `solve` does.
+    """
+    accuracy = accuracy or optimum.accuracy
+    operator = BellmanOperator(plant, accuracy, discount=optimum.discount, workers=workers)
+    start = begin(operator, optimum.grid, optimum.actions)
+    report = _Reporter(progress)
+    report.level = settings.level if level is None else level
+    grid = optimum.grid if level is None else _finer(operator, start, settings, level)
+    iterate = _converge(operator, _transfer(operator, start, grid), settings, report)
+    return _optimum(iterate, operator, accuracy)
+
+
+def _optimum(iterate: Iterate, operator: BellmanOperator, accuracy: Accuracy) -> Optimum:
+    optimum = Optimum(
+        iterate.grid,
+        iterate.actions,
+        iterate.W,
+        iterate.gain,
+        min(iterate.lower, iterate.gain) if operator.discount == 1.0 else iterate.lower,
+        max(iterate.upper, iterate.gain) if operator.discount == 1.0 else iterate.upper,
+        np.maximum(iterate.distribution, 0.0),
+        operator.discount,
+        accuracy,
+    )
+    if iterate.spread > 0.01 * abs(iterate.gain):
+        raise OptimumError(
+            f"policy iteration: the bounds of the gain, {iterate.lower:.6g} and "
+            f"{iterate.upper:.6g}, are more than 1 % apart; allow more rounds or another grid"
+        )
+    if optimum.edge_mass > 1e-4:
+        raise OptimumError(
+            f"the optimal closed loop is on the edge of the grid's box in "
+            f"{100 * optimum.edge_mass:.3g} % of the samples; widen the state bounds"
+        )
+    return optimum
+
+
+class _Reporter:
+    """Passes iterates on to the caller's progress function."""
+
+    def __init__(self, progress: Callable[[Progress], None] | None) -> None:
+        self.level = 0
+        self._progress = progress
+
+    def __call__(self, iterate: Iterate, k: int) -> None:
+        if self._progress is not None:
+            size = iterate.grid.size
+            self._progress(
+                Progress(self.level, k, size, iterate.gain, iterate.lower, iterate.upper)
+            )
+
+
+def _approach(
+    operator: BellmanOperator, iterate: Iterate, settings: Settings, report: _Reporter
+) -> Iterate:
+    """Iterate until the gain falls no more: a start for the next grid needs no bounds."""
+    return iterate_policy(
+        operator,
+        iterate,
+        rounds=settings.rounds,
+        scan_points=5,
+        enough=lambda before, after: before.gain - after.gain <= 1e-4 * abs(after.gain),
+        report=report,
+    )
+
+
+def _scan(operator: BellmanOperator, iterate: Iterate, report: _Reporter) -> Iterate:
+    """One round that looks for better actions in the whole action box."""
+    return iterate_policy(
+        operator, iterate, rounds=1, scan_points=9, enough=lambda *_: True, report=report
+    )
+
+
+def _converge(
+    operator: BellmanOperator, iterate: Iterate, settings: Settings, report: _Reporter
+) -> Iterate:
+    """Iterate until the bounds meet."""
+    return iterate_policy(
+        operator,
+        iterate,
+        rounds=settings.rounds,
+        scan_points=3,
+        enough=lambda _, after: after.spread <= settings.tolerance * abs(after.gain),
+        report=report,
+    )
+
+
+def _finer(
+    operator: BellmanOperator,
+    found: Iterate,
+    settings: Settings,
+    level: int,
+    *,
+    smooth: bool = True,
+) -> Grid:
+    return finer_grid(
+        operator,
+        found.grid,
+        found.actions,
+        found.distribution,
+        settings,
+        level,
+        smooth=smooth,
+    )
+
+
+def _transfer(operator: BellmanOperator, iterate: Iterate, grid: Grid) -> Iterate:
+    actions = iterate.grid.resample(iterate.actions, grid)
+    start = begin(operator, grid, actions)
+    return replace(start, step=0.1 * start.step)

@@ -1,0 +1,442 @@
+"""The NMPC cost tuned by economics, after Zanon, Gros and Diehl (2016)."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import null_space, solve_discrete_are
+
+from controllers import sdp
+from controllers.errors import TuningError
+from controllers.model import discretise
+from controllers.problem import Problem
+from controllers.theta import Parameters, ThetaBlocks
+
+Array = NDArray[np.float64]
+
+
+# A bound counts as strictly active above this share of the largest multiplier.
+_STRICT = 1e-6
+
+
+@dataclass(frozen=True)
+class SteadyState:
+    """Optimum of min ℓ(x, u) s.t. x = f(x, u) and the bounds, for the sampled nominal model.
+
+    `x` (n,), `u` (m,), `cost` ℓ_s; `costate` λ (n,) of f(x, u) − x = 0; `multipliers` (n+m,) of the
+    bounds of w = (x, u), positive at a lower and negative at an upper bound; `A` (n, n), `B` (n, m)
+    Jacobians of f; `hessian` H = ∇²_w (ℓ + λᵀf) (n+m, n+m); `gradient` (n+m,) of ℓ + λᵀ(f − x),
+    which equals `multipliers`. `C` (n_c, n+m) holds the gradients of the strictly active bounds
+    and `active` says which they are.
+    """
+
+    x: Array
+    u: Array
+    cost: float
+    costate: Array
+    multipliers: Array
+    A: Array
+    B: Array
+    hessian: Array
+    gradient: Array
+    C: Array
+    active: tuple[str, ...]
+
+    @property
+    def eigenvalues(self) -> Array:
+        """Eigenvalues of `hessian`, ascending."""
+        return np.linalg.eigvalsh(self.hessian).astype(np.float64)
+
+
+def optimal_steady_state(problem: Problem) -> SteadyState:
+    """Solve for the optimal steady state with IPOPT, started from the problem's reference.
+
+    Raises TuningError where IPOPT fails, or where a state bound's multiplier exceeds the linear
+    weight of the penalty, so that the relaxed problem would rather violate the bound.
+    """
+    model = problem.model
+    n = problem.n_states
+    x, u = ca.SX.sym("x", n), ca.SX.sym("u", problem.n_actions)
+    d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
+    x_next = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
+    cost = model.economic_cost(x, u, ca.SX(d), ca.SX(p))
+    w = ca.vertcat(x, u)
+    options: dict[str, Any] = {
+        "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-11, "bound_relax_factor": 0.0},
+        "print_time": False,
+        "error_on_fail": False,
+    }
+    solver = ca.nlpsol("steady_state", "ipopt", {"x": w, "f": cost, "g": x_next - x}, options)
+    found = solver(
+        x0=np.concatenate([problem.reference_state, problem.reference_action]),
+        lbx=np.concatenate([problem.state_lower, problem.action_lower]),
+        ubx=np.concatenate([problem.state_upper, problem.action_upper]),
+        lbg=0.0,
+        ubg=0.0,
+    )
+    stats = solver.stats()
+    if not stats["success"]:
+        raise TuningError(
+            f"the optimal steady state of model '{model.name}' was not found (IPOPT: "
+            f"{stats['return_status']}); check bounds, and the reference, which is its start"
+        )
+    point, costate = found["x"].full().reshape(-1), found["lam_g"].full().reshape(-1)
+    lagrangian = cost + ca.dot(ca.SX(ca.DM(costate)), x_next - x)
+    hessian, gradient = ca.hessian(lagrangian, w)
+    derivatives = ca.Function("d", [w], [hessian, gradient, ca.jacobian(x_next, w)])
+    hessian, gradient, jacobian = (value.full() for value in derivatives(point))
+    # CasADi's bound multipliers are those of +w ≤ upper: the other sign.
+    multipliers = -found["lam_x"].full().reshape(-1)
+    strict = np.flatnonzero(np.abs(multipliers) > _STRICT * max(1.0, np.abs(multipliers).max()))
+    for i in strict[strict < n]:
+        if abs(multipliers[i]) >= problem.penalty_linear[i]:
+            raise TuningError(
+                f"the penalty of {model.states[i].name} is too small: its linear weight "
+                f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
+                f"{abs(multipliers[i]):g}"
+            )
+    return SteadyState(
+        x=point[:n],
+        u=point[n:],
+        cost=float(found["f"]),
+        costate=costate,
+        multipliers=multipliers,
+        A=jacobian[:, :n],
+        B=jacobian[:, n:],
+        hessian=hessian,
+        gradient=gradient.reshape(-1),
+        C=np.eye(len(point))[strict],
+        active=tuple(_describe(problem, int(i), bool(multipliers[i] > 0)) for i in strict),
+    )
+
+
+def _describe(problem: Problem, index: int, at_lower: bool) -> str:
+    lower = np.concatenate([problem.state_lower, problem.action_lower])
+    upper = np.concatenate([problem.state_upper, problem.action_upper])
+    quantity = (*problem.model.states, *problem.model.actions)[index]
+    relation, bound = ("≥", lower[index]) if at_lower else ("≤", upper[index])
+    return f"{quantity.name} {relation} {bound:g} {quantity.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class LocalFeedback:
+    """Optimal u = K x of min Σ ½ wᵀHw, w = (x, u), x₊ = Ax + Bu, with value ½ xᵀPx.
+
+    `gain` K (m, n); `value` P (n, n), symmetric; both for γ = 1.
+    """
+
+    gain: Array
+    value: Array
+
+
+def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
+    """Solve the Riccati equation on the manifold C w_k = 0, k ≥ 1, of the active constraints.
+
+    A row of `C` (n_c, n+m) that has an entry in u binds from k = 0 on; one of the state alone binds
+    the next state. H (n+m, n+m) may be indefinite. Raises TuningError where the actions cannot
+    keep the constraints, or no stabilising solution exists.
+    """
+    n, m = B.shape
+    on_action = np.abs(C[:, n:]).max(axis=1, initial=0.0) > 0
+    rows = np.vstack([C[on_action], C[~on_action, :n] @ np.hstack([A, B])])
+    # Actions that keep the constraints: u = particular x + free v.
+    gain, free = np.zeros((m, n)), np.eye(m)
+    if len(rows):
+        if np.linalg.matrix_rank(rows[:, n:]) < len(rows):
+            raise TuningError(
+                f"the {len(rows)} active constraints cannot all be kept by the {m} actions within "
+                "one sample: local feedback is not defined by them"
+            )
+        gain = -np.linalg.pinv(rows[:, n:]) @ rows[:, :n]
+        free = null_space(rows[:, n:])
+    if free.shape[1]:
+        gain = gain + free @ _reduced_gain(A, B, H, gain, free)
+    closed, stage = A + B @ gain, np.vstack([np.eye(n), gain])
+    return LocalFeedback(gain, _lyapunov(closed, stage.T @ H @ stage))
+
+
+def _reduced_gain(A: Array, B: Array, H: Array, particular: Array, free: Array) -> Array:
+    """Gain of v in u = particular x + free v, from the Riccati equation."""
+    n = len(A)
+    change = np.block([[np.eye(n), np.zeros((n, free.shape[1]))], [particular, free]])
+    reduced = change.T @ H @ change
+    a, b = A + B @ particular, B @ free
+    q, r, s = reduced[:n, :n], reduced[n:, n:], reduced[:n, n:]
+    try:
+        P = solve_discrete_are(a, b, q, r, s=s)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise TuningError(
+            f"the steady state has no stabilising local feedback of finite cost ({error})"
+        ) from error
+    curvature = r + b.T @ P @ b
+    if np.linalg.eigvalsh(0.5 * (curvature + curvature.T)).min() <= 0:
+        raise TuningError("the steady state is no local minimum of the economic cost")
+    gain: Array = -np.linalg.solve(curvature, b.T @ P @ a + s.T)
+    return gain
+
+
+def _lyapunov(closed: Array, stage: Array) -> Array:
+    """P = stage + closedᵀ P closed; raises TuningError where the closed loop is unstable.
+
+    More accurate than the Riccati solver's P, of which only the gain's part is well conditioned.
+    """
+    n = len(closed)
+    if np.abs(np.linalg.eigvals(closed)).max() >= 1:
+        raise TuningError("the active constraints, once kept, make the closed loop unstable")
+    system = np.eye(n * n) - np.kron(closed.T, closed.T)
+    P = np.linalg.solve(system, stage.reshape(-1)).reshape(n, n)
+    symmetric: Array = 0.5 * (P + P.T)
+    return symmetric
+
+
+@dataclass(frozen=True)
+class Convexification:
+    """H̃ = H + 𝓗(δP) + CᵀFC with I/α ⪯ H̃ ⪯ (β/α) I.
+
+    `hessian` H̃ (n+m, n+m), `delta_P` (n, n) and `F` (n_c, n_c) are those of H̃ itself, the
+    programme's divided by α.
+    """
+
+    hessian: Array
+    delta_P: Array
+    F: Array
+    alpha: float
+    beta: float
+
+    @property
+    def eigenvalues(self) -> Array:
+        """Eigenvalues of H̃, ascending."""
+        return np.linalg.eigvalsh(self.hessian).astype(np.float64)
+
+
+def rotation(A: Array, B: Array, delta_P: Array) -> Array:
+    """𝓗(δP) = [A B]ᵀ δP [A B] − [I 0]ᵀ δP [I 0]: what the storage ½xᵀδPx adds to a stage."""
+    dynamics = np.hstack([A, B])
+    rotated: Array = dynamics.T @ delta_P @ dynamics
+    rotated[: len(A), : len(A)] -= delta_P
+    return rotated
+
+
+def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> Convexification:
+    """Least conditioned convex stage cost that leaves the local optimum where it is.
+
+    min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F, with ρ = `weight`
+    (Zanon, Gros, Diehl 2016). 𝓗(δP) telescopes along a trajectory; CᵀFC vanishes where the active
+    constraints C w = 0 hold: neither changes the optimal feedback. Raises TuningError where there
+    is no solution: then the steady state is not locally optimal under these constraints.
+    """
+    size, n, n_c = len(H), len(A), len(C)
+    basis = [("α", H)]
+    basis += [("δP", rotation(A, B, e)) for e in _symmetric_basis(n)]
+    basis += [("F", C.T @ e @ C) for e in _symmetric_basis(n_c)]
+    columns = np.stack([sdp.svec(matrix) for _, matrix in basis], axis=1)
+    count, triangle = columns.shape[1], columns.shape[0]
+    identity = sdp.svec(np.eye(size))[:, None]
+    # Variables: α, δP, F, β, t with t ≥ ‖F‖.
+    n_F = n_c * (n_c + 1) // 2
+    zeros = np.zeros((triangle, 1))
+    norm = np.zeros((1 + n_F, count + 2))
+    norm[0, -1] = -1.0
+    for k, e in enumerate(_symmetric_basis(n_c)):
+        norm[1 + k, count - n_F + k] = -np.linalg.norm(e)
+    nonnegative = np.zeros((1, count + 2))
+    nonnegative[0, 0] = -1.0
+    constraints = np.vstack(
+        [
+            nonnegative,
+            norm,
+            np.hstack([-columns, zeros, zeros]),
+            np.hstack([columns, -identity, zeros]),
+        ]
+    )
+    offset = np.concatenate([np.zeros(2 + n_F), -identity[:, 0], np.zeros(triangle)])
+    cones = [sdp.nonnegative(1), sdp.second_order(1 + n_F)]
+    cones += [sdp.semidefinite(size), sdp.semidefinite(size)]
+    objective = np.zeros(count + 2)
+    objective[-2:] = 1.0, weight
+    z, status = sdp.solve(
+        np.zeros((count + 2, count + 2)), objective, constraints, offset, cones, iterations=500
+    )
+    if z is None or not z[0] > 0:
+        raise TuningError(
+            f"no convex cost has the local optimum of the economic one (Clarabel: {status}) with "
+            f"{n_c} active constraint{'' if n_c == 1 else 's'}: the steady state is not optimally "
+            "operated under them"
+        )
+    alpha = float(z[0])
+    delta_P = sum_of(z[1 : count - n_F], n) / alpha
+    F = sum_of(z[count - n_F : count], n_c) / alpha
+    hessian = H + rotation(A, B, delta_P) + C.T @ F @ C
+    found = Convexification(0.5 * (hessian + hessian.T), delta_P, F, alpha, float(z[-2]))
+    if not found.eigenvalues[0] > 0:
+        raise TuningError(
+            f"the convexified cost is not positive definite (smallest eigenvalue "
+            f"{found.eigenvalues[0]:.3g}, Clarabel: {status})"
+        )
+    return found
+
+
+def _symmetric_basis(size: int) -> list[Array]:
+    """Basis of the symmetric matrices: e_ij + e_ji, upper triangle row by row."""
+    basis = []
+    for i, j in zip(*np.triu_indices(size), strict=True):
+        matrix = np.zeros((size, size))
+        matrix[i, j] = matrix[j, i] = 1.0
+        basis.append(matrix)
+    return basis
+
+
+def sum_of(weights: Array, size: int) -> Array:
+    """Symmetric matrix (size, size) with the given upper triangle, row by row."""
+    matrix = np.zeros((size, size))
+    for weight, element in zip(weights, _symmetric_basis(size), strict=True):
+        matrix += weight * element
+    return matrix
+
+
+@dataclass(frozen=True)
+class EconomicTuning:
+    """Tuned θ with its certificate.
+
+    `economic` is the local optimum of the economic cost itself (γ = 1, active constraints kept),
+    `tuned` that of the convexified one.
+    """
+
+    parameters: Parameters
+    steady_state: SteadyState
+    convexification: Convexification
+    economic: LocalFeedback
+    tuned: LocalFeedback
+
+    @property
+    def gain_error(self) -> float:
+        """Largest difference between the tuned local feedback gain and the economic one."""
+        return float(np.abs(self.tuned.gain - self.economic.gain).max())
+
+    def __str__(self) -> str:
+        """The certificate in six lines."""
+        steady, convex = self.steady_state, self.convexification
+        active = ", ".join(
+            f"{name} (multiplier {multiplier:.4g})"
+            for name, multiplier in zip(steady.active, steady.C @ steady.multipliers, strict=True)
+        )
+        return "\n".join(
+            [
+                f"optimal steady state  x = {_short(steady.x)}, u = {_short(steady.u)}, "
+                f"cost {steady.cost:.6g}",
+                f"strictly active       {active or 'none'}",
+                f"economic Hessian      eigenvalues {_short(steady.eigenvalues)}",
+                f"convexified Hessian   eigenvalues {_short(convex.eigenvalues)}, "
+                f"α = {convex.alpha:.4g}, β = {convex.beta:.4g}, F = {_short(convex.F)}",
+                f"economic gain         {_short(self.economic.gain)}",
+                f"tuned gain            differs by {self.gain_error:.2g}",
+            ]
+        )
+
+
+def tune(
+    problem: Problem,
+    blocks: ThetaBlocks | None = None,
+    *,
+    value_offset: float | None = None,
+    weight: float = 1e-3,
+    accuracy: float = 1e-8,
+) -> EconomicTuning:
+    """Tune the NMPC so that its local feedback is that of the economic optimum.
+
+    The economic cost is rotated by the costate λ of the optimal steady state, which leaves its
+    gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = `weight`,
+    published as 1e-3). For this the model is integrated in as many steps as bring the relative
+    error of a sample's A and B below `accuracy`, published as 1e-8; the controller's own model
+    keeps its `substeps`.
+    Then ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B], V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx with P
+    the value of H̃ under γ = 1: the term in 1−γ, which the published procedure for γ = 1 does not
+    need, makes P and its feedback those of the discounted problem as well, for any γ and horizon.
+    Without it a discounted NMPC would act as if what it postpones were cheaper. λ_θ undoes both
+    rotations, so that V_θ is to second order the economic value. `value_offset` is c_λ where it
+    shall not be ℓ_s. Raises TuningError where steady state, local optimum or convexification do
+    not exist.
+    """
+    steady = optimal_steady_state(
+        dataclasses.replace(problem, substeps=accurate_substeps(problem, accuracy))
+    )
+    n, A, B = problem.n_states, steady.A, steady.B
+    economic = local_feedback(A, B, steady.hessian, steady.C)
+    convex = convexify(A, B, steady.hessian, steady.C, weight)
+    tuned = local_feedback(A, B, convex.hessian, steady.C)
+    P, dynamics = tuned.value, np.hstack([A, B])
+    M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
+    q, C_x = steady.gradient, steady.C[:, :n]
+    # θ's quadratics are about the reference, the tuning's about the optimal steady state.
+    shift = np.concatenate(
+        [problem.reference_state - steady.x, problem.reference_action - steady.u]
+    )
+    initial = convex.delta_P - C_x.T @ convex.F @ C_x
+    parameters = Parameters.naive(problem, blocks, value_offset=value_offset).replace(
+        {
+            "B_l": _symmetric(0.5 * M),
+            "b_l": q + M @ shift,
+            "B_Vf": _symmetric(0.5 * P),
+            "b_Vf": q[:n] + P @ shift[:n],
+            "B_lambda": _symmetric(0.5 * initial),
+            "b_lambda": steady.costate + initial @ shift[:n],
+        }
+    )
+    return EconomicTuning(
+        parameters=parameters,
+        steady_state=steady,
+        convexification=convex,
+        economic=economic,
+        tuned=tuned,
+    )
+
+
+def accurate_substeps(problem: Problem, accuracy: float) -> int:
+    """Runge–Kutta steps a sample with a relative error below `accuracy`, at the reference.
+
+    The error is that of A and B: a steady state itself is integrated exactly by any number of
+    steps. The problem's own number is doubled until doubling it once more changes less. Raises
+    TuningError where that does not come about in 1024 steps.
+    """
+    model, substeps = problem.model, problem.substeps
+    point = (
+        problem.reference_state,
+        problem.reference_action,
+        model.nominal_disturbance,
+        model.nominal_parameters,
+    )
+
+    def end(steps: int) -> Array:
+        x, u, d, p = model.symbols()
+        following = discretise(model, problem.sampling_time, steps)(x, u, d, p)
+        jacobian = ca.jacobian(following, ca.vertcat(x, u))
+        found: Array = ca.Function("AB", [x, u, d, p], [jacobian])(*point).full()
+        return found
+
+    present = end(substeps)
+    while substeps <= 1024:
+        finer = end(2 * substeps)
+        if (np.abs(finer - present) <= accuracy * (1.0 + np.abs(present))).all():
+            return substeps
+        substeps, present = 2 * substeps, finer
+    raise TuningError(
+        f"model '{model.name}' cannot be integrated to {accuracy:g} over a sample of "
+        f"{problem.sampling_time:g} s"
+    )
+
+
+def _symmetric(matrix: Array) -> Array:
+    """Rounding made symmetric, as θ's packing demands."""
+    symmetric: Array = 0.5 * (matrix + matrix.T)
+    return symmetric
+
+
+def _short(array: Array) -> str:
+    """Entries to five digits, on one line."""
+    rows = [_short(row) if row.ndim else f"{float(row):.5g}" for row in array]
+    return f"[{', '.join(rows)}]"

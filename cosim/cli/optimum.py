@@ -165,9 +165,9 @@ def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) 
     from controllers import factories
     from controllers.dynamic_programming.policy_iteration import SEARCH, Figure
     from controllers.optimum import OptimalPolicy
-    from cosim.evaluation.statistics import mean
     from cosim.plant import FmuPlant
     from cosim.simulation import simulate
+    from cosim.statistics import mean
 
     def costs(controller: Any, fmu: FmuPlant) -> Any:
         runs = (simulate(fmu, controller, STEPS, seed, residuals=False) for seed in SEEDS)

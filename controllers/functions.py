@@ -6,7 +6,6 @@ import hashlib
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from typing import TypeVar
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
 from controllers.shared_library import FLAGS, Build, find, find_compiler, lock_of
-from cosim.cache import sweep, trusted_folder
+from cosim.files import cache_folder
 
 Vector = NDArray[np.float64]
 
@@ -193,7 +192,7 @@ def description() -> str:
     compiler = find_compiler(os.environ.get("CC"))
     if compiler is None:
         return f"{INTERPRETED} (no C compiler found)"
-    return f"{COMPILED} by {compiler.path} {' '.join(FLAGS)}, kept in {trusted_folder(KIND)}"
+    return f"{COMPILED} by {compiler.path} {' '.join(FLAGS)}, kept in {cache_folder(KIND)}"
 
 
 class Compilation:
@@ -269,7 +268,7 @@ class Compilation:
             self._source = c_source([function.function for function in self._functions])
             content = "\0".join((self._source, compiler.identity, *FLAGS))
             self._name = hashlib.sha256(content.encode()).hexdigest()[:32]
-            self._compiler, self._folder = compiler, trusted_folder(KIND)
+            self._compiler, self._folder = compiler, cache_folder(KIND)
         return True
 
     def _start(self, *, wait: bool = False) -> None:
@@ -288,8 +287,6 @@ class Compilation:
         path, self._build = self._build.publish(), None
         self._take(path)
         self._next = sys.maxsize
-        with suppress(OSError):
-            sweep(self._folder)
 
     def _stored(self) -> Path | None:
         return find(self._name, self._folder)

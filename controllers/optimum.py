@@ -34,8 +34,7 @@ from controllers.dynamic_programming.policy_iteration import (
 )
 from controllers.errors import ModelError, OptimumError, QpError
 from controllers.problem import load_model
-from cosim.cache import trusted_folder
-from cosim.files import read_arrays, write_atomically
+from cosim.files import cache_folder, read_arrays, write_atomically
 from cosim.scenario import Scenario
 
 Vector = NDArray[np.float64]
@@ -97,7 +96,7 @@ def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
 
 def stored_file(key: str) -> Path | None:
     """File of a solved problem by its key: the package's own, else the user's, else None."""
-    for path in (SHIPPED / f"{key}.npz", trusted_folder("optima") / f"{key}.npz"):
+    for path in (SHIPPED / f"{key}.npz", cache_folder("optima") / f"{key}.npz"):
         if path.is_file():
             return path
     return None
@@ -105,7 +104,7 @@ def stored_file(key: str) -> Path | None:
 
 def keep(key: str, optimum: Optimum) -> Path:
     """Keep a solved problem in the user's cache, or for this process where others can write it."""
-    return write_optimum(trusted_folder("optima") / f"{key}.npz", optimum, key)
+    return write_optimum(cache_folder("optima") / f"{key}.npz", optimum, key)
 
 
 def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:

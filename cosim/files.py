@@ -1,54 +1,239 @@
-"""Files: written whole or not at all; TOML, JSON and arrays with one message for each error."""
+"""Files: written whole or not at all, read with one message per error, cached, temporary."""
 
 from __future__ import annotations
 
+import atexit
 import errno
+import hashlib
 import json
 import os
+import re
+import secrets
+import shutil
+import socket
+import stat
 import tempfile
+import time
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+import platformdirs
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+# NumPy is imported where arrays are read: `cosim --help` has no use for it.
+
+_inputs: set[tuple[int, int]] = set()
 
 
-def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Path:
-    """Write a file under a temporary name in its folder, then rename it into place.
+def protect(paths: Iterable[str | Path]) -> None:
+    """Let no writer replace these files, the inputs of the command; forgets those of before."""
+    _inputs.clear()
+    for path in paths:
+        with suppress(OSError, ValueError):
+            if stat.S_ISREG((status := Path(path).stat()).st_mode):
+                _inputs.add((status.st_dev, status.st_ino))
 
-    A reader never sees half a file, and what stood under the name before survives any failure.
-    Text, whole or in pieces that are written as they come, is encoded as UTF-8. Raises OSError,
-    which names the file, where the folder cannot be written or is full, or where something other
-    than a file has its name: a device would be no more, a folder cannot be replaced.
+
+def check_target(path: str | Path) -> Path:
+    """The path, where a file may be written there.
+
+    Raises FileExistsError where an input of this command, or anything but a regular file (a folder,
+    a device, a FIFO), has the name.
     """
     path = Path(path)
-    if path.exists() and not path.is_file():
-        raise FileExistsError(errno.EEXIST, "it is not a regular file", str(path))
-    pieces = (data,) if isinstance(data, bytes | str) else data
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            for piece in pieces:
-                stream.write(piece.encode() if isinstance(piece, str) else piece)
-            stream.flush()
-            os.fsync(stream.fileno())
-        make_public(Path(temporary))
-        Path(temporary).replace(path)
-    except BaseException as error:
-        Path(temporary).unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno and not error.filename:
-            error.filename = str(path)
-        raise
+    if path.exists():
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise FileExistsError(errno.EEXIST, "it is not a regular file", str(path))
+        if (status.st_dev, status.st_ino) in _inputs:
+            raise FileExistsError(errno.EEXIST, "it is an input of this command", str(path))
     return path
 
 
-def make_public(path: Path) -> None:
-    """Give a file that mkstemp made private the rights of any other new file of the user."""
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path` to write to; rename it into place after the block.
+
+    A reader never sees half a file, and what stood under the name before survives any failure.
+    Raises what `check_target` raises, and OSError, which names the file, where the folder cannot be
+    written or is full.
+    """
+    path = check_target(path)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        yield temporary
+        publish(temporary, path)
+    except BaseException as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and not error.filename2:
+            error.filename = str(path)
+        raise
+
+
+def publish(temporary: Path, path: Path) -> None:
+    """Rename a complete file into place, synchronised and with the rights of any new file.
+
+    Raises OSError, and what `check_target` raises.
+    """
+    check_target(path)
+    with temporary.open("rb+") as stream:
+        os.fsync(stream.fileno())
     umask = os.umask(0)
     os.umask(umask)
-    path.chmod(0o666 & ~umask)
+    temporary.chmod(0o666 & ~umask)
+    temporary.replace(path)
+
+
+def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Path:
+    """Write a file as `replacing` does.
+
+    Text, whole or in pieces that are written as they come, is encoded as UTF-8.
+    """
+    pieces = (data,) if isinstance(data, bytes | str) else data
+    with replacing(path) as temporary, temporary.open("xb") as stream:
+        for piece in pieces:
+            stream.write(piece.encode() if isinstance(piece, str) else piece)
+    return Path(path)
+
+
+CACHE_VARIABLE = "COSIM_CACHE"
+UNUSED_DAYS = 30
+TAG = "CACHEDIR.TAG"
+TAGGED = """\
+Signature: 8a477f597d28d172789f06886806bc55
+# A cache of rti-cosim, by which backups know what they may leave out. What nobody has used for
+# some weeks is deleted here, and nothing where this file is missing or another.
+"""
+"""The mark of a folder that this cache made; see https://bford.info/cachedir/."""
+_ENTRY = re.compile(r"[0-9a-f]{16,64}(\..*)?|\.partial-.*")
+_caches: dict[Path, Path] = {}
+
+
+def user_cache(kind: str) -> Path:
+    """The user's folder for cached files of a kind, which need not exist yet.
+
+    It lies under the environment's COSIM_CACHE, else where the platform keeps caches.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE)
+    root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
+    return root.absolute() / kind
+
+
+def cache_folder(kind: str) -> Path:
+    """The folder for cached files of a `kind`: the user's, made if need be, or a temporary one.
+
+    Temporary, until this process ends, where the user's cannot be written or others could write it:
+    native code is loaded from here. Entries unused for `UNUSED_DAYS` are deleted once per process.
+    """
+    folder = user_cache(kind)
+    if folder in _caches and _caches[folder].is_dir():
+        return _caches[folder]
+    try:
+        folder.parent.parent.mkdir(parents=True, exist_ok=True)
+        for level in (folder.parent, folder):
+            level.mkdir(mode=0o700, exist_ok=True)
+        usable = is_trusted(folder) and os.access(folder, os.W_OK | os.X_OK)
+        if usable and not any(folder.iterdir()):
+            (folder / TAG).write_text(TAGGED, "utf-8")
+    except OSError:
+        usable = False
+    if usable:
+        _sweep(folder)
+        _caches[folder] = folder
+    else:
+        _caches[folder] = _make_temporary(f"cosim-{kind}-", None)
+        atexit.register(shutil.rmtree, _caches[folder], ignore_errors=True)
+    return _caches[folder]
+
+
+def is_trusted(path: Path) -> bool:
+    """Whether a cached file, or folder, and the two folders above it are the user's alone.
+
+    Each must belong to the user, be closed to others for writing and be no link. Windows closes a
+    user's profile by other means and is trusted.
+    """
+    if os.name == "nt":
+        return path.exists()
+    try:
+        found = [level.lstat() for level in (path, path.parent)]
+    except OSError:
+        return False
+    return all(
+        status.st_uid == os.geteuid()
+        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        and not stat.S_ISLNK(status.st_mode)
+        for status in found
+    )
+
+
+def _sweep(folder: Path) -> None:
+    """Delete unused entries of a folder that carries this cache's mark, by their kind of name."""
+    try:
+        if (folder / TAG).read_text("utf-8", "replace") != TAGGED:
+            return
+        entries = [entry for entry in folder.iterdir() if _ENTRY.fullmatch(entry.name)]
+    except OSError:
+        return
+    for entry in entries:
+        with suppress(OSError):
+            if entry.lstat().st_mtime < time.time() - UNUSED_DAYS * 86400:
+                _delete(entry)
+
+
+def _delete(entry: Path) -> None:
+    if entry.is_dir() and not entry.is_symlink():
+        shutil.rmtree(entry, ignore_errors=True)
+    else:
+        entry.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
+    """A new folder that only this user can enter, deleted at the end of the block.
+
+    `parent` is where it lies, by default where the system keeps temporary files. Its name has the
+    prefix, the machine and this process's number: a folder whose process was killed is deleted by
+    the next call with the same prefix. Raises OSError where it cannot be made.
+    """
+    folder = _make_temporary(prefix, parent)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _make_temporary(prefix: str, parent: Path | None) -> Path:
+    root = Path(tempfile.gettempdir() if parent is None else parent).absolute()
+    start = prefix + hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
+    for other in root.glob(f"{start}-*-????????"):
+        if _is_abandoned(other):
+            _delete(other)
+    folder = root / f"{start}-{os.getpid()}-{secrets.token_hex(4)}"
+    folder.mkdir(mode=0o700)
+    return folder
+
+
+def _is_abandoned(folder: Path) -> bool:
+    """Whether the process that made a temporary folder of this user has ended."""
+    import psutil  # noqa: PLC0415 (most commands meet no such folder)
+
+    try:
+        number = int(folder.name.rpartition("-")[0].rpartition("-")[2])
+        status = folder.lstat()
+        if number == os.getpid() or (os.name != "nt" and status.st_uid != os.geteuid()):
+            return False
+        # A process that began after the folder was last changed has its number again.
+        return bool(psutil.Process(number).create_time() > status.st_mtime + 2.0)
+    except psutil.NoSuchProcess:
+        return True
+    except (OSError, ValueError, psutil.Error):
+        return False
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -56,6 +241,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises OSError where the file cannot be opened, ValueError where its content is damaged.
     """
+    import numpy as np  # noqa: PLC0415
+
     # NumPy leaves a file open that it opened itself and then found damaged.
     with path.open("rb") as stream:
         try:

@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 
 import fmpy
 
-from cosim.temporary import temporary_folder
+from cosim.files import temporary_folder
 from fmus import BuildError
 from fmus.description import build_description, c_header, model_description
 from fmus.model import C_IDENTIFIER, FmiVersion, Model, Variable

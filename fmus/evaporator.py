@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from cosim.temporary import temporary_folder
+from cosim.files import temporary_folder
 from fmus import BuildError
 from fmus.build import (
     COMPILER_FLAGS,

@@ -10,13 +10,13 @@ from typing import Any, get_args, get_origin
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from cosim.evaluation.provenance import source_hashes
+from cosim.files import temporary_folder
 from cosim.lookup import GROUP as CONTROLLERS
 from cosim.lookup import build_controller as controller_by_name
 from cosim.lookup import import_from_here
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.study.protocols import Progress, Training
-from cosim.temporary import temporary_folder
 from learning.errors import ConfigurationError
 from learning.log import COLUMNS, LogRow, to_csv
 from learning.optimum import stored_optimum

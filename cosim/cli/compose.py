@@ -52,8 +52,8 @@ def announce(scenario: Scenario, output: Output) -> None:
 
 def announce_fmu(name: str, output: Output) -> None:
     """Do the same for an FMU by its path, or a shipped one's name."""
-    from cosim.cli.supervision import watch
     from cosim.plant.archive import SHIPPED, unpack
+    from cosim.processes import watch
 
     if name not in SHIPPED:
         fmu = unpack(name)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
 from collections.abc import Sequence
 from itertools import pairwise
@@ -23,27 +25,40 @@ from cosim.cli import (
     scenario,
     simulate,
     study,
-    supervision,
     train,
     tuning,
     view,
 )
-from cosim.cli.streams import open_streams
 from cosim.errors import CosimError
-from cosim.lifetime import Interrupted, Terminated, unwinding_on_signals, unwound
+from cosim.files import protect
+from cosim.processes import (
+    Finished,
+    Interrupted,
+    Terminated,
+    command_process,
+    unwinding_on_signals,
+    unwound,
+)
+
+OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
+"""Options whose value names what a command writes."""
 
 
 class _Commands(TyperGroup):
     """The commands, none of which takes an empty word."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse empty words: as a path, one would mean the working directory."""
+        """Refuse empty words: as a path, one would mean the working directory; protect inputs."""
+        inputs: list[str] = []
         for before, word in pairwise(["", *args]):
             name, equals, value = word.partition("=")
             if not word or (name.startswith("--") and equals and not value):
                 name = name or (before if before.startswith("-") else "")
                 what = f"the value of '{name}'" if name else "an argument"
                 raise CosimError(f"{what} is empty: give one, or leave it out")
+            if not {before, name} & set(OUTPUTS):
+                inputs += [word, *re.split("[,=]", word)]
+        protect(inputs)
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -52,6 +67,10 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except KeyboardInterrupt as error:
             raise Interrupted(*getattr(error, "__notes__", [])) from None
+        except BrokenPipeError:
+            raise CosimError("a pipe that the command, or a plug-in, writes to is closed") from None
+        except SystemExit as error:
+            raise CosimError(f"a plug-in ended the command by exit({error.code})") from error
 
 
 app = typer.Typer(
@@ -131,13 +150,27 @@ def main() -> None:
     Bad input ends in one line on standard error and exit code 2, what nobody foresaw in one line,
     a report with the traceback and exit code 70.
     """
-    open_streams()
-    with unwinding_on_signals():
-        supervision.enter()
-        try:
-            _run()
-        finally:
-            supervision.finish()
+    _open_streams()
+    with unwinding_on_signals(), command_process():
+        _run()
+
+
+def _open_streams() -> None:
+    """Make both standard streams writable whatever the caller left of them.
+
+    A character that a stream's encoding lacks is written as its escape. A closed stream swallows
+    what it is given; `--json`, whose document would be lost, refuses a closed standard output.
+    """
+    if sys.stdout is None and "--json" in sys.argv:
+        if sys.stderr is not None:
+            print("error: standard output is closed: --json prints nowhere", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _run() -> None:
@@ -145,8 +178,8 @@ def _run() -> None:
         app()
     except tuple(_known_errors()) as error:
         _fail(str(error))
-    except BrokenPipeError:
-        sys.exit(1)
+    except Finished as error:
+        sys.exit(error.args[0])
     except OSError as error:
         name = f"'{error.filename}': " if error.filename else ""
         _fail(f"{name}{error.strerror or error}")
@@ -158,7 +191,9 @@ def _run() -> None:
     except Terminated as error:
         unwound()
         _end("terminated", getattr(error, "__notes__", ()), EXIT_TERMINATED)
-    except Exception as error:
+    except SystemExit:
+        raise
+    except BaseException as error:
         _report(error)
 
 
@@ -176,7 +211,7 @@ def _end(word: str, notes: Sequence[str], code: int) -> None:
     sys.exit(code)
 
 
-def _report(error: Exception) -> None:
+def _report(error: BaseException) -> None:
     """Leave the traceback in a file, and say in a line where and what to do with it."""
     import tempfile
     import traceback

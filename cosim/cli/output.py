@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from cosim.errors import CosimError
-from cosim.lifetime import Terminated
+from cosim.processes import Terminated, hold, release
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -134,7 +134,7 @@ def output(as_json: bool) -> Iterator[Output]:
         try:
             yield result
         finally:
-            _release()
+            release()
         return
     sys.stdout.flush()
     result._stdout = os.dup(1)
@@ -142,7 +142,7 @@ def output(as_json: bool) -> Iterator[Output]:
     try:
         yield result
     finally:
-        _release()
+        release()
         sys.stdout.flush()
         os.dup2(result._stdout, 1)
         os.close(result._stdout)
@@ -163,13 +163,6 @@ def resumable(how: Callable[[], str]) -> Iterator[None]:
 def again() -> str:
     """How a command goes on that finds again what it has finished."""
     return "what is finished is kept: the same command goes on from there"
-
-
-def _release() -> None:
-    """Give back the folders that the command held, if it held any."""
-    locking = sys.modules.get("cosim.cli.locking")
-    if locking is not None:
-        locking.release()
 
 
 def _has_descriptor() -> bool:
@@ -198,8 +191,6 @@ def open_folder(folder: Path) -> Path:
 
     Raises CosimError before the work where it cannot be written or another process holds it.
     """
-    from cosim.cli.locking import hold
-
     writable_folder(folder)
     hold(folder)
     return folder

@@ -48,10 +48,10 @@ def check(
     2 where a stored table is missing or damaged. Writes nothing.
     """
     with output(json) as out_:
+        from cosim.files import temporary_folder
         from cosim.study.check import differences, load_tolerances
         from cosim.study.results import StudyResults
         from cosim.study.stored import chosen, stored_results, stored_studies
-        from cosim.temporary import temporary_folder
 
         folder = folder or (Path("results") if Path("results").is_dir() else stored_results())
         tolerances, studies = load_tolerances(folder), stored_studies(folder)

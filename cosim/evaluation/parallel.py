@@ -16,8 +16,8 @@ import loky
 
 from cosim.errors import EvaluationError
 from cosim.evaluation.cluster import cluster
-from cosim.lifetime import follow_parent, out_of_reach_of_ctrl_c
-from cosim.temporary import temporary_folder
+from cosim.files import temporary_folder
+from cosim.processes import follow_parent, out_of_reach_of_ctrl_c
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")

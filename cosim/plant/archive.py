@@ -18,9 +18,8 @@ from typing import Any
 from fmpy.model_description import ValidationError, read_model_description
 
 import fmus
-from cosim.cache import sweep, trusted_folder
 from cosim.errors import PlantError
-from cosim.temporary import temporary_folder
+from cosim.files import cache_folder, temporary_folder
 
 SHIPPED = ("evaporator", "evaporator_fmi3")
 DESCRIPTION = "modelDescription.xml"
@@ -176,14 +175,13 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     ends with this process. Raises OSError and what zipfile raises where the archive cannot be
     unpacked.
     """
-    cache = trusted_folder("fmus")
+    cache = cache_folder("fmus")
     folder = cache / sha256
     if _holds(folder, archive):
         return folder
     with temporary_folder(".partial-", cache) as partial:
         archive.extractall(partial)
         _publish(partial, folder, archive)
-    sweep(cache)
     return folder
 
 

@@ -19,7 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.errors import RecordingError
-from cosim.files import make_public
+from cosim.files import publish
 from cosim.protocols import Array
 
 TIME, SAMPLE = "time", "sample"
@@ -186,8 +186,7 @@ class Stream:
             written.seek(-min(len(_FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
             if _FOOTER not in written.read():
                 self._give_up("its end is missing")
-        make_public(self._partial)
-        self._partial.replace(self.path)
+        publish(self._partial, self.path)
 
     def discard(self) -> None:
         """End the recording without a file."""

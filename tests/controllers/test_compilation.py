@@ -16,7 +16,7 @@ from controllers import (
 from controllers import functions as compilation
 from controllers.functions import BufferedFunction, Compilation, description
 from controllers.shared_library import find, find_compiler
-from cosim.cache import TAG
+from cosim.files import TAG
 from cosim.scenario import Scenario
 from cosim.scenario.loading import presets
 from tests.helpers.command import run_cosim

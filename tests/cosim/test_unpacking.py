@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import fmus
-from cosim.cache import TAG, UNUSED_DAYS
+from cosim.files import TAG
 from cosim.plant.archive import place, unpack
 from tests.helpers.command import run_cosim
 
@@ -79,17 +79,6 @@ def test_a_cache_that_is_deleted_in_mid_run_is_filled_again(cache):
         path.rmdir() if path.is_dir() else path.unlink()
     first.folder.rmdir()
     assert (unpack("evaporator").folder / "modelDescription.xml").is_file()
-
-
-def test_what_nobody_used_for_long_is_deleted(cache, archive):
-    place(archive, "1" * 64)
-    old, recent = cache / ("a" * 64), cache / ("b" * 64)
-    for folder, days in ((old, UNUSED_DAYS + 1), (recent, UNUSED_DAYS - 1)):
-        (folder / "sources").mkdir(parents=True)
-        then = folder.stat().st_mtime - days * DAY
-        os.utime(folder, (then, then))
-    place(archive, "0" * 64)
-    assert {path.name[0] for path in entries(cache)} == {"0", "1", "b"}
 
 
 def test_use_counts_even_where_nothing_is_unpacked(cache, archive):

@@ -11,7 +11,7 @@ import pytest
 
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
-from cosim.cache import CACHE_VARIABLE
+from cosim.files import CACHE_VARIABLE
 from fmus.checks import Status, check
 from fmus.plant import build_plant
 from tests.helpers.command import run_cosim

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import filelock
 
-from cosim.cli.locking import HOLDER, LOCK
+from cosim.processes import HOLDER, LOCK
 from tests.helpers.campaigns import Trial, finish, main, start, trials
 
 MARK = "COSIM_ORPHANS"

@@ -11,9 +11,9 @@ from controllers import RtiNmpc
 from cosim.cli.benchmark.figures import clock, figure
 from cosim.cli.compose import build_plant
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
+from cosim.files import temporary_folder
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
-from cosim.temporary import temporary_folder
 from fmus.sampled import SampledInstance
 
 TARGET = 30.0

@@ -9,7 +9,7 @@ from importlib import import_module
 import pytest
 
 from cosim.cli import output
-from cosim.lifetime import Terminated
+from cosim.processes import Terminated
 from tests.helpers.command import LONG_STUDY
 from tests.helpers.processes import eventually
 

@@ -1,0 +1,331 @@
+"""Processes and signals: who ends with whom, who writes where, and foreign code in a child."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import IO, TYPE_CHECKING
+
+from cosim.errors import CosimError, PlantError
+from cosim.files import temporary_folder
+
+# psutil and filelock are imported where they are needed: every command imports this file.
+if TYPE_CHECKING:
+    import filelock
+    import psutil
+
+
+class Terminated(BaseException):
+    """SIGTERM or SIGHUP was received; raised so that a command unwinds as it does on Ctrl-C."""
+
+
+class Interrupted(BaseException):
+    """Ctrl-C was pressed, and the command has unwound; its arguments say how it goes on."""
+
+
+_unwound = threading.Event()
+_SIGNALS = [
+    getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)
+]
+
+
+@contextmanager
+def unwinding_on_signals() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt, SIGTERM and SIGHUP `Terminated`, once per command.
+
+    Signals that the caller ignores, as nohup and a shell's background jobs do, stay ignored.
+    Restores the previous handlers; at interpreter shutdown the signals are ignored.
+    """
+    _unwound.clear()
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number in _SIGNALS:
+        if before[number] in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, _raise)
+    try:
+        yield
+    finally:
+        _unwound.set()
+        atexit.register(_ignore)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+def unwound() -> None:
+    """Take no more notice of the signals: the command has unwound."""
+    _unwound.set()
+    _ignore()
+
+
+def _ignore() -> None:
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _raise(number: int, _: FrameType | None) -> None:
+    """Raise the signal's exception, and again after a second where C code has cleared it."""
+    found = sys.exception()
+    while found is not None and not isinstance(found, KeyboardInterrupt | Terminated):
+        found = found.__context__
+    if _unwound.is_set() or found is not None:
+        return
+
+    def again() -> None:
+        if not _unwound.is_set():
+            signal.raise_signal(number) if os.name == "nt" else os.kill(os.getpid(), number)
+
+    timer = threading.Timer(1.0, again)
+    timer.daemon = True
+    timer.start()
+    raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+
+
+@contextmanager
+def out_of_reach_of_ctrl_c() -> Iterator[None]:
+    """Start a worker here that Ctrl-C in the terminal does not reach: its parent decides.
+
+    Its threads and its children inherit that. On Windows nothing is done.
+    """
+    if os.name == "nt":
+        yield
+        return
+    from multiprocessing.resource_tracker import ensure_running  # noqa: PLC0415
+
+    ensure_running()  # it would be started first, and let Ctrl-C through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def follow_parent(number: int | None = None) -> None:
+    """End this worker process, without further ado, as soon as its parent has ended.
+
+    To be called once in a worker, whose work is lost with its parent anyway. `number` is the
+    parent's, which may have ended before the worker could ask for it.
+    """
+    from multiprocessing import parent_process  # noqa: PLC0415
+
+    import psutil  # noqa: PLC0415
+
+    if number is None:
+        parent = parent_process()
+        number = os.getppid() if parent is None else parent.pid
+
+    def watch() -> None:
+        with suppress(psutil.Error):
+            psutil.Process(number).wait()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="follow-parent", daemon=True).start()
+
+
+def _die_with_parent() -> None:
+    """Ask Linux to kill this process, a child before its command starts, when its parent ends."""
+    import ctypes  # noqa: PLC0415
+
+    PR_SET_PDEATHSIG = 1
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
+@contextmanager
+def child_process(
+    command: Sequence[str],
+    *,
+    folder: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    log: IO[bytes] | int | None = None,
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a command; end it, and all that it has started, at the end of the block.
+
+    It belongs to this process's group, so that whatever ends the group, a closed terminal for
+    instance, ends it too; on Linux a kill of this process alone ends the command as well. `folder`
+    is its working directory and takes its temporary files; `env` is its environment; `log` takes
+    what it prints. Raises OSError where the command cannot be started.
+    """
+    environment = dict(os.environ if env is None else env)
+    if folder is not None:
+        environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
+    child = subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=log if log is None or log == subprocess.DEVNULL else subprocess.STDOUT,
+        preexec_fn=_die_with_parent if sys.platform == "linux" else None,  # noqa: PLW1509
+    )
+    try:
+        yield child
+    finally:
+        _end(child)
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End a child and its descendants: politely, then, after two seconds, at once."""
+    import psutil  # noqa: PLC0415
+
+    family: list[psutil.Process] = []
+    with suppress(psutil.Error):
+        family = psutil.Process(child.pid).children(recursive=True)
+    for process in (child, *family):
+        with suppress(psutil.Error, OSError):
+            process.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(2.0)
+    for process in (*psutil.wait_procs(family, 0.1)[1], child):
+        with suppress(psutil.Error, OSError):
+            process.kill()
+    child.wait()
+
+
+def run_child(
+    command: Sequence[str],
+    *,
+    timeout: float,
+    folder: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    log: IO[bytes] | int | None = None,
+) -> int:
+    """Exit code of a command that is run as `child_process` does.
+
+    Raises subprocess.TimeoutExpired after `timeout` seconds, and OSError.
+    """
+    with child_process(command, folder=folder, env=env, log=log) as child:
+        return child.wait(timeout)
+
+
+LOCK = ".cosim.lock"
+HOLDER = ".cosim.lock.json"
+_held: dict[Path, filelock.BaseFileLock] = {}
+
+
+def hold(folder: Path) -> None:
+    """Take a folder's lock until `release`; this process may take it again.
+
+    The system gives the lock back when the process ends, however it ends. Raises CosimError that
+    says who holds it, since when, and what to do, and OSError where the folder cannot be written.
+    """
+    import filelock  # noqa: PLC0415
+
+    folder = folder.resolve()
+    if folder in _held:
+        return
+    lock = filelock.FileLock(folder / LOCK, blocking=False)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise CosimError(f"{_holder(folder)}; wait for it or choose another --out") from None
+    _held[folder] = lock
+    holder = {
+        "command": " ".join(["cosim", *sys.argv[1:]]),
+        "process": os.getpid(),
+        "machine": socket.gethostname(),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    (folder / HOLDER).write_text(json.dumps(holder), "utf-8")
+
+
+def release() -> list[Path]:
+    """Give back every lock that this process holds, and leave no trace of them; the folders."""
+    folders = list(_held)
+    while _held:
+        folder, lock = _held.popitem()
+        # Removed while it is held: whoever opens it meanwhile finds it gone and makes another.
+        for name in (HOLDER, LOCK):
+            with suppress(OSError):
+                (folder / name).unlink()
+        lock.release()
+    return folders
+
+
+def _holder(folder: Path) -> str:
+    try:
+        found = json.loads((folder / HOLDER).read_text("utf-8"))
+        who = (
+            f"process {found['process']} on {found['machine']} ({found['command']}) since "
+            f"{found['since']}"
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        who = "another process"
+    return f"folder '{folder}' is being written by {who}"
+
+
+MARK = "COSIM_FINISHED"
+"""Environment variable of a watched command: its parent's number and the file that it leaves."""
+_marks: list[str | None] = []
+"""Of a process of the command line: its mark, or None where nobody watches it."""
+
+
+@contextmanager
+def command_process() -> Iterator[None]:
+    """Mark this process as the command line's: one that may be watched, or that is.
+
+    An FMU may call `exit(0)`, be killed, or close what the process has open: a process that is
+    watched leaves word that the command came to its end, whatever its exit code.
+    """
+    # Taken out, so that what this command starts does not take itself for it.
+    _marks.append(os.environ.pop(MARK, None))
+    if _marks[-1] is not None:
+        follow_parent(int(_marks[-1].partition(" ")[0]))
+    try:
+        yield
+    finally:
+        if (mark := _marks.pop()) is not None:
+            with suppress(OSError):
+                Path(mark.partition(" ")[2]).touch()
+
+
+def watch(fmu: Path, stdout: int | None) -> None:
+    """Run this command again in a process of its own, and exit as that does; else return.
+
+    It returns in that process, and where the command line was not the one called. `stdout` is the
+    descriptor of standard output where another is in its place. Raises PlantError where the
+    process ended before the command did.
+    """
+    if not _marks or _marks[-1] is not None:
+        return
+    flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
+    command = [sys.executable, *flags, "-m", "cosim", *sys.argv[1:]]
+    folders = release()  # for the process that does the work
+    with temporary_folder("cosim-") as temporary:
+        mark = temporary / "finished"
+        environment = os.environ | {MARK: f"{os.getpid()} {mark}"}
+        child = subprocess.Popen(command, stdout=stdout, env=environment)
+        code = _outcome(child)
+        finished = mark.exists()
+    if finished and code >= 0:
+        raise Finished(code)
+    for folder in folders:  # so that the locks of a process that was killed are cleared away
+        with suppress(CosimError, OSError):
+            hold(folder)
+    how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+    raise PlantError(
+        f"FMU '{fmu}', or other native code, ended the process {how} before the command finished"
+    )
+
+
+class Finished(BaseException):
+    """A watched command has ended; its argument is the exit code."""
+
+
+def _outcome(child: subprocess.Popen[bytes]) -> int:
+    """The child's exit code; what ends this process meanwhile ends the child first."""
+    try:
+        return child.wait()
+    except BaseException as error:
+        if not isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the child, too: it unwinds
+            child.terminate()
+        child.wait()
+        raise

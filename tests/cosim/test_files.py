@@ -1,0 +1,245 @@
+"""Files are whole or not there; caches are the user's alone; temporary folders end."""
+
+import os
+import stat
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from cosim import files
+from cosim.files import (
+    DEEPEST,
+    LARGEST,
+    TAG,
+    UNUSED_DAYS,
+    cache_folder,
+    is_trusted,
+    protect,
+    read_arrays,
+    read_json,
+    read_toml,
+    temporary_folder,
+    write_atomically,
+)
+
+posix = pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
+
+
+def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path):
+    assert write_atomically(tmp_path / "text", "θ\n").read_bytes() == "θ\n".encode()
+    assert write_atomically(tmp_path / "bytes", b"\x00\xff").read_bytes() == b"\x00\xff"
+
+
+def test_what_stood_there_survives_a_failure(tmp_path, monkeypatch):
+    path = write_atomically(tmp_path / "file", "old")
+
+    def broken():
+        yield "half"
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_atomically(path, broken())
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(5, "disk full")))
+    with pytest.raises(OSError, match="disk full") as caught:
+        write_atomically(path, "new")
+    assert caught.value.filename == str(path)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_is_as_readable_as_any_other(tmp_path):
+    (tmp_path / "plain").write_text("")
+    path = write_atomically(tmp_path / "file", "")
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+
+
+@posix
+@pytest.mark.parametrize("kind", ["folder", "fifo", "device", "link to a device"])
+def test_what_is_not_a_file_is_never_replaced(tmp_path, kind):
+    path = tmp_path / "target"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/null")
+    before = path.lstat()
+    with pytest.raises(FileExistsError):
+        write_atomically(path, "new")
+    assert (path.lstat().st_ino, path.lstat().st_mode) == (before.st_ino, before.st_mode)
+
+
+@posix
+def test_an_input_of_the_command_is_never_replaced_by_whatever_name(tmp_path):
+    path = write_atomically(tmp_path / "input", "old")
+    (tmp_path / "link").symlink_to(path)
+    (tmp_path / "second name").hardlink_to(path)
+    protect([path, tmp_path, "no such file", "\0"])
+    try:
+        for name in ("input", "link", "second name"):
+            with pytest.raises(FileExistsError):
+                write_atomically(tmp_path / name, "new")
+    finally:
+        protect([])
+    assert path.read_text() == "old"
+
+
+def test_arrays_with_any_byte_changed_are_read_as_they_were_or_refused(tmp_path):
+    path, arrays = tmp_path / "arrays.npz", {"a": np.arange(3.0), "b": np.array("text")}
+    np.savez_compressed(path, **arrays)
+    whole = path.read_bytes()
+    refused = 0
+    for position in range(0, len(whole), 3):
+        for change in (0x01, 0x40, 0xFF):
+            path.write_bytes(
+                whole[:position] + bytes([whole[position] ^ change]) + whole[position + 1 :]
+            )
+            try:
+                found = read_arrays(path)
+            except ValueError:
+                refused += 1
+            else:
+                for name, value in found.items():
+                    np.testing.assert_array_equal(value, arrays.get(name, value))
+    assert refused > 0
+
+
+@pytest.mark.parametrize("read", [read_toml, read_json])
+@pytest.mark.parametrize(
+    "content",
+    [None, b"\xff", b"{ [ no", b"1", b"x" * (LARGEST + 1), b"[" * 10**5, b"a = " + b"9" * 10**5],
+    ids=["missing", "not UTF-8", "no document", "a number", "large", "endless", "long number"],
+)
+def test_a_document_that_is_none_is_one_line_that_names_it(tmp_path, read, content):
+    path = tmp_path / "document"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(LookupError) as caught:
+        read(path, "the document", LookupError)
+    assert str(caught.value).startswith("the document ")
+
+
+def test_documents_may_be_nested_to_a_limit(tmp_path):
+    path = tmp_path / "document"
+    path.write_text("a = " + "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1))
+    read_toml(path, "it", LookupError)
+    path.write_text("a = " + "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1))
+    with pytest.raises(LookupError):
+        read_toml(path, "it", LookupError)
+
+
+@pytest.fixture
+def own_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(files, "_caches", {})
+    return tmp_path / "cache"
+
+
+@posix
+def test_the_cache_is_made_and_closed_to_others(own_cache):
+    folder = cache_folder("compiled")
+    assert folder == own_cache / "compiled"
+    assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(own_cache.stat().st_mode) == 0o700
+
+
+@posix
+@pytest.mark.parametrize("level", ["cache", "cache/compiled"])
+@pytest.mark.parametrize("fault", [0o770, 0o707, "link", "owner", "file"])
+def test_a_cache_that_others_can_write_is_not_used(own_cache, tmp_path, monkeypatch, level, fault):
+    place = tmp_path / level
+    (own_cache / "compiled").mkdir(parents=True, mode=0o700)
+    own_cache.chmod(0o700)
+    if fault == "link":
+        place.rename(tmp_path / "elsewhere")
+        place.symlink_to(tmp_path / "elsewhere")
+    elif fault == "file":
+        place.rename(tmp_path / "elsewhere")
+        place.write_text("")
+    elif fault == "owner":
+        owner = os.geteuid()
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    else:
+        place.chmod(fault)
+    folder = cache_folder("compiled")
+    assert tmp_path not in folder.parents
+    assert cache_folder("compiled") == folder
+
+
+@posix
+def test_a_cached_file_that_others_can_write_is_not_trusted(own_cache):
+    path = cache_folder("compiled") / "library"
+    assert not is_trusted(path)
+    path.touch(0o600)
+    assert is_trusted(path)
+    path.chmod(0o620)
+    assert not is_trusted(path)
+
+
+HASH = "0123456789abcdef" * 4
+
+
+@posix
+@pytest.mark.parametrize("marked", [True, False])
+def test_only_unused_entries_of_our_own_kind_are_swept(own_cache, tmp_path, monkeypatch, marked):
+    folder = cache_folder("fmus")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "kept").touch()
+    old = [HASH, HASH[:16] + ".npz", HASH[:32] + "." + HASH, ".partial-old"]
+    foreign = ["plant.fmu", ".git", "0123", HASH + "0", HASH.upper()]
+    for name in (*old, *foreign, HASH.replace("0", "1")):
+        (folder / name).mkdir()
+    (folder / HASH[:20]).symlink_to(tmp_path / "elsewhere")
+    for name in (*old, *foreign, HASH[:20]):
+        then = (folder / name).lstat().st_mtime - (UNUSED_DAYS + 1) * 86400
+        os.utime(folder / name, (then, then), follow_symlinks=False)
+    if not marked:
+        (folder / TAG).write_text("another")
+    monkeypatch.setattr(files, "_caches", {})
+    cache_folder("fmus")
+    left = {path.name for path in folder.iterdir()}
+    kept = {TAG, *foreign, HASH.replace("0", "1")}
+    assert left == kept if marked else left == kept | {*old, HASH[:20]}
+    assert (tmp_path / "elsewhere" / "kept").exists()
+
+
+def test_a_temporary_folder_is_deleted_with_what_is_in_it_whatever_is_raised(tmp_path):
+    with pytest.raises(ZeroDivisionError), temporary_folder("mine-", tmp_path) as folder:
+        assert folder.parent == tmp_path
+        (folder / "deep" / "deeper").mkdir(parents=True)
+        if os.name != "nt":
+            assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+PROGRAM = (
+    "import sys, time\n"
+    "from pathlib import Path\n"
+    "from cosim.files import temporary_folder\n"
+    "with temporary_folder('mine-', Path(sys.argv[1])) as folder:\n"
+    "    print(folder.name, flush=True)\n    sys.stdin.read()\n"
+)
+
+
+def test_the_folder_of_a_killed_process_is_deleted_by_the_next_run_and_a_living_ones_is_not(
+    tmp_path,
+):
+    words, pipe = [sys.executable, "-c", PROGRAM, str(tmp_path)], subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True) as process:
+        name = process.stdout.readline().strip()
+        with temporary_folder("mine-", tmp_path):
+            assert (tmp_path / name).is_dir()
+        process.kill()
+    assert (tmp_path / name).is_dir()
+    (tmp_path / "mine-kept").mkdir()
+    with temporary_folder("mine-", tmp_path):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["mine-kept"]
+
+
+def test_python_objects_in_arrays_are_refused_not_executed(tmp_path):
+    np.savez(tmp_path / "arrays.npz", a=np.array([print], dtype=object))
+    with pytest.raises(ValueError, match="pickle"):
+        read_arrays(tmp_path / "arrays.npz")

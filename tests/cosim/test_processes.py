@@ -1,0 +1,315 @@
+"""Whatever ends a command ends what it started; one writer per folder; foreign code is watched."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cosim import processes
+from cosim.cli.output import open_folder, output
+from cosim.errors import CosimError
+from cosim.processes import run_child, unwinding_on_signals
+from tests.helpers.command import run_cosim, start_cosim
+from tests.helpers.kinds import build_kind, scenario_for
+from tests.helpers.processes import alive, eventually
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+SLOW = pytest.mark.slow
+
+WORKERS = (
+    "import os, time\n"
+    "from cosim.evaluation.parallel import run_all\n"
+    "def work(path):\n"
+    "    open(path + str(os.getpid()), 'w').close()\n"
+    "    time.sleep(600)\n"
+    "run_all(work, {{str(k): {folder!r} + '/' for k in range(4)}}.items(), print, jobs=2)\n"
+)
+
+
+@linux
+def test_workers_end_with_the_parent(tmp_path):
+    program = WORKERS.format(folder=str(tmp_path))
+    with subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL) as parent:
+        assert eventually(lambda: len(list(tmp_path.iterdir())) == 2)
+        workers = [int(path.name) for path in tmp_path.iterdir()]
+        parent.kill()
+    assert eventually(lambda: not any(map(alive, workers)))
+
+
+def test_a_worker_whose_parent_ended_before_it_asked_ends():
+    program = "import time; from cosim.processes import follow_parent; follow_parent(1 << 30); "
+    with subprocess.Popen([sys.executable, "-c", f"{program}time.sleep(600)"]) as worker:
+        assert worker.wait(60) == 1
+
+
+CHILD = (
+    "import subprocess, sys\n"
+    "from cosim.processes import run_child, unwinding_on_signals\n"
+    "words = [sys.executable, '-c', 'import os, time; print(os.getpid(), flush=True);'\n"
+    "         'time.sleep(600)']\n"
+    "with unwinding_on_signals():\n    run_child(words, timeout=600.0)\n"
+)
+
+
+@linux
+@pytest.mark.parametrize("group", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_child_ends_with_its_parent(number, group):
+    with subprocess.Popen(
+        [sys.executable, "-c", CHILD],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        # nohup ignores SIGHUP
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # noqa: PLW1509
+    ) as process:
+        child = int(process.stdout.readline())
+        (os.killpg if group else os.kill)(process.pid, number)
+        assert eventually(lambda: not alive(child))
+
+
+def test_a_child_that_takes_too_long_is_ended_with_its_children(tmp_path):
+    program = (
+        "import subprocess, sys, signal, time, pathlib\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
+        "pathlib.Path('number').write_text(str(child.pid))\n"
+        "time.sleep(600)\n"
+    )
+    with pytest.raises(subprocess.TimeoutExpired):
+        run_child([sys.executable, "-c", program], timeout=2.0, folder=tmp_path)
+    number = int((tmp_path / "number").read_text())
+    assert eventually(lambda: not alive(number))
+
+
+def test_a_child_has_its_exit_code_and_its_temporary_files_in_its_folder(tmp_path):
+    program = "import sys, tempfile; open('here', 'w').write(tempfile.gettempdir()); sys.exit(3)"
+    assert run_child([sys.executable, "-c", program], timeout=60.0, folder=tmp_path) == 3
+    assert (tmp_path / "here").read_text() == str(tmp_path)
+
+
+def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
+    options = ["--controller", "naive", "--steps", "2000000", "--out", str(tmp_path / "out")]
+    with start_cosim("simulate", "--scenario", "paper", *options) as process:
+        assert eventually((tmp_path / "out").is_dir)
+        time.sleep(1.0)  # into the run
+        process.terminate()
+        _, words = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert words == "terminated\n"
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+LOST = """
+import sys, time
+from cosim.processes import Terminated, unwinding_on_signals, unwound
+
+class Slow:
+    def __del__(self):  # what is raised in here is lost
+        print("ready", flush=True)
+        time.sleep(60)
+
+sys.unraisablehook = lambda _: print("lost", flush=True)
+with unwinding_on_signals():
+    try:
+        slow = Slow()
+        del slow
+        time.sleep(60)
+    except (KeyboardInterrupt, Terminated) as error:
+        try:
+            time.sleep(1.5)  # the signal comes again, and is not raised again
+            {}["unwinding"]
+        except KeyError:
+            time.sleep(0.5)
+        unwound()
+        print(type(error).__name__)
+time.sleep(0.5)
+"""
+
+
+@linux
+@pytest.mark.parametrize(
+    ("number", "word"), [(signal.SIGINT, "KeyboardInterrupt"), (signal.SIGTERM, "Terminated")]
+)
+def test_a_signal_whose_exception_was_lost_comes_again_and_unwinds_once(number, word):
+    with subprocess.Popen(
+        [sys.executable, "-c", LOST], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(number)
+        assert process.communicate(timeout=30) == (f"lost\n{word}\n", "")
+
+
+@linux
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_after_the_command_has_ended_changes_nothing(number):
+    program = (
+        "import atexit, sys, time\n"
+        "from cosim.cli import main\n"
+        "atexit.register(lambda: (print('ending', flush=True), time.sleep(0.5)))\n"
+        "sys.argv[1:] = ['--help']\n"
+        "main()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        while process.stdout.readline() != "ending\n":
+            pass
+        process.send_signal(number)
+        assert process.communicate(timeout=30) == ("", "")
+    assert process.returncode == 0
+
+
+def test_handlers_are_put_back_and_ignored_signals_stay_ignored():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with unwinding_on_signals():
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+            assert signal.getsignal(signal.SIGTERM) is not before[signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGINT, before[signal.SIGINT])
+    assert before == {number: signal.getsignal(number) for number in before}
+
+
+HOLD = (
+    "import sys, time\n"
+    "from pathlib import Path\n"
+    "from cosim.processes import hold\n"
+    "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)\n"
+)
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that holds the folder `out`."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, folder], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["simulate", "-n", "10"],
+        pytest.param(["evaluate", "--controllers", "naive", "--seeds", "1"], marks=SLOW),
+        pytest.param(["train", "-a", "q-learning", "-n", "10"], marks=SLOW),
+    ],
+)
+def test_a_folder_that_is_being_written_is_refused(holder, tmp_path, command):
+    done = run_cosim(*command, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert re.search(rf"written by process {holder.pid} on \S+ \(.*\) since \S+; ", done.stderr)
+    (tmp_path / "out" / processes.HOLDER).write_text("{")
+    with pytest.raises(CosimError, match="another process"):
+        processes.hold(tmp_path / "out")
+
+
+@SLOW
+def test_the_lock_of_a_killed_process_is_given_back(holder, tmp_path):
+    holder.kill()
+    holder.wait()
+    assert run_cosim("simulate", "-n", "10", "--out", tmp_path / "out").returncode == 0
+    left = {path.name for path in (tmp_path / "out").iterdir()}
+    assert not left & {processes.LOCK, processes.HOLDER}
+
+
+def test_a_command_may_open_its_folder_twice_and_leaves_no_lock_behind(tmp_path):
+    def command():
+        with output(False):
+            open_folder(tmp_path)
+            open_folder(tmp_path)
+            assert (tmp_path / processes.LOCK).exists()
+            raise CosimError("failed")
+
+    with pytest.raises(CosimError):
+        command()
+    assert list(tmp_path.iterdir()) == []
+
+
+def run_foreign(folder, fmu, fault, *more):
+    """A short run of an FMU with a fault of its kind."""
+    scenario = scenario_for(folder, fmu, fault=fault)
+    words = ["simulate", "-s", scenario, "-c", "tests.helpers.loop:hold", "-n", 3, "--out", "out"]
+    environment = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    return run_cosim(*words, *more, folder=folder, env=environment)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (3, "with exit code 0 before the command finished"),
+        pytest.param(4, "with exit code 0 before the command finished", marks=SLOW),
+        pytest.param(8, "by SIGKILL before the command finished", marks=SLOW),
+        pytest.param(9, "by SIGSEGV before the command finished", marks=SLOW),
+    ],
+    ids=["exit", "_exit", "kill", "crash"],
+)
+def test_an_fmu_that_ends_the_process_is_one_line_and_exit_code_2(tmp_path, fault, words):
+    result = run_foreign(tmp_path, build_kind(tmp_path, 2), fault)
+    assert result.returncode == 2
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert words in line
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@SLOW
+@pytest.mark.parametrize("fault", [5, 6, 7, 10], ids=["chdir", "closes all", "SIGTERM", "thread"])
+def test_an_fmu_that_meddles_has_no_exit_code_0_without_results(tmp_path, fault):
+    result = run_foreign(tmp_path, build_kind(tmp_path, 3), fault)
+    assert (result.returncode == 0) <= (tmp_path / "out" / "summary.json").exists()
+    assert fault != 7 or result.returncode == 143
+
+
+def test_json_and_notes_come_through_the_watching_process(tmp_path):
+    fmu = build_kind(tmp_path, 2)
+    result = run_foreign(tmp_path, fmu, 0, "--json")
+    assert json.loads(result.stdout)["samples"] == 3
+    assert run_foreign(tmp_path, fmu, 0).stderr.count("native code of") == 1
+
+
+@SLOW
+def test_the_watched_process_ends_with_the_watching_one(tmp_path):
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, 2), fault=12)
+    words = ["simulate", "-s", scenario, "-c", "tests.helpers.loop:hold", "-n", 3, "--out", "out"]
+    environment = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    with start_cosim(*words, folder=tmp_path, env=environment) as process:
+        assert "native code of" in process.stderr.readline()
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        # The watched process holds the other end of the pipe until it ends, too.
+        begin = time.monotonic()
+        process.stderr.read()
+        assert time.monotonic() - begin < 30.0
+
+
+@SLOW
+def test_a_recording_of_another_run_does_not_stand_beside_the_signals(tmp_path):
+    assert run_cosim("simulate", "-n", "20", "--record", "--out", tmp_path).returncode == 0
+    assert (tmp_path / "run.rrd").exists()
+    assert run_cosim("simulate", "-n", "20", "--seed", "1", "--out", tmp_path).returncode == 0
+    assert not (tmp_path / "run.rrd").exists()
+
+
+@SLOW
+def test_a_training_is_neither_overwritten_nor_mixed_unless_asked(tmp_path):
+    words = ["train", "-a", "q-learning", "--scenario", "paper", "--json", "-n", "300"]
+    words += ["--log-every", "100", "--checkpoint-every", "300", "--out", str(tmp_path)]
+    assert run_cosim(*words).returncode == 0
+    kept = (tmp_path / "learning.csv").read_bytes()
+    assert run_cosim(*words, "--seed", "1").returncode == 2
+    assert (tmp_path / "learning.csv").read_bytes() == kept
+    assert run_cosim(*words, "--seed", "1", "--overwrite").returncode == 0
+    assert (tmp_path / "learning.csv").read_bytes() != kept

@@ -15,8 +15,7 @@ import pytest
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.factories import naive
 from controllers.qp.daqp_backend import DaqpBackend
-from cosim import FmuPlant, Scenario, evaluate, simulate
-from cosim.cli import locking
+from cosim import FmuPlant, Scenario, evaluate, processes, simulate
 from cosim.errors import RecordingError
 from cosim.recording import read_recording
 from tests.faults.kill import JOBS, campaign
@@ -127,7 +126,7 @@ def test_a_folder_that_was_locked_in_mid_run_is_one_line(tmp_path):
     assert "Permission denied" in said
     # In a folder that is locked, not even the command's own lock can be removed.
     left = {path.name for path in (tmp_path / "out").iterdir()}
-    assert left <= {locking.LOCK, locking.HOLDER}
+    assert left <= {processes.LOCK, processes.HOLDER}
 
 
 LOCKING = """

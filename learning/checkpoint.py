@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cosim.files import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
-SCHEMA = 6
+SCHEMA = 7
 Array = NDArray[Any]
 
 

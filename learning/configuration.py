@@ -72,10 +72,10 @@ class Configuration(BaseModel):
         1e-3,
         description="least eigenvalue that B_l and B_Vf may have, in the problem's own units",
     )
-    exploration: Literal["additive", "literal", "perturbed-cost", "none"] = Field(
+    exploration: Literal["additive", "literal", "none"] = Field(
         "additive",
-        description="a = sat(π+e), a = sat(e), a = π of a cost with a random linear term in u, "
-        "or always a = π; this and what follows: unless the scenario has a table [exploration]",
+        description="a = sat(π+e), a = sat(e), or always a = π; this and what follows: unless the "
+        "scenario has a table [exploration]",
     )
     exploration_probability: ExplorationProbability = 1.0
     exploration_probability_end: Share | None = Field(

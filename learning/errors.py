@@ -23,3 +23,7 @@ class AlgorithmLookupError(LearningError):
 
 class DivergenceError(LearningError):
     """Learning left the region where θ means anything; the last good θ is kept."""
+
+
+class PrivilegeError(LearningError):
+    """An algorithm that asks for a plant in operation uses what only a simulator can."""

@@ -1,7 +1,8 @@
-"""Greedy evaluation of θ on noise that training never sees, against the naive one and J*."""
+"""Greedy evaluation of a training's θ on noise that it never sees, against the naive θ and J*."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
@@ -15,34 +16,20 @@ from controllers.problem import Problem
 from cosim.protocols import Controller, Plant
 from cosim.simulation import simulate
 from cosim.statistics import Estimate, gap_closed, regret
-from learning.protocols import LearnableController
-from learning.starting_point import build_controller
-from learning.training_run import TrainingRun
+from learning.training_run import TrainingRun, build_controller
 
+Array = NDArray[np.float64]
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
+FIGURES = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
 
 
-@dataclass(frozen=True)
-class HeldOutRuns:
-    """Runs of `steps` samples of `plant` from the initial state, one for each of the `seeds`."""
-
-    plant: Plant
-    seeds: tuple[int, ...]
-    steps: int
-
-    def costs(self, controller: Controller) -> dict[str, NDArray[np.float64]]:
-        """Summary figures of each run, (seeds,): J, economic_cost, mean_violation and so on."""
-        summaries = [
-            simulate(self.plant, controller, self.steps, seed, residuals=False).summary()
-            for seed in self.seeds
-        ]
-        names = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
-        return {name: np.array([float(s[name]) for s in summaries]) for name in names}
-
-    def means(self, controller: Controller) -> dict[str, float]:
-        """Mean of each figure over the seeds; `failures` is their sum."""
-        return means(self.costs(controller))
+def held_out_costs(
+    plant: Plant, controller: Controller, steps: int, seeds: Sequence[int]
+) -> dict[str, Array]:
+    """`FIGURES` of a run of `steps` samples from the initial state for each seed, (seeds,) each."""
+    runs = [simulate(plant, controller, steps, seed, residuals=False).summary() for seed in seeds]
+    return {name: np.array([float(run[name]) for run in runs]) for name in FIGURES}
 
 
 @dataclass(frozen=True)
@@ -82,25 +69,17 @@ class Judge:
     def __init__(
         self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
     ) -> None:
-        self._run, self._start, self._optimum = run, start, optimum
+        self._run, self._plant, self._start, self._optimum = run, plant, start, optimum
         self._problem = Problem.from_scenario(run.scenario)
-        self._controller = self._build(start)
-        self._evaluation = HeldOutRuns(plant, held_out(run.evaluation_seeds), run.evaluation_steps)
+        self._controller = build_controller(run.controller, run.scenario, start)
 
-    def _build(self, parameters: Parameters) -> LearnableController:
-        run = self._run
-        return build_controller(run.controller, run.scenario, parameters)
-
-    def controller(self, theta: NDArray[np.float64]) -> Controller:
-        """The greedy controller at θ (n_θ,); the same one, moved, at every call."""
-        self._controller.theta = theta
-        return self._controller
-
-    def verdict(self, theta: NDArray[np.float64]) -> Verdict:
+    def verdict(self, theta: Array) -> Verdict:
         """The greedy policy at θ (n_θ,), judged."""
-        costs = self._evaluation.costs(self.controller(theta))
+        costs = self._costs(theta)
+        means: dict[str, float] = {name: float(values.mean()) for name, values in costs.items()}
+        means["failures"] = int(costs["failures"].sum())
         return Verdict(
-            means(costs),
+            means,
             regret(costs["J"], self._optimal_cost),
             gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value,
         )
@@ -113,41 +92,37 @@ class Judge:
             found["optimal"] = float(self._optimal_cost.mean())
         return found
 
-    @property
+    @cached_property
     def start_J(self) -> float:
         """J on the held-out runs of θ where the run starts."""
-        return float(self._start_cost.mean())
+        return float(self._costs(self._start.theta)["J"].mean())
 
     @property
     def limit(self) -> float:
         """Greedy J above which a run has diverged."""
         # A cost may be negative, a profit say: the margin counts in its magnitude.
-        worst = max(float(self._naive_cost.mean()), float(self._start_cost.mean()))
+        worst = max(float(self._naive_cost.mean()), self.start_J)
         return worst + (self._run.divergence - 1) * abs(worst)
 
-    @cached_property
-    def _naive_cost(self) -> NDArray[np.float64]:
-        naive = self._build(Parameters.naive(self._problem))
-        return self._evaluation.costs(naive)["J"]
+    def _costs(self, policy: Array | Controller) -> dict[str, Array]:
+        """Figures on the held-out seeds of the greedy policy at θ, or of a controller."""
+        controller: Controller
+        if isinstance(policy, np.ndarray):
+            self._controller.theta = policy
+            controller = self._controller
+        else:
+            controller = policy
+        seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
+        return held_out_costs(self._plant, controller, self._run.evaluation_steps, seeds)
 
     @cached_property
-    def _start_cost(self) -> NDArray[np.float64]:
-        return self._evaluation.costs(self.controller(self._start.theta))["J"]
+    def _naive_cost(self) -> Array:
+        run = self._run
+        naive = build_controller(run.controller, run.scenario, Parameters.naive(self._problem))
+        return self._costs(naive)["J"]
 
     @cached_property
-    def _optimal_cost(self) -> NDArray[np.float64]:
+    def _optimal_cost(self) -> Array:
         if self._optimum is None:
-            return np.full(len(self._evaluation.seeds), np.nan)
-        return self._evaluation.costs(self._optimum)["J"]
-
-
-def means(costs: dict[str, NDArray[np.float64]]) -> dict[str, float]:
-    """Mean of each figure over the seeds; `failures` is their sum."""
-    figures: dict[str, Any] = {name: float(values.mean()) for name, values in costs.items()}
-    figures["failures"] = int(costs["failures"].sum())
-    return figures
-
-
-def held_out(count: int) -> tuple[int, ...]:
-    """The first `count` held-out seeds."""
-    return tuple(HELD_OUT + k for k in range(count))
+            return np.full(self._run.evaluation_seeds, np.nan)
+        return self._costs(self._optimum)["J"]

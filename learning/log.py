@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from math import inf, isnan
 
 import numpy as np
 
 from controllers.parameters import Parameters
 from cosim.text_tables import csv_text
-from learning.protocols import Update
+from learning.algorithm import Update
 
 COLUMNS = (
     "samples",
@@ -28,8 +27,6 @@ COLUMNS = (
     "weakly_active",
     "licq_failed",
     "plant_samples",
-    "validated_J",
-    "accepted",
     "greedy_J",
     "greedy_economic_cost",
     "greedy_mean_violation",
@@ -40,43 +37,17 @@ COLUMNS = (
 )
 
 
-class LogRow(Mapping[str, float]):
-    """A line of the log: `figures` by column, NaN where not measured, and the `parameters` then.
+class LogRow(dict[str, float]):
+    """A line of the log: figures by column, NaN where not measured, and the `parameters` then.
 
-    It reads as the mapping of its figures; the entries of θ get names in the CSV alone.
+    The entries of θ have names in the CSV alone.
     """
 
-    # A long run keeps many rows: small NumPy arrays, each alive among what comes and goes, would
-    # hold a page of memory each.
-    __slots__ = ("_blocks", "_figures", "_positions", "_theta")
+    __slots__ = ("parameters",)
 
     def __init__(self, figures: Mapping[str, float], parameters: Parameters) -> None:
-        self._positions = _positions(tuple(figures))
-        self._figures = np.fromiter(figures.values(), np.float64, len(figures)).tobytes()
-        self._blocks, self._theta = parameters.blocks, parameters.theta.tobytes()
-
-    @property
-    def parameters(self) -> Parameters:
-        """θ at the time of the row."""
-        return Parameters(self._blocks, np.frombuffer(self._theta))
-
-    def __getitem__(self, name: str) -> float:
-        """A figure by its column."""
-        return float(np.frombuffer(self._figures)[self._positions[name]])
-
-    def __iter__(self) -> Iterator[str]:
-        """The columns."""
-        return iter(self._positions)
-
-    def __len__(self) -> int:
-        """Return the number of figures."""
-        return len(self._positions)
-
-
-@cache
-def _positions(columns: tuple[str, ...]) -> dict[str, int]:
-    """Where a column stands; the same dictionary for the same columns."""
-    return {name: k for k, name in enumerate(columns)}
+        super().__init__(figures)
+        self.parameters = parameters
 
 
 @dataclass
@@ -96,8 +67,12 @@ class Totals:
     refused: int = 0
     smallest_eigenvalue: float = inf
 
-    def add(self, update: Update) -> None:
-        """Take an update."""
+    def add(self, cost: float, update: Update | None) -> None:
+        """Take a sample's cost and its update, if there was one."""
+        self.cost += cost
+        self.samples += 1
+        if update is None:
+            return
         self.updates += 1
         self.squares += update.td_error**2
         self.step += update.step
@@ -134,3 +109,18 @@ def to_csv(rows: Sequence[LogRow]) -> str:
 
 def _cell(value: float) -> str:
     return "" if isnan(value) else repr(int(value) if value == int(value) else value)
+
+
+def late_movement(start: Parameters, rows: Sequence[LogRow]) -> float:
+    """‖θ_K − θ_0.8K‖/‖θ_K − θ_0‖ in scaled entries: the criterion of convergence, below 0.05.
+
+    θ_0.8K is that of the last row within the first four fifths of the samples. NaN where θ never
+    moved or the log has no such row.
+    """
+    early = [row for row in rows if row["samples"] <= 0.8 * rows[-1]["samples"]]
+    if not early:
+        return float("nan")
+    last, scale = rows[-1].parameters.theta, start.blocks.scale
+    way = float(np.linalg.norm((last - start.theta) / scale))
+    moved = float(np.linalg.norm((last - early[-1].parameters.theta) / scale))
+    return moved / way if way > 0 else float("nan")

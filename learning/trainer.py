@@ -23,7 +23,7 @@ from learning.optimum import stored_optimum
 from learning.registry import GROUP as ALGORITHMS
 from learning.registry import load_algorithm
 from learning.starting_point import build_controller, starting_parameters
-from learning.training_loop import CHECKPOINT, training_loop
+from learning.training import CHECKPOINT, run_training
 from learning.training_run import TrainingRun, prepare
 
 SEQUENCES = (list, tuple, set, frozenset)
@@ -63,15 +63,14 @@ class Trainer:
         with temporary_folder("cosim-training-") as folder:
             if checkpoint:
                 (folder / CHECKPOINT).write_bytes(checkpoint)
-            with training_loop(run, out=folder) as loop:
-                try:
-                    result = loop.go(resume=bool(checkpoint), progress=hand_over)
-                except _HandOver:
-                    return Progress(
-                        reached,
-                        checkpoint=(folder / CHECKPOINT).read_bytes(),
-                        wall_seconds=time.perf_counter() - begin,
-                    )
+            try:
+                result = run_training(run, folder, resume=bool(checkpoint), progress=hand_over)
+            except _HandOver:
+                return Progress(
+                    reached,
+                    checkpoint=(folder / CHECKPOINT).read_bytes(),
+                    wall_seconds=time.perf_counter() - begin,
+                )
             result.parameters.save(folder / "parameters.toml")
             samples = int(result.rows[-1]["samples"]) if result.rows else reached
             return Progress(

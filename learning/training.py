@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
+from itertools import islice
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,53 +15,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
+from cosim.errors import CapabilityError, PlantError
 from cosim.files import write_atomically
 from cosim.lookup import build_controller
+from cosim.plant import FmuPlant
+from cosim.protocols import functions_of
 from cosim.scenario import Scenario
 from cosim.statistics import shown
+from learning import checkpoint
+from learning.algorithm import Algorithm, LearnableController, load_algorithm
+from learning.checkpoint import Checkpoint
 from learning.configuration import Configuration
-from learning.errors import ConfigurationError
-from learning.log import to_csv
+from learning.definiteness import certificate
+from learning.drift import Drift
+from learning.errors import CheckpointError, ConfigurationError, DivergenceError
+from learning.evaluation import Judge
+from learning.log import COLUMNS, LogRow, Totals, late_movement, to_csv
+from learning.loop import TrainingLoop, begin
 from learning.optimum import stored_optimum
-from learning.protocols import LearnableController
-from learning.starting_point import build_controller as build_learnt
-from learning.training_loop import Progress, training_loop
-from learning.training_run import TrainingRecorder, TrainingResult, TrainingRun, prepare
+from learning.training_run import TrainingRun, prepare
+from learning.training_run import build_controller as build_learnt
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-FIGURE = "learning.png"
+CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
 
 
 @dataclass(frozen=True)
 class Training:
-    """A training that has ended: its `run`, the `result`, and how long it took, `wall_seconds`."""
+    """A training that has ended.
+
+    `parameters` are θ as the run hands it over, `rows` its log. `evaluation` is the greedy policy
+    on held-out noise (`Verdict.summary`); `start` is θ where it started and `start_J` its greedy J,
+    `baselines` that of `naive` and, where it is known, `optimal` on the same noise. `status` is
+    `finished` or `diverged: …`, which changes nothing of what θ is. `functions` says whether the
+    controller's were `interpreted` or `compiled`; `without_checkpoint` why there is none, if there
+    should be one.
+    """
 
     run: TrainingRun
-    result: TrainingResult
-    wall_seconds: float = field(compare=False)
-
-    @property
-    def parameters(self) -> Parameters:
-        """θ that it ended with."""
-        return self.result.parameters
-
-    @property
-    def status(self) -> str:
-        """`finished`, or `diverged: …`."""
-        return self.result.status
+    parameters: Parameters
+    rows: list[LogRow]
+    evaluation: dict[str, Any]
+    status: str
+    plant_samples: int
+    start: Parameters
+    start_J: float
+    baselines: Mapping[str, float]
+    functions: str | None = None
+    without_checkpoint: str | None = None
+    wall_seconds: float = field(default=float("nan"), compare=False)
 
     @property
     def J(self) -> float:
         """Mean of economic cost and penalty per sample of the greedy policy, on held-out noise."""
-        return float(self.result.evaluation["J"])
+        return float(self.evaluation["J"])
 
     @property
     def regret(self) -> float:
         """(J − J*)/|J*| on that noise, NaN where J* is not known."""
-        found = self.result.evaluation["regret"]
+        found = self.evaluation["regret"]
         return float("nan") if found is None else float(found)
 
     def controller(self) -> LearnableController:
@@ -68,20 +85,19 @@ class Training:
 
     def log(self) -> dict[str, Array]:
         """The columns of the training's log, (K,) each, NaN where not measured."""
-        rows = self.result.rows
+        rows = self.rows
         return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
     def theta(self) -> dict[str, Array]:
         """Increments of θ since the start by block, (K, entries) each."""
-        blocks, start = self.parameters.blocks, self.result.start
-        moved = np.array([row.parameters.theta - start.theta for row in self.result.rows])
-        return {name: moved[:, where] for name, where in blocks.slices.items()}
+        moved = np.array([row.parameters.theta - self.start.theta for row in self.rows])
+        return {name: moved[:, where] for name, where in self.parameters.blocks.slices.items()}
 
     def figure(self) -> Figure:
         """Cost, violations, TD error and θ over the samples; LearningError without a log."""
         from cosim.figures.training import training_figure  # noqa: PLC0415 - matplotlib
 
-        if not self.result.rows:
+        if not self.rows:
             raise ConfigurationError("this training's log has no row: there is nothing to draw")
         blocks, run = self.parameters.blocks, self.run
         scale = {name: blocks.scale[where] for name, where in blocks.slices.items()}
@@ -89,8 +105,8 @@ class Training:
         return training_figure(
             self.log(),
             {name: values / scale[name] for name, values in self.theta().items()},
-            self.result.baselines,
-            start=self.result.start_J,
+            self.baselines,
+            start=self.start_J,
             title=f"{run.algorithm} on {run.scenario.name} from {Path(run.start).stem}, seed "
             f"{run.seed}: {end}, J = {greedy}",
         )
@@ -105,53 +121,41 @@ class Training:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / "learning.csv", to_csv(self.result.rows))
+        write_atomically(folder / "learning.csv", to_csv(self.rows))
         self.parameters.save(folder / "parameters.toml")
         write_atomically(folder / "scenario.toml", self.run.scenario.to_toml())
-        if self.result.rows:
+        if self.rows:
             self.plot(folder / FIGURE)
         return folder
 
     def summary(self) -> dict[str, Any]:
         """The training as a JSON document: settings, the greedy policy's figures, how it ended."""
-        run, result = self.run, self.result
-        last: Mapping[str, float] = result.rows[-1] if result.rows else {}
+        run = self.run
+        last: Mapping[str, float] = self.rows[-1] if self.rows else {}
         return {
             "version": version("rti-cosim"),
             "algorithm": run.algorithm,
+            "asks_for": getattr(load_algorithm(run.algorithm), "asks_for", "simulator"),
             "scenario": run.scenario.name,
             "scenario_hash": run.scenario.hash,
             "controller": run.controller,
             "start": run.start,
             "samples": int(last.get("samples", 0)),
-            "plant_samples": result.plant_samples,
-            "validation": _validation(run, result),
+            "plant_samples": self.plant_samples,
             "seed": run.seed,
-            "status": result.status,
+            "status": self.status,
             "hyperparameters": run.configuration.model_dump(mode="json"),
-            "parameters_hash": result.parameters.hash,
+            "parameters_hash": self.parameters.hash,
             "evaluation_seeds": run.evaluation_seeds,
             "evaluation_steps": run.evaluation_steps,
-            **result.evaluation,
+            **self.evaluation,
             "smallest_eigenvalue": last.get("smallest_eigenvalue"),
             "td_error": last.get("td_error"),
-            "late_movement": result.late_movement,
+            "late_movement": late_movement(self.start, self.rows) if self.rows else float("nan"),
             "training_failures": last.get("failures"),
             "weakly_active": last.get("weakly_active"),
             "licq_failed": last.get("licq_failed"),
         }
-
-
-def _validation(run: TrainingRun, result: TrainingResult) -> dict[str, int] | None:
-    """How θ was chosen among those of the run, None where it is simply the last one."""
-    if not run.validate_every:
-        return None
-    return {
-        "validate_every": run.validate_every,
-        "validation_samples": run.validation_samples,
-        "samples": result.validated,
-        "accepted": int(result.rows[-1]["accepted"]) if result.rows else 0,
-    }
 
 
 def train(
@@ -165,18 +169,18 @@ def train(
     out: str | Path | None = None,
     resume: bool = False,
     optimum: str | None = None,
-    recorder: TrainingRecorder | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, LogRow], None] | None = None,
     **options: Any,
 ) -> Training:
     """Train a controller's θ on a scenario's plant.
 
     Raises AlgorithmLookupError, ConfigurationError, ScenarioError, PlantError, CheckpointError,
-    each in one line, before the work where it can be known before.
+    each in one line, before the work where it can be known before; PrivilegeError where an
+    algorithm asks more of the plant than it states.
 
     Parameters
     ----------
-    algorithm : a registered name (`learning.registry.algorithms`) or `module:Class`.
+    algorithm : a registered name (`learning.algorithm.algorithms`) or `module:Class`.
     scenario : a scenario, a preset's name or a TOML file.
     samples : plant samples; None is what the algorithm says, else 50 000.
     seed : seed of noise and exploration.
@@ -186,7 +190,6 @@ def train(
         the rest.
     resume : go on from the checkpoint in `out`.
     optimum : name of the controller whose J is J*; None is `optimal` where its solution is stored.
-    recorder : gets every row of the log, for a recording.
     progress : called with the samples done and the last row of the log.
     options : further fields of `TrainingRun`, `evaluate_every=1000` say.
     """
@@ -194,25 +197,209 @@ def train(
         scenario = Scenario.load(scenario)
     fields = {"seed": seed, "start": str(start), **options}
     run = prepare(algorithm, scenario, samples, settings, fields)
-    return carry_out(
-        run, out=out, resume=resume, optimum=optimum, recorder=recorder, progress=progress
-    )
+    optimum = optimum or stored_optimum(scenario)
+    return run_training(run, out, resume=resume, optimum=optimum, progress=progress)
 
 
-def carry_out(
+def run_training(
     run: TrainingRun,
-    *,
     out: str | Path | None = None,
+    *,
     resume: bool = False,
     optimum: str | None = None,
-    recorder: TrainingRecorder | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, LogRow], None] | None = None,
+    rule: type[Algorithm] | None = None,
 ) -> Training:
-    """Train as `run` says; the other arguments and the errors are those of `train`."""
-    begin = time.perf_counter()
-    optimum = optimum or stored_optimum(run.scenario)
-    yardstick = build_controller(optimum, run.scenario) if optimum else None
+    """Train as `run` says; the other arguments and the errors are those of `train`.
+
+    With `out`, learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on;
+    a plant that cannot serialise its state leaves no checkpoint, and the result says so. Log,
+    evaluations and files are of the θ that the run would hand over if it ended there. Without an
+    `optimum` regret and gap closed are not known. `rule` is the algorithm's class where it is not
+    to be looked up by its name.
+    """
+    clock = time.perf_counter()
+    best = build_controller(optimum, run.scenario) if optimum else None
     folder = None if out is None else Path(out)
-    with training_loop(run, optimum=yardstick, out=folder, recorder=recorder) as loop:
-        result = loop.go(resume=resume, progress=progress)
-    return Training(run, result, time.perf_counter() - begin)
+    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
+        session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
+        judge = Judge(run, evaluation_plant, session.start, best)
+        if resume:
+            session.load()
+        else:
+            session.checkpoint()
+        status = session.run_to_the_end(judge, progress)
+        parameters = session.loop.parameters
+        return Training(
+            run=run,
+            parameters=parameters,
+            rows=session.rows,
+            evaluation=judge.verdict(parameters.theta).summary(),
+            status=status,
+            plant_samples=session.loop.counts.number,
+            start=session.start,
+            start_J=judge.start_J,
+            baselines=judge.baselines,
+            functions=functions_of(session.loop.controller),
+            without_checkpoint=session.without_checkpoint,
+            wall_seconds=time.perf_counter() - clock,
+        )
+
+
+class _Session:
+    """A run that goes on: its loop, its log so far, and its checkpoint.
+
+    The checkpoint needs a snapshot of the plant, which is the run's own right: what the algorithm
+    asks for bounds the algorithm alone.
+    """
+
+    def __init__(
+        self, run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant, out: Path | None
+    ) -> None:
+        self.run, self.plant, self.out = run, plant, out
+        self.loop: TrainingLoop = begin(run, algorithm, plant)
+        self.start = self.loop.start_parameters
+        self.rows: list[LogRow] = []
+        self.totals = Totals()
+        self.drift = Drift.of(run.scenario)
+        self.without_checkpoint: str | None = None
+
+    def run_to_the_end(self, judge: Judge, progress: Callable[[int, LogRow], None] | None) -> str:
+        """Take all samples, with log, evaluations and checkpoints; `finished` or `diverged: …`."""
+        run, loop = self.run, self.loop
+        while (number := loop.counts.number) < run.samples:
+            try:
+                cost, update = loop.advance()
+            except DivergenceError as error:
+                self.rows.append(self.row(number + 1, judge))
+                return f"diverged: {error} at sample {number + 1}"
+            number += 1
+            self.totals.add(cost, update)
+            if number % run.log_every and number < run.samples:
+                continue
+            judged = number % run.evaluate_every == 0 or number == run.samples
+            row = self.row(number, judge if judged else None)
+            self.rows.append(row)
+            if trouble := self.trouble(row, judge):
+                return trouble
+            if number % run.checkpoint_every == 0 or number == run.samples:
+                self.checkpoint()
+            if progress is not None:
+                progress(number, row)
+        return "finished"
+
+    def row(self, number: int, judge: Judge | None) -> LogRow:
+        """A line of the log: what happened since the last one, with an evaluation by a judge."""
+        answer, counts = self.loop.parameters, asdict(self.loop.counts)
+        figures = dict.fromkeys(COLUMNS, float("nan")) | self.totals.means() | counts
+        del figures["number"]
+        figures |= {
+            "samples": number,
+            # The least certificate of the updates since the last row, whichever step gave it.
+            "smallest_eigenvalue": min(
+                self.totals.smallest_eigenvalue, certificate(answer.blocks, answer.theta).smallest
+            ),
+            "plant_samples": counts["number"],
+        }
+        if self.drift is not None:
+            figures |= self.drift.row(self.plant.time)
+        if judge is not None:
+            figures |= judge.verdict(answer.theta).row()
+        self.totals = Totals()
+        return LogRow(figures, answer)
+
+    def trouble(self, row: LogRow, judge: Judge) -> str | None:
+        """Why the run must stop, or None.
+
+        One evaluation above the limit may be an excursion: two in a row end the run, or the last.
+        """
+        greedy = row["greedy_J"]
+        if not isfinite(greedy) or not greedy > (limit := judge.limit):
+            return None
+        earlier = (last["greedy_J"] for last in islice(reversed(self.rows), 1, None))
+        before = next((judged for judged in earlier if isfinite(judged)), limit)
+        if before <= limit and row["samples"] < self.run.samples:
+            return None
+        reason = f"greedy J = {shown(greedy)} exceeds {shown(limit)}"
+        return f"diverged: {reason} at sample {int(row['samples'])}"
+
+    def checkpoint(self) -> None:
+        """Start the solver afresh, as a resumed run will, and write the files of the run so far."""
+        self.loop.restart()
+        if self.out is None:
+            return
+        write_atomically(self.out / "learning.csv", to_csv(self.rows))
+        self.loop.parameters.save(self.out / "parameters.toml")
+        try:
+            plant = self.plant.serialise(self.plant.snapshot())
+            values, arrays = self.loop.state()
+        except CapabilityError as error:
+            self.without_checkpoint = str(error)
+            return
+        values |= {
+            "totals": asdict(self.totals),
+            "columns": list(self.rows[0]) if self.rows else [],
+        }
+        arrays |= {
+            "plant": np.frombuffer(plant, dtype=np.uint8),
+            "rows": np.array([list(row.values()) for row in self.rows]),
+            "row_thetas": np.array([row.parameters.theta for row in self.rows]),
+        }
+        checkpoint.save(self.out / CHECKPOINT, Checkpoint(self.run.identity(), values, arrays))
+
+    def load(self) -> None:
+        """Take up the folder's checkpoint; raises CheckpointError where there is none that fits."""
+        if self.out is None:
+            raise ConfigurationError("a run without a folder cannot be resumed")
+        path = self.out / CHECKPOINT
+        found = checkpoint.load(path, self.run.identity(), but=("samples",))
+        try:
+            self._require_same_beginning(path, int(found.run["samples"]))
+            columns, arrays = found.state["columns"], found.arrays
+            self.rows = [
+                LogRow(
+                    dict(zip(columns, map(float, figures), strict=True)),
+                    self.start.with_theta(theta),
+                )
+                for figures, theta in zip(
+                    arrays["rows"].tolist(), arrays["row_thetas"], strict=True
+                )
+            ]
+            self.totals = Totals(**found.state["totals"])
+            self.plant.restore(self.plant.deserialise(arrays["plant"].tobytes()))
+            self.loop.restore(found.state, arrays)
+        except (
+            LookupError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+            PlantError,
+        ) as e:
+            raise CheckpointError(
+                f"{path}: its content is not that of this run ({type(e).__name__}: {e}); start the "
+                "run anew"
+            ) from None
+
+    def _require_same_beginning(self, path: Path, samples: int) -> None:
+        """Raise CheckpointError where a run of `samples` samples was no part of this one."""
+        run = self.run
+        if samples == run.samples:
+            return
+        if samples > run.samples:
+            raise CheckpointError(
+                f"{path}: the checkpoint is of a run of {samples} samples; it cannot be made a "
+                f"run of {run.samples}"
+            )
+        if schedules := run.configuration.depends_on_samples():
+            raise CheckpointError(
+                f"{path}: a run of {samples} samples cannot be given more, since "
+                f"{', '.join(schedules)} would have gone another way from the first one: train "
+                "anew, or in future without a schedule"
+            )
+        for name in ("evaluate_every", "checkpoint_every"):
+            if samples % (every := getattr(run, name)):
+                raise CheckpointError(
+                    f"{path}: a run of {samples} samples cannot be given more, since it ended "
+                    f"between two multiples of {name} = {every}, where a longer run does not stop"
+                )

@@ -1,86 +1,88 @@
-"""What a training run is, what comes of it, and who may watch."""
+"""A training run: its settings, checked, and the θ and controller that it starts with."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from controllers.economic import tune
+from controllers.factories import nmpc
 from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.theta import ThetaBlocks
+from cosim.evaluation.provenance import source_hashes
 from cosim.lookup import import_from_here
-from cosim.protocols import Controller
 from cosim.scenario import Scenario
+from learning.algorithm import LearnableController, algorithm_target, load_algorithm
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.log import LogRow
-from learning.registry import load_algorithm
 
-PLANT, EXPLORATION, ALGORITHM, VALIDATION = range(4)
-"""Children of the run's seed sequence, by what they are for."""
-
-
+Vector = NDArray[np.float64]
+CONTROLLERS = ("rti", "converged")
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
+MOST = 100_000_000
+"""Samples of the longest run."""
+
+
+def _about(text: str, least: int | None = None, most: int = MOST) -> dict[str, Any]:
+    """A field's help and range, of which the command's option is made too."""
+    return {"text": text, "least": least, "most": most}
 
 
 @dataclass(frozen=True)
 class TrainingRun:
     """What identifies a training run; a checkpoint goes on only in the very same one.
 
-    The `algorithm` by name, its `configuration`, the `scenario`, the kind of `controller` (`rti` or
-    `converged`) that learns from `samples` samples with this `seed` of noise and exploration.
-    `log_every`, `evaluate_every`, `checkpoint_every` in samples; `evaluation_seeds` held-out runs
-    of `evaluation_steps` samples. A greedy J that is worse than that of the naive θ and that of
-    the start by more than (`divergence` − 1) of its magnitude, twice in a row or at the end, is
-    divergence and ends the run.
+    The `algorithm` by name, its `configuration`, completed by what the `scenario` states; the other
+    fields' meaning is their help in `cosim train`. A greedy J that is worse than that of the naive
+    θ and that of the start by more than (`divergence` − 1) of its magnitude, twice in a row or at
+    the end, is divergence and ends the run.
 
-    `start` is where θ starts: `naive`, `tuned` or the path of a parameters file. With
-    `validate_every` the θ handed over is validated that often, in samples, by a greedy run of
-    `validation_samples` samples, and the run ends with the best of them (`Validation`).
-
-    After `rest_after` samples, if given, the rule rests: θ stays and nothing explores, while the
-    samples go on to be counted.
-
-    The configuration is completed by what the scenario states (`Configuration.for_scenario`).
+    Raises ConfigurationError on counts that make no run.
     """
 
     algorithm: str
     scenario: Scenario
-    samples: int
-    seed: int
+    samples: int = field(
+        metadata=_about("Plant samples; default: 50 000, or what the algorithm says.", 1)
+    )
+    seed: int = field(metadata=_about("Seed of noise and exploration.", 0, 999_999))
     configuration: Configuration
-    controller: str = "rti"
-    log_every: int = 1000
-    evaluate_every: int = 5000
-    checkpoint_every: int = 5000
-    evaluation_seeds: int = 4
-    evaluation_steps: int = 500
-    divergence: float = 1.5
-    start: str = "naive"
-    validate_every: int = 0
-    validation_samples: int = 1000
-    rest_after: int | None = None
+    controller: str = field(default="rti", metadata=_about("What carries θ: rti or converged."))
+    log_every: int = field(default=1000, metadata=_about("Samples per row of the log.", 1))
+    evaluate_every: int = field(default=5000, metadata=_about("Samples per greedy evaluation.", 1))
+    checkpoint_every: int = field(default=5000, metadata=_about("Samples per checkpoint.", 1))
+    evaluation_seeds: int = field(
+        default=4, metadata=_about("Held-out runs per evaluation.", 1, 1_000_000)
+    )
+    evaluation_steps: int = field(default=500, metadata=_about("Samples of each of them.", 1))
+    divergence: float = field(
+        default=1.5, metadata=_about("Times the start's J at which a run has diverged.")
+    )
+    start: str = field(
+        default="naive", metadata=_about("Where θ starts: naive, tuned or a parameters file.")
+    )
+    rest_after: int | None = field(
+        default=None,
+        metadata=_about("Samples after which θ stays and nothing explores; default: never.", 1),
+    )
 
     def __post_init__(self) -> None:
-        """Complete the configuration; raise ConfigurationError on counts that make no run."""
+        """Complete the configuration and check the counts."""
         completed = self.configuration.for_scenario(self.scenario)
         object.__setattr__(self, "configuration", completed)
-        for name in (
-            "samples",
-            "log_every",
-            "evaluate_every",
-            "checkpoint_every",
-            "validation_samples",
-        ):
-            if getattr(self, name) < 1:
-                raise ConfigurationError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.rest_after is not None and self.rest_after < 1:
-            raise ConfigurationError(f"rest_after must be at least 1, not {self.rest_after}")
-        for name in ("evaluate_every", "checkpoint_every", "validate_every"):
+        for option in fields(self):
+            value, least = getattr(self, option.name), option.metadata.get("least")
+            if least is not None and value is not None and value < least:
+                raise ConfigurationError(f"{option.name} must be at least {least}, not {value}")
+        for name in ("evaluate_every", "checkpoint_every"):
             if getattr(self, name) % self.log_every:
                 raise ConfigurationError(
                     f"{name} = {getattr(self, name)} must be a multiple of log_every = "
@@ -88,17 +90,22 @@ class TrainingRun:
                 )
 
     def identity(self) -> dict[str, Any]:
-        """The run as JSON-ready values."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        """The run as JSON-ready values, with the hash of each foreign source file behind it."""
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
         values["scenario"] = self.scenario.hash
         values["configuration"] = self.configuration.model_dump(mode="json")
         if (file := Path(self.start)).is_file():
             values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        targets = (algorithm_target(self.algorithm), self.scenario.controller.model)
+        for target in filter(None, targets):
+            for file_name, digest in source_hashes(target).items():
+                values[f"source of {file_name}"] = digest
         return values
 
-    def spawned(self, purpose: int) -> np.random.SeedSequence:
-        """Child of the run's seed sequence for a purpose, `ALGORITHM` or `VALIDATION` say."""
-        return np.random.SeedSequence(self.seed).spawn(purpose + 1)[purpose]
+    def algorithm_rng(self) -> np.random.Generator:
+        """The algorithm's own generator, apart from those of noise and exploration."""
+        # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
+        return np.random.default_rng(np.random.SeedSequence(self.seed).spawn(3)[2])
 
 
 def prepare(
@@ -128,57 +135,85 @@ def prepare(
         raise ConfigurationError(f"training: {error}") from None
 
 
-class TrainingRecorder(Protocol):
-    """Takes a training run row by row; `cosim.recording.TrainingRecorder` is one."""
+def starting_parameters(
+    problem: Problem, configuration: Configuration, start: str = "naive"
+) -> Parameters:
+    """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
 
-    def start(self, run: TrainingRun, parameters: Parameters) -> None:
-        """Open the record."""
-
-    def record(self, row: LogRow, parameters: Parameters, controller: Controller) -> None:
-        """Append a row of the log with θ as it is."""
-
-    def close(self) -> None:
-        """Finish the record."""
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """What came of a run: θ, the log's `rows`, the greedy evaluation of θ, and how it ended.
-
-    `parameters` are what the run would hand over: the algorithm's last ones, or the best validated
-    ones where there was validation. `evaluation` is a `Verdict.summary`; `status` is `finished` or
-    `diverged: …`, which changes nothing of what θ is; `plant_samples` counts those of training
-    and validation, `validated` those of the latter; `functions` says whether the controller's were
-    `interpreted` or `compiled` at the end; `late_movement` how far θ still went in the last fifth
-    of the run, as a share of its way from the start; `start` is θ there and `start_J` its
-    greedy J, `baselines` that of `naive` and `optimal` on the same noise. `without_checkpoint` says
-    why it left no checkpoint, if it was to leave one.
+    `start` is `naive`, `tuned` or the path of a parameters file. `naive` and `tuned` take c_lambda
+    and, with the extended θ, the slack weights from the configuration; blocks that a file has
+    stand as they are, those of the configuration's parametrisation that it lacks start as with
+    `naive`. Raises ConfigurationError where the file has slack weights and the parametrisation
+    none, ParameterError on a bad file, TuningError where the tuning fails.
     """
+    blocks = ThetaBlocks.of(
+        problem,
+        slack_weights=configuration.parametrisation == "extended",
+        model_parameters=configuration.learned_parameters(problem.model),
+    )
+    offset = _value_offset(problem, configuration)
+    naive = Parameters.naive(problem, blocks, value_offset=offset)
+    if start == "naive":
+        return naive.replace(_slack_weights(blocks, configuration))
+    if start == "tuned":
+        tuned = tune(problem, blocks, value_offset=offset).parameters
+        return tuned.replace(_slack_weights(blocks, configuration))
+    return _extended(problem, configuration, start)
 
-    parameters: Parameters
-    rows: list[LogRow]
-    evaluation: dict[str, Any]
-    status: str
-    plant_samples: int
-    validated: int
-    start: Parameters
-    start_J: float
-    baselines: Mapping[str, float]
-    functions: str | None = None
-    late_movement: float = float("nan")
-    without_checkpoint: str | None = None
+
+def _value_offset(problem: Problem, configuration: Configuration) -> float | None:
+    """c_lambda at the start, None for ℓ_s; the level of V is that of the TD error's discount."""
+    chosen: float | None = getattr(configuration, "discount", None)
+    return problem.value_level(chosen) if configuration.value_offset == "discounted" else None
 
 
-def late_movement(start: Parameters, rows: Sequence[LogRow]) -> float:
-    """‖θ_K − θ_0.8K‖/‖θ_K − θ_0‖ in scaled entries: the criterion of convergence, below 0.05.
+def _slack_weights(blocks: ThetaBlocks, configuration: Configuration) -> dict[str, Vector]:
+    """The slack weights at the start by block, none for the paper's θ."""
+    chosen = {
+        "w_sigma": configuration.slack_linear_weight,
+        "W_sigma": configuration.slack_quadratic_weight,
+    }
+    return {
+        name: blocks.scale[blocks.slices[name]]
+        if weight is None
+        else np.full(blocks.block(name).size, weight)
+        for name, weight in chosen.items()
+        if name in blocks
+    }
 
-    θ_0.8K is that of the last row within the first four fifths of the samples. NaN where θ never
-    moved or the log has no such row.
-    """
-    early = [row for row in rows if row["samples"] <= 0.8 * rows[-1]["samples"]]
-    if not early:
-        return float("nan")
-    last, scale = rows[-1].parameters.theta, start.blocks.scale
-    way = float(np.linalg.norm((last - start.theta) / scale))
-    moved = float(np.linalg.norm((last - early[-1].parameters.theta) / scale))
-    return moved / way if way > 0 else float("nan")
+
+def _extended(problem: Problem, configuration: Configuration, path: str) -> Parameters:
+    """θ of a file, with the blocks that it lacks."""
+    found = Parameters.load(path, problem)
+    learned = "w_sigma" in found.blocks
+    if learned and configuration.parametrisation == "paper":
+        raise ConfigurationError(
+            f"{path}: θ has slack weights, which the parametrisation 'paper' has not; set "
+            "parametrisation=extended"
+        )
+    names = found.blocks.block("p").labels if "p" in found.blocks else ()
+    more = tuple(
+        name for name in configuration.learned_parameters(problem.model) if name not in names
+    )
+    blocks = ThetaBlocks.of(
+        problem,
+        slack_weights=configuration.parametrisation == "extended",
+        model_parameters=(*names, *more),
+    )
+    values: dict[str, ArrayLike] = {block.name: found[block.name] for block in found.blocks}
+    if not learned:
+        values |= _slack_weights(blocks, configuration)
+    if more:
+        chosen = problem.model.parameter_indices(more)
+        nominal = problem.model.nominal_parameters[chosen]
+        values["p"] = np.concatenate([values.get("p", np.empty(0)), nominal])
+    return Parameters.naive(problem, blocks).replace(values)
+
+
+def build_controller(kind: str, scenario: Scenario, parameters: Parameters) -> LearnableController:
+    """`rti` or `converged`; raises ConfigurationError on another kind."""
+    if kind not in CONTROLLERS:
+        raise ConfigurationError(
+            f"there is no learnable controller '{kind}'; there are {', '.join(CONTROLLERS)}"
+        )
+    return nmpc(scenario, parameters, kind)

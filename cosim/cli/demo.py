@@ -160,7 +160,7 @@ def _table(
         rows.append(
             {
                 "controller": name,
-                "plant_samples": trained[name].result.plant_samples if name in trained else 0,
+                "plant_samples": trained[name].plant_samples if name in trained else 0,
                 "regret": beyond.value,
                 "regret_interval": None if name == OPTIMAL else beyond.t,
                 **means,

@@ -61,6 +61,11 @@ class _Commands(TyperGroup):
         protect(inputs)
         return super().parse_args(ctx, args)
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find a command; `train` gets the options that are made of TrainingRun's fields."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, train.command() if name == "train" else command, rest
+
     def invoke(self, ctx: Any) -> Any:
         """Let Ctrl-C through, which Typer would end without a word."""
         try:

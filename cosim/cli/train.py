@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -26,6 +28,8 @@ FILES = (
     "training.rrd",
 )
 """What a training leaves in its folder; each belongs to the same run."""
+DEFAULTS = {"samples": None, "seed": 0}
+"""Of fields of `TrainingRun` that have none."""
 # Columns of the log behind the progress bar: name, text, scale, format.
 FIGURES = (
     ("J", "J", 1, ".0f"),
@@ -35,29 +39,13 @@ FIGURES = (
     ("smallest_eigenvalue", "λmin", 1, ".2g"),
 )
 
-AlgorithmOption = Annotated[
-    str,
-    typer.Option(
-        "--algorithm",
-        "-a",
-        help="actor-critic, batch-q-learning, q-learning; backoff, offset-free, identified, "
-        "policy-search; another registered one or module:Class.",
-    ),
-]
-
 
 def train(
-    algorithm: AlgorithmOption,
+    algorithm: Annotated[
+        str,
+        typer.Option("--algorithm", "-a", help="A registered one or module:Class."),
+    ],
     scenario: ScenarioOption = "paper",
-    samples: Annotated[
-        int | None,
-        count(
-            "--samples", "-n", text="Plant samples; default: 50 000, or what the algorithm says."
-        ),
-    ] = None,
-    seed: Annotated[
-        int, count("--seed", least=0, most=999_999, text="Seed of noise and exploration.")
-    ] = 0,
     out: OutOption = Path("cosim-train"),
     resume: Annotated[
         bool,
@@ -72,33 +60,6 @@ def train(
         list[str] | None,
         typer.Option("--set", help="Hyperparameter as name=value; may be repeated."),
     ] = None,
-    start: Annotated[
-        str, typer.Option("--start", help="Where θ starts: naive, tuned or a parameters file.")
-    ] = "naive",
-    validate_every: Annotated[
-        int,
-        count(
-            "--validate-every",
-            least=0,
-            text="Samples per validation run, which chooses among θ; 0: none.",
-        ),
-    ] = 0,
-    validation_samples: Annotated[
-        int,
-        count(
-            "--validation-samples",
-            text="Samples of each validation run; they count as plant samples.",
-        ),
-    ] = 1000,
-    rest_after: Annotated[
-        int | None,
-        count(
-            "--rest-after", text="Samples after which θ stays and nothing explores; default: never."
-        ),
-    ] = None,
-    controller: Annotated[
-        str, typer.Option("--controller", help="What carries θ: rti or converged.")
-    ] = "rti",
     optimum: Annotated[
         str | None,
         typer.Option(
@@ -106,33 +67,22 @@ def train(
             help="Controller whose J is J*; default: optimal, where its solution is stored.",
         ),
     ] = None,
-    log_every: Annotated[int, count("--log-every", text="Samples per row.")] = 1000,
-    evaluate_every: Annotated[
-        int, count("--evaluate-every", text="Samples per greedy evaluation.")
-    ] = 5000,
-    checkpoint_every: Annotated[
-        int, count("--checkpoint-every", text="Samples per checkpoint.")
-    ] = 5000,
-    evaluation_seeds: Annotated[
-        int, count("--evaluation-seeds", most=1_000_000, text="Held-out runs per evaluation.")
-    ] = 4,
-    evaluation_steps: Annotated[
-        int, count("--evaluation-steps", text="Samples of each of them.")
-    ] = 500,
     explain: Annotated[
         bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")
     ] = False,
     record: RecordOption = False,
     json: JsonOption = False,
+    **options: Any,
 ) -> None:
     """Train a controller's θ; write parameters.toml, learning.csv, learning.png, summary.json.
 
-    Exit code 1: learning diverged; the files hold the run's own last θ and the summary says why.
+    Exit code 1: learning diverged; the files hold the θ that the run ended with and the summary
+    says why.
     """
     with output(json) as out_:
         from cosim.lookup import import_from_here
         from cosim.scenario import Scenario
-        from learning.registry import load_algorithm
+        from learning.algorithm import load_algorithm
         from learning.training_run import prepare
 
         import_from_here()
@@ -140,35 +90,21 @@ def train(
         if explain:
             _explain(algorithm, found.Configuration.documentation(), out_)
             return
-        run = prepare(
-            algorithm,
-            Scenario.load(scenario),
-            samples,
-            found.Configuration.from_assignments(assignments or []),
-            {
-                "seed": seed,
-                "controller": controller,
-                "log_every": log_every,
-                "evaluate_every": evaluate_every,
-                "checkpoint_every": checkpoint_every,
-                "evaluation_seeds": evaluation_seeds,
-                "evaluation_steps": evaluation_steps,
-                "start": start,
-                "validate_every": validate_every,
-                "validation_samples": validation_samples,
-                "rest_after": rest_after,
-            },
-        )
+        settings = found.Configuration.from_assignments(assignments or [])
+        samples = options.pop("samples")
+        run = prepare(algorithm, Scenario.load(scenario), samples, settings, options)
         folder = open_folder(out).absolute()
         if not (resume or overwrite):
             _require_no_run(folder)
-        training = _execute(run, folder, optimum, resume, record, out_)
+        training = _execute(run, folder, optimum, resume, out_)
         summary = training.summary()
         summary["timing"] = {
             "wall_seconds": training.wall_seconds,
-            "functions": training.result.functions,
+            "functions": training.functions,
         }
         _write(folder, training, summary)
+        if record:
+            record_training(folder / "training.rrd", training)
         if overwrite and not record:
             # Only now: had this run failed, the one before it would have been lost.
             (folder / "training.rrd").unlink(missing_ok=True)
@@ -177,6 +113,53 @@ def train(
         out_.json(summary)
     if training.status != "finished":
         raise typer.Exit(1)
+
+
+_SIGNATURE = inspect.signature(train, eval_str=True)
+# What the list of all commands needs: without the options that `command` adds.
+train.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
+    parameters=list(_SIGNATURE.parameters.values())[:-1]
+)
+
+
+def command() -> Any:
+    """The command with an option for each further field of `TrainingRun`.
+
+    Made only where it is asked for: the fields' module imports the whole of learning.
+    """
+    from learning.training_run import TrainingRun
+
+    types = get_type_hints(TrainingRun)
+    parameters = list(inspect.signature(train).parameters.values())
+    for field in fields(TrainingRun):
+        if field.metadata:
+            default = DEFAULTS.get(field.name, field.default)
+            kind: Any = types[field.name] | None if default is None else types[field.name]
+            annotation = Annotated[kind, _option(field.name, field.metadata)]
+            parameters.append(
+                inspect.Parameter(
+                    field.name,
+                    inspect.Parameter.KEYWORD_ONLY,
+                    default=default,
+                    annotation=annotation,
+                )
+            )
+
+    def complete(**values: Any) -> None:
+        train(**values)
+
+    complete.__doc__ = train.__doc__
+    complete.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    app = typer.Typer(add_completion=False)
+    app.command("train")(complete)
+    return typer.main.get_command(app)
+
+
+def _option(name: str, about: Mapping[str, Any]) -> Any:
+    names = [f"--{name.replace('_', '-')}", *(["-n"] if name == "samples" else [])]
+    if about["least"] is None:
+        return typer.Option(*names, help=about["text"])
+    return count(*names, least=about["least"], most=about["most"], text=about["text"])
 
 
 def _require_no_run(folder: Path) -> None:
@@ -190,11 +173,11 @@ def _require_no_run(folder: Path) -> None:
 
 
 def _execute(
-    run: TrainingRun, folder: Path, optimum: str | None, resume: bool, record: bool, output: Output
+    run: TrainingRun, folder: Path, optimum: str | None, resume: bool, output: Output
 ) -> Training:
     from cosim.cli.compose import announce
-    from learning.training import carry_out
-    from learning.training_loop import CHECKPOINT
+    from learning.optimum import stored_optimum
+    from learning.training import CHECKPOINT, run_training
 
     announce(run.scenario, output)
     checkpoint = folder / CHECKPOINT
@@ -204,18 +187,39 @@ def _execute(
         return there if checkpoint.is_file() else ""
 
     with resumable(how), output.progress(run.algorithm, run.samples) as progress:
-        training = carry_out(
+        training = run_training(
             run,
-            out=folder,
+            folder,
             resume=resume,
-            optimum=optimum,
+            optimum=optimum or stored_optimum(run.scenario),
             progress=_remark(progress),
         )
-    if record:
-        record_training(folder / "training.rrd", training)
-    if reason := training.result.without_checkpoint:
+    if reason := training.without_checkpoint:
         output.note(f"left no checkpoint, --resume is not possible: {reason}")
     return training
+
+
+def _remark(progress: Progressing) -> Callable[[int, LogRow], None]:
+    """Show J, TD error, regret and the smallest eigenvalue of the log's rows behind the bar."""
+    last: dict[str, float] = {}
+
+    def update(done: int, row: LogRow) -> None:
+        last.update({name: value for name, value in row.items() if not isnan(value)})
+        figures = [
+            f"{text} {scale * last[name]:{form}}"
+            for name, text, scale, form in FIGURES
+            if name in last
+        ]
+        progress(done, "  ".join(figures))
+
+    return update
+
+
+def _write(folder: Path, training: Training, summary: dict[str, Any]) -> None:
+    from cosim.files import write_atomically
+
+    training.save(folder)
+    write_atomically(folder / "summary.json", dump(summary))
 
 
 def record_training(path: Path, training: Training) -> None:
@@ -238,31 +242,6 @@ def record_training(path: Path, training: Training) -> None:
             **run.configuration.model_dump(mode="json"),
         },
     )
-
-
-def _remark(progress: Progressing) -> Callable[[int, LogRow | None], None]:
-    """Show J, TD error, regret and the smallest eigenvalue of the log's rows behind the bar."""
-    last: dict[str, float] = {}
-
-    def update(done: int, row: LogRow | None) -> None:
-        if row is None:
-            return
-        last.update({name: value for name, value in row.items() if not isnan(value)})
-        figures = [
-            f"{text} {scale * last[name]:{form}}"
-            for name, text, scale, form in FIGURES
-            if name in last
-        ]
-        progress(done, "  ".join(figures))
-
-    return update
-
-
-def _write(folder: Path, training: Training, summary: dict[str, Any]) -> None:
-    from cosim.files import write_atomically
-
-    training.save(folder)
-    write_atomically(folder / "summary.json", dump(summary))
 
 
 def _show(summary: dict[str, Any], output: Output) -> None:

@@ -30,10 +30,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim import FmuPlant, Scenario, evaluate
+from cosim import Scenario, evaluate
 from cosim.lookup import build_controller
 from learning.q_learning import QLearning
-from learning.training_loop import TrainingLoop
+from learning.training import run_training
 from learning.training_run import TrainingRun
 
 TENTHS = 10
@@ -82,10 +82,8 @@ def endure(
     # What is loaded once is loaded first: SciPy's LAPACK comes with the first dπ/dθ, which a search
     # asks for when learning no longer pays.
     build_controller("naive", scenario).feedback(scenario.initial_state).policy_jacobian  # noqa: B018
-    with FmuPlant(scenario) as plant, FmuPlant(scenario) as other:
-        training = TrainingLoop(run, QLearning, plant, other, out=folder)
-        look(0, None)
-        result = training.go(progress=look)
+    look(0, None)
+    result = run_training(run, folder, progress=look)
     held = [row for row in result.rows if row["samples"] % tenth == 0]
     per_sample = [1e6 * (b - a) / tenth for a, b in pairwise(cpu)]
     per_wall = [1e6 * (b - a) / tenth for a, b in pairwise(wall)]

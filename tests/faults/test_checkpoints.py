@@ -7,9 +7,8 @@ from controllers.errors import ControllerError
 from cosim import FmuPlant
 from learning import checkpoint
 from learning.errors import LearningError
-from learning.learner import Learner
 from learning.q_learning import QLearning
-from learning.run_state import RunState
+from learning.training import _Session
 from tests.helpers.training import make_run, train
 
 RUN = make_run()
@@ -25,19 +24,19 @@ def good(tmp_path_factory):
 @pytest.fixture(scope="module")
 def resume(tmp_path_factory):
     """Take up a checkpoint with a content and a checksum that fits it, always in one run."""
-    path = tmp_path_factory.mktemp("resumed") / "checkpoint.npz"
+    folder = tmp_path_factory.mktemp("resumed")
     with FmuPlant(RUN.scenario) as plant:
-        state = RunState(RUN, Learner(RUN, QLearning, plant), plant, None)
+        session = _Session(RUN, QLearning, plant, folder)
 
         def attempt(content):
-            checkpoint.save(path, content)
-            state.load(path)
+            checkpoint.save(folder / "checkpoint.npz", content)
+            session.load()
 
         yield attempt
 
 
 ENTRIES = ("plant", "rows", "row_thetas", "theta")
-STATE = ("interaction", "totals", "generator", "algorithm_generator", "columns")
+STATE = ("counts", "totals", "generator", "algorithm_generator", "columns")
 HARM = {
     "none": lambda a: np.zeros(0),
     "one row too many": lambda a: np.concatenate([a, a[:1]]),

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from cosim import FmuPlant, Scenario
-from learning.protocols import Algorithm
-from learning.registry import load_algorithm
-from learning.training_loop import Progress, TrainingLoop
-from learning.training_run import TrainingResult, TrainingRun
+from cosim import Scenario
+from learning.algorithm import Algorithm, load_algorithm
+from learning.log import LogRow
+from learning.training import Training, run_training
+from learning.training_run import TrainingRun
 
 
 class Killed(BaseException):
@@ -46,18 +46,15 @@ def train(
     *,
     rule: type[Algorithm] | None = None,
     resume: bool = False,
-    progress: Progress | None = None,
-) -> TrainingResult:
-    """Train to the end, by another rule than the run's where one is given."""
-    rule = rule or load_algorithm(run.algorithm)
-    with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as other:
-        loop = TrainingLoop(run, rule, plant, other, out=out)
-        return loop.go(resume=resume, progress=progress)
+    progress: Callable[[int, LogRow], None] | None = None,
+) -> Training:
+    """Train to the end without an optimum, by another rule than the run's where one is given."""
+    return run_training(run, out, rule=rule, resume=resume, progress=progress)
 
 
 def killed_and_resumed(
     run: TrainingRun, out: Path, at: int, rule: type[Algorithm] | None = None
-) -> TrainingResult:
+) -> Training:
     """The result of a run that was killed when it had done `at` samples, and resumed."""
 
     def die(done: int, row: object) -> None:

@@ -7,7 +7,7 @@ from cosim import FmuPlant
 from learning import BatchQLearning
 from learning.batch_q_learning import RULES, gauss_newton, projected_bellman, steepest_descent
 from learning.interaction import Interaction
-from learning.learner import Learner
+from learning.loop import begin
 from learning.starting_point import build_strategy
 from learning.training_run import TrainingRun
 
@@ -132,8 +132,7 @@ def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenar
         configuration = algorithm.Configuration.from_dict(settings | {"measure_offset": measured})
         run = TrainingRun("batch-q-learning", scenario, 120, 3, configuration, start="tuned")
         with FmuPlant(scenario) as plant:
-            learner = Learner(run, algorithm, plant)
-            learner.begin()
+            learner = begin(run, algorithm, plant)
             updates = [learner.advance()[1] is not None for _ in range(120)]
         assert np.flatnonzero(updates).tolist() == [59, 79, 99, 119]
         offsets[measured] = learner.controller.parameters["c_f"]

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.exploration import strategy
-from learning.schedule import linear
+from learning.exploration import Geometric, Strategy, build_strategy, linear
 
 LOWER, UPPER = np.array([100.0, 100.0]), np.array([400.0, 400.0])
 POLICY = np.array([190.0, 215.0])
@@ -11,14 +11,13 @@ FIRST = np.array([0])
 
 
 def make(kind, probability=1.0, deviation=(10.0,)):
-    return strategy(
+    return Strategy(
         kind, LOWER, UPPER, linear(probability, None, 100), linear(deviation, None, 100)
     )
 
 
 def draws(explore, rng, action=POLICY, count=20_000):
-    perturbed = [explore(action, rng, 0, lambda d: action + d) for _ in range(count)]
-    return np.array([np.clip(a, LOWER, UPPER) for a in perturbed])
+    return np.array([np.clip(explore(action, rng, 0), LOWER, UPPER) for _ in range(count)])
 
 
 def test_additive_noise_has_the_moments_asked_for(rng):
@@ -29,23 +28,12 @@ def test_additive_noise_has_the_moments_asked_for(rng):
 
 def test_a_greedy_sample_returns_nothing(rng):
     explore = make("additive", probability=0.3)
-    greedy = [explore(POLICY, rng, 0, lambda d: d) is None for _ in range(5000)]
+    greedy = [explore(POLICY, rng, 0) is None for _ in range(5000)]
     assert np.mean(greedy) == pytest.approx(0.7, abs=0.03)
 
 
 def test_literal_reading_always_ends_in_the_lower_corner(rng):
     assert (draws(make("literal"), rng, count=100) == LOWER).all()
-
-
-def test_perturbed_cost_asks_the_policy_of_the_perturbed_cost(rng):
-    seen = []
-
-    def perturbed(d):
-        seen.append(d)
-        return POLICY + 1.0
-
-    assert (make("perturbed-cost")(POLICY, rng, 0, perturbed) == POLICY + 1.0).all()
-    assert len(seen) == 1 and seen[0].shape == (2,)
 
 
 @pytest.mark.parametrize("action", [POLICY, np.array([100.0, 395.0]), np.array([104.0, 400.0])])
@@ -59,26 +47,48 @@ def test_bias_of_the_literal_reading_is_the_way_to_the_corner():
     assert make("literal").bias(POLICY[None], FIRST)[0] == pytest.approx(LOWER - POLICY, abs=1e-6)
 
 
-def test_bias_of_the_perturbed_cost_is_not_known():
-    assert np.isnan(make("perturbed-cost").bias(POLICY[None], FIRST)).all()
-
-
 def test_noise_is_drawn_alike_whatever_the_probability():
     paired = []
     for probability in (0.0, 1.0):
         rng = np.random.default_rng(3)
         explore = make("additive", probability)
         for _ in range(10):
-            explore(POLICY, rng, 0, lambda d: d)
+            explore(POLICY, rng, 0)
         paired.append(rng.random())
     assert paired[0] == paired[1]
 
 
-def test_a_wrong_number_of_deviations_is_refused():
+def test_a_wrong_number_of_deviations_is_refused(scenario):
     with pytest.raises(ConfigurationError, match="3 entries"):
-        make("additive", deviation=(1.0, 2.0, 3.0))
+        build_strategy(Configuration(exploration_deviation=(1.0, 2.0, 3.0)), scenario, 100)
 
 
-def test_an_unknown_strategy_is_named():
-    with pytest.raises(ConfigurationError, match=r"'random'.*additive, literal, perturbed-cost"):
-        make("random")
+def test_no_exploration_is_greedy(scenario, rng):
+    explore = build_strategy(Configuration(exploration="none"), scenario, 100)
+    assert all(explore(scenario.reference_action, rng, k) is None for k in range(20))
+
+
+def test_a_linear_schedule_is_linear_and_then_constant():
+    values = linear((10.0,), (2.0,), 100)
+    assert values(0) == 10.0 and values(50) == 6.0 and values(100) == 2.0 and values(500) == 2.0
+
+
+def test_without_an_end_it_is_constant():
+    values = linear((10.0, 3.0), None, 100)
+    assert values(0).tolist() == values(70).tolist() == [10.0, 3.0]
+
+
+def test_values_at_many_samples_are_those_of_each():
+    for end in (None, [9.0, -2.0]):
+        for length in (0, 7):
+            schedule = linear([1.0, 0.3], end, length)
+            each = [schedule(k) for k in range(12)]
+            assert schedule.at(np.arange(12)).tobytes() == np.array(each).tobytes()
+
+
+def test_a_geometric_schedule_has_equal_ratios_and_then_stays():
+    values = Geometric(0.5, 0.05, 100)
+    found = [values(k) for k in range(0, 101, 10)]
+    assert found[0] == 0.5 and found[-1] == pytest.approx(0.05, rel=1e-12)
+    assert np.ptp(np.divide(found[1:], found[:-1])) < 1e-12
+    assert values(500) == values(100)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant
-from learning.learner import Learner
-from learning.registry import load_algorithm
+from learning.algorithm import load_algorithm
+from learning.loop import begin
 from learning.training_run import TrainingRun
 
 ALGORITHMS = ("q-learning", "batch-q-learning", "actor-critic")
@@ -18,9 +18,7 @@ def learner(plant, name, samples=1500, **settings):
     algorithm = load_algorithm(name)
     configuration = algorithm.Configuration.from_dict({**SETTINGS[name], **settings})
     run = TrainingRun(name, plant.scenario, samples, 3, configuration)
-    made = Learner(run, algorithm, plant)
-    made.begin()
-    return made
+    return begin(run, algorithm, plant)
 
 
 @pytest.fixture(scope="module")
@@ -32,14 +30,14 @@ def plant(scenario):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_what_is_handed_over_is_the_incumbent_and_its_trials_are_greedy(plant, name):
     made = learner(plant, name)
-    start = made.start.theta.copy()
+    start = made.start_parameters.theta.copy()
     explored_in_trials, thetas = 0, []
     for _ in range(1500):
-        explores, before = made.algorithm.explores, made.interaction.explored
+        explores, before = made.algorithm.explores, made.counts.explored
         made.advance()
-        explored_in_trials += not explores and made.interaction.explored > before
+        explored_in_trials += not explores and made.counts.explored > before
         thetas.append(made.parameters.theta)
-    assert explored_in_trials == 0 < made.interaction.explored
+    assert explored_in_trials == 0 < made.counts.explored
     assert np.array_equal(thetas[0], start)
     assert not np.array_equal(thetas[-1], start), "the naive start is easily beaten"
 
@@ -49,7 +47,7 @@ def test_without_globalisation_the_rule_moves_what_is_handed_over(plant):
     for _ in range(100):
         made.advance()
     assert made.algorithm.theta is None
-    assert not np.array_equal(made.parameters.theta, made.start.theta)
+    assert not np.array_equal(made.parameters.theta, made.start_parameters.theta)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -60,31 +58,27 @@ def test_a_restored_search_goes_on_as_the_first_one(scenario, name, at):
         whole, resumed = learner(first, name), learner(second, name)
         for _ in range(at):
             whole.advance()
-        whole.interaction.restart()
-        numbers, arrays = whole.interaction.state()
-        resumed.controller.theta = whole.controller.theta
+        whole.restart()
         second.restore(second.deserialise(first.serialise(first.snapshot())))
-        resumed.algorithm.restore(whole.algorithm.state())
-        resumed.rng.bit_generator.state = whole.rng.bit_generator.state
-        resumed.interaction.resume(numbers, arrays)
+        resumed.restore(*whole.state())
         for _ in range(500):
             whole.advance()
             resumed.advance()
-            assert np.array_equal(whole.interaction.s, resumed.interaction.s)
+            assert np.array_equal(whole.s, resumed.s)
         assert np.array_equal(whole.controller.theta, resumed.controller.theta)
         assert np.array_equal(whole.parameters.theta, resumed.parameters.theta)
 
 
 def test_the_last_race_begins_a_new_episode(plant):
     made, seeds = learner(plant, "q-learning"), []
-    begin = made.interaction.start
+    go_on = made.start
 
-    def start(seed):
-        seeds.append(made.interaction.number)
-        begin(seed)
-        assert np.array_equal(made.interaction.s, plant.scenario.initial_state)
+    def start(s):
+        seeds.append(made.counts.number)
+        go_on(s)
+        assert np.array_equal(made.s, plant.scenario.initial_state)
 
-    made.interaction.start = start
+    made.start = start
     for _ in range(1500):
         made.advance()
     assert len(seeds) == 1

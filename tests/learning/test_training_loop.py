@@ -10,12 +10,10 @@ from controllers.rti import RtiNmpc
 from controllers.rti.solution import RtiSolution
 from cosim import FmuPlant
 from learning.errors import CheckpointError, ConfigurationError
-from learning.evaluation import HeldOutRuns, held_out
-from learning.log import LogRow, to_csv
-from learning.protocols import Update
+from learning.evaluation import HELD_OUT, held_out_costs
+from learning.log import LogRow, late_movement, to_csv
 from learning.q_learning import StepwiseQLearning
 from learning.registry import load_algorithm
-from learning.training_run import late_movement
 from tests.helpers import training
 from tests.helpers.command import run_cosim, start_cosim
 from tests.helpers.processes import eventually
@@ -142,7 +140,7 @@ def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tm
     assert result.rows[-1].parameters["x_l"][0] == result.parameters["x_l"][0]
     with FmuPlant(scenario) as plant:
         own = RtiNmpc(Problem.from_scenario(scenario), result.parameters)
-        assert result.evaluation["J"] == HeldOutRuns(plant, held_out(1), 20).means(own)["J"]
+        assert result.evaluation["J"] == held_out_costs(plant, own, 20, [HELD_OUT])["J"]
 
 
 def test_the_runs_seed_reaches_the_algorithm(scenario):
@@ -191,44 +189,6 @@ def test_a_run_that_began_otherwise_is_given_no_more_samples(scenario, tmp_path,
     longer = dataclasses.replace(run, samples=400)
     with pytest.raises(CheckpointError, match=message):
         train(longer, tmp_path, resume=True)
-
-
-class Worsening(load_algorithm("q-learning")):
-    """Lowers the back-off that a good start has, step by step."""
-
-    def __init__(self, controller, *rest):
-        super().__init__(controller, *rest)
-        self._carrier, self.heard = controller, []
-
-    def observe(self, sample):
-        parameters = self._carrier.parameters
-        self._carrier.parameters = parameters.replace({"x_l": parameters["x_l"] - [0.05, 0.0]})
-        return Update(td_error=0.0, step=0.05, smallest_eigenvalue=1.0)
-
-    def validated(self, accepted, theta):
-        self.heard.append(accepted)
-
-
-def test_validation_keeps_a_good_start_and_counts_its_samples(scenario, problem, tmp_path):
-    start = Parameters.naive(problem).replace({"x_l": [27.5, 40.0]}).save(tmp_path / "start.toml")
-    changes = {"samples": 200, "start": str(start), "validate_every": 50, "validation_samples": 60}
-    run = make_run(scenario, "q-learning", **changes)
-    result = train(run, rule=Worsening)
-    lost = train(dataclasses.replace(run, validate_every=0), rule=Worsening)
-    assert result.parameters["x_l"].tolist() == [27.5, 40.0]
-    assert lost.parameters["x_l"][0] < 20.0 and lost.plant_samples == 200
-    assert result.plant_samples == 200 + 5 * 60 and result.validated == 5 * 60
-    assert [row["plant_samples"] for row in result.rows] == [170, 280, 390, 500]
-    assert all(row["validated_J"] > 6000 for row in result.rows)
-    assert result.rows[-1]["accepted"] == 0
-
-
-def test_validation_resumes_to_the_same_digits(scenario, tmp_path):
-    run = make_run(scenario, "q-learning", samples=300, validate_every=50, validation_samples=40)
-    whole = train(run)
-    resumed = killed_and_resumed(run, tmp_path, 250)
-    assert to_csv(resumed.rows) == to_csv(whole.rows)
-    assert resumed.rows[-1]["accepted"] >= 1
 
 
 def test_scenarios_that_differ_in_open_points_train_differently(scenario):

@@ -1,7 +1,7 @@
 """A learner in a process of its own: it takes samples when it is told to and says what they took.
 
 Run as a program, also on other versions of the packages, so it asks only for what all of them have:
-the `Learner` of a run, its `advance`, and the methods of plant, controller and rule.
+the loop of a run, its `advance`, and the methods of plant, controller and rule.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def _say(answers: TextIO, answer: Any) -> None:
 def _learner(scenario: str, algorithm: str, samples: int, settings: dict[str, Any]) -> Any:
     """A plant, and an algorithm in its loop with it, without log, evaluation and checkpoints."""
     from cosim import FmuPlant
-    from learning.learner import Learner
-    from learning.registry import load_algorithm
+    from learning.algorithm import load_algorithm
+    from learning.loop import begin
 
     try:
         run = importlib.import_module("learning.training_run").TrainingRun
@@ -75,9 +75,7 @@ def _learner(scenario: str, algorithm: str, samples: int, settings: dict[str, An
     known = {k: v for k, v in settings.items() if k in rule.Configuration.model_fields}
     plant = FmuPlant(scenario)
     configuration = rule.Configuration.from_dict(known)
-    learner = Learner(run(algorithm, plant.scenario, samples, 0, configuration), rule, plant)
-    learner.begin()
-    return plant, learner
+    return plant, begin(run(algorithm, plant.scenario, samples, 0, configuration), rule, plant)
 
 
 def _take(learner: Any, samples: int) -> float:

@@ -63,13 +63,7 @@ def test_training_starts_from_tuned_and_from_a_file(cosim, tmp_path):
     slow = (*SHORT, "--set", "gain=1e-3", "--set", "gain_end=1e-3")
     code, out, _ = cosim(*slow, "--start", "tuned", "--out", "one", "--json")
     assert code == 0 and json.loads(out)["start"] == "tuned"
-    code, out, _ = cosim(
-        *slow, "--start", "one/parameters.toml", "--validate-every", 100,
-        "--validation-samples", 30, "--out", "two", "--json",
-    )  # fmt: skip
-    summary = json.loads(out)
-    assert code == 0 and summary["plant_samples"] == 200 + summary["validation"]["samples"]
-    assert summary["validation"]["samples"] == 3 * 30
+    assert cosim(*slow, "--start", "one/parameters.toml", "--out", "two", "--json")[0] == 0
     code, _, err = cosim(*SHORT, "--start", "none.toml", "--out", "three")
     assert code == 2 and "does not exist" in err
 

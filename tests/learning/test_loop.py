@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 
 import numpy as np
@@ -8,8 +9,10 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant, simulate
 from cosim.simulation import spawn_seeds
 from learning import QLearning
-from learning.interaction import Interaction
-from learning.starting_point import build_strategy, starting_parameters
+from learning.algorithm import Update
+from learning.exploration import build_strategy
+from learning.loop import TrainingLoop, begin
+from learning.training_run import TrainingRun, starting_parameters
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +24,15 @@ def plant(scenario):
 class Idle:
     """An algorithm that learns nothing."""
 
+    asks_for = "operation"
     needs_action_value = True
     needs_points = True
+
+    def state(self):
+        return {}
+
+    def restore(self, state):
+        pass
 
 
 def interaction(plant, problem, controller=None, **settings):
@@ -30,8 +40,8 @@ def interaction(plant, problem, controller=None, **settings):
     controller = controller or RtiNmpc(problem, starting_parameters(problem, configuration))
     strategy = build_strategy(configuration, plant.scenario, 100)
     plant_seed, rng = spawn_seeds(4)
-    made = Interaction(plant, controller, Idle(), strategy, rng)
-    made.start(plant_seed)
+    made = TrainingLoop(plant, controller, Idle(), strategy, rng)
+    made.start(plant.reset(plant_seed))
     return made, controller
 
 
@@ -58,7 +68,7 @@ def test_a_sample_is_consistent(plant, problem):
         if before.explored:
             assert before.action_value.value >= before.policy.value - 1e-6
     assert {sample.explored for sample in samples} == {True, False}
-    assert loop.explored == sum(sample.explored for sample in samples)
+    assert loop.counts.explored == sum(sample.explored for sample in samples)
 
 
 def test_penalty_is_moved_by_one_sample(plant, problem):
@@ -73,23 +83,7 @@ def test_literal_exploration_saturates_every_explored_sample(plant, problem):
     loop, _ = interaction(plant, problem, exploration="literal", exploration_probability=0.2)
     for _ in range(50):
         loop.next()
-    assert loop.explored > 0 and loop.saturated == loop.explored
-
-
-def test_perturbed_cost_explores_within_the_bounds_and_leaves_theta(plant, problem):
-    loop, controller = interaction(
-        plant,
-        problem,
-        exploration="perturbed-cost",
-        exploration_probability=1.0,
-        exploration_deviation=(20.0,),
-    )
-    theta = controller.theta.copy()
-    samples = [loop.next()[0] for _ in range(20)]
-    moved = np.array([sample.a - sample.policy.action for sample in samples])
-    assert np.abs(moved).max() > 1.0
-    assert loop.explored == 20
-    assert np.array_equal(controller.theta, theta)
+    assert loop.counts.explored > 0 and loop.counts.saturated == loop.counts.explored
 
 
 class Failing(RtiNmpc):
@@ -111,7 +105,7 @@ def test_a_failure_repeats_the_action_is_counted_and_learned_from_no_more(
     loop, _ = interaction(plant, problem, Failing(problem, parameters), exploration_probability=0.0)
     got = [loop.next()[0] for _ in range(10)]
     assert [sample is None for sample in got] == [False] * 3 + [True] * 2 + [False] * 5
-    assert loop.failures == 1
+    assert loop.counts.failures == 1
 
 
 def test_restart_changes_nothing_that_a_resume_would_not(plant, problem):
@@ -120,11 +114,60 @@ def test_restart_changes_nothing_that_a_resume_would_not(plant, problem):
         loop.next()
     snapshot = plant.snapshot()
     loop.restart()
-    numbers, arrays = loop.state()
-    rng_state = loop._rng.bit_generator.state
+    state = loop.state()
     first = [loop.next()[1] for _ in range(20)]
     other, _ = interaction(plant, problem)
     plant.restore(snapshot)
-    other._rng.bit_generator.state = rng_state
-    other.resume(numbers, arrays)
+    other.restore(*state)
     assert [other.next()[1] for _ in range(20)] == first
+
+
+def make_run(scenario, seed=3):
+    configuration = QLearning.Configuration.from_dict({"rule": "gauss-newton", "warm_up": 20})
+    return TrainingRun("q-learning", scenario, 100, seed, configuration)
+
+
+class Counting(QLearning):
+    """Moves nothing, but says on every sample that it did and that two QPs failed."""
+
+    def observe(self, sample):
+        return Update(td_error=1.0, step=0.0, smallest_eigenvalue=1.0, failures=2)
+
+
+def costs(plant, seed):
+    loop = begin(make_run(plant.scenario, seed), QLearning, plant)
+    return [loop.advance()[0] for _ in range(30)]
+
+
+def test_the_runs_seed_gives_the_samples(plant):
+    assert costs(plant, 3) == costs(plant, 3)
+    assert costs(plant, 3) != costs(plant, 4)
+
+
+def test_an_update_is_reported_where_theta_moves(plant):
+    loop = begin(make_run(plant.scenario), QLearning, plant)
+    for number in range(40):
+        before = loop.controller.theta.copy()
+        _, update = loop.advance()
+        assert (update is not None) == (number == 39)
+        assert np.array_equal(before, loop.controller.theta) == (update is None)
+    assert not np.array_equal(loop.start_parameters.theta, loop.controller.theta)
+
+
+def test_failures_of_an_update_count_with_those_of_the_loop(plant):
+    loop = begin(make_run(plant.scenario), Counting, plant)
+    for _ in range(5):
+        loop.advance()
+    assert loop.counts.failures == 10
+
+
+def test_a_rule_that_rests_neither_moves_nor_explores(plant):
+    run = dataclasses.replace(make_run(plant.scenario), rest_after=40)
+    loop = begin(run, QLearning, plant)
+    updates = [loop.advance()[1] for _ in range(40)]
+    assert updates[-1] is not None
+    theta, explored = loop.controller.theta.copy(), loop.counts.explored
+    assert explored > 0
+    assert [loop.advance()[1] for _ in range(40)] == [None] * 40
+    np.testing.assert_array_equal(loop.controller.theta, theta)
+    assert loop.counts.explored == explored

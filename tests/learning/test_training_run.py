@@ -9,8 +9,8 @@ from controllers.theta import ThetaBlocks
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.exploration import Literal
-from learning.starting_point import build_controller, build_strategy, starting_parameters
+from learning.exploration import build_strategy
+from learning.training_run import build_controller, starting_parameters
 
 
 def test_the_papers_theta_is_the_naive_guess(problem):
@@ -45,7 +45,7 @@ STATED = {
 def test_what_the_scenario_states_takes_the_place_of_defaults(scenario):
     configuration = QLearning.Configuration().for_scenario(scenario.replace(STATED))
     strategy = build_strategy(configuration, scenario, 100)
-    assert type(strategy) is Literal
+    assert strategy.kind == "literal"
     assert (strategy.probability(0), strategy.deviation(0).tolist()) == (0.2, [3.0, 4.0])
     assert configuration.value_offset == "stage-cost"
 
@@ -63,12 +63,6 @@ def test_what_the_user_sets_stands_against_the_scenario(scenario):
 def test_a_scenario_that_leaves_them_open_changes_nothing(scenario):
     configuration = QLearning.Configuration()
     assert configuration.for_scenario(scenario) == configuration
-
-
-def test_no_exploration_is_greedy(scenario, rng):
-    strategy = build_strategy(Configuration(exploration="none"), scenario, 100)
-    action = scenario.reference_action
-    assert all(strategy(action, rng, k, None) is None for k in range(20))
 
 
 def test_the_level_of_the_value_follows_the_discount_of_the_td_error(problem):

@@ -1,0 +1,207 @@
+"""What a training asks of an algorithm and of a learnable controller; algorithms by name.
+
+An own rule needs of this file `Transition`, which it is given, `Update`, which it returns, and the
+protocol `Algorithm`, which says what else it has.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.parameters import Parameters
+from controllers.rti.prepared import LinearisationPoint
+from cosim.plugins import load_plugin
+from cosim.protocols import Controller, Solution
+from cosim.scenario import Scenario
+from cosim.validation import suggestion
+from learning.configuration import Configuration
+from learning.errors import AlgorithmLookupError
+from learning.exploration import Strategy
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+Privilege = Literal["operation", "simulator"]
+GROUP = "cosim.algorithms"
+"""Entry points by which algorithms have names."""
+
+
+class LearnableSolution(Solution, Protocol):
+    """V or Q with its sensitivities to θ; `controllers.rti.RtiSolution` is one."""
+
+    @property
+    def value_gradient(self) -> Vector:
+        """dV/dθ or dQ/dθ, (n_θ,)."""
+
+    @property
+    def policy_jacobian(self) -> Matrix:
+        """dπ/dθ, (m, n_θ)."""
+
+    @property
+    def weakly_active(self) -> bool:
+        """Whether a constraint is about to change its activity: derivatives are one-sided."""
+
+    @property
+    def licq(self) -> bool:
+        """Whether the active constraints' gradients are linearly independent."""
+
+
+class LearnableController(Controller, Protocol):
+    """A controller with parameters θ; `RtiNmpc` and `ConvergedNmpc` are.
+
+    `memoryless` says that a feedback depends, to the tolerance of its solver, on nothing but θ, the
+    point at which it was prepared, s and a; so what was solved for once need not be again.
+    """
+
+    theta: Vector
+    memoryless: bool
+
+    @property
+    def parameters(self) -> Parameters:
+        """θ with its blocks."""
+
+    @property
+    def linearisation_point(self) -> LinearisationPoint:
+        """Where the QP was linearised, copies."""
+
+    def prepare_at(self, point: LinearisationPoint) -> None:
+        """Linearise at a point, at the present θ."""
+
+    def feedback(self, s: Vector, a: Vector | None = None) -> LearnableSolution:
+        """Solve for V and π, or with the first action fixed for Q."""
+
+
+class Transition(NamedTuple):
+    """One transition (s, a, ℓ, s₊) as the training loop saw it, all at one θ.
+
+    `policy` is the solution for V(s) and π(s); `action_value` that for Q(s, a), the same object
+    where the sample was greedy (then Q = V) or the algorithm does not need it; `next_policy` that
+    for V(s₊), π(s₊); `next_s` is s₊; `explored` says that a is not π(s). `stage_cost` is ℓ, `cost`
+    ℓ plus the penalty of s, the sample's share of J; `next_penalty` the penalty of s₊. `point` and
+    `next_point` are the linearisation points at s and s₊, None unless the algorithm
+    `needs_points`. `number` counts from 0.
+    """
+
+    number: int
+    s: Vector
+    a: Vector
+    explored: bool
+    policy: LearnableSolution
+    action_value: LearnableSolution
+    stage_cost: float
+    cost: float
+    next_s: Vector
+    next_penalty: float
+    next_policy: LearnableSolution
+    point: LinearisationPoint | None
+    next_point: LinearisationPoint | None
+
+
+class Update(NamedTuple):
+    """What an algorithm says of an update of θ, for the log, and what it asks of the plant.
+
+    `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
+    step, `smallest_eigenvalue` that of B_l and B_Vf at the new θ; `corrected` and `refused` say
+    that the step was changed to keep them definite, or not taken; `failures` counts QPs of the
+    algorithm's own that failed.
+
+    The last three are for algorithms that ask for a simulator; PrivilegeError otherwise. `episode`
+    resets the plant to the scenario's initial state with this seed of its noise. `mark` remembers
+    the plant as it is now, `rewind` puts it back to there, with the same noise to come.
+    """
+
+    td_error: float
+    step: float
+    smallest_eigenvalue: float
+    corrected: bool = False
+    refused: bool = False
+    failures: int = 0
+    episode: int | None = None
+    mark: bool = False
+    rewind: bool = False
+
+
+class Rule(Protocol):
+    """What learns from transitions: an algorithm, or the rule that a search has inside."""
+
+    @property
+    def needs_action_value(self) -> bool:
+        """Whether `Transition.action_value` must be solved for where the sample explored."""
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether `Transition.point` and `Transition.next_point` must be kept."""
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Take one sample; move θ and say so, or return None."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that must survive a checkpoint but θ (`learning.checkpoint.arrays_of` helps)."""
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+
+
+class Algorithm(Rule, Protocol):
+    """A learning algorithm. Register its class in the entry-point group `cosim.algorithms`.
+
+    `Configuration` is the class of its hyperparameters. `asks_for` states what it needs of a plant:
+    `operation`, one trajectory as it comes, or `simulator`, a plant that can be reset, put back and
+    given the same noise twice. The loop constructs it with a controller that it may move
+    (`controller.theta`), calls `observe` once per sample, and evaluates the policy anew whenever
+    `observe` returned an Update. `rng` is a generator of its own, spawned from the run's seed; the
+    loop keeps its state in checkpoints.
+
+    Optional, looked up by name:
+
+    - `theta` (n_θ,), a property: the θ that the run would hand over now, where the controller
+      carries another one. Log, evaluation, divergence, parameters.toml and summary are of it.
+    - `budget`, int, of the class: samples of a run where the user says nothing, else 50 000.
+    - `first_episode`, int (simulator only): seed of the plant's noise at the start.
+    - `explores`, bool: whether the samples explore now; they do where it is not there.
+    - `failed(cost) -> Update | None`: called in place of `observe` on a sample at which the
+      controller failed, with the sample's share of J.
+    """
+
+    Configuration: ClassVar[type[Configuration]]
+    asks_for: ClassVar[Privilege]
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: Any,
+        samples: int,
+        strategy: Strategy,
+        rng: np.random.Generator,
+    ) -> None: ...
+
+
+def algorithms() -> list[str]:
+    """Names of the algorithms that are registered."""
+    return sorted(point.name for point in entry_points(group=GROUP))
+
+
+def algorithm_target(name: str) -> str:
+    """The `module:Class` of a registered name; any other text as it is."""
+    return next((point.value for point in entry_points(group=GROUP) if point.name == name), name)
+
+
+def load_algorithm(name: str) -> type[Algorithm]:
+    """Class of an algorithm by registered name or `module:Class`; raises AlgorithmLookupError."""
+    target = algorithm_target(name)
+    if ":" not in target:
+        known = algorithms()
+        raise AlgorithmLookupError(
+            f"unknown algorithm '{name}'{suggestion(name, known)}; registered are "
+            f"{', '.join(known)}, or give module:Class"
+        )
+    found = load_plugin(target, f"algorithm '{name}'", AlgorithmLookupError)
+    needed = ("Configuration", "observe", "state", "restore")
+    if missing := [part for part in needed if not hasattr(found, part)]:
+        raise AlgorithmLookupError(f"algorithm '{name}' lacks {', '.join(missing)}")
+    algorithm: type[Algorithm] = found
+    return algorithm

@@ -1,0 +1,334 @@
+"""The training loop: plant, controller and learning rule, sample by sample, and its checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from controllers.rti.prepared import LinearisationPoint
+from cosim.plant import FmuPlant
+from cosim.protocols import Step, recover
+from cosim.simulation import spawn_seeds
+from learning.algorithm import (
+    Algorithm,
+    LearnableController,
+    LearnableSolution,
+    Transition,
+    Update,
+)
+from learning.checkpoint import generator_state, group, prefixed, restore_generator
+from learning.errors import PrivilegeError
+from learning.exploration import Strategy, build_strategy
+from learning.training_run import TrainingRun, build_controller, starting_parameters
+
+Vector = NDArray[np.float64]
+CHECKED_EVERY = 10
+"""The flags of a solution cost as much as a feedback; of this many samples one pays for them."""
+
+
+class PlantInOperation:
+    """What is left of a plant in operation: its next sample.
+
+    It cannot be reset, put back, or told which noise to meet.
+    """
+
+    __slots__ = ("scenario", "step", "units")
+
+    def __init__(self, plant: FmuPlant) -> None:
+        self.scenario, self.units = plant.scenario, plant.units
+
+        def step(a: Vector) -> Step:
+            """Hold an action (m,) for one sample."""
+            return plant.step(a)
+
+        self.step = step
+
+
+@dataclass
+class Counts:
+    """What a loop has counted since its start.
+
+    `number` of samples; `failures` of the controller; samples that `explored`, and of these those
+    `saturated` at an actuator's bound; of every tenth sample, the policies whose derivatives are
+    one-sided, `weakly_active`, and those whose active constraints are dependent, `licq_failed`.
+    """
+
+    number: int = 0
+    failures: int = 0
+    explored: int = 0
+    saturated: int = 0
+    weakly_active: int = 0
+    licq_failed: int = 0
+
+
+class TrainingLoop:
+    """Takes samples from a plant and lets a rule move the controller's θ.
+
+    V(s₊) of a sample is V(s) of the next one, so a greedy sample costs one QP. Where the controller
+    fails, the last action is applied once more, the failure is counted and the controller starts
+    from its reference. After `rest_after` samples θ stays and nothing explores.
+
+    `plant` has been reset. An algorithm that asks for `operation` has a `PlantInOperation` here: it
+    gets transitions, and nothing else of the plant. `rng` draws the exploration; `algorithm_rng` is
+    the algorithm's own and goes through checkpoints.
+    """
+
+    def __init__(
+        self,
+        plant: FmuPlant,
+        controller: LearnableController,
+        algorithm: Algorithm,
+        strategy: Strategy,
+        rng: np.random.Generator,
+        rest_after: int | None = None,
+        algorithm_rng: np.random.Generator | None = None,
+    ) -> None:
+        scenario = plant.scenario
+        simulator = getattr(algorithm, "asks_for", "simulator") == "simulator"
+        self._simulator = plant if simulator else None
+        self._plant = plant if simulator else PlantInOperation(plant)
+        self.controller, self.algorithm, self.rng = controller, algorithm, rng
+        self._strategy, self._algorithm_rng = strategy, algorithm_rng
+        self.start_parameters = controller.parameters
+        self._rest_after = inf if rest_after is None else rest_after
+        self._lower, self._upper = scenario.action_lower, scenario.action_upper
+        self._penalty, self._saturate = scenario.state_penalty, scenario.saturate
+        self._applied = scenario.reference_action
+        self._policy: LearnableSolution | None = None
+        self._point: LinearisationPoint | None = None
+        self._marked: tuple[Any, Vector, LinearisationPoint | None] | None = None
+        self.s: Vector = scenario.initial_state
+        self.counts = Counts()
+
+    def start(self, s: Vector) -> None:
+        """Begin an episode at the state s (n,) to which the plant has been reset."""
+        self.s = s
+        self.controller.reset()
+        self._policy = self._solve()
+
+    @property
+    def parameters(self) -> Parameters:
+        """The θ that the rule would hand over now: what it reports, else what it behaves with."""
+        theta = getattr(self.algorithm, "theta", None)
+        present = self.controller.parameters
+        return present if theta is None else present.with_theta(theta)
+
+    @property
+    def rests(self) -> bool:
+        """Whether exploration and learning are over, and the rest is for the record."""
+        return self.counts.number >= self._rest_after
+
+    def advance(self) -> tuple[float, Update | None]:
+        """One sample of plant and rule: its cost, and the update if θ moved.
+
+        Raises DivergenceError where the rule finds that θ means nothing any more, PrivilegeError
+        where it asks more of the plant than it stated.
+        """
+        rests = self.rests
+        transition, cost = self.next()
+        update: Update | None = None
+        if rests:
+            return cost, None
+        if transition is not None:
+            update = self.algorithm.observe(transition)
+        elif failed := getattr(self.algorithm, "failed", None):
+            update = failed(cost)
+        if update is None:
+            return cost, None
+        self.counts.failures += update.failures
+        if update.mark:
+            self._marked = (self._asked("mark").snapshot(), self.s, self._point)
+        if update.rewind:
+            self._rewind()
+        elif update.episode is not None:
+            self.start(self._asked("episode").reset(update.episode))
+        else:
+            self.renew()
+        return cost, update
+
+    def renew(self) -> None:
+        """Solve once more for the present state, at the guess as it was: θ has moved."""
+        if self._point is not None:
+            self.controller.prepare_at(self._point)
+            self._policy = self._feedback(self.s)
+
+    def next(self) -> tuple[Transition | None, float]:
+        """One sample of the plant: its transition, None after a failure, and its cost."""
+        policy, point, s, number = self._policy, self._point, self.s, self.counts.number
+        a, explored = (self._applied, False) if policy is None else self._choose(policy.action)
+        action_value = policy
+        if explored and self.algorithm.needs_action_value:
+            action_value = self._feedback(s, a)
+        if policy is not None and number % CHECKED_EVERY == 0:
+            self.counts.weakly_active += policy.weakly_active
+            self.counts.licq_failed += not policy.licq
+        step = self._plant.step(a)
+        self._applied, self.s, self.counts.number = a, step.s, number + 1
+        self._policy = self._solve()
+        cost = step.stage_cost + step.penalty
+        if policy is None or action_value is None or self._policy is None:
+            return None, cost
+        keep = self.algorithm.needs_points
+        return Transition(
+            number=number,
+            s=s,
+            a=a,
+            explored=explored,
+            policy=policy,
+            action_value=action_value,
+            stage_cost=step.stage_cost,
+            cost=cost,
+            next_s=self.s,
+            next_penalty=self._penalty(self.s.tolist()),
+            next_policy=self._policy,
+            point=point if keep else None,
+            next_point=self._point if keep else None,
+        ), cost
+
+    def _choose(self, action: Vector) -> tuple[Vector, bool]:
+        """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
+        explored: Vector | None = None
+        if not self.rests and getattr(self.algorithm, "explores", True):
+            explored = self._strategy(action, self.rng, self.counts.number)
+        # The QP keeps bounds to its tolerance, the actuator exactly.
+        if explored is None:
+            return self._saturate(action), False
+        a = self._saturate(explored)
+        self.counts.explored += 1
+        self.counts.saturated += bool(((a == self._lower) | (a == self._upper)).any())
+        return a, True
+
+    def _asked(self, privilege: str) -> FmuPlant:
+        """The plant with all that a simulator can; PrivilegeError where none was asked for."""
+        if self._simulator is None:
+            raise PrivilegeError(
+                f"{type(self.algorithm).__name__} asks for a plant in operation, and its update "
+                f"has '{privilege}', which only a simulator can; state asks_for = \"simulator\""
+            )
+        return self._simulator
+
+    def _rewind(self) -> None:
+        """Put plant and guess back to where they were marked, and solve there."""
+        plant = self._asked("rewind")
+        if self._marked is None:
+            raise PrivilegeError(f"{type(self.algorithm).__name__}: 'rewind' before any 'mark'")
+        snapshot, self.s, self._point = self._marked
+        plant.restore(snapshot)
+        self.restart()
+
+    # the controller -----------------------------------------------------------------------------
+
+    def _solve(self) -> LearnableSolution | None:
+        """V(s) and π(s) at the present state, prepared anew."""
+
+        def solve() -> LearnableSolution:
+            self.controller.prepare()
+            self._point = self.controller.linearisation_point
+            return self.controller.feedback(self.s)
+
+        return self._attempt(solve)
+
+    def _feedback(self, s: Vector, a: Vector | None = None) -> LearnableSolution | None:
+        """V(s) and π(s), or Q(s, a), as prepared."""
+        return self._attempt(lambda: self.controller.feedback(s, a))
+
+    def _attempt(self, solve: Callable[[], LearnableSolution]) -> LearnableSolution | None:
+        """What `solve` returns, or None where the controller fails, which is counted."""
+        try:
+            return solve()
+        except Exception as error:
+            recover(self.controller, error)
+        self.counts.failures += 1
+        self._point = None
+        return None
+
+    def restart(self) -> None:
+        """Forget all that a solver may carry from sample to sample but the guess itself.
+
+        Called at a checkpoint in the run that goes on as in the one that resumes, so that both
+        see the same digits ever after.
+        """
+        point = self._point
+        self.controller.reset()
+        if point is None:
+            self._policy = self._solve()
+        else:
+            self.controller.prepare_at(point)
+            self._policy = self._feedback(self.s)
+
+    # checkpoints --------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """JSON-ready values and arrays from which `restore` goes on; the plant's are the run's."""
+        arrays = {"s": self.s, "applied": self._applied, **_stored("point", self._point)}
+        if self._marked is not None:
+            content = self._asked("mark").serialise(self._marked[0])
+            arrays |= {"marked_s": self._marked[1], "marked": np.frombuffer(content, np.uint8)}
+            arrays |= _stored("marked_point", self._marked[2])
+        values = {"counts": asdict(self.counts), "generator": generator_state(self.rng)}
+        if self._algorithm_rng is not None:
+            values["algorithm_generator"] = generator_state(self._algorithm_rng)
+        stored = {"theta": self.controller.theta, **prefixed("loop ", arrays)}
+        return values, stored | prefixed("algorithm ", self.algorithm.state())
+
+    def restore(self, values: dict[str, Any], stored: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave; the plant must have been restored before.
+
+        Raises KeyError, TypeError, ValueError or another error where it is not that.
+        """
+        restore_generator(self.rng, values["generator"])
+        if self._algorithm_rng is not None:
+            restore_generator(self._algorithm_rng, values["algorithm_generator"])
+        self.controller.theta = stored["theta"]
+        self.algorithm.restore(group(stored, "algorithm "))
+        self.counts = Counts(**{name: int(values["counts"][name]) for name in asdict(Counts())})
+        arrays = group(stored, "loop ")
+        self.s, self._applied = arrays["s"], arrays["applied"]
+        self._marked = None
+        if "marked" in arrays:
+            snapshot = self._asked("mark").deserialise(arrays["marked"].tobytes())
+            self._marked = (snapshot, arrays["marked_s"], _point("marked_point", arrays))
+        self._point = _point("point", arrays)
+        self.restart()
+
+
+def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> TrainingLoop:
+    """The loop of a run at its start: the plant is reset, once, and the first state is solved for.
+
+    All random numbers come from the run's seed.
+    """
+    problem = Problem.from_scenario(run.scenario)
+    start = starting_parameters(problem, run.configuration, run.start)
+    controller = build_controller(run.controller, run.scenario, start)
+    strategy = build_strategy(run.configuration, run.scenario, run.samples)
+    plant_seed, rng = spawn_seeds(run.seed)
+    own = run.algorithm_rng()
+    rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
+    loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
+    first: int | None = getattr(rule, "first_episode", None)
+    if first is not None and getattr(rule, "asks_for", "simulator") != "simulator":
+        raise PrivilegeError(
+            f"{algorithm.__name__} asks for a plant in operation and states 'first_episode', which "
+            "only a simulator has"
+        )
+    loop.start(plant.reset(plant_seed if first is None else first))
+    return loop
+
+
+def _stored(name: str, point: LinearisationPoint | None) -> dict[str, Vector]:
+    if point is None:
+        return {}
+    return {f"{name}_{key}": value for key, value in point._asdict().items()}
+
+
+def _point(name: str, arrays: dict[str, Vector]) -> LinearisationPoint | None:
+    if f"{name}_x" not in arrays:
+        return None
+    return LinearisationPoint(*(arrays[f"{name}_{key}"] for key in LinearisationPoint._fields))

@@ -6,7 +6,7 @@ from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError, QpError
 from controllers.model import Model, Quantity
 from controllers.problem import Problem
-from controllers.rti import RtiNmpc
+from controllers.rti import RtiNmpc, compile_functions
 from controllers.rti.solution import LinearisationPoint, RtiSolution
 from controllers.theta import Parameters, ThetaBlocks
 
@@ -26,6 +26,7 @@ __all__ = [
     "RtiNmpc",
     "RtiSolution",
     "ThetaBlocks",
+    "compile_functions",
 ]
 
 

@@ -157,8 +157,9 @@ class ConvergedNmpc(RtiNmpc):
         self._merit = merit(problem, parameters.blocks)
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
-    def _compilable(self) -> list[BufferedFunction]:
-        return [*super()._compilable(), self._merit]
+    def casadi_functions(self) -> list[BufferedFunction]:
+        """All CasADi functions that a sample may call."""
+        return [*super().casadi_functions(), self._merit]
 
     @property
     def _lifts(self) -> bool:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
+import shutil
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from math import isfinite
@@ -11,12 +14,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import casadi as ca
+import filelock
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
-from controllers.shared_library import FLAGS, Build, find, find_compiler, lock_of
-from cosim.files import cache_folder
+from cosim.files import cache_folder, temporary_folder
+from cosim.processes import run_child
 
 Vector = NDArray[np.float64]
 
@@ -166,140 +170,86 @@ def c_source(functions: Sequence[ca.Function]) -> str:
     return source
 
 
-KIND = "compiled"
 SWITCH = "COSIM_COMPILE"
 CHOICES = ("auto", "never", "now")
 INTERPRETED, COMPILED = "interpreted", "compiled"
-LOOK, WORTH, POLL = 50, 2000, 200
-"""Calls after which a stored library is looked for, one is compiled, and each look at its end."""
+FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+LOOK, LONG = 1000, 20_000
+"""Samples from which a stored library is worth looking for, and from which one is worth making."""
+PATIENCE = 120.0
+"""Seconds that a compiler may take."""
+
+
+def bind_compiled(functions: Sequence[BufferedFunction], samples: int = LONG) -> str:
+    """Let compiled C compute the functions of a run of `samples`; `compiled` or `interpreted`.
+
+    A library that an earlier run has left in the user's cache is taken from `LOOK` samples on, and
+    one is made, and waited for, from `LONG` on. COSIM_COMPILE says `never`, or `now` for any
+    number. Without a compiler, and where it fails, the interpreter stays; the results are the same
+    to the bit. Raises ControllerError on another word in COSIM_COMPILE.
+    """
+    chosen, compiler = switch(), find_compiler()
+    if chosen == "never" or compiler is None or (samples < LOOK and chosen != "now"):
+        return INTERPRETED
+    source = c_source([function.function for function in functions])
+    content = "\0".join((source, identity(compiler), *FLAGS))
+    path = cache_folder("compiled") / f"{hashlib.sha256(content.encode()).hexdigest()[:32]}.lib"
+    try:
+        if not path.is_file():
+            if samples < LONG and chosen != "now":
+                return INTERPRETED
+            _compile(compiler, source, path)
+        os.utime(path)
+        libraries = [ca.external(each.function.name(), str(path)) for each in functions]
+    except (OSError, RuntimeError, subprocess.SubprocessError, filelock.Timeout):
+        return INTERPRETED
+    for function, library in zip(functions, libraries, strict=True):
+        function.bind(library)
+    return COMPILED
+
+
+def _compile(compiler: str, source: str, path: Path) -> None:
+    """Make a library; it appears whole, and of several processes one makes it."""
+    with filelock.FileLock(path.with_suffix(".lock"), timeout=PATIENCE):
+        if path.is_file():
+            return
+        with temporary_folder(".partial-", path.parent) as folder:
+            (folder / "functions.c").write_text(source, encoding="utf-8")
+            command = [compiler, *FLAGS, "-o", "library", "functions.c", "-lm"]
+            if run_child(command, timeout=PATIENCE, folder=folder, log=subprocess.DEVNULL):
+                raise OSError("the compiler failed")
+            (folder / "library").replace(path)
 
 
 def switch() -> str:
-    """`auto`, `never` or `now`, as the environment's COSIM_COMPILE says.
-
-    Raises ControllerError on another word.
-    """
+    """`auto`, `never` or `now`, as the environment's COSIM_COMPILE says; ControllerError else."""
     chosen = os.environ.get(SWITCH) or CHOICES[0]
     if chosen not in CHOICES:
         raise ControllerError(f"{SWITCH} is '{chosen}'; it must be {', '.join(CHOICES)} or not set")
     return chosen
 
 
+def find_compiler() -> str | None:
+    """The C compiler that CC names, else the first of cc, gcc and clang; None where none is."""
+    names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
+    found = next(filter(None, map(shutil.which, names)), None)
+    if found and sys.platform == "darwin":  # its `cc` may only ask the user to install a compiler
+        answer = subprocess.run(["xcode-select", "-p"], capture_output=True, check=False)
+        return found if answer.returncode == 0 else None
+    return found
+
+
+def identity(compiler: str) -> str:
+    """One line that tells a compiler from others, and machines of unlike processors."""
+    status = Path(compiler).resolve().stat()
+    return f"{compiler} {status.st_size} {status.st_mtime_ns} {platform.machine()}"
+
+
 def description() -> str:
     """Which of compiler and interpreter a long run uses here, in a few words."""
     if switch() == "never":
         return f"{INTERPRETED} ({SWITCH}=never)"
-    compiler = find_compiler(os.environ.get("CC"))
+    compiler = find_compiler()
     if compiler is None:
         return f"{INTERPRETED} (no C compiler found)"
-    return f"{COMPILED} by {compiler.path} {' '.join(FLAGS)}, kept in {cache_folder(KIND)}"
-
-
-class Compilation:
-    """Functions that are interpreted at first and compiled once enough calls show that it pays.
-
-    `count()` is called once a sample. Early on, a library that some earlier run has left is taken
-    up; after `WORTH` samples the compiler is started, and its library taken up when it is there,
-    while the samples go on. The bytes of all results are the same throughout. Without compiler, and
-    where it fails, the interpreter stays. The environment's COSIM_COMPILE may say `never`, or
-    `now` to have it done, and waited for, at once.
-    """
-
-    def __init__(self, functions: Sequence[BufferedFunction]) -> None:
-        self._functions = functions
-        self.mode = INTERPRETED
-        """Whether the functions are `interpreted` or `compiled` now."""
-        self._calls, self._next = 0, LOOK
-        self._build: Build | None = None
-        self._source = ""
-        chosen = switch()
-        if chosen == "never":
-            self._next = sys.maxsize
-        elif chosen == "now":
-            self.finish()
-
-    def count(self) -> None:
-        """Count a sample."""
-        self._calls += 1
-        if self._calls >= self._next:
-            self._advance()
-
-    def postpone(self) -> None:
-        """Change nothing before `finish`, however many samples are counted."""
-        self._next = sys.maxsize
-
-    def finish(self) -> str:
-        """Do at once, and wait for, what `count` would do in time; returns `mode`.
-
-        With COSIM_COMPILE=never that is nothing.
-        """
-        wanted = self.mode == INTERPRETED and switch() != "never"
-        if wanted and self._prepare() and not self._take(self._stored()):
-            if self._build is None:
-                self._start(wait=True)
-            if self._build is not None:
-                self._build.done(wait=True)
-                self._finish_build()
-        self._next = sys.maxsize
-        return self.mode
-
-    def _advance(self) -> None:
-        if self._build is not None:
-            self._next = self._calls + POLL
-            if self._build.done():
-                self._finish_build()
-        elif not self._prepare() or self._take(self._stored()):
-            self._next = sys.maxsize
-        elif self._calls < WORTH:
-            self._next = WORTH
-        else:
-            self._next = self._calls + POLL
-            try:
-                self._start()
-            except OSError:
-                self._next = sys.maxsize
-
-    def _prepare(self) -> bool:
-        """Write the source and name the library; False where there is no compiler."""
-        compiler = find_compiler(os.environ.get("CC"))
-        if compiler is None:
-            return False
-        if not self._source:
-            self._source = c_source([function.function for function in self._functions])
-            content = "\0".join((self._source, compiler.identity, *FLAGS))
-            self._name = hashlib.sha256(content.encode()).hexdigest()[:32]
-            self._compiler, self._folder = compiler, cache_folder(KIND)
-        return True
-
-    def _start(self, *, wait: bool = False) -> None:
-        """Start the compiler unless another process is at it, or, after a wait, has been."""
-        lock = lock_of(self._name, self._folder, wait=wait)
-        if lock is None:
-            return
-        if self._take(self._stored()):
-            lock.release()
-            self._next = sys.maxsize
-            return
-        self._build = Build(self._compiler, self._source, self._name, self._folder, lock)
-
-    def _finish_build(self) -> None:
-        assert self._build is not None
-        path, self._build = self._build.publish(), None
-        self._take(path)
-        self._next = sys.maxsize
-
-    def _stored(self) -> Path | None:
-        return find(self._name, self._folder)
-
-    def _take(self, path: Path | None) -> bool:
-        """Put the library's functions in place of the interpreted ones."""
-        if path is None:
-            return False
-        try:
-            loaded = [ca.external(f.function.name(), str(path)) for f in self._functions]
-        except RuntimeError:  # not a library that this system loads
-            return False
-        for function, compiled in zip(self._functions, loaded, strict=True):
-            function.bind(compiled)
-        self.mode = COMPILED
-        return True
+    return f"{COMPILED} by {compiler} {' '.join(FLAGS)}, kept in {cache_folder('compiled')}"

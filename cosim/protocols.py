@@ -80,7 +80,7 @@ class Controller(Protocol):
     """A feedback law in two phases: `prepare` before the state is known, `feedback` after.
 
     Optional attributes that are used when present: `name` (str), `parameters` (with `.hash`) and
-    `compilation`, whose `mode` says how its functions are computed.
+    `functions`, which says how its functions are computed.
     An exception whose class has `is_solver_failure = True` makes the loop apply its fallback.
     """
 
@@ -160,7 +160,7 @@ def recover(controller: Controller, error: Exception) -> None:
 
 def functions_of(controller: Any) -> str | None:
     """How a controller's functions are computed, `interpreted` or `compiled`; None without any."""
-    mode = getattr(getattr(controller, "compilation", None), "mode", None)
+    mode = getattr(controller, "functions", None)
     return mode if isinstance(mode, str) else None
 
 

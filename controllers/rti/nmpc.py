@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.functions import BufferedFunction, Compilation
+from controllers.functions import INTERPRETED, LONG, BufferedFunction, bind_compiled, switch
 from controllers.problem import Problem
 from controllers.qp import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
@@ -44,8 +44,9 @@ class RtiNmpc:
     `feedback(s, a)` after `feedback(s)` uses the same QP data.
 
     `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
-    or a function that makes a `QpBackend`; `compilation` says whether the CasADi functions are
-    interpreted or compiled, which changes no bit. Raises ControllerError on another choice.
+    or a function that makes a `QpBackend`; `functions` says whether the CasADi functions are
+    `interpreted` or `compiled`, which changes no bit (see `compile_functions`). Raises ControllerError on
+    another choice.
     """
 
     name = "rti"
@@ -75,7 +76,6 @@ class RtiNmpc:
             problem, self._prepare, self._embed, self._readout, gradient, policy
         )
         self._riccati = riccati(problem, self._prepare) if horizon * m >= LEAST_CONTROLS else None
-        self.compilation = Compilation(self._compilable())
         self._qp, self._stages = qp_in_memory(problem, self._prepare, self._embed)
         if self._riccati is not None:
             self._qp.factor = partial(limits_of, self._riccati)
@@ -97,10 +97,13 @@ class RtiNmpc:
         self._value = self._readout.slices["value"].start
         self._constant = 0.0
         self.parameters = parameters
+        self.functions = INTERPRETED
+        if switch() == "now":
+            compile_functions(self)
         self.reset()
 
-    def _compilable(self) -> list[BufferedFunction]:
-        """All functions that a sample may call."""
+    def casadi_functions(self) -> list[BufferedFunction]:
+        """All CasADi functions that a sample may call."""
         f = self._functions
         return [
             *(f.preparation, f.embedding, f.readout, f.gradient, f.policy),
@@ -203,7 +206,6 @@ class RtiNmpc:
 
     def _linearise(self) -> None:
         prepare = self._prepare
-        self.compilation.count()
         self._prepared = None
         self._constant = self._hessian.fill(self._x, self._u, self._costates)
         prepare()
@@ -306,6 +308,15 @@ class RtiNmpc:
     def policy(self, s: ArrayLike) -> Vector:
         """π(s) of the prepared QP, (m,)."""
         return self._solve(s, None).action
+
+
+def compile_functions(controller: object, samples: int = LONG) -> None:
+    """Compile an NMPC's functions if a run of `samples` is worth it; nothing on other controllers.
+
+    To be called before the first sample; see `controllers.functions.bind_compiled`.
+    """
+    if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
+        controller.functions = bind_compiled(controller.casadi_functions(), samples)
 
 
 def _vector(kind: str, values: ArrayLike, size: int) -> Vector:

@@ -1,7 +1,10 @@
+"""Functions compiled by the machine's own compiler: the interpreter's bytes, a cache, no endless wait."""
+
 import json
 import shutil
 import sys
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -12,11 +15,9 @@ from controllers import (
     Problem,
     RtiNmpc,
     ThetaBlocks,
+    functions,
 )
-from controllers import functions as compilation
-from controllers.functions import BufferedFunction, Compilation, description
-from controllers.shared_library import find, find_compiler
-from cosim.files import TAG
+from controllers.functions import BufferedFunction, bind_compiled, description, find_compiler
 from cosim.scenario import Scenario
 from cosim.scenario.loading import presets
 from tests.helpers.command import run_cosim
@@ -26,8 +27,6 @@ needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compil
 
 
 def small_function(name="small"):
-    import casadi as ca
-
     x = ca.SX.sym("x", 3)
     values = [
         ca.sin(x[0]) * x[1] + x[2] * x[1],
@@ -45,16 +44,10 @@ def folder(monkeypatch, tmp_path):
     return tmp_path / "cache" / "compiled"
 
 
-def libraries(folder):
-    if not folder.is_dir():
-        return []
-    return [p for p in folder.iterdir() if p.suffix != ".lock" and p.name != TAG]
-
-
 @needs_compiler
 def test_a_compiled_function_gives_the_interpreters_bytes(folder, rng):
     interpreted, compiled = small_function(), small_function()
-    assert Compilation([compiled]).finish() == "compiled"
+    assert bind_compiled([compiled]) == "compiled"
     ties = [(0.0, -0.0, 1.0), (-0.0, 0.0, 1.0), (np.nan, 1.0, -1.0), (1.0, np.nan, np.inf)]
     for values in [*ties, *rng.normal(size=(200, 3)) * 10.0 ** rng.integers(-8, 8, (200, 1))]:
         for function in (interpreted, compiled):
@@ -87,7 +80,7 @@ def compare(monkeypatch, kind, problem):
             if kind == "converged"
             else RtiNmpc(problem, parameters, hessian=kind)
         )
-        assert controller.compilation.mode == {"never": "interpreted", "now": "compiled"}[mode]
+        assert controller.functions == {"never": "interpreted", "now": "compiled"}[mode]
         rows[mode] = visits(controller, np.random.default_rng(5))
     assert rows["never"] == rows["now"]
 
@@ -114,105 +107,49 @@ def visits(controller, rng):
 
 
 @needs_compiler
-def test_a_long_run_is_compiled_while_it_goes_on_and_the_next_one_finds_the_library(folder):
-    first = Compilation([small_function()])
-    while first._build is None:
-        assert first._calls <= compilation.WORTH
-        first.count()
-    first._build.done(wait=True)
-    for _ in range(compilation.POLL):
-        first.count()
-    assert first.mode == "compiled"
-    second = Compilation([small_function()])
-    for _ in range(compilation.LOOK - 1):
-        second.count()
-    assert second.mode == "interpreted"
-    second.count()
-    assert second.mode == "compiled"
-    assert len(libraries(folder)) == 1
-
-
-def test_a_short_run_starts_no_compiler(folder):
-    run = Compilation([small_function()])
-    for _ in range(compilation.WORTH - 1):
-        run.count()
-    assert run.mode == "interpreted"
-    assert libraries(folder) == []
+def test_a_long_run_compiles_and_a_shorter_one_finds_the_library(folder):
+    assert bind_compiled([small_function()], functions.LONG - 1) == "interpreted"
+    assert bind_compiled([small_function()], functions.LONG) == "compiled"
+    assert bind_compiled([small_function()], functions.LOOK) == "compiled"
+    assert bind_compiled([small_function()], functions.LOOK - 1) == "interpreted"
+    assert len(list(folder.glob("*.lib"))) == 1
 
 
 @needs_compiler
-@pytest.mark.parametrize("damage", ["flip", "cut", "open to others"])
-def test_a_damaged_or_foreign_library_is_not_loaded(folder, damage):
-    # Not loaded before it is damaged: a process does not survive damage to what it runs.
-    run = Compilation([small_function()])
-    run._prepare()
-    run._start()
-    run._build.done(wait=True)
-    path = run._build.publish()
-    content = path.read_bytes()
-    if damage == "flip":
-        path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    elif damage == "cut":
-        path.write_bytes(content[:100])
-    else:
-        path.chmod(0o777)
-    assert find(run._name, folder) is None
-    again = Compilation([small_function()])
-    assert again.finish() == "compiled"
-    assert find(run._name, folder) is not None
+def test_a_library_in_a_folder_open_to_others_is_not_loaded(folder):
+    bind_compiled([small_function()])
+    folder.chmod(0o777)
+    functions.cache_folder.__globals__["_caches"].clear()
+    assert bind_compiled([small_function()], functions.LOOK) == "interpreted"
 
 
 def test_without_a_compiler_the_interpreter_works_and_says_so(folder, monkeypatch):
-    monkeypatch.setattr(compilation, "find_compiler", lambda chosen=None: None)
-    assert Compilation([small_function()]).finish() == "interpreted"
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert bind_compiled([small_function()]) == "interpreted"
     assert "no C compiler" in description()
 
 
-def test_a_compiler_that_fails_leaves_the_interpreter(folder, monkeypatch):
+def test_a_compiler_that_fails_or_hangs_leaves_the_interpreter(folder, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", shutil.which("false") or sys.executable)
-    assert Compilation([small_function()]).finish() == "interpreted"
-    assert libraries(folder) == []
-
-
-@needs_compiler
-def test_a_postponed_compilation_waits_to_be_finished(folder):
-    Compilation([small_function()]).finish()
-    run = Compilation([small_function()])
-    run.postpone()
-    for _ in range(2 * compilation.LOOK):
-        run.count()
-    assert run.mode == "interpreted"
-    assert run.finish() == "compiled"
+    assert bind_compiled([small_function()]) == "interpreted"
+    hangs = tmp_path / "cc"
+    hangs.write_text("#!/bin/sh\nsleep 600\n")
+    hangs.chmod(0o700)
+    monkeypatch.setenv("CC", str(hangs))
+    monkeypatch.setattr(functions, "PATIENCE", 0.5)
+    assert bind_compiled([small_function()]) == "interpreted"
+    assert list(folder.glob("*.lib")) == []
 
 
 def test_never_means_never(folder, monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "never")
-    assert Compilation([small_function()]).finish() == "interpreted"
-    assert libraries(folder) == []
+    assert bind_compiled([small_function()]) == "interpreted"
 
 
 def test_an_unknown_word_in_the_switch_is_refused(monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "yes")
-    with pytest.raises(ControllerError, match="COSIM_COMPILE is 'yes'; it must be auto"):
+    with pytest.raises(ControllerError):
         RtiNmpc(evaporator_problem(), Parameters.naive(evaporator_problem()))
-
-
-def test_another_compiler_or_other_flags_do_not_share_a_library(folder, monkeypatch, tmp_path):
-    other = tmp_path / "cc"
-    other.write_text("#!/bin/sh\n")
-    other.chmod(0o700)
-    names = set()
-    for chosen in (None, str(other)):
-        if chosen:
-            monkeypatch.setenv("CC", chosen)
-        run = Compilation([small_function()])
-        if run._prepare():
-            names.add(run._name)
-    monkeypatch.setattr(compilation, "FLAGS", ("-O0",))
-    run = Compilation([small_function()])
-    run._prepare()
-    names.add(run._name)
-    assert len(names) == 3 - (find_compiler() is None)
 
 
 @needs_compiler

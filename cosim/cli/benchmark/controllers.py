@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from controllers import RtiNmpc
+from controllers import RtiNmpc, compile_functions
 from cosim.cli.benchmark.figures import clock, figure
 from cosim.cli.benchmark.references import Q_SAMPLE, SAMPLE, Visit, references, rti_controller
 from cosim.cli.compose import build_plant
@@ -47,13 +47,12 @@ def measure(
         PROXQP: rti_controller(scenario, "proxqp"),
     }
     for name, controller in controllers.items():
-        controller.compilation.postpone()
         if name != INTERPRETER:
-            controller.compilation.finish()
-    mode = controllers[DAQP].compilation.mode
+            compile_functions(controller)
+    mode = controllers[DAQP].functions
     seconds, visits = _run(scenario, controllers, steps, progress)
     ours = seconds[DAQP]
-    interpreted = controllers[INTERPRETER].compilation.mode != mode
+    interpreted = controllers[INTERPRETER].functions != mode
     rows = [
         figure(
             f"DAQP: {phase}",

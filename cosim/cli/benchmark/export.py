@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from controllers import RtiNmpc
+from controllers import RtiNmpc, compile_functions
 from cosim.cli.benchmark.figures import clock, figure
 from cosim.cli.compose import build_plant
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
@@ -30,7 +30,7 @@ def measure(
     Raises ControllerLookupError on a controller that cannot be exported.
     """
     python = rti_controller(controller, scenario)
-    python.compilation.finish()
+    compile_functions(python)
     with build_plant(scenario) as plant, temporary_folder("cosim-") as folder:
         system = sampled_controller(python, scenario, plant.units)
         path = write_fmu(system, python, scenario, folder / "controller.fmu", 2, False)
@@ -45,7 +45,7 @@ def measure(
         "controller": controller,
         "hessian": scenario.controller.hessian,
         "steps": steps,
-        "functions": python.compilation.mode,
+        "functions": python.functions,
         "largest_difference": max(differences),
         "rows": [row, figure("Python", seconds["Python"])],
     }

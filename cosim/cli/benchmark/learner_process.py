@@ -49,8 +49,7 @@ def serve(questions: Iterable[str], answers: TextIO) -> None:
     """
     lines = iter(questions)
     plant, learner = _learner(**json.loads(next(lines)))
-    compilation = getattr(learner.controller, "compilation", None)
-    _say(answers, getattr(compilation, "mode", "interpreted"))
+    _say(answers, getattr(learner.controller, "functions", "interpreted"))
     for line in lines:
         word, _, count = line.strip().rpartition(" ")
         _say(answers, _profile(learner, plant, int(count)) if word else _take(learner, int(count)))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks
+from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks, compile_functions
 from cosim.cli.benchmark.figures import clock
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
@@ -47,9 +47,9 @@ def _row(scenario: Scenario, horizon: int, kind: str) -> dict[str, Any]:
         problem, Parameters.naive(problem, blocks), hessian=scenario.controller.hessian
     )
     construction = clock() - begin
-    controller.compilation.postpone()
-    microseconds = {controller.compilation.mode: _phases(controller)}
-    mode = controller.compilation.finish()
+    microseconds = {controller.functions: _phases(controller)}
+    compile_functions(controller)
+    mode = controller.functions
     microseconds[mode] = _phases(controller)
     first, last = next(iter(microseconds.values())), microseconds[mode]
     return {

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -137,13 +136,13 @@ def test_a_finished_evaluation_is_read_not_run_again(paper, tmp_path, ledger):
 def compiled_once_it_pays(scenario):
     """A controller whose functions are compiled after its second run."""
     controller = Proportional(scenario)
-    controller.compilation = SimpleNamespace(mode="interpreted")
+    controller.functions = "interpreted"
     reset = controller.reset
 
     def count():
         reset()
         if controller.resets == 3:  # the settling run may be one
-            controller.compilation.mode = "compiled"
+            controller.functions = "compiled"
 
     controller.reset = count
     return controller

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -66,7 +65,7 @@ class Compiling(ToyTrainer):
 
     def controller(self, name, scenario):
         controller = super().controller(name, scenario)
-        controller.compilation = SimpleNamespace(mode="compiled")
+        controller.functions = "compiled"
         return controller
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers import compile_functions
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import write_atomically
@@ -223,6 +224,7 @@ def run_training(
     folder = None if out is None else Path(out)
     with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
         session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
+        compile_functions(session.loop.controller, run.samples)
         judge = Judge(run, evaluation_plant, session.start, best)
         if resume:
             session.load()

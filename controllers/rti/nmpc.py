@@ -45,8 +45,8 @@ class RtiNmpc:
 
     `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
     or a function that makes a `QpBackend`; `functions` says whether the CasADi functions are
-    `interpreted` or `compiled`, which changes no bit (see `compile_functions`). Raises ControllerError on
-    another choice.
+    `interpreted` or `compiled`, which changes no bit (see `compile_functions`). Raises
+    ControllerError on another choice.
     """
 
     name = "rti"

@@ -30,6 +30,7 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     Returns the trajectory and the summary. Everything that a clock measured is in timing.csv and
     the summary's `timing`; all other bytes are the same for the same command and seed.
     """
+    from controllers import compile_functions
     from cosim.cli.compose import announce, load_scenario
     from cosim.files import write_atomically
     from cosim.lookup import build_controller
@@ -41,6 +42,7 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     announce(scenario, output)
     with FmuPlant(scenario) as plant:
         controller = build_controller(run.controller, scenario)
+        compile_functions(controller, run.steps)
         recorder = None
         if run.record:
             from cosim.recording import RerunRecorder

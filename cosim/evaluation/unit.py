@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
+from controllers import compile_functions
 from cosim.errors import EvaluationError
 from cosim.evaluation import reuse
 from cosim.evaluation.provenance import EVALUATING
@@ -67,6 +68,7 @@ def run(unit: RunUnit) -> UnitResult:
     controller = reuse.controller(
         f"{unit.session} {unit.controller}", lambda: unit.factory(unit.scenario)
     )
+    compile_functions(controller, len(unit.seeds) * unit.steps)
     found: dict[str, list[float]] = {}
     timing: dict[str, list[float]] = {}
     functions: dict[str, None] = {}

@@ -1,4 +1,4 @@
-"""Functions compiled by the machine's own compiler: the interpreter's bytes, a cache, no endless wait."""
+"""Compiled functions: the interpreter's bytes, a cache, no endless wait."""
 
 import json
 import shutil

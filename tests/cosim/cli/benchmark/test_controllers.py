@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from controllers import ConvergedNmpc, Parameters, Problem
-from controllers.shared_library import find_compiler
+from controllers.functions import find_compiler
 from cosim.cli import app
 from cosim.cli.benchmark import references
 from cosim.scenario import Scenario

@@ -13,14 +13,12 @@ demo: $(VENV)/installed
 test: $(VENV)/installed
 	$(PYTEST)
 
-# What CI runs after `make test`: lint, types, the FMUs in every importer, the slow tests, the stored
+# What CI runs after `make test`: lint, types, the slow tests (the FMUs in every importer among them), the stored
 # results and the main job on a small budget.
 check: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/cosim fmu check evaporator
-	$(BIN)/cosim fmu check evaporator_fmi3
 	$(PYTEST) -m slow
 	$(BIN)/cosim results check
 	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo

@@ -1,10 +1,10 @@
-"""`cosim fmu`: what is in an FMU, whether other tools accept it, and the build of ours."""
+"""`cosim fmu`: what is in an FMU, whether it is right, and the build of ours."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -12,8 +12,10 @@ from cosim.cli.options import JsonOption
 from cosim.cli.output import output, writable_folder
 
 DIFFERENT = 1
+SHOWN = 500
+"""Variables that a table shows."""
 
-app = typer.Typer(help="Look into an FMU, check it with independent importers, build ours.")
+app = typer.Typer(help="Look into an FMU, check it, build ours.")
 
 FileArgument = Annotated[
     str, typer.Argument(help="FMU file, or evaporator or evaporator_fmi3 (shipped).")
@@ -26,9 +28,9 @@ def _path(name: str) -> Path:
     return fmus.path(name) if name in fmus.NAMES else Path(name)
 
 
-def _short(number: str | None) -> str:
+def _short(number: object) -> str:
     try:
-        return "" if number is None else f"{float(number):.8g}"
+        return "" if number is None else f"{float(str(number)):.8g}"
     except ValueError:
         return str(number)
 
@@ -37,66 +39,65 @@ def _binary(folder: str, made_for: tuple[str, ...]) -> str:
     return f"{folder} ({', '.join(made_for)})" if made_for else folder
 
 
-def _refusals(fmu: Path) -> list[str]:
-    """Why no scenario can use the FMU as its plant."""
+def _as_plant(fmu: Path) -> tuple[Any, list[str]]:
+    """Model description, None where it is not to be had, and why the FMU can be no plant."""
     from cosim.errors import PlantError
     from cosim.plant.archive import unpack
     from cosim.plant.wiring import refusals
 
     try:
-        return list(refusals(unpack(fmu)))
+        unpacked = unpack(fmu)
     except PlantError as error:
-        return [str(error)]
+        return None, [str(error)]
+    return unpacked.description, list(refusals(unpacked))
 
 
 @app.command()
 def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
     with output(json) as out_:
-        from dataclasses import asdict
-
         from fmus.information import information
 
-        found = information(_path(file))
-        out_.note(f"{found.path}\nsha256 {found.sha256}\n{found.name}: {found.description}")
-        out_.note(f"FMI {found.fmi_version}: {', '.join(found.interfaces)}")
+        description, refused = _as_plant(_path(file))
+        found = information(_path(file), description)
+        about = found.description
+        out_.note(f"{found.path}\nsha256 {found.sha256}\n{about.modelName}: {about.description}")
+        out_.note(f"FMI {about.fmiVersion}: {', '.join(found.flags)}")
         out_.note(f"binaries: {', '.join(_binary(*item) for item in found.platforms.items())}")
-        refused = _refusals(_path(file))
-        for reason in refused:
-            out_.note(f"no plant: {reason}")
-        if not refused:
-            out_.note("the plant accepts it")
+        out_.note("\n".join(f"no plant: {reason}" for reason in refused) or "the plant accepts it")
         names = list(dict.fromkeys(name for flags in found.flags.values() for name in flags))
         flags = [(name, *(f.get(name, "–") for f in found.flags.values())) for name in names]
         out_.table("capability flags", ("flag", *found.flags), flags)
         header = ("variable", "causality", "unit", "start", "min", "max")
         rows = [
             (v.name, v.causality, v.unit or "", *(_short(x) for x in (v.start, v.min, v.max)))
-            for v in found.variables
+            for v in about.modelVariables[:SHOWN]
         ]
-        out_.table(f"{len(rows)} variables", header, rows)
-        out_.json(asdict(found) | {"refusals": refused})
+        count = len(about.modelVariables)
+        out_.table(f"{count} variables", header, rows)
+        if count > SHOWN:
+            out_.note(f"the first {SHOWN} variables are shown; --json has all of them")
+        if json:
+            out_.json(found.to_dict() | {"refusals": refused})
 
 
 @app.command()
 def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
-    """Run an FMU through every independent importer that is installed.
+    """Validate an FMU's model description, read all its variables, run its experiment.
 
-    Exit code 1 if the FMU is wrong, not if an importer is unable. The optional importers:
-    pip install 'rti-cosim\\[fmi-check]'.
+    Exit code 1 if the FMU is wrong.
     """
     with output(json) as out_:
-        from dataclasses import asdict
+        from dataclasses import astuple
 
-        from fmus.checks import Status
-        from fmus.checks import check as run_checks
+        from cosim.cli.compose import announce_fmu
+        from fmus.check import check as run_checks
 
+        announce_fmu(file, out_)
         findings = run_checks(_path(file))
-        header = ("tool", "check", "result", "detail")
-        rows = [(f.tool, f.subject, str(f.status), f.detail) for f in findings]
-        out_.table(str(_path(file)), header, rows)
-        passed = all(f.status is not Status.FAILED for f in findings)
-        out_.json({"passed": passed, "checks": [asdict(f) for f in findings]})
+        out_.table(str(_path(file)), ("check", "result", "detail"), list(map(astuple, findings)))
+        passed = all(f.status != "failed" for f in findings)
+        out_.json({"passed": passed, "checks": [vars(f) for f in findings]})
     if not passed:
         raise typer.Exit(DIFFERENT)
 

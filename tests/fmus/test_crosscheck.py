@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import fmus
 from fmus import FmuError, crosscheck
-from fmus.checks.trajectory import relative_difference
+from fmus.check import relative_difference
 
 
 @pytest.mark.parametrize("name", fmus.NAMES)

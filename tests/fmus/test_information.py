@@ -14,8 +14,8 @@ from fmus.information import information
 def test_tells_what_is_in_the_file(version: int) -> None:
     path = fmus.path(fmus.NAMES[version - 2])
     found = information(path)
-    assert found.fmi_version == f"{version}.0"
-    assert found.interfaces == ("co-simulation", "model exchange")
+    assert found.description.fmiVersion == f"{version}.0"
+    assert set(found.flags) == {"co-simulation", "model exchange"}
     for flags in found.flags.values():
         assert flags["needsExecutionTool"] == "false"
         assert flags["canBeInstantiatedOnlyOncePerProcess"] == "false"
@@ -26,10 +26,11 @@ def test_tells_what_is_in_the_file(version: int) -> None:
     if version == 2:
         folders["darwin64"] = ("x86_64-darwin", "aarch64-darwin")
     assert found.platforms == folders
-    assert (found.start_time, found.stop_time, found.step_size) == (0.0, 6000.0, 60.0)
+    data = found.to_dict()
+    assert [data[key] for key in ("start_time", "stop_time", "step_size")] == [0.0, 6000.0, 60.0]
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
-    (pressure,) = [v for v in found.variables if v.name == "P100"]
-    assert (pressure.causality, pressure.unit, pressure.min) == ("input", "kPa", "100.0")
+    (pressure,) = [v for v in data["variables"] if v["name"] == "P100"]
+    assert [pressure[key] for key in ("causality", "unit", "min")] == ["input", "kPa", "100.0"]
 
 
 def test_missing_and_corrupt_files_are_errors(tmp_path: Path) -> None:

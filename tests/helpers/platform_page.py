@@ -11,8 +11,8 @@ from pathlib import Path
 
 from cosim.text_tables import markdown_table
 from fmus.build import PLATFORMS
-from fmus.checks import check
 from fmus.model import FmiVersion
+from tests.helpers.importers import check
 from tests.helpers.platforms import (
     LAWS,
     NATIVE,

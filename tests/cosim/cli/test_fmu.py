@@ -33,25 +33,20 @@ def test_info_takes_a_file(cosim):
     assert cosim("fmu", "info", fmus.path())[0] == 0
 
 
-@pytest.mark.slow
-def test_check_prints_a_table_and_ends_with_0(cosim):
+def test_check_runs_the_fmu_and_ends_with_0(cosim):
     code, out, _ = cosim("fmu", "check")
     assert code == 0
-    for words in ("fmpy", "casadi", "ecospy", "libcosimpy", "fmutool", "bit-identical"):
-        assert words in out
+    assert "bit-identical" in out
 
 
 def test_failed_check_ends_with_1(cosim, monkeypatch):
-    from fmus import checks
+    from fmus import check
 
-    failed = checks.Finding("tool", "subject", checks.Status.FAILED, "why")
-    monkeypatch.setattr(checks, "check", lambda path: [failed])
+    failed = check.Finding("subject", "failed", "why")
+    monkeypatch.setattr(check, "check", lambda path: [failed])
     code, out, _ = cosim("fmu", "check", "--json")
     assert code == 1
-    assert json.loads(out) == {
-        "passed": False,
-        "checks": [{"tool": "tool", "subject": "subject", "status": "failed", "detail": "why"}],
-    }
+    assert json.loads(out) == {"passed": False, "checks": [vars(failed)]}
 
 
 @needs_compiler
@@ -84,8 +79,8 @@ def test_reference_signals_are_reproduced(cosim):
 BAD_INPUT = {
     "no such file": (["info", "none.fmu"], "there is no file none.fmu"),
     "no FMU": (["info", "text.fmu"], "text.fmu is not an FMU"),
-    "nothing to check": (["check", "none.fmu"], "there is no file none.fmu"),
-    "check of no FMU": (["check", "text.fmu"], "text.fmu is not an FMU"),
+    "nothing to check": (["check", "none.fmu"], "does not exist"),
+    "check of no FMU": (["check", "text.fmu"], "not an FMU"),
     "build without a target": (["build"], "give one of --out DIR, --check and --in-place"),
     "build with two": (["build", "--check", "--out", "x"], "give one of --out DIR"),
     "own plant into a folder": (["build", ".", "--out", "x"], "FOLDER --out FILE.fmu"),

@@ -1,0 +1,254 @@
+"""Independent FMI importers run an FMU: python -m tests.helpers.importers TOOL SUBJECT FILE.
+
+Native importers write to the console and may crash: each check is a process of its own, whose
+last line is its finding as JSON.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+from numpy.typing import NDArray
+
+from fmus import CheckError, FmuError
+from fmus.check import (
+    NotOfferedError,
+    declared_variables,
+    experiment,
+    reference,
+    relative_difference,
+    require_equal,
+    simulated,
+    validate,
+)
+from fmus.information import information
+
+TIMEOUT = 300.0  # s for one importer
+JUDGES = ("fmpy", "fmutool")
+"""Tools whose failure is the FMU's; any other may be unable."""
+WORDS = 200  # last characters of what a crashed importer said
+AGREEMENT = 1e-6
+PASSED, FAILED, NOTED, CANNOT = "passed", "failed", "noted", "importer cannot"
+NOT_INSTALLED, NOT_OFFERED = "not installed", "not offered"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Which tool looked at what, and what it found.
+
+    `FAILED` says that the FMU is wrong; `CANNOT` that the importer does not do with it what
+    others do; `NOTED` what is worth knowing and no fault.
+    """
+
+    tool: str
+    subject: str
+    status: str
+    detail: str
+
+
+class NotedError(FmuError):
+    """A finding that is worth a line but no fault of the FMU."""
+
+
+class NotInstalledError(FmuError):
+    """The importer, or a library that it needs, is not there."""
+
+
+def require(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except (ImportError, OSError) as error:
+        raise NotInstalledError(f"{module} does not load: {error}") from error
+
+
+def fmpy_co_simulation(fmu: Path) -> str:
+    return require_equal(simulated(fmu, "CoSimulation"), fmu)
+
+
+def model_exchange(fmu: Path) -> str:
+    """CVode with a tight tolerance agrees with co-simulation to 1e-6 relative, or it is noted."""
+    rows = simulated(fmu, "ModelExchange", solver="CVode", relative_tolerance=1e-10)
+    error = relative_difference(rows, reference(fmu))
+    if not error <= AGREEMENT:
+        raise NotedError(
+            f"differs from co-simulation by {error:.1e} relative: its own integration is no finer"
+        )
+    return f"agrees with co-simulation to {error:.1e} relative"
+
+
+def ecos(fmu: Path) -> str:
+    """Ecos' fixed-step algorithm (C++, FMI 1.0 to 3.0) gives what a plain loop gives."""
+    simulations = require("ecospy.EcosSimulation")
+    structures = require("ecospy.EcosSimulationStructure")
+    plan = experiment(fmpy.read_model_description(str(fmu)))
+    rows = []
+    with structures.EcosSimulationStructure() as structure:
+        structure.add_model("plant", str(fmu))
+        with simulations.EcosSimulation(plan.step_size, structure=structure) as simulation:
+            simulation.init()
+            for k in range(plan.steps + 1):
+                if k > 0:
+                    simulation.step()
+                rows.append([simulation.get_real(f"plant::{name}") for name in plan.names])
+    return require_equal(np.array(rows), fmu)
+
+
+def libcosim(fmu: Path) -> str:
+    """Libcosim's fixed-step algorithm (over FMI Library) gives what a plain loop gives."""
+    executions = require("libcosimpy.CosimExecution")
+    observers = require("libcosimpy.CosimObserver")
+    slaves = require("libcosimpy.CosimSlave")
+    description = fmpy.read_model_description(str(fmu))
+    if description.fmiVersion != "2.0":
+        raise NotOfferedError("libcosim imports FMI 1.0 and 2.0 only")
+    plan = experiment(description)
+    execution = executions.CosimExecution.from_step_size(round(plan.step_size * 1e9))  # ns
+    slave = slaves.CosimLocalSlave(fmu_path=str(fmu), instance_name="plant")
+    index = execution.add_local_slave(slave)
+    observer = observers.CosimObserver.create_last_value()
+    execution.add_observer(observer)
+    references = [variable.valueReference for variable in plan.outputs]
+    rows = []
+    for _ in range(plan.steps):
+        execution.step()
+        rows.append(list(observer.last_real_values(index, references)))
+    return require_equal(np.array(rows), fmu)
+
+
+def conformity(fmu: Path) -> str:
+    """`fmutool -check` of the FMU Manipulation Toolbox logs neither an error nor a warning."""
+    require("fmu_manipulation_toolbox")
+    program = "from fmu_manipulation_toolbox.cli.fmutool import fmutool; fmutool()"
+    command = [sys.executable, "-c", program, "-input", str(fmu), "-check"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    output = result.stdout + result.stderr
+    bad = [
+        line for line in output.splitlines() if line.startswith(("ERROR", "WARNING", "CRITICAL"))
+    ]
+    if result.returncode != 0 or bad:
+        raise CheckError("; ".join(bad) or f"fmutool ended with code {result.returncode}")
+    found = [line.split("|")[-1].strip() for line in output.splitlines() if "compliant" in line]
+    return " ".join(found) or "no problem found"
+
+
+def jacobian(fmu: Path) -> str:
+    """CasADi: ∂(ẋ, y)/∂(x, u) at the start point agrees with central differences to 1e-6."""
+    casadi = require("casadi")
+    casadi.GlobalOptions.setNumpyMode(-1)
+    if fmpy.read_model_description(str(fmu)).modelExchange is None:
+        raise NotOfferedError("the FMU has no model-exchange interface")
+    flags = information(fmu).flags["model exchange"]
+    if "true" not in {v for k, v in flags.items() if k.startswith("providesDirectional")}:
+        raise NotOfferedError("the FMU provides no directional derivatives")
+    folder = fmpy.extract(str(fmu))
+    try:
+        dae = casadi.DaeBuilder("check", str(folder))
+        if dae.nx() == 0:
+            raise NotOfferedError("the FMU has no continuous states")
+        names = dae.x()
+        start = fmpy.simulate_fmu(
+            str(fmu), stop_time=1e-3, output_interval=1e-3, output=names, fmi_type="ModelExchange"
+        )
+        point = [
+            np.array([start[name][0] for name in names]),
+            np.array(dae.start(dae.u()), dtype=float),
+        ]
+        exact, numeric = _jacobians(casadi, dae, point)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    error = float(np.max(np.abs(exact - numeric) / np.maximum(1.0, np.abs(numeric))))
+    if not error <= AGREEMENT:
+        raise CheckError(f"Jacobian differs from finite differences by {error:.1e}")
+    rows, columns = exact.shape
+    return f"{rows} × {columns} Jacobian agrees with finite differences to {error:.1e}"
+
+
+def _jacobians(
+    casadi: Any, dae: Any, point: list[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    outputs = ["ode", "y"] if dae.ny() else ["ode"]
+    inputs = ["x", "u"] if dae.nu() else ["x"]
+    function = dae.create("f", inputs, outputs)
+
+    def evaluate(values: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        result = function(**dict(zip(inputs, values, strict=False)))
+        return np.concatenate([np.array(result[name]).ravel() for name in outputs])
+
+    symbols = dict(
+        zip(
+            inputs,
+            [casadi.MX.sym("x", dae.nx()), casadi.MX.sym("u", dae.nu())],
+            strict=False,
+        )
+    )
+    stacked = casadi.vertcat(*[function(**symbols)[name] for name in outputs])
+    both = casadi.vertcat(*symbols.values())
+    exact = casadi.Function("J", list(symbols.values()), [casadi.jacobian(stacked, both)])
+    columns = []
+    for i, block in enumerate(point[: len(inputs)]):
+        for j in range(len(block)):
+            h = 1e-6 * max(1.0, abs(block[j]))
+            shifted = [[b.copy() for b in point] for _ in range(2)]
+            shifted[0][i][j] += h
+            shifted[1][i][j] -= h
+            columns.append((evaluate(shifted[0]) - evaluate(shifted[1])) / (2 * h))
+    return np.array(exact(*point[: len(inputs)])), np.array(columns).T
+
+
+CHECKS: dict[tuple[str, str], Callable[[Path], str]] = {
+    ("fmpy", "validation"): validate,
+    ("fmpy", "declared variables"): declared_variables,
+    ("fmpy", "co-simulation"): fmpy_co_simulation,
+    ("fmpy", "model exchange, CVode"): model_exchange,
+    ("casadi", "model exchange, Jacobian"): jacobian,
+    ("ecospy", "co-simulation"): ecos,
+    ("libcosimpy", "co-simulation"): libcosim,
+    ("fmutool", "conformity"): conformity,
+}
+_STATUS = {NotInstalledError: NOT_INSTALLED, NotOfferedError: NOT_OFFERED, NotedError: NOTED}
+
+
+def check(fmu: Path) -> list[Finding]:
+    """Check the file `fmu` with every importer, in the order of `CHECKS`."""
+    return [_in_own_process(tool, subject, fmu) for tool, subject in CHECKS]
+
+
+def _in_own_process(tool: str, subject: str, fmu: Path) -> Finding:
+    blame = FAILED if tool in JUDGES else CANNOT
+    command = [sys.executable, "-m", "tests.helpers.importers", tool, subject, str(fmu.resolve())]
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Finding(tool, subject, blame, f"no result after {TIMEOUT:.0f} s")
+    lines = result.stdout.splitlines()
+    if result.returncode != 0 or not lines:
+        words = " ".join(result.stderr.split())[-WORDS:]
+        return Finding(tool, subject, blame, f"ended with code {result.returncode}: {words}")
+    status, detail = json.loads(lines[-1])
+    return Finding(tool, subject, status, detail)
+
+
+def run(tool: str, subject: str, fmu: Path) -> tuple[str, str]:
+    """Status and detail of one check in this process."""
+    try:
+        return PASSED, CHECKS[tool, subject](fmu)
+    except FmuError as error:
+        return _STATUS.get(type(error), FAILED), str(error)
+    except Exception as error:
+        return FAILED if tool in JUDGES else CANNOT, f"{type(error).__name__}: {error}"
+
+
+if __name__ == "__main__":
+    print("\n" + json.dumps(run(sys.argv[1], sys.argv[2], Path(sys.argv[3]))))

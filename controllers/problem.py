@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +14,7 @@ from controllers.errors import ModelError
 from controllers.model import Model
 from controllers.qp.daqp_backend import FIXED, MEANING, SETTINGS
 from cosim.penalty import Penalty
+from cosim.plugins import blamed, load_plugin
 from cosim.scenario import Scenario
 
 Vector = NDArray[np.float64]
@@ -273,16 +273,11 @@ def load_model(name: str | None) -> Model:
             'the scenario names no model for this controller; add model = "module:factory" to its '
             'table [controller], for the evaporator "controllers.evaporator:model"'
         )
-    module_name, _, factory_name = name.partition(":")
+    factory = load_plugin(name, f"model '{name}'", ModelError)
     try:
-        factory = getattr(importlib.import_module(module_name), factory_name)
         model = factory()
-    # A user's module may raise anything, and one that is a script may even exit.
-    except (Exception, SystemExit) as error:
-        raise ModelError(
-            f"model '{name}' cannot be loaded ({type(error).__name__}: {error}); name it as "
-            "module:factory"
-        ) from error
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
+        raise ModelError(f"model '{name}' cannot be made: {blamed(error)}") from error
     if not isinstance(model, Model):
         raise ModelError(f"model '{name}' returned {type(model).__name__}, not a controllers.Model")
     return model

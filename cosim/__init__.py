@@ -1,9 +1,10 @@
 """Co-simulation of an FMU plant with a controller: scenarios, closed loop, records, results."""
 
-from typing import TYPE_CHECKING
-
-from cosim.lazy import on_first_use
-from cosim.registration import register_environments
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cosim.evaluation import Evaluation as Evaluation
@@ -16,24 +17,26 @@ if TYPE_CHECKING:
     from cosim.study.outcome import run_study as run_study
     from cosim.study.results import StudyResults as StudyResults
     from cosim.trajectory import Trajectory as Trajectory
+    from learning.training import Training as Training
+    from learning.training import train as train
+
+    __version__: str
 
 # Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
-__getattr__, __dir__ = on_first_use(
-    __name__,
-    {
-        "Evaluation": "cosim.evaluation",
-        "evaluate": "cosim.evaluation",
-        "FmuPlant": "cosim.plant",
-        "Scenario": "cosim.scenario",
-        "Trajectory": "cosim.trajectory",
-        "Study": "cosim.study.engine",
-        "StudyOutcome": "cosim.study.outcome",
-        "StudyResults": "cosim.study.results",
-        "simulate": "cosim.simulation",
-        "run_study": "cosim.study.outcome",
-    },
-)
-
+_HOMES = {
+    "Evaluation": "cosim.evaluation",
+    "FmuPlant": "cosim.plant",
+    "Scenario": "cosim.scenario",
+    "Study": "cosim.study.engine",
+    "StudyOutcome": "cosim.study.outcome",
+    "StudyResults": "cosim.study.results",
+    "Training": "learning.training",
+    "Trajectory": "cosim.trajectory",
+    "evaluate": "cosim.evaluation",
+    "run_study": "cosim.study.outcome",
+    "simulate": "cosim.simulation",
+    "train": "learning.training",
+}
 __all__ = [
     "Evaluation",
     "FmuPlant",
@@ -41,11 +44,47 @@ __all__ = [
     "Study",
     "StudyOutcome",
     "StudyResults",
+    "Training",
     "Trajectory",
     "evaluate",
     "run_study",
     "simulate",
+    "train",
 ]
 
 
-register_environments()
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version  # noqa: PLC0415
+
+        return version("rti-cosim")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'cosim' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES, "__version__"})
+
+
+def _refuse_shadows() -> None:
+    """Raise ImportError in one line where a user's file has the name of one of our packages."""
+    root = Path(__file__).parents[1]
+    for name in ("controllers", "fmus", "learning"):
+        loaded = sys.modules.get(name)
+        spec = find_spec(name) if loaded is None else loaded.__spec__
+        origin = None if spec is None else spec.origin
+        if origin is not None and Path(origin).resolve() == (root / name / "__init__.py").resolve():
+            continue
+        found = origin or next(iter(getattr(spec, "submodule_search_locations", None) or ()), name)
+        line = (
+            f"'{found}' hides the package '{name}' of rti-cosim: rename it, or start Python in "
+            "another folder"
+        )
+        if sys.argv[:1] == ["-m"]:  # of `python -m cosim`, which prints no traceback
+            print(f"error: {line}", file=sys.stderr)
+            raise SystemExit(2)
+        raise ImportError(line)
+
+
+_refuse_shadows()

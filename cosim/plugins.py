@@ -1,36 +1,89 @@
-"""Loads what users bring along, `module:Name`, and says whose line it was that failed."""
+"""Controllers and other plug-ins by name, and the hashes of everything that a result depends on."""
 
 from __future__ import annotations
 
+import ast
+import hashlib
 import importlib
+import json
+import os
+import platform
 import re
+import sys
+import sysconfig
 import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cache, partial
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib.util import resolve_name
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+from cosim.errors import ControllerLookupError
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.validation import suggestion
+
+CONTROLLERS, FILES, ALGORITHMS = "cosim.controllers", "cosim.controller_files", "cosim.algorithms"
+"""Groups of entry points: factory(scenario), factory(scenario, path) by suffix, algorithms."""
+PARAMETERS = EntryPoint("toml", "controllers.factories:from_file", FILES)
+"""What a parameters file is read by, unless another package registers its own reader."""
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
-
-
 OURS = ("fmus", "cosim", "controllers", "learning")
 """The packages of this distribution; any other is a user's."""
+
+_folders: list[str] = []
+
+
+def import_from(folder: str | Path) -> None:
+    """Let `module:Name` name a module of this folder too, in this process."""
+    if (text := str(Path(folder).absolute())) not in _folders:
+        _folders.append(text)
+
+
+@contextmanager
+def _importable() -> Iterator[None]:
+    """Search the folders of `import_from` and the working directory after all other places."""
+    added = [folder for folder in (*_folders, str(Path.cwd())) if folder not in sys.path]
+    for package in OURS:  # a folder of such a name would be found before an editable install
+        if any(
+            (Path(folder) / f"{package}{end}").exists() for folder in added for end in ("", ".py")
+        ):
+            importlib.import_module(package)
+    sys.path.extend(added)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        for folder in added:
+            with suppress(ValueError):
+                sys.path.remove(folder)
 
 
 def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
     """Object that `module:Name` leads to; `what` is what messages call it.
 
-    Raises `error` where the text has another form, where the import fails for whatever reason, or
-    where the module has no such name.
+    Modules are searched in the working directory too, and in the folders of `import_from`. Raises
+    `error` where the text has another form, where the import fails for whatever reason, or where
+    the module has no such name.
     """
     if not TARGET.fullmatch(target):
         raise error(f"{what} must be given as module:Name, not '{target}'")
     module, _, attribute = target.partition(":")
+    before = set(sys.modules)
     try:
-        found: Any = importlib.import_module(module)
+        with _importable():
+            found: Any = importlib.import_module(module)
         for part in attribute.split("."):
             found = getattr(found, part)
     # A module may raise anything while it is imported, and one that is a script may even exit.
     except (Exception, SystemExit) as cause:
         raise error(f"{what} cannot be imported: {blamed(cause)}") from cause
+    finally:
+        _brought.setdefault(module, set()).update(set(sys.modules) - before)
+        _hash_foreign_modules()
     return found
 
 
@@ -44,3 +97,241 @@ def blamed(cause: BaseException) -> str:
     ]
     where = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
     return f"{' '.join(said.split())}{where}"
+
+
+def build_controller(name: str, scenario: Scenario) -> Controller:
+    """Build a controller for a scenario; raises ControllerLookupError and the controller's own.
+
+    `name` is an entry point of the group `cosim.controllers`; the path of a file, θ of the RTI-NMPC
+    (TOML) or one whose suffix is an entry point, factory(scenario, path), of the group
+    `cosim.controller_files`; or a `module:factory` with factory(scenario) -> Controller.
+    """
+    known = {point.name: point for point in entry_points(group=CONTROLLERS)}
+    if name in known:
+        return _made(name, known[name].value, scenario)
+    suffix = Path(name).suffix.removeprefix(".")
+    files = {point.name: point for point in (PARAMETERS, *entry_points(group=FILES))}
+    if suffix in files:
+        read = load_plugin(files[suffix].value, f"the reader of .{suffix}", ControllerLookupError)
+        controller: Controller = read(scenario, name)
+        return _named(controller, Path(name).stem)
+    if ":" in name:
+        return _made(name, name, scenario)
+    raise ControllerLookupError(
+        f"unknown controller '{name}'{suggestion(name, known)}; give one of "
+        f"{', '.join(sorted(known))}, a parameters file (.toml), or module:factory"
+    )
+
+
+def _made(name: str, target: str, scenario: Scenario) -> Controller:
+    factory = load_plugin(target, f"controller '{name}'", ControllerLookupError)
+    if not callable(factory):
+        raise ControllerLookupError(f"controller '{name}' is not a factory of one scenario")
+    before = set(sys.modules)
+    try:
+        with _importable():
+            controller = factory(scenario)
+    except TypeError as error:
+        raise ControllerLookupError(
+            f"controller '{name}' is not a factory of one scenario: {blamed(error)}"
+        ) from error
+    except (Exception, SystemExit) as error:
+        if target == name and not _is_ours(error):
+            raise ControllerLookupError(
+                f"the factory of controller '{name}' failed: {blamed(error)}"
+            ) from error
+        raise
+    finally:
+        _brought[target.partition(":")[0]].update(set(sys.modules) - before)
+        _hash_foreign_modules()
+    if not isinstance(controller, Controller):
+        raise ControllerLookupError(
+            f"controller '{name}' made a {type(controller).__name__}, which lacks reset, prepare "
+            "or feedback"
+        )
+    return _named(controller, name)
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether an error is one of this project, whose words say enough."""
+    packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
+    return bool(packages & set(OURS))
+
+
+def _named(controller: Controller, name: str) -> Controller:
+    """Let tables and recordings call the controller what the user called it."""
+    with suppress(AttributeError):
+        setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
+    return controller
+
+
+# What a result depends on
+
+DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
+EVALUATING = tuple(package for package in OURS if package != "learning")
+"""Packages that decide what a controller does on a plant."""
+SUFFIXES = (".py", ".toml", ".fmu", ".npz")
+# Nothing that these files hold bears on a number.
+ASIDE = {"cli", "figures", "recording", "study", "__pycache__", "report.py", "figures.py"}
+
+_brought: dict[str, set[str]] = {}
+"""Modules that loading a plug-in, and calling its factory, imported, by the plug-in's module."""
+_sources: dict[str, tuple[ModuleType, str]] = {}
+"""Users' modules with the hash of their source as it was when they were loaded."""
+
+
+def depends_on(
+    scenario: Scenario,
+    *parts: Any,
+    settings: Mapping[str, Any] | None = None,
+    packages: tuple[str, ...] = EVALUATING,
+) -> dict[str, str]:
+    """Hashes by name (16 hex digits each, versions as text) of all that a result depends on.
+
+    The versions of what computes, our own code (`packages`), the scenario, its FMU and models, the
+    `settings`, and of each of the `parts` (controllers, algorithms: a registered name, a
+    `module:Name`, a file's path, a class or factory) its files: a parameters file, or the module
+    and all that it imports from outside installed packages, as they were loaded. Data files that a
+    plug-in reads are not known. Raises the errors of `load_plugin` as ControllerLookupError.
+    """
+    found = {
+        "versions": versions(),
+        "rti-cosim": code_hash(packages),
+        "scenario": scenario.hash,
+        "settings": _digest(json.dumps(settings or {}, sort_keys=True, default=str).encode()),
+    }
+    fmu = Path(scenario.plant.fmu)
+    if fmu.is_file():
+        found[fmu.name] = _digest(fmu.read_bytes())
+    for part in (scenario.controller.model, scenario.plant.model, *parts):
+        if part is not None:
+            found |= sources_of(part)
+    return dict(sorted(found.items()))
+
+
+def changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Names of what differs between two answers of `depends_on`."""
+    return sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+
+
+def sources_of(part: Any) -> dict[str, str]:
+    """Hashes by name of the users' files behind one part; see `depends_on`."""
+    if isinstance(part, partial):
+        found = sources_of(part.func)
+        for argument in (*part.args, *part.keywords.values()):
+            if isinstance(argument, str | Path) or callable(argument):
+                found |= sources_of(argument)
+        return found
+    if not isinstance(part, str | Path):
+        _hash_foreign_modules()
+        return _closure(getattr(part, "__module__", None) or type(part).__module__)
+    for group in (CONTROLLERS, ALGORITHMS):
+        for point in entry_points(group=group):
+            if point.name == part:
+                return sources_of(point.value)
+    if TARGET.fullmatch(str(part)):
+        module = str(part).partition(":")[0]
+        if module.partition(".")[0] in OURS:
+            return {}
+        load_plugin(str(part), f"'{part}'", ControllerLookupError)
+        return _closure(module)
+    path = Path(part)
+    return {path.name: _digest(path.read_bytes())} if path.is_file() else {}
+
+
+def _closure(module: str) -> dict[str, str]:
+    """Hashes of a user's module and of those that it reaches by import statements or brought."""
+    found: dict[str, str] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        waiting += [name.rpartition(".")[0]] if "." in name else []
+        if name not in _sources or _file_name(name) in found:
+            continue
+        found[_file_name(name)] = _sources[name][1]
+        waiting += [*_imports(name), *_brought.get(name, ())]
+    return found
+
+
+def _file_name(module: str) -> str:
+    path = Path(str(_sources[module][0].__file__))
+    parts = len(module.split(".")) + (path.name == "__init__.py")
+    return "/".join(path.parts[-parts:])
+
+
+def _imports(module: str) -> list[str]:
+    """Names that the import statements of a user's module may mean as modules."""
+    loaded = _sources[module][0]
+    try:
+        tree = ast.parse(Path(str(loaded.__file__)).read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return []
+    names: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                with suppress(ImportError):
+                    base = resolve_name("." * node.level + base, loaded.__package__)
+            names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return names
+
+
+def _hash_foreign_modules() -> None:
+    """Note the source of users' modules, as soon as they have been loaded."""
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if not isinstance(file, str) or not isinstance(module, ModuleType):
+            continue
+        if name in _sources and _sources[name][0] is module:
+            continue
+        if _is_foreign(os.path.dirname(file)):  # noqa: PTH120 (some thousand modules)
+            with suppress(OSError):
+                _sources[name] = (module, _digest(Path(file).read_bytes()))
+
+
+@cache
+def _is_foreign(folder: str) -> bool:
+    """Whether modules of a folder are a user's: neither ours, installed, nor Python's own."""
+    path = Path(folder).absolute()
+    if {"site-packages", "dist-packages"} & set(path.parts):
+        return False
+    root = Path(__file__).absolute().parents[1]
+    own = [root / package for package in OURS]
+    python = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
+    return not any(path.is_relative_to(place) for place in (*own, *python))
+
+
+@cache
+def versions() -> str:
+    """Versions of Python and of the distributions that results depend on, as one line."""
+    found = [f"python {platform.python_version()}"]
+    for name in DISTRIBUTIONS:
+        with suppress(PackageNotFoundError):
+            found.append(f"{name} {version(name)}")
+    return "; ".join(found)
+
+
+@cache
+def code_hash(packages: tuple[str, ...] = EVALUATING) -> str:
+    """First 16 hex digits of the SHA-256 of the code that results depend on, FMUs included."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[1]
+    for package in packages:
+        for path in sorted((root / package).rglob("*")):
+            relative = path.relative_to(root)
+            if path.suffix in SUFFIXES and not ASIDE & set(relative.parts) and path.is_file():
+                digest.update(f"{relative.as_posix()}\0".encode())
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
+def parameters_hash(controller: Any) -> str:
+    """The hash of the controller's parameters, empty if it has none."""
+    return str(getattr(getattr(controller, "parameters", None), "hash", "") or "")
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]

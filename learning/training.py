@@ -18,8 +18,8 @@ from controllers import compile_functions
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import write_atomically
-from cosim.lookup import build_controller
 from cosim.plant import FmuPlant
+from cosim.plugins import build_controller
 from cosim.protocols import functions_of
 from cosim.scenario import Scenario
 from cosim.statistics import shown

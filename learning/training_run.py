@@ -17,7 +17,6 @@ from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.theta import ThetaBlocks
 from cosim.evaluation.provenance import source_hashes
-from cosim.lookup import import_from_here
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, algorithm_target, load_algorithm
 from learning.configuration import Configuration
@@ -119,7 +118,6 @@ def prepare(
 
     Raises AlgorithmLookupError; ConfigurationError on settings or options that make no run.
     """
-    import_from_here()
     found = load_algorithm(algorithm)
     if not isinstance(settings, Configuration):
         settings = found.Configuration.from_dict(dict(settings or {}))

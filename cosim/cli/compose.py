@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cosim.lookup import import_from, import_from_here
+from cosim.plugins import import_from
 
 LONG = 200
 """Stages of a horizon above which building a controller takes seconds."""
@@ -24,7 +24,6 @@ def load_scenario(name: str) -> Scenario:
     """
     from cosim.scenario import Scenario
 
-    import_from_here()
     if Path(name).is_file():
         import_from(Path(name).resolve().parent)
     return Scenario.load(name)
@@ -34,7 +33,6 @@ def build_plant(scenario: Scenario, output: Output | None = None) -> FmuPlant:
     """Build the scenario's plant, announced on `output` if it is foreign; raises PlantError."""
     from cosim.plant import FmuPlant
 
-    import_from_here()
     if output is not None:
         announce(scenario, output)
     return FmuPlant(scenario)

@@ -9,7 +9,7 @@ from typing import Any
 from controllers import RtiNmpc
 from controllers.export import Entry, core, table
 from cosim.errors import ControllerLookupError
-from cosim.lookup import build_controller
+from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from fmus.model import FmiVersion
 from fmus.sampled import SampledSystem, Signal, build_sampled

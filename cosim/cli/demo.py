@@ -108,7 +108,7 @@ def _remark(scenario: Scenario, progress: Any) -> Callable[[int, LogRow], None]:
 
 
 def _controllers(scenario: Scenario, trained: Mapping[str, Training]) -> dict[str, Controller]:
-    from cosim.lookup import build_controller
+    from cosim.plugins import build_controller
 
     learnt: dict[str, Controller] = {name: one.controller() for name, one in trained.items()}
     return {

@@ -33,8 +33,8 @@ def execute(run: Run, output: Output) -> tuple[Trajectory, dict[str, Any]]:
     from controllers import compile_functions
     from cosim.cli.compose import announce, load_scenario
     from cosim.files import write_atomically
-    from cosim.lookup import build_controller
     from cosim.plant import FmuPlant
+    from cosim.plugins import build_controller
     from cosim.simulation import simulate
 
     scenario = load_scenario(run.scenario)

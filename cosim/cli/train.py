@@ -80,12 +80,10 @@ def train(
     says why.
     """
     with output(json) as out_:
-        from cosim.lookup import import_from_here
         from cosim.scenario import Scenario
         from learning.algorithm import load_algorithm
         from learning.training_run import prepare
 
-        import_from_here()
         found = load_algorithm(algorithm)
         if explain:
             _explain(algorithm, found.Configuration.documentation(), out_)

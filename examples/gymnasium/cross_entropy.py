@@ -36,7 +36,9 @@ def main():
     arguments = parser.parse_args()
     rng = np.random.default_rng(arguments.seed)
     envs = gymnasium.make_vec(
-        "cosim:cosim/EvaporatorNormalised-v0", num_envs=POPULATION, scenario=arguments.scenario
+        "cosim.environment:cosim/EvaporatorNormalised-v0",
+        num_envs=POPULATION,
+        scenario=arguments.scenario,
     )
     n = envs.single_observation_space.shape[0]
     m = envs.single_action_space.shape[0]

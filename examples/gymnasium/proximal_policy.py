@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
-import cosim  # noqa: F401 (registers the environments)
+import cosim.environment  # noqa: F401 (registers the environments)
 
 HELD_OUT = 1_000_000
 

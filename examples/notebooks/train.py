@@ -22,7 +22,7 @@ for name, keeps, bound in zip(training.run.scenario.plant.states, learnt, told, 
 # %% The learnt controller in the loop
 from cosim import FmuPlant, simulate  # noqa: E402
 from cosim.figures import overlay_figure  # noqa: E402
-from cosim.lookup import build_controller  # noqa: E402
+from cosim.plugins import build_controller  # noqa: E402
 
 scenario = training.run.scenario
 with FmuPlant(scenario) as plant:

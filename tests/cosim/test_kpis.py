@@ -3,7 +3,7 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.kpis import displaced, indicators, input_effort, settling_time
-from cosim.lookup import build_controller
+from cosim.plugins import build_controller
 from cosim.signals import signal_names
 from cosim.trajectory import Signal, Trajectory
 from tests.helpers.loop import Hold, Proportional

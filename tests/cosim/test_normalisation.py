@@ -4,9 +4,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from cosim import Scenario
-from cosim.environment import PlantEnv
+from cosim.environment import Normalisation, NormalisedEnv, PlantEnv
 from cosim.errors import PlantError
-from cosim.normalisation import Normalisation, NormalisedEnv
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim import Scenario, evaluate
-from cosim.lookup import build_controller
+from cosim.plugins import build_controller
 from learning.q_learning import QLearning
 from learning.training import run_training
 from learning.training_run import TrainingRun

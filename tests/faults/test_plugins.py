@@ -6,8 +6,7 @@ import pytest
 
 from cosim import Scenario
 from cosim.errors import ControllerLookupError
-from cosim.lookup import build_controller
-from cosim.plugins import load_plugin
+from cosim.plugins import build_controller, load_plugin
 from learning.errors import AlgorithmLookupError
 from learning.registry import load_algorithm
 from tests.helpers.command import run_cosim

@@ -1,0 +1,122 @@
+"""Plug-ins by name from the user's folders, what results depend on, and files that hide ours."""
+
+import os
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from cosim import Scenario
+from cosim.errors import ControllerLookupError
+from cosim.plugins import build_controller, changed, depends_on, load_plugin, sources_of
+
+ROOT = Path(__file__).parents[2]
+PAPER = Scenario.load("paper")
+CONTROLLER = (
+    "from {helper} import HORIZON\n"
+    "class Mine:\n"
+    "    def reset(self): pass\n"
+    "    def prepare(self): pass\n"
+    "    def feedback(self, s, a=None): return HORIZON\n"
+    "def make(scenario):\n    import {lazy}\n    return Mine()\n"
+)
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch, request):
+    """A module with a helper that it imports and one that its factory imports."""
+    name = f"mine_{abs(hash(request.node.name))}"
+    monkeypatch.chdir(tmp_path)
+    words = {"helper": f"{name}_helper", "lazy": f"{name}_lazy"}
+    (tmp_path / f"{name}.py").write_text(CONTROLLER.format(**words))
+    (tmp_path / f"{name}_helper.py").write_text("HORIZON = 3\n")
+    (tmp_path / f"{name}_lazy.py").write_text("")
+
+    def forget():
+        for module in [module for module in sys.modules if module.startswith(name)]:
+            del sys.modules[module]
+
+    yield name, forget
+    forget()
+
+
+def test_a_factory_of_the_working_directory_is_found_and_the_import_path_is_as_before(plugin):
+    name, _ = plugin
+    path, finders = list(sys.path), list(sys.meta_path)
+    controller = build_controller(f"{name}:make", PAPER)
+    assert controller.feedback([0.0, 0.0]) == 3
+    assert controller.name == f"{name}:make"
+    assert (sys.path, sys.meta_path) == (path, finders)
+
+
+@pytest.mark.parametrize("package", [".py", ""])
+def test_the_working_directory_hides_none_of_our_packages(tmp_path, package):
+    (tmp_path / "learning").mkdir() if not package else (tmp_path / "learning.py").touch()
+    (tmp_path / "mine.py").write_text("import learning\nfound = learning.__file__\n")
+    code = "from cosim.plugins import load_plugin; print(load_plugin('mine:found', 'it', OSError))"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert Path(done.stdout.strip()) == ROOT / "learning" / "__init__.py"
+
+
+@pytest.mark.parametrize("edited", ["", "_helper", "_lazy"])
+def test_an_edit_of_the_module_or_of_what_it_imports_is_said_by_name(plugin, tmp_path, edited):
+    name, forget = plugin
+    build_controller(f"{name}:make", PAPER)
+    before = depends_on(PAPER, f"{name}:make")
+    path = tmp_path / f"{name}{edited}.py"
+    path.write_text(path.read_text() + "# edited\n")
+    assert depends_on(PAPER, f"{name}:make") == before  # what was loaded is what computes
+    forget()
+    build_controller(f"{name}:make", PAPER)
+    assert changed(before, depends_on(PAPER, f"{name}:make")) == [path.name]
+
+
+def test_what_a_result_depends_on_has_names(plugin, tmp_path):
+    name, _ = plugin
+    build_controller(f"{name}:make", PAPER)
+    (tmp_path / "theta.toml").write_text("a = 1\n")
+    found = depends_on(PAPER, "naive", f"{name}:make", "theta.toml", settings={"a": 1})
+    modules = {f"{name}.py", f"{name}_helper.py", f"{name}_lazy.py"}
+    assert found.keys() == {
+        "versions", "rti-cosim", "scenario", "settings", "theta.toml", *modules
+    }  # fmt: skip
+    other = depends_on(Scenario.load("fouled"), "naive", "theta.toml", settings={"a": 2})
+    assert changed(found, other) == sorted(["scenario", "settings", *modules])
+
+
+def test_a_class_and_a_partial_have_the_sources_of_their_module(plugin):
+    name, _ = plugin
+    made = load_plugin(f"{name}:Mine", "it", ControllerLookupError)
+    assert set(sources_of(made)) == {f"{name}.py", f"{name}_helper.py"}
+    assert sources_of(partial(build_controller, f"{name}:make")) == sources_of(f"{name}:make")
+    assert sources_of(build_controller) == {}
+
+
+@pytest.mark.parametrize("name", ["controllers", "fmus", "learning"])
+@pytest.mark.parametrize("kind", ["file", "package", "folder"])
+@pytest.mark.parametrize("way", ["python -m cosim", "import cosim"])
+def test_a_file_that_hides_a_package_is_one_line_that_names_both(tmp_path, name, kind, way):
+    path = tmp_path / f"{name}.py" if kind == "file" else tmp_path / name
+    if kind == "file":
+        path.touch()
+    else:
+        path.mkdir()
+    if kind == "package":
+        (path / "__init__.py").touch()
+    words = ["-m", "cosim", "--help"] if way.startswith("python") else ["-c", "import cosim"]
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
+    done = subprocess.run(
+        [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env=environment,
+    )  # fmt: skip
+    if kind == "folder" and done.returncode == 0:
+        return  # a plain folder hides nothing that is installed as a package
+    line = done.stderr.strip().splitlines()[-1]
+    assert str(path) in line
+    assert f"'{name}'" in line
+    if way.startswith("python"):
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)

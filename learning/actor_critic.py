@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from cosim.scenario import Scenario
+from learning.algorithm import LearnableController, Transition, Update
 from learning.configuration import Configuration, Count, Positive
-from learning.constrained_step import ConstrainedStep
 from learning.critic import AdvantageRegression, lstdv
-from learning.exploration import Strategy
-from learning.fit import policy_gradient_fit
-from learning.globalised import GlobalisedLearning
-from learning.globalised_configuration import GlobalisedConfiguration
-from learning.kalman_q_learning import KalmanConfiguration, KalmanQLearning
-from learning.protocols import LearnableController, Rule, Transition, Update
-from learning.schedule import Geometric
+from learning.exploration import Geometric, Strategy
+from learning.step import ConstrainedStep, policy_gradient_fit
 
 Vector = NDArray[np.float64]
 
 
-class ActorCriticConfiguration(GlobalisedConfiguration):
+class ActorCriticConfiguration(Configuration):
     """Hyperparameters of the actor-critic."""
 
     batch_size: Count = Field(1000, description="samples per step of θ, all at one θ")
@@ -49,14 +44,15 @@ class ActorCriticConfiguration(GlobalisedConfiguration):
     radius_end: Positive = Field(
         0.04, description="trust region at the end, approached geometrically"
     )
-    q_learning_first: bool = Field(
-        True,
-        description="validated: phases of Q-learning by the Kalman filter come first and in turn, "
-        "since a policy gradient finds no way out of a start that violates its bounds",
-    )
+
+    def narrowed(self, width: float) -> Self:
+        """Copy whose trust region is `width` times as wide."""
+        return self.model_copy(
+            update={"radius": width * self.radius, "radius_end": width * self.radius_end}
+        )
 
 
-class PolicyGradient:
+class ActorCritic:
     """Descends J along ∇J = E[∇π ∇πᵀ] w (paper.tex, eq. pg_update and pg_solution).
 
     Each batch at one θ: LSTDV fits the smooth part W of V = penalty + W, LSTDQ the weights w of
@@ -64,6 +60,11 @@ class PolicyGradient:
     gives to the exploration. The known penalty is moved to the next state, r = ℓ + γ·penalty(s₊),
     so that the critic meets no kink.
     """
+
+    Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
+    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
+    needs_action_value = False
+    needs_points = False
 
     def __init__(
         self,
@@ -73,13 +74,9 @@ class PolicyGradient:
         samples: int,
         strategy: Strategy,
         rng: np.random.Generator,
-        *,
-        width: float = 1.0,
     ) -> None:
         self._configuration, self._strategy = configuration, strategy
-        self._radius = Geometric(
-            width * configuration.radius, width * configuration.radius_end, samples
-        )
+        self._radius = Geometric(configuration.radius, configuration.radius_end, samples)
         self._discount = configuration.critic_discount
         self._step = ConstrainedStep(controller, configuration)
         # Actions count in the exploration's standard deviations.
@@ -98,8 +95,6 @@ class PolicyGradient:
         }
         self._advantage = AdvantageRegression(size, configuration.forgetting, configuration.ridge)
         self._filled = 0
-        self.needs_action_value = False
-        self.needs_points = False
 
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
@@ -160,27 +155,3 @@ class PolicyGradient:
         self._filled = len(state["reward"])
         for name, values in self._batch.items():
             values[: self._filled] = state[name]
-
-
-class ActorCritic(GlobalisedLearning):
-    """`PolicyGradient`, globalised unless the configuration says otherwise."""
-
-    Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
-
-    _made = 0
-
-    def rule(self, samples: int, width: float) -> Rule:
-        """The policy gradient, in turn with Q-learning where that comes first.
-
-        Its trust region, or the prior's width, is `width` times as wide.
-        """
-        settings: ActorCriticConfiguration = self._configuration
-        shared = (samples, self._strategy, self._rng)
-        self._made += 1
-        if settings.q_learning_first and settings.globalised and self._made % 2:
-            common = {
-                name: getattr(settings, name) for name in GlobalisedConfiguration.model_fields
-            }
-            q = KalmanConfiguration(**common)
-            return KalmanQLearning(self._controller, self._scenario, q, *shared, width=width)
-        return PolicyGradient(self._controller, self._scenario, settings, *shared, width=width)

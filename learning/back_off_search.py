@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from cosim.scenario import Scenario
+from learning.algorithm import Transition
 from learning.errors import ConfigurationError
 from learning.prediction_errors import KnownPenalty, OneStepModel
-from learning.protocols import Transition
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

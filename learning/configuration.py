@@ -65,7 +65,7 @@ class Configuration(BaseModel):
     model_parameters: tuple[str, ...] = Field(
         (), description="parameters of the controller's model that θ has, in its block p"
     )
-    definiteness: Literal["lmi", "projection", "cholesky"] = Field(
+    definiteness: Literal["lmi", "cholesky"] = Field(
         "lmi", description="how B_l and B_Vf are kept positive definite"
     )
     smallest_eigenvalue: Positive = Field(

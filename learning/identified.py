@@ -14,11 +14,11 @@ from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.model import Model
 from controllers.parameters import Parameters
+from learning.algorithm import Transition
 from learning.configuration import Count
 from learning.errors import DivergenceError
 from learning.practitioner import Practitioner, PractitionerConfiguration
 from learning.prediction_errors import OneStepModel
-from learning.protocols import Transition
 
 Vector = NDArray[np.float64]
 

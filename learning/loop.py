@@ -39,10 +39,10 @@ class PlantInOperation:
     It cannot be reset, put back, or told which noise to meet.
     """
 
-    __slots__ = ("scenario", "step", "units")
+    __slots__ = ("scenario", "step")
 
     def __init__(self, plant: FmuPlant) -> None:
-        self.scenario, self.units = plant.scenario, plant.units
+        self.scenario = plant.scenario
 
         def step(a: Vector) -> Step:
             """Hold an action (m,) for one sample."""

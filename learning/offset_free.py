@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from controllers.parameters import Parameters
+from learning.algorithm import Transition
 from learning.configuration import Count
 from learning.practitioner import Practitioner, PractitionerConfiguration
 from learning.prediction_errors import OneStepModel
-from learning.protocols import Transition
 
 Vector = NDArray[np.float64]
 

@@ -12,11 +12,11 @@ from scipy.linalg import expm
 
 from controllers.parameters import Parameters
 from cosim.scenario import Scenario
+from learning.algorithm import LearnableController, Transition, Update
 from learning.configuration import Configuration, Count, Positive
-from learning.definiteness import HESSIANS, certificate
 from learning.exploration import Strategy
 from learning.greedy_configuration import GreedyConfiguration
-from learning.protocols import LearnableController, Transition, Update
+from learning.step import HESSIANS, certificate
 
 Vector = NDArray[np.float64]
 

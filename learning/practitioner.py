@@ -11,13 +11,13 @@ from pydantic import Field
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from cosim.scenario import Scenario
+from learning.algorithm import LearnableController, Transition, Update
 from learning.back_off_search import BackOffSearch
 from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration, Share
-from learning.definiteness import certificate
 from learning.exploration import Strategy
 from learning.greedy_configuration import GreedyConfiguration
-from learning.protocols import LearnableController, Transition, Update
+from learning.step import certificate
 
 Vector = NDArray[np.float64]
 

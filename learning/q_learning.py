@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Literal
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +12,25 @@ from pydantic import Field
 
 from controllers.errors import QpError
 from cosim.scenario import Scenario
-from learning.average_cost import AverageCost
-from learning.configuration import Configuration, Count, Positive
-from learning.constrained_step import ConstrainedStep
+from learning.algorithm import LearnableController, Transition, Update
+from learning.configuration import (
+    Configuration,
+    Count,
+    ExplorationProbability,
+    ExplorationShare,
+    NonNegative,
+    Positive,
+)
+from learning.errors import DivergenceError
 from learning.exploration import Strategy
-from learning.fit import Fit, least_squares, line_search, td_fit, td_step
-from learning.globalised import GlobalisedLearning
-from learning.kalman_q_learning import KalmanConfiguration, KalmanQLearning
-from learning.protocols import LearnableController, Rule, Transition, Update
+from learning.prediction_errors import OneStepModel, PredictionErrors
+from learning.step import ConstrainedStep, Fit, line_search, measured_prior, td_fit, td_step
 
 Vector = NDArray[np.float64]
-
-
+Matrix = NDArray[np.float64]
+Values = TypeVar("Values", float, NDArray[np.float64])
+OUTLIER = 25.0
+"""Squares of innovations beyond this many variances count as this many."""
 AS_PRINTED: dict[str, Any] = {
     "rule": "fit",
     "step_size": 1e-3,
@@ -32,78 +40,88 @@ AS_PRINTED: dict[str, Any] = {
     "exploration_deviation": [3.1622776601683795],
     "value_offset": "stage-cost",
     "parametrisation": "paper",
-    "globalisation": "none",
 }
 """Hyperparameters of the rule as the paper prints it (paper.tex, Simulations)."""
-ONE_SAMPLE = {"td": td_step, "fit": td_fit}
-"""The rules that step on one sample; `gauss-newton` steps on all that it remembers."""
+
+# The Kalman forms, online and in batches, share these.
+Discount = Annotated[
+    float | None,
+    Field(gt=0, le=1, description="of the TD error: the scenario's if not given; 1 is mean cost"),
+]
+PriorWidth = Annotated[
+    Positive,
+    Field(description="how far θ may be from its start, as a share of the start's cost"),
+]
+MeasureOffset = Annotated[
+    bool,
+    Field(
+        description="c_f becomes the mean of the first prediction errors; false: it starts as it "
+        "is, for a start that has learnt its offset"
+    ),
+]
+InnovationClip = Annotated[
+    Positive, Field(description="innovations are cut at this many standard deviations")
+]
+VarianceMemory = Annotated[
+    Positive, Field(description="samples over which the innovations' variance is taken")
+]
+ErrorsKept = Annotated[
+    Count, Field(description="prediction errors over which the next penalty is expected")
+]
 
 
-class QLearningConfiguration(KalmanConfiguration):
-    """Hyperparameters of online Q-learning; the defaults are the recommended variant.
+class QLearningConfiguration(Configuration):
+    """Hyperparameters of online Q-learning; `AS_PRINTED` has those of the paper's rule."""
 
-    `AS_PRINTED` has those of the paper's rule.
-    """
-
-    OPTIONS: ClassVar[Mapping[tuple[str, ...], tuple[str, ...]]] = {
-        ("td", "fit"): ("step_size", "line_search"),
-        ("gauss-newton",): (
-            "update_every", "gain", "gain_end", "memory", "ridge", "largest_step", "warm_up",
-        ),
-        ("kalman",): (
-            "prior_width", "prior_samples", "measure_offset", "step_every", "innovation_clip",
-            "variance_memory", "prediction_errors", "parameter_drift",
-        ),
-    }  # fmt: skip
-
-    rule: Literal["kalman", "gauss-newton", "td", "fit"] = Field(
+    exploration_probability: ExplorationProbability = 0.3
+    exploration_share: ExplorationShare = 1 / 30
+    rule: Literal["kalman", "td", "fit"] = Field(
         "kalman",
-        description="Kalman filter with a prior on θ; recursive Gauss–Newton with forgetting; "
-        "αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
+        description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
     )
-    scaled: bool = Field(True, description="step in coordinates θ/scale, else in θ itself")
+    discount: Discount = None
+    prior_width: PriorWidth = 0.3
+    prior_samples: Count = Field(
+        500, description="first samples, at which θ rests: they give noise and widths"
+    )
+    measure_offset: MeasureOffset = True
+    step_every: Count = Field(50, description="samples per step of θ")
+    innovation_clip: InnovationClip = 3.0
+    variance_memory: VarianceMemory = 2000.0
+    prediction_errors: ErrorsKept = 1000
+    parameter_drift: NonNegative = Field(
+        0.0,
+        description="variance that each sample adds to θ, in units of the prior's, so that "
+        "learning goes on where the plant changes",
+    )
     step_size: Positive = Field(1e-3, description="rules td and fit: α")
     line_search: bool = Field(
         False, description="rules td and fit: shorten a step until its TD error does not rise"
     )
-    update_every: Count = Field(20, description="gauss-newton: samples per step of θ")
-    memory: Positive = Field(
-        4000.0, description="gauss-newton: samples after which a sample's weight has fallen to 1/e"
+    scaled: bool = Field(
+        True, description="rules td and fit: step in coordinates θ/scale, else in θ itself"
     )
-    largest_step: Positive = Field(
-        1.0, description="gauss-newton: cap on each scaled entry of a step, before definiteness"
-    )
-    warm_up: int = Field(200, ge=0, description="gauss-newton: samples before the first step")
 
-    @property
-    def globalised(self) -> bool:
-        """The Kalman form is validated unless it shall not be, the others only if they shall."""
-        if self.globalisation is None:
-            return self.rule == "kalman"
-        return self.globalisation == "validated"
+    def narrowed(self, width: float) -> Self:
+        """Copy whose prior is `width` times as wide."""
+        return self.model_copy(update={"prior_width": width * self.prior_width})
+
+    def without_part(self) -> Mapping[str, str]:
+        """What belongs to other rules than the chosen one."""
+        if self.rule == "kalman":
+            names = ["step_size", "line_search", "scaled"]
+        else:
+            names = ["prior_width", "prior_samples", "measure_offset", "step_every"]
+            names += ["innovation_clip", "variance_memory", "prediction_errors", "parameter_drift"]
+        return dict.fromkeys(names, f"the rule {self.rule}")
 
 
-class QLearning(GlobalisedLearning):
-    """Online Q-learning by the rule that the configuration names, globalised if it says so."""
+class QLearning:
+    """Online Q-learning by the configuration's rule: `KalmanFilter` or `SampleSteps`."""
 
     Configuration: ClassVar[type[Configuration]] = QLearningConfiguration
-
-    def rule(self, samples: int, width: float) -> Rule:
-        """The Kalman form, or the rules that step as transitions come."""
-        settings: QLearningConfiguration = self._configuration
-        arguments = (self._controller, self._scenario, settings, samples, self._strategy, self._rng)
-        if settings.rule == "kalman":
-            return KalmanQLearning(*arguments, width=width)
-        return StepwiseQLearning(*arguments)
-
-
-class StepwiseQLearning:
-    """Q-learning on δ = ℓ + γV_θ(s₊) − Q_θ(s, a) (paper.tex, eq. Qlearning and q_solution).
-
-    The rules `td` and `fit` step on each transition as it comes; `gauss-newton` keeps the
-    information A = Σ λᵏ ∇Q∇Qᵀ and steps now and then by gain·(A+ρ)⁻¹ Σ δ∇Q, the sum since its last
-    step.
-    """
+    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
+    needs_action_value = True
 
     def __init__(
         self,
@@ -114,45 +132,222 @@ class StepwiseQLearning:
         strategy: Strategy,
         rng: np.random.Generator,
     ) -> None:
-        self._controller, self._configuration = controller, configuration
-        self._gain = configuration.gains(samples)
-        self._step = ConstrainedStep(controller, configuration, scaled=configuration.scaled)
-        self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
-        size = self._step.scale.size
-        self._information = np.zeros((size, size))
-        self._gradient = np.zeros(size)
-        self._squares, self._count = 0.0, 0
-        self.needs_action_value = True
+        form = KalmanFilter if configuration.rule == "kalman" else SampleSteps
+        self._form: KalmanFilter | SampleSteps = form(controller, scenario, configuration)
         self.needs_points = configuration.line_search
 
     def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; each moves θ, or one in `update_every` under gauss-newton."""
+        """Take one sample; move θ and say so, or return None."""
+        return self._form.observe(transition)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that the rule remembers, as arrays."""
+        return self._form.state()
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._form.restore(state)
+
+
+class KalmanFilter:
+    """Extended Kalman filter for Q with the target held, and the next penalty by its expectation.
+
+    θ ~ N(θ₀, diag(σ²)) with the widths of `learning.step`. One TD error measures ∇Qᵀd with
+    variance r (`KalmanRegression`):
+
+        δ = ℓ + p(s) + γ[V_θ(s₊) − p(s₊) + mean_i p(f(s, a) + e_i)] − Q_θ(s, a)
+
+    with f the controller's nominal model and e_i its latest prediction errors. Every `step_every`
+    samples d goes into θ under the constraints on θ, in the metric P⁻¹. The first `prior_samples`
+    leave θ as it is, but for c_f, which becomes the mean of e. Kalman temporal differences after
+    Geist and Pietquin (2010), linearised and with the target held.
+    """
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: QLearningConfiguration,
+    ) -> None:
+        self._controller, self._scenario, self._configuration = controller, scenario, configuration
+        self._model = OneStepModel(scenario)
+        self._errors = PredictionErrors(scenario, configuration.prediction_errors)
+        self._adopt(np.ones(controller.theta.size))
+        self._regression: KalmanRegression | None = None
+        rows, n = configuration.prior_samples, scenario.state_lower.size
+        self._first = {
+            "states": np.zeros((rows, n)),
+            "prediction_errors": np.zeros((rows, n)),
+            "td_errors": np.zeros(rows),
+        }
+        self._count = 0
+        self._squares = 0.0
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Take one sample; one in `step_every` moves θ."""
+        prediction = self._model(transition.s, transition.a)
+        error = transition.next_s - prediction
+        self._errors.add(error)
+        expected = self._errors.expected_penalty(prediction)
+        value = transition.next_policy.value - transition.next_penalty + expected
+        solution = transition.action_value
+        td_error = self._average_cost.target(transition.cost, value) - solution.value
+        count, self._count = self._count, self._count + 1
+        if self._regression is None:
+            first = self._first
+            first["states"][count], first["prediction_errors"][count] = transition.s, error
+            first["td_errors"][count] = td_error
+            return self._begin() if self._count == len(first["states"]) else None
+        gradient = solution.value_gradient * self._step.scale
+        innovation = self._regression.update(td_error, gradient)
+        self._squares += innovation * innovation
+        every = self._configuration.step_every
+        if self._count % every:
+            return None
+        error_size, self._squares = (self._squares / every) ** 0.5, 0.0
+        update = self._step.take(self._average_cost.take(self._regression.fit()), error_size)
+        self._regression.taken()
+        return update
+
+    def _begin(self) -> Update:
+        """Take the noise, the widths and c_f from the first samples."""
+        first, settings = self._first, self._configuration
+        variance = float(np.mean(first["td_errors"] ** 2))
+        if not np.isfinite(variance):
+            raise DivergenceError("TD errors are not finite")
+        start, scale = measured_prior(
+            self._controller.parameters,
+            first["states"],
+            first["prediction_errors"],
+            settings.deviation(self._scenario),
+            variance**0.5,
+            settings.prior_width,
+            measure_offset=settings.measure_offset,
+        )
+        self._adopt(scale)
+        self._regression = self._filter(max(variance, np.finfo(np.float64).tiny))
+        return self._step.move(start.theta, variance**0.5)
+
+    def _adopt(self, scale: Vector) -> None:
+        """Work in coordinates of this scale, (n_θ,)."""
+        settings = self._configuration
+        self._step = ConstrainedStep(self._controller, settings, scale=scale)
+        self._average_cost = AverageCost.of(settings.discount, self._scenario, self._step)
+
+    def _filter(self, variance: float) -> KalmanRegression:
+        settings = self._configuration
+        return KalmanRegression(
+            self._step.scale.size,
+            variance,
+            clip=settings.innovation_clip,
+            memory=settings.variance_memory,
+            drift=settings.parameter_drift,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Filter, errors and first samples."""
+        state = {
+            **self._first,
+            **self._errors.state(),
+            "scale": self._step.scale,
+            "sums": np.array([self._count, self._squares, self._average_cost.mean_cost]),
+        }
+        if self._regression is not None:
+            state |= self._regression.state()
+        return {name: np.array(values) for name, values in state.items()}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._first = {name: state[name] for name in self._first}
+        self._errors.restore(state)
+        self._adopt(state["scale"])
+        count, self._squares, self._average_cost.mean_cost = (float(v) for v in state["sums"])
+        self._count = int(count)
+        if "covariance" in state:
+            self._regression = self._filter(float(state["variance"]))
+            self._regression.restore(state)
+
+
+class KalmanRegression:
+    """d ~ N(0, I) in scaled coordinates; each δ measures ∇Qᵀd with variance r.
+
+        K = P∇Q/(r + ∇QᵀP∇Q),  d ← d + K·clip(δ − ∇Qᵀd),  P ← P − K∇QᵀP
+
+    Without clip and with r constant this is the ridge regression min Σ(δ−∇Qᵀd)²/r + ‖d‖². The
+    innovation is cut at ±`clip`·√r; r follows the mean square of the innovations with a memory of
+    `memory` samples. `drift` is added to P's diagonal at each sample.
+    """
+
+    def __init__(
+        self, size: int, variance: float, *, clip: float, memory: float, drift: float = 0.0
+    ) -> None:
+        self._clip, self._memory, self._drift = clip, memory, drift
+        self.covariance: Matrix = np.eye(size)
+        self.mean: Vector = np.zeros(size)
+        self.variance = variance
+
+    def update(self, td_error: float, gradient: Vector) -> float:
+        """Take δ and ∇Q (n,), scaled; returns the innovation δ − ∇Qᵀd."""
+        spread = self.covariance @ gradient
+        scale = self.variance + float(gradient @ spread)
+        innovation = td_error - float(gradient @ self.mean)
+        limit = self._clip * self.variance**0.5
+        gain = spread / scale
+        self.mean += gain * min(max(innovation, -limit), limit)
+        self.covariance -= gain[:, None] * spread
+        if self._drift:
+            self.covariance[np.diag_indices_from(self.covariance)] += self._drift
+        square = min(innovation * innovation, OUTLIER * self.variance)
+        self.variance += (square - self.variance) / self._memory
+        return innovation
+
+    def fit(self) -> Fit:
+        """The step d as a fit in the metric P⁻¹, for constraints that it violates."""
+        covariance = (self.covariance + self.covariance.T) / 2
+        information: Matrix = np.linalg.inv(covariance).astype(np.float64)
+        return Fit(information @ self.mean, self.mean.copy(), lambda: information)
+
+    def taken(self) -> None:
+        """The step has gone into θ: d starts from zero again, P stays."""
+        self.mean[:] = 0.0
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Mean, covariance and variance."""
+        return {
+            "mean": self.mean.copy(),
+            "covariance": self.covariance.copy(),
+            "variance": np.array(self.variance),
+        }
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self.mean, self.covariance = state["mean"].copy(), state["covariance"].copy()
+        self.variance = float(state["variance"])
+
+
+class SampleSteps:
+    """Steps on each sample's δ = ℓ + γV_θ(s₊) − Q_θ(s, a) (paper.tex, eq. Qlearning)."""
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: QLearningConfiguration,
+    ) -> None:
+        self._controller, self._configuration = controller, configuration
+        self._step = ConstrainedStep(controller, configuration, scaled=configuration.scaled)
+        self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
+        self._fit = td_fit if configuration.rule == "fit" else td_step
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Take one sample; each moves θ."""
         target = self._average_cost.target(transition.cost, transition.next_policy.value)
         td_error = target - transition.action_value.value
         gradient = transition.action_value.value_gradient * self._step.scale
-        settings = self._configuration
-        if settings.rule == "gauss-newton":
-            return self._recursive(transition.number, td_error, gradient)
-        fit = ONE_SAMPLE[settings.rule](td_error, gradient, settings.step_size)
-        if settings.line_search:
+        fit = self._fit(td_error, gradient, self._configuration.step_size)
+        if self._configuration.line_search:
             fit = fit.shrunk(line_search(self._error_along(transition, target, fit)))
         return self._step.take(self._average_cost.take(fit), abs(td_error))
-
-    def _recursive(self, number: int, td_error: float, gradient: Vector) -> Update | None:
-        settings = self._configuration
-        self._information *= 1.0 - 1.0 / settings.memory
-        self._information += np.outer(gradient, gradient)
-        self._gradient += td_error * gradient
-        self._squares += td_error * td_error
-        self._count += 1
-        if (number + 1) % settings.update_every or number < settings.warm_up:
-            return None
-        fit = least_squares(self._information, self._gradient, settings.ridge)
-        td_error = (self._squares / self._count) ** 0.5
-        self._gradient[:] = 0.0
-        self._squares, self._count = 0.0, 0
-        fit = self._average_cost.take(fit.shrunk(self._gain(number)).clipped(settings.largest_step))
-        return self._step.take(fit, td_error)
 
     def _error_along(
         self, transition: Transition, target: float, fit: Fit
@@ -176,15 +371,50 @@ class StepwiseQLearning:
         return error
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Information matrix and the sums since the last step."""
-        return {
-            "information": self._information,
-            "gradient": self._gradient,
-            "sums": np.array([self._squares, self._count, self._average_cost.mean_cost]),
-        }
+        """The mean cost."""
+        return {"mean_cost": np.array(self._average_cost.mean_cost)}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
-        self._information, self._gradient = state["information"], state["gradient"]
-        squares, count, self._average_cost.mean_cost = (float(value) for value in state["sums"])
-        self._squares, self._count = squares, int(count)
+        self._average_cost.mean_cost = float(state["mean_cost"])
+
+
+class AverageCost:
+    """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
+
+    At γ = 1 the constant c_lambda cancels out of δ, and what the fit would have it do is to take
+    up the mean of δ. That is what g, the mean cost per sample, has to do: so the step of
+    c_lambda goes to g, and c_lambda stays. This is differential Q-learning; it serves the
+    yardstick J itself, which a discounted optimum need not.
+
+    `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
+    """
+
+    def __init__(self, discount: float, position: int, scale: float, start: float) -> None:
+        self.discount = discount
+        self.mean_cost = start if discount == 1.0 else 0.0
+        self._position, self._scale = position, scale
+
+    @classmethod
+    def of(cls, discount: float | None, scenario: Scenario, step: ConstrainedStep) -> AverageCost:
+        """Target of a scenario's TD error; `discount` None is the scenario's own."""
+        position = step.blocks.slices["c_lambda"].start
+        return cls(
+            scenario.discount if discount is None else discount,
+            position,
+            float(step.scale[position]),
+            scenario.controller.reference_cost,
+        )
+
+    def target(self, cost: Values, next_value: Values) -> Values:
+        """What Q(s, a) is fitted to, of one sample or of several, (K,)."""
+        return cost - self.mean_cost + self.discount * next_value
+
+    def take(self, fit: Fit) -> Fit:
+        """Move g by its part of a fit's step; returns the rest, which is for θ."""
+        if self.discount != 1.0:
+            return fit
+        minimiser = fit.minimiser.copy()
+        self.mean_cost += float(minimiser[self._position]) * self._scale
+        minimiser[self._position] = 0.0
+        return replace(fit, gradient=fit.metric() @ minimiser, minimiser=minimiser)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from controllers.errors import QpError
 from controllers.rti.prepared import LinearisationPoint
-from learning.average_cost import AverageCost
+from learning.algorithm import LearnableController, LearnableSolution, Transition
 from learning.checkpoint import group, prefixed
-from learning.protocols import LearnableController, LearnableSolution, Transition
+from learning.q_learning import AverageCost
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -29,15 +29,14 @@ COLUMNS = ("number", "s", "a", "explored", "cost", "next_s", *POINT, *NEXT_POINT
 class Replayed:
     """K transitions at one θ: `action_value` Q(s, a), `target` ℓ + γV(s₊), both (K,).
 
-    `number` says which samples they are; `gradient` ∇Q and `next_gradient` ∇V(s₊), (K, n_θ), are
-    in θ itself. Transitions whose QP failed at this θ are left out; `failures` counts them.
+    `number` says which samples they are; `gradient` ∇Q, (K, n_θ), is in θ
+    itself. Transitions whose QP failed at this θ are left out; `failures` counts them.
     """
 
     number: NDArray[np.int64]
     action_value: Vector
     target: Vector
     gradient: Matrix
-    next_gradient: Matrix
     failures: int
 
     @property
@@ -49,14 +48,14 @@ class Replayed:
 class Judgements:
     """What is known of a buffer's transitions at one `theta`, NaN where nothing is.
 
-    `action_value` Q(s, a) and `next_value` V(s₊), (capacity,), and their gradients in θ,
-    (capacity, n_θ), which mean nothing where the value is NaN.
+    `action_value` Q(s, a) and `next_value` V(s₊), (capacity,), and ∇Q in θ,
+    (capacity, n_θ), which means nothing where the value is NaN.
     """
 
     def __init__(self, capacity: int, theta: Vector) -> None:
         self.theta = theta
         self.action_value, self.next_value = np.full((2, capacity), np.nan)
-        self.gradient, self.next_gradient = np.zeros((2, capacity, theta.size))
+        self.gradient = np.zeros((capacity, theta.size))
 
     def begin(self, theta: Vector) -> None:
         """Know nothing, at another θ."""
@@ -118,7 +117,6 @@ class ReplayBuffer:
         for judgements in self._judgements:
             judgements.forget(row)
         known.next_value[row] = transition.next_policy.value
-        known.next_gradient[row] = transition.next_policy.value_gradient
         if not transition.explored:
             known.action_value[row] = transition.policy.value
             known.gradient[row] = transition.policy.value_gradient
@@ -139,7 +137,6 @@ class ReplayBuffer:
             known.action_value[order],
             target,
             known.gradient[order],
-            known.next_gradient[order],
             int(count - kept.sum()),
         )
 
@@ -188,7 +185,6 @@ class ReplayBuffer:
                     controller.prepare_at(LinearisationPoint(*(p[row] for p in next_points)))
                     at, value = number + 1, controller.feedback(columns["next_s"][row])
                     known.next_value[row] = value.value
-                    known.next_gradient[row] = value.value_gradient
             except QpError:
                 at = None
 

@@ -27,13 +27,13 @@ from learning import checkpoint
 from learning.algorithm import Algorithm, LearnableController, load_algorithm
 from learning.checkpoint import Checkpoint
 from learning.configuration import Configuration
-from learning.definiteness import certificate
 from learning.drift import Drift
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.evaluation import Judge
 from learning.log import COLUMNS, LogRow, Totals, late_movement, to_csv
 from learning.loop import TrainingLoop, begin
 from learning.optimum import stored_optimum
+from learning.step import certificate
 from learning.training_run import TrainingRun, prepare
 from learning.training_run import build_controller as build_learnt
 

@@ -1,6 +1,6 @@
 """Endurance: a long learning run, or an evaluation of very many units; memory, time, failures.
 
-    python tests/faults/endurance.py --samples 1000000 [--record] [--globalisation none]
+    python tests/faults/endurance.py --samples 1000000 [--record] [--rule-alone]
     python tests/faults/endurance.py --units 1000000 [--jobs 2]
 
 The first one trains on one plant and looks at every tenth of the run; the second one evaluates a
@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from cosim import Scenario, evaluate
 from cosim.plugins import build_controller
 from learning.q_learning import QLearning
+from learning.search import Search
 from learning.training import run_training
 from learning.training_run import TrainingRun
 
@@ -49,7 +50,7 @@ def resident() -> int:
 
 
 def endure(
-    samples: int, folder: Path, *, record: bool = False, globalisation: str = "validated"
+    samples: int, folder: Path, *, record: bool = False, alone: bool = False
 ) -> dict[str, object]:
     """Train for `samples` samples with checkpoints; figures of each tenth of the run.
 
@@ -60,11 +61,13 @@ def endure(
     every = tenth // 100 if record else tenth
     scenario = Scenario.load("paper")
     run = TrainingRun(
-        algorithm="q-learning",
+        algorithm="q-learning" if alone else "search",
         scenario=scenario,
         samples=tenth * TENTHS,
         seed=0,
-        configuration=QLearning.Configuration.from_dict({"globalisation": globalisation}),
+        configuration=QLearning.Configuration()
+        if alone
+        else Search.Configuration(rule="q-learning"),
         log_every=every,
         evaluate_every=tenth,
         checkpoint_every=tenth,
@@ -180,7 +183,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--samples", type=int, default=1_000_000)
     parser.add_argument("--record", action="store_true", help="write a recording, too")
-    parser.add_argument("--globalisation", choices=("validated", "none"), default="validated")
+    parser.add_argument("--rule-alone", action="store_true", help="no search around the rule")
     parser.add_argument("--units", type=int, help="evaluate as many units in place of training")
     parser.add_argument("--jobs", type=int, default=1, help="processes that evaluate them")
     parser.add_argument("--megabytes", type=float, default=5.0)
@@ -192,7 +195,7 @@ def main() -> int:
                 options.samples,
                 Path(folder),
                 record=options.record,
-                globalisation=options.globalisation,
+                alone=options.rule_alone,
             )
         else:
             figures = evaluate_units(options.units, Path(folder), jobs=options.jobs)

@@ -25,6 +25,20 @@ def _cost(x, u, d, p):
     return x.T @ ca.DM(STATE_COST) @ x + u.T @ ca.DM(ACTION_COST) @ u
 
 
+def model():
+    """The task's own model."""
+    return Model(
+        name="linear",
+        states=(Quantity("x1", "1"), Quantity("x2", "1")),
+        actions=(Quantity("u", "1"),),
+        disturbances=(),
+        parameters=(),
+        ode=_ode,
+        economic_cost=_cost,
+        time_unit=60.0,
+    )
+
+
 class LinearQuadratic:
     """Plant, scenario, problem and Riccati solution; noise w ~ N(0, noise²·I) on the next state."""
 
@@ -50,6 +64,7 @@ class LinearQuadratic:
                 },
                 "penalty": {"linear": [1e5, 1e5], "quadratic": [1.0, 1.0]},
                 "controller": {
+                    "model": "tests.helpers.linear_quadratic:model",
                     "horizon": 3,
                     "reference_state": [0.0, 0.0],
                     "reference_action": [0.0],
@@ -57,19 +72,9 @@ class LinearQuadratic:
                 },
             }
         )
-        model = Model(
-            name="linear",
-            states=(Quantity("x1", "1"), Quantity("x2", "1")),
-            actions=(Quantity("u", "1"),),
-            disturbances=(),
-            parameters=(),
-            ode=_ode,
-            economic_cost=_cost,
-            time_unit=60.0,
-        )
         scenario = self.scenario
         self.problem = Problem(
-            model=model,
+            model=model(),
             sampling_time=scenario.sampling_time,
             horizon=3,
             discount=DISCOUNT,
@@ -83,7 +88,7 @@ class LinearQuadratic:
             reference_action=scenario.reference_action,
             reference_cost=0.0,
         )
-        step = discretise(model, scenario.sampling_time, 2)
+        step = discretise(model(), scenario.sampling_time, 2)
         none = np.zeros(0)
         columns = [np.array(step(e, [0.0], none, none)).ravel() for e in np.eye(2)]
         self.A = np.array(columns).T

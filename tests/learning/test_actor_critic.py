@@ -3,8 +3,8 @@ import pytest
 
 from controllers.parameters import Parameters
 from learning import ActorCritic
-from learning.protocols import Transition
-from learning.starting_point import build_strategy
+from learning.algorithm import Transition
+from learning.exploration import build_strategy
 from tests.helpers.carrier import Carrier
 
 
@@ -18,7 +18,6 @@ def algorithm(problem, scenario, **settings):
         batch_size=400,
         forgetting=0.0,
         parametrisation="paper",
-        globalisation="none",
         **settings,
     )
     carrier = Carrier(Parameters.naive(problem))
@@ -86,7 +85,7 @@ def test_saturation_does_not_bias_the_gradient(problem, scenario, rng):
     carrier, actor = algorithm(problem, scenario)
     feed(actor, carrier, rng, np.zeros(2), action, noise=1.0, clip=scenario.action_upper)
     raw_mean = -5.0 * 0.3  # what the noise would average to, roughly
-    assert abs(actor._rule._deviation()[:, 0].mean()) < 0.25 * abs(raw_mean)
+    assert abs(actor._deviation()[:, 0].mean()) < 0.25 * abs(raw_mean)
 
 
 def test_only_a_full_batch_moves_theta(problem, scenario, rng):

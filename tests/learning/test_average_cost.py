@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from learning.average_cost import AverageCost
-from learning.fit import Fit
+from learning.q_learning import AverageCost
+from learning.step import Fit
 
 
 def fit():
@@ -25,20 +25,3 @@ def test_mean_cost_takes_the_step_of_c_lambda():
     assert average_cost.mean_cost == pytest.approx(6000.0 - 4.0)
     assert rest.minimiser.tolist() == [0.3, 0.0]
     assert rest.gradient == pytest.approx(rest.metric() @ rest.minimiser)
-
-
-def test_the_descent_of_a_discounted_fit_is_that_of_theta():
-    change = np.ones((3, 2))
-    assert AverageCost(0.9, 1, 10.0, 6000.0).descent(change) is change
-
-
-def test_a_fits_step_of_the_mean_cost_lowers_every_td_error_alike():
-    average_cost = AverageCost(1.0, 1, 10.0, 6000.0)
-    before = average_cost.target(6001.0, 100.0)
-    step = np.array([0.0, 0.4])
-    average_cost.take(Fit(step, step, lambda: np.eye(2)))
-    change = np.zeros((3, 2))
-    assert average_cost.descent(change) @ step == pytest.approx(
-        before - average_cost.target(6001.0, 100.0)
-    )
-    assert (change == 0).all()

@@ -11,11 +11,11 @@ from controllers.problem import Problem
 from controllers.quasi_static import Fouling
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant, Scenario, simulate
+from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.log import to_csv
 from learning.policy_search import Coordinates
 from learning.prediction_errors import OneStepModel
-from learning.registry import load_algorithm
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed, train
 

@@ -1,10 +1,11 @@
 import pytest
 
 from learning import ActorCritic, BatchQLearning, QLearning
+from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.registry import load_algorithm
+from learning.search import Search
 
-CLASSES = (QLearning, BatchQLearning, ActorCritic)
+CLASSES = (QLearning, BatchQLearning, ActorCritic, Search)
 
 
 @pytest.mark.parametrize("cls", CLASSES)
@@ -25,12 +26,12 @@ def test_assignments_are_read_as_toml_and_bare_words_as_text():
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
-        ("gain", "write name=value"),
-        ("gian=0.1", "did you mean 'gain'"),
-        ("gain=-1", "gain"),
-        ("gain=nan", "gain"),
+        ("prior_width", "write name=value"),
+        ("prior_widht=0.1", "did you mean 'prior_width'"),
+        ("prior_width=-1", "prior_width"),
+        ("prior_width=nan", "prior_width"),
         ("rule=newton", "rule.*td"),
-        ("memory=many", "memory"),
+        ("step_every=many", "step_every"),
         ("line_search=true", "line_search: has no part in the rule kalman"),
     ],
 )
@@ -40,20 +41,19 @@ def test_a_bad_assignment_gets_one_clear_message(assignment, message):
 
 
 def test_an_option_of_another_rule_is_refused_and_its_default_is_not():
-    with pytest.raises(ConfigurationError, match="memory: has no part in the rule fit"):
-        QLearning.Configuration.from_dict({"rule": "fit", "memory": 10.0})
-    QLearning.Configuration.from_dict({"rule": "fit", "memory": 4000.0})
+    with pytest.raises(ConfigurationError, match="step_every: has no part in the rule fit"):
+        QLearning.Configuration.from_dict({"rule": "fit", "step_every": 10})
+    QLearning.Configuration.from_dict({"rule": "fit", "step_every": 50})
 
 
 @pytest.mark.parametrize(
     ("algorithm", "assignment", "message"),
     [
-        ("batch-q-learning", "radius=2.0", "radius: has no part in the rule kalman"),
         ("batch-q-learning", "parameter_drift=0.1", "no hyperparameter 'parameter_drift'"),
-        ("actor-critic", "globalisation=none blocks=4", "blocks: has no part in a rule that is"),
+        ("search", "phase=100", "phase: has no part in a search without a rule"),
         ("backoff", "exploration_share=0.1", "exploration_share: has no part in a rule that tries"),
         ("policy-search", "definiteness=cholesky", "definiteness: has no part in a rule that"),
-        ("identified", "globalisation=none", "no hyperparameter 'globalisation'"),
+        ("q-learning", "block=4", "no hyperparameter 'block'"),
     ],
 )
 def test_what_acts_nowhere_is_refused(algorithm, assignment, message):
@@ -64,11 +64,9 @@ def test_what_acts_nowhere_is_refused(algorithm, assignment, message):
 @pytest.mark.parametrize(
     ("algorithm", "settings", "schedules"),
     [
-        ("q-learning", {}, ["globalisation"]),
-        ("q-learning", {"globalisation": "none"}, []),
-        ("q-learning", {"rule": "gauss-newton"}, ["gain"]),
-        ("batch-q-learning", {"rule": "lstdq", "gain_end": 0.5}, ["globalisation"]),
-        ("actor-critic", {"globalisation": "none"}, ["radius"]),
+        ("q-learning", {}, []),
+        ("actor-critic", {}, ["radius"]),
+        ("search", {}, ["samples (shared out by the search)"]),
         ("policy-search", {}, []),
         ("backoff", {}, ["samples (shared out among the stages)"]),
     ],

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from qpsolvers import solve_qp
 
-from learning.errors import DivergenceError
-from learning.fit import least_squares, line_search, policy_gradient_fit, td_fit, td_step
+from learning.step import line_search, policy_gradient_fit, td_fit, td_step
 
 SIZE = 6
 
@@ -47,29 +46,6 @@ def test_td_fit_is_normalised_and_the_td_step_is_not(rng):
     check(td_step(2.0, gradient, 0.3))
 
 
-def test_least_squares_solves_the_regularised_normal_equations(rng):
-    rows = rng.normal(size=(40, SIZE))
-    fit = least_squares(rows.T @ rows, rows.T @ rng.normal(size=40), 1e-2)
-    check(fit)
-
-
-def test_least_squares_step_does_not_depend_on_the_units_of_theta(rng):
-    rows, errors = rng.normal(size=(40, SIZE)), rng.normal(size=40)
-    units = np.array([1.0, 10.0, 0.1, 3.0, 0.5, 2.0])
-    plain = least_squares(rows.T @ rows, rows.T @ errors, 1e-2).minimiser
-    scaled = rows * units
-    other = least_squares(scaled.T @ scaled, scaled.T @ errors, 1e-2).minimiser
-    # What is left is the floor for entries without information, 1e-8 of the largest.
-    assert other * units == pytest.approx(plain, rel=2e-3)
-    damped = least_squares(scaled.T @ scaled + 0.2 * np.eye(SIZE), scaled.T @ errors, 0.0).minimiser
-    assert np.abs(damped * units / plain - 1).max() > 0.05
-
-
-def test_least_squares_refuses_what_is_not_finite():
-    with pytest.raises(DivergenceError, match="not finite"):
-        least_squares(np.eye(2), np.array([1.0, np.nan]), 1e-2)
-
-
 @pytest.mark.parametrize("natural", [False, True])
 def test_policy_gradient_fit_descends_and_equals_its_programme(rng, natural):
     root = rng.normal(size=(SIZE, SIZE))
@@ -78,16 +54,6 @@ def test_policy_gradient_fit_descends_and_equals_its_programme(rng, natural):
     fit = policy_gradient_fit(gradient, 0.7, metric)
     check(fit)
     assert fit.minimiser @ gradient < 0
-
-
-def test_shrinking_and_clipping_keep_the_fit_consistent(rng):
-    rows = rng.normal(size=(20, SIZE))
-    fit = least_squares(rows.T @ rows, 50 * rng.normal(size=SIZE), 1e-2)
-    check(fit.shrunk(0.3))
-    clipped = fit.clipped(0.5)
-    assert np.abs(clipped.minimiser).max() == 0.5
-    check(clipped)
-    assert fit.clipped(1e9).minimiser is fit.minimiser
 
 
 @pytest.mark.parametrize(

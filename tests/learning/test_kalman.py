@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from learning.kalman import KalmanRegression
+from learning.q_learning import KalmanRegression
 
 
 def regression(size, variance, **changes):

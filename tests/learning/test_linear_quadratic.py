@@ -6,8 +6,8 @@ import pytest
 from controllers.converged import ConvergedNmpc
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
-from learning.interaction import Interaction
-from learning.starting_point import build_strategy
+from learning.exploration import build_strategy
+from learning.loop import TrainingLoop
 
 
 def learn(*arguments, **settings):
@@ -25,10 +25,9 @@ def train(task, cls, samples, noise, controller=None, **settings):
     algorithm = cls(
         controller, task.scenario, configuration, samples, strategy, np.random.default_rng(0)
     )
-    interaction = Interaction(
-        task.plant(noise), controller, algorithm, strategy, np.random.default_rng(1)
-    )
-    interaction.start(7)
+    plant = task.plant(noise)
+    interaction = TrainingLoop(plant, controller, algorithm, strategy, np.random.default_rng(1))
+    interaction.start(plant.reset(7))
     for _ in range(samples):
         sample, _ = interaction.next()
         if algorithm.observe(sample) is not None:
@@ -68,85 +67,48 @@ def test_wrong_parameters_do_not(linear_quadratic):
     assert np.abs(value_hessian(controller) - linear_quadratic.P).max() > 0.5
 
 
-EXPLORATION = {
-    "exploration_probability": 0.5,
-    "exploration_deviation": (1.0,),
-    "globalisation": "none",
-}
+EXPLORATION = {"exploration_probability": 0.5, "exploration_deviation": (1.0,)}
+ONLINE = {"prior_width": 1.0, "prior_samples": 50, "step_every": 10, **EXPLORATION}
+BATCH = {"prior_width": 3.0, "batch_size": 50, "variance_memory": 50.0, **EXPLORATION}
 
 
 def test_online_q_learning_finds_the_riccati_solution(linear_quadratic):
-    controller = learn(
-        linear_quadratic,
-        QLearning,
-        8000,
-        0.0,
-        rule="gauss-newton",
-        gain=1.0,
-        gain_end=1.0,
-        memory=100.0,
-        ridge=1e-6,
-        warm_up=50,
-        **EXPLORATION,
-    )
+    settings = {"parameter_drift": 1e-3, "variance_memory": 50.0, **ONLINE}
+    controller = learn(linear_quadratic, QLearning, 4000, 0.0, **settings)
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-3)
     assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
 
 
-@pytest.mark.parametrize("rule", ["gauss-newton", "lstdq"])
-def test_batch_q_learning_finds_the_riccati_solution(linear_quadratic, rule):
-    controller = learn(
-        linear_quadratic,
-        BatchQLearning,
-        2000,
-        0.0,
-        rule=rule,
-        batch_size=50,
-        buffer_size=100,
-        gain=1.0,
-        gain_end=1.0,
-        ridge=1e-6,
-        **EXPLORATION,
-    )
+def test_batch_q_learning_finds_the_riccati_solution(linear_quadratic):
+    controller = learn(linear_quadratic, BatchQLearning, 4000, 0.0, **BATCH)
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-3)
     assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
 
 
-MEAN_COST = {"discount": 1.0, "gain": 1.0, "ridge": 1e-6, **EXPLORATION}
-
-
-@pytest.mark.parametrize("rule", ["gauss-newton", "lstdq"])
-def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, rule):
+@pytest.mark.parametrize(
+    ("rule", "settings"),
+    [
+        (QLearning, {"parameter_drift": 1e-3, "variance_memory": 50.0, **ONLINE}),
+        (BatchQLearning, BATCH),
+    ],
+)
+def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, rule, settings):
     exact = linear_quadratic.riccati(1.0)[1]
     assert np.abs(exact - linear_quadratic.K).max() > 0.04
-    settings = {"rule": rule, "batch_size": 50, "buffer_size": 100, "gain_end": 1.0, **MEAN_COST}
-    controller = learn(linear_quadratic, BatchQLearning, 3000, 0.0, **settings)
+    controller = learn(linear_quadratic, rule, 6000, 0.0, discount=1.0, **settings)
     assert gain(controller) == pytest.approx(exact, abs=0.01)
 
 
-@pytest.mark.parametrize("rule", ["gauss-newton", "lstdq"])
-def test_the_mean_cost_is_found_beside_theta(linear_quadratic, rule):
+def test_the_mean_cost_is_found_beside_theta(linear_quadratic):
     noise = 0.1
     exact = noise**2 * np.trace(linear_quadratic.riccati(1.0)[0])
-    settings = {"rule": rule, "batch_size": 100, "buffer_size": 300, "gain_end": 0.1, **MEAN_COST}
-    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **settings)
-    assert float(algorithm.state()["rule mean_cost"]) == pytest.approx(exact, rel=0.2)
+    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, discount=1.0, **BATCH)
+    assert algorithm._average_cost.mean_cost == pytest.approx(exact, rel=0.2)
 
 
 def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
-    controller = learn(
-        linear_quadratic,
-        QLearning,
-        20_000,
-        0.1,
-        rule="gauss-newton",
-        gain=1.0,
-        gain_end=0.02,
-        memory=1000.0,
-        ridge=1e-6,
-        warm_up=50,
-        **EXPLORATION,
-    )
+    settings = {"parameter_drift": 1e-6, **ONLINE}
+    controller = learn(linear_quadratic, QLearning, 20_000, 0.1, **settings)
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=0.03)
 
 
@@ -155,7 +117,6 @@ ACTOR = {
     "step_size": 0.2,
     "exploration_deviation": (1.0,),
     "radius": 0.3,
-    "globalisation": "none",
 }
 
 
@@ -179,18 +140,6 @@ def test_actor_critic_finds_the_riccati_gain_of_the_mean_cost(linear_quadratic):
 
 
 def test_converged_nmpc_learns_the_same_on_a_linear_plant(linear_quadratic):
-    controller = learn(
-        linear_quadratic,
-        BatchQLearning,
-        1000,
-        0.0,
-        controller=ConvergedNmpc(linear_quadratic.problem, linear_quadratic.wrong()),
-        rule="gauss-newton",
-        batch_size=50,
-        buffer_size=100,
-        gain=1.0,
-        gain_end=1.0,
-        ridge=1e-6,
-        **EXPLORATION,
-    )
+    converged = ConvergedNmpc(linear_quadratic.problem, linear_quadratic.wrong())
+    controller = learn(linear_quadratic, BatchQLearning, 2000, 0.0, converged, **BATCH)
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=2e-3)

@@ -3,7 +3,7 @@ import pytest
 
 from controllers.parameters import Parameters
 from controllers.theta import ThetaBlocks
-from learning.prior import prior_deviation
+from learning.step import prior_deviation
 from tests.helpers.other_units import factors
 
 

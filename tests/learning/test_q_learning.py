@@ -4,10 +4,11 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import QLearning
-from learning.fit import line_search
-from learning.interaction import Interaction
+from learning.exploration import build_strategy
+from learning.loop import TrainingLoop
 from learning.q_learning import AS_PRINTED
-from learning.starting_point import build_strategy, starting_parameters
+from learning.step import line_search
+from learning.training_run import starting_parameters
 
 
 class Bench:
@@ -21,10 +22,10 @@ class Bench:
         self.algorithm = QLearning(
             self.controller, self.scenario, configuration, 1000, strategy, np.random.default_rng(0)
         )
-        self.interaction = Interaction(
+        self.interaction = TrainingLoop(
             plant, self.controller, self.algorithm, strategy, np.random.default_rng(0)
         )
-        self.interaction.start(11)
+        self.interaction.start(plant.reset(11))
 
     def td_error(self, sample, target=None):
         """δ of a sample at the present θ, by its own linearisation point; and its target."""
@@ -91,24 +92,12 @@ def test_without_line_search_some_steps_do_raise_it(plant, problem):
     assert raised > 0
 
 
-def test_gauss_newton_moves_every_so_many_samples_after_the_warm_up(plant, problem):
-    bench = Bench(plant, problem, rule="gauss-newton", update_every=10, warm_up=25)
-    moved = []
-    for k in range(60):
-        sample, _ = bench.interaction.next()
-        if bench.algorithm.observe(sample) is not None:
-            bench.interaction.renew()
-            moved.append(k)
-    assert moved == [29, 39, 49, 59]
-
-
 def test_state_and_restore_carry_all_memory(plant, problem):
-    bench, other = (
-        Bench(plant, problem, rule="gauss-newton", update_every=50, warm_up=0) for _ in range(2)
-    )
+    bench, other = (Bench(plant, problem, prior_samples=20, step_every=30) for _ in range(2))
     samples = [bench.interaction.next()[0] for _ in range(50)]
     for sample in samples[:30]:
         bench.algorithm.observe(sample)
+    other.controller.theta = bench.controller.theta
     other.algorithm.restore({k: v.copy() for k, v in bench.algorithm.state().items()})
     for sample in samples[30:]:
         first, second = bench.algorithm.observe(sample), other.algorithm.observe(sample)

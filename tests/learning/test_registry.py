@@ -1,8 +1,8 @@
 import pytest
 
 from learning import ActorCritic, BatchQLearning, QLearning
+from learning.algorithm import algorithms, load_algorithm
 from learning.errors import AlgorithmLookupError
-from learning.registry import algorithms, load_algorithm
 
 
 def test_the_shipped_algorithms_are_registered():

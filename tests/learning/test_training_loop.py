@@ -9,27 +9,21 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.rti.solution import RtiSolution
 from cosim import FmuPlant
+from learning.algorithm import load_algorithm
 from learning.errors import CheckpointError, ConfigurationError
 from learning.evaluation import HELD_OUT, held_out_costs
 from learning.log import LogRow, late_movement, to_csv
-from learning.q_learning import StepwiseQLearning
-from learning.registry import load_algorithm
+from learning.q_learning import QLearning
 from tests.helpers import training
 from tests.helpers.command import run_cosim, start_cosim
 from tests.helpers.processes import eventually
 from tests.helpers.training import killed_and_resumed, train
 
 SETTINGS = {
-    "q-learning": {"rule": "gauss-newton", "warm_up": 20},
+    "q-learning": {"prior_samples": 20, "step_every": 20},
     "batch-q-learning": {"batch_size": 50},
     "actor-critic": {"batch_size": 80},
 }
-
-
-def alone(name):
-    """The rule without globalisation."""
-    settings = {**SETTINGS[name], "globalisation": "none"}
-    return load_algorithm(name).Configuration.from_dict(settings)
 
 
 def make_run(scenario, name, **changes):
@@ -51,7 +45,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, name, tmp_
 
 def train_start(run):
     from controllers.problem import Problem
-    from learning.starting_point import starting_parameters
+    from learning.training_run import starting_parameters
 
     return starting_parameters(Problem.from_scenario(run.scenario), run.configuration).theta
 
@@ -92,7 +86,7 @@ def test_the_log_keeps_the_least_certificate_of_all_updates(scenario):
 
 
 def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
-    run = make_run(scenario, "actor-critic", divergence=1e-3, configuration=alone("actor-critic"))
+    run = make_run(scenario, "actor-critic", divergence=1e-3)
     result = train(run, tmp_path)
     assert result.status.startswith("diverged: greedy J")
     assert "at sample 200" in result.status, "the second evaluation in a row"
@@ -107,18 +101,19 @@ def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
 def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
     run = make_run(scenario, "q-learning")
 
-    class Broken(StepwiseQLearning):
-        def _recursive(self, number, td_error, gradient):
-            return super()._recursive(number, float("nan") if number > 200 else td_error, gradient)
+    class Broken(QLearning):
+        def observe(self, sample):
+            cost = float("nan") if sample.number > 200 else sample.cost
+            return super().observe(sample._replace(cost=cost))
 
     result = train(run, rule=Broken)
-    assert result.status.startswith("diverged: TD errors or gradients are not finite")
+    assert result.status.startswith("diverged: the step of θ is not finite")
     assert result.rows[-1]["samples"] == 220, "the row of the sample at which it broke"
     assert result.rows[-1]["greedy_J"] == result.evaluation["J"]
     assert not np.array_equal(result.parameters.theta, train_start(run))
 
 
-class Reporting(StepwiseQLearning):
+class Reporting(QLearning):
     """Behaves with one θ and hands over another; draws from the generator of its own."""
 
     def __init__(self, controller, *rest):
@@ -158,18 +153,13 @@ def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
 
 
-CONSTANT = {**SETTINGS["q-learning"], "gain": 0.1, "gain_end": 0.1}
-
-
-def constant_run(scenario, samples, **changes):
-    configuration = load_algorithm("q-learning").Configuration.from_dict(CONSTANT)
-    return make_run(scenario, "q-learning", samples=samples, configuration=configuration, **changes)
+FADING = load_algorithm("q-learning").Configuration(exploration_probability_end=0.1)
 
 
 def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
-    run = constant_run(scenario, 400)
+    run = make_run(scenario, "q-learning", samples=400)
     whole = train(run)
-    train(constant_run(scenario, 200), tmp_path)
+    train(make_run(scenario, "q-learning", samples=200), tmp_path)
     more = train(run, tmp_path, resume=True)
     assert to_csv(more.rows) == to_csv(whole.rows)
     assert np.array_equal(more.parameters.theta, whole.parameters.theta)
@@ -178,9 +168,15 @@ def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
 @pytest.mark.parametrize(
     ("first", "message"),
     [
-        (lambda s: make_run(s, "q-learning", samples=200), "gain would have gone another way"),
-        (lambda s: constant_run(s, 250), "between two multiples of evaluate_every = 100"),
-        (lambda s: constant_run(s, 500), "cannot be made a run of 400"),
+        (
+            lambda s: make_run(s, "q-learning", samples=200, configuration=FADING),
+            "exploration_probability would have gone another way",
+        ),
+        (
+            lambda s: make_run(s, "q-learning", samples=250),
+            "between two multiples of evaluate_every = 100",
+        ),
+        (lambda s: make_run(s, "q-learning", samples=500), "cannot be made a run of 400"),
     ],
 )
 def test_a_run_that_began_otherwise_is_given_no_more_samples(scenario, tmp_path, first, message):

@@ -5,7 +5,7 @@ import pytest
 SHORT = (
     "train", "-a", "q-learning", "-n", 200, "--log-every", 50, "--evaluate-every", 100,
     "--checkpoint-every", 100, "--evaluation-seeds", 1, "--evaluation-steps", 30,
-    "--set", "rule=gauss-newton", "--set", "warm_up=20",
+    "--set", "prior_samples=20", "--set", "step_every=20",
 )  # fmt: skip
 
 
@@ -15,7 +15,7 @@ def test_train_writes_theta_log_and_summary(cosim, tmp_path):
     summary = json.loads(out)
     assert summary == json.loads((tmp_path / "run/summary.json").read_text())
     assert {"economic_cost", "mean_violation", "violating_share", "J", "failures"} <= set(summary)
-    assert summary["hyperparameters"]["warm_up"] == 20
+    assert summary["hyperparameters"]["prior_samples"] == 20
     assert (summary["status"], summary["samples"], summary["seed"]) == ("finished", 200, 5)
     log = (tmp_path / "run/learning.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in log] == ["samples", "50", "100", "150", "200"]

@@ -1,0 +1,450 @@
+"""A step of θ: the fit that a rule proposes, the constraints on θ, and the prior's coordinates.
+
+Every rule proposes min_d dᵀMd − 2bᵀd in scaled coordinates d = (θ̄ − θ) / scale (`Fit`). Its free
+minimiser is all that most steps need; M is built only where a constraint asks for it.
+`ConstrainedStep` moves the controller's θ by it. `prior_deviation` says how far each entry of θ may
+be from where it starts, without units of any plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from controllers import sdp
+from controllers.parameters import Parameters
+from controllers.theta import ThetaBlocks
+from learning.algorithm import LearnableController, Update
+from learning.configuration import Configuration
+from learning.errors import DefinitenessError, DivergenceError
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+HESSIANS = ("B_l", "B_Vf")
+LEVEL = 0.16
+"""Width of c_lambda as a share of V's level, which is all that it carries."""
+OFFSET = 0.02
+"""Width of c_f in standard deviations of e: its mean is measured, the TD error need not say it."""
+BACK_OFF = 2.0
+"""Width of x_l and x_u in standard deviations of e."""
+SLOW = 0.3
+"""A slow state moves by this share of its standard deviation where that is more than e's."""
+GRADIENT = 0.3
+"""Width of a cost gradient as a share of the start's, where that is more than a shift's."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The problem min_d dᵀMd − 2bᵀd.
+
+    `gradient` is b (n,), `minimiser` M⁻¹b (n,), `metric()` M (n, n). `reach(d)` says how far a
+    step goes, as a multiple of the cap or trust region that the fit keeps: a step that a constraint
+    on θ corrects must still have at most 1.
+    """
+
+    gradient: Vector
+    minimiser: Vector
+    metric: Callable[[], Matrix]
+    reach: Callable[[Vector], float] | None = None
+
+    def shrunk(self, factor: float) -> Fit:
+        """The fit whose minimiser is `factor` times this one's, with the same metric."""
+        if factor == 1.0:
+            return self
+        return replace(self, gradient=factor * self.gradient, minimiser=factor * self.minimiser)
+
+    def within(self, radius: float, size: Callable[[Vector], float]) -> Fit:
+        """The fit whose minimiser is this one's, shortened to `size(d)` ≤ `radius`, same metric.
+
+        `size` must be a norm of the step.
+        """
+
+        def reach(step: Vector) -> float:
+            return size(step) / radius
+
+        return replace(self.shrunk(1.0 / max(1.0, reach(self.minimiser))), reach=reach)
+
+
+def td_fit(td_error: float, gradient: Vector, step_size: float) -> Fit:
+    """Fit of one transition, min (δ − ∇Qᵀd)² + ‖d‖²/α, in closed form d = αδ∇Q/(1+α‖∇Q‖²).
+
+    `td_error` δ, `gradient` ∇Q (n,) in scaled coordinates, `step_size` α (paper.tex, eq.
+    q_learning_fitting with Q_lin = Q + ∇Qᵀ(θ̄−θ)).
+    """
+    weight = step_size * td_error / (1.0 + step_size * float(gradient @ gradient))
+    return Fit(
+        gradient=td_error * gradient,
+        minimiser=weight * gradient,
+        metric=lambda: np.outer(gradient, gradient) + np.eye(gradient.size) / step_size,
+    )
+
+
+def td_step(td_error: float, gradient: Vector, step_size: float) -> Fit:
+    """The recursion θ ← θ + αδ∇Q as the fit min ‖d‖²/α − 2δ∇Qᵀd (paper.tex, eq. Qlearning)."""
+    return Fit(
+        gradient=td_error * gradient,
+        minimiser=step_size * td_error * gradient,
+        metric=lambda: np.eye(gradient.size) / step_size,
+    )
+
+
+def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix | None = None) -> Fit:
+    """Fit min ∇Jᵀd + dᵀFd/α (paper.tex, eq. pg_solution), d = −α F⁻¹∇J / 2.
+
+    `gradient` ∇J (n,) in scaled coordinates; `metric` F (n, n), positive definite, is the identity
+    for the plain gradient and the Fisher matrix E[∇π ∇πᵀ] for the natural one.
+    """
+    half = -gradient / 2
+    if metric is None:
+        return Fit(half, step_size * half, lambda: np.eye(gradient.size) / step_size)
+    minimiser = step_size * cho_solve(cho_factor(metric), half)
+    return Fit(half, minimiser, lambda: metric / step_size)
+
+
+def line_search(error: Callable[[float], float], *, shrink: float = 0.5, trials: int = 8) -> float:
+    """Largest of the steps 1, β, β², … that does not raise |TD error|, else 0.
+
+    `error(t)` is the TD error with the fit's step scaled by t, its target held (paper.tex, after
+    eq. q_solution); it may be NaN where the QP fails, which counts as a rise.
+    """
+    start = abs(error(0.0))
+    step = 1.0
+    for _ in range(trials):
+        if abs(error(step)) <= start:
+            return step
+        step *= shrink
+    return 0.0
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What vouches for a step: `eigenvalues`, the least of each Hessian block after it, by block.
+
+    `corrected` says that the free step would have violated the constraint, `refused` that no
+    admissible step was found and θ stays.
+    """
+
+    eigenvalues: dict[str, float]
+    corrected: bool = False
+    refused: bool = False
+
+    @property
+    def smallest(self) -> float:
+        """Least eigenvalue of all blocks."""
+        return min(self.eigenvalues.values())
+
+
+def certificate(
+    blocks: ThetaBlocks, theta: Vector, *, corrected: bool = False, refused: bool = False
+) -> Certificate:
+    """Least eigenvalue of B_l and B_Vf at θ."""
+    return Certificate(
+        {name: float(np.linalg.eigvalsh(matrix_of(blocks, theta, name))[0]) for name in HESSIANS},
+        corrected,
+        refused,
+    )
+
+
+def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
+    """Symmetric block `name` of θ, in its own unit."""
+    block = blocks.block(name)
+    return block.unpack(theta[blocks.slices[name]] / block.packed_unit)
+
+
+class LinearMatrixInequality:
+    """The fit's own minimiser under B ⪰ εI, by Clarabel where the free minimiser violates it.
+
+    min dᵀMd − 2bᵀd  s.t.  B_l(θ+Sd) ⪰ εI, B_Vf(θ+Sd) ⪰ εI with scaled steps d (S = diag scale):
+    a quadratic programme over positive semidefinite cones (paper.tex, eq. q_solution, pg_solution).
+    """
+
+    def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
+        self._blocks, self._smallest = blocks, smallest
+        self._rows = {name: sdp.svec_order(blocks.block(name).dimension) for name in HESSIANS}
+
+    def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
+        """Step of the constrained fit; a failure of the solver refuses the step."""
+        blocks = self._blocks
+        free = theta + blocks.scale * fit.minimiser
+        found = certificate(blocks, free)
+        if found.smallest >= self._smallest:
+            return free, found
+        step = self.solve(theta, fit)
+        if step is None:
+            return theta, certificate(blocks, theta, corrected=True, refused=True)
+        # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
+        theta = clip_eigenvalues(blocks, theta + blocks.scale * step, self._smallest)
+        return theta, certificate(blocks, theta, corrected=True)
+
+    def solve(self, theta: Vector, fit: Fit) -> Vector | None:
+        """Scaled step of the constrained fit by the conic solver, (n,), or None where it fails."""
+        blocks = self._blocks
+        size = blocks.size
+        matrices, offsets, cones = [], [], []
+        for name in HESSIANS:
+            block, where = blocks.block(name), blocks.slices[name]
+            order, weight = self._rows[name]
+            shifted = matrix_of(blocks, theta, name) - self._smallest * np.eye(block.dimension)
+            scale = blocks.scale[where] / block.packed_unit
+            rows = np.zeros((block.size, size))
+            rows[np.arange(block.size), where.start + order] = -weight * scale[order]
+            matrices.append(rows)
+            offsets.append(weight * block.pack(shifted)[order])
+            cones.append(sdp.semidefinite(block.dimension))
+        # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
+        metric = fit.metric()
+        unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
+        return sdp.solve(
+            2 * metric / unit,
+            -2 * fit.gradient / unit,
+            np.vstack(matrices),
+            np.concatenate(offsets),
+            cones,
+        ).x
+
+
+class CholeskyParametrisation:
+    """The step taken in the factor L of B = LLᵀ + εI, so that B ≻ εI by construction.
+
+    dL is the change that reproduces the free step D of B to first order, dL Lᵀ + L dLᵀ = D:
+    dL = L Φ(X), X = L⁻¹ D L⁻ᵀ, where Φ takes the lower triangle and halves the diagonal. To first
+    order means little where ‖X‖₂ > 1, where the free step would double B or lose it: the block's
+    step is shortened to ‖X‖₂ = 1 then.
+    """
+
+    FLOOR = 1e-9
+
+    def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
+        self._blocks, self._smallest = blocks, smallest
+
+    def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
+        """Move the factors; raises DefinitenessError where B(θ) ⪰ εI does not hold already."""
+        blocks = self._blocks
+        step = blocks.scale * fit.minimiser
+        result = theta + step
+        corrected = certificate(blocks, result).smallest < self._smallest
+        for name in HESSIANS:
+            block, where = blocks.block(name), blocks.slices[name]
+            shift = (self._smallest - self.FLOOR) * np.eye(block.dimension)
+            try:
+                factor = np.linalg.cholesky(matrix_of(blocks, theta, name) - shift)
+            except np.linalg.LinAlgError as error:
+                raise DefinitenessError(
+                    f"θ block {name} does not have all eigenvalues above {self._smallest}; "
+                    "choose a smaller smallest_eigenvalue or start from another θ"
+                ) from error
+            unit = block.packed_unit
+            inner = solve_triangular(factor, block.unpack(step[where] / unit), lower=True)
+            inner = solve_triangular(factor, inner.T, lower=True)
+            inner /= max(1.0, float(np.linalg.norm(inner, 2)))
+            lower = np.tril(inner)
+            np.fill_diagonal(lower, np.diag(inner) / 2)
+            moved = factor + factor @ lower
+            matrix = moved @ moved.T + self._smallest * np.eye(block.dimension)
+            result[where] = unit * block.pack((matrix + matrix.T) / 2)
+        return result, certificate(blocks, result, corrected=corrected)
+
+
+def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vector:
+    """Copy of θ whose Hessian blocks have no eigenvalue below `smallest`."""
+    theta = theta.copy()
+    for name in HESSIANS:
+        matrix = matrix_of(blocks, theta, name)
+        values, vectors = np.linalg.eigh(matrix)
+        if values[0] < smallest:
+            # Rounding of the product must not take the last digits back.
+            values = np.maximum(values, smallest * (1 + 1e-9))
+            matrix = (vectors * values) @ vectors.T
+            block = blocks.block(name)
+            theta[blocks.slices[name]] = block.packed_unit * block.pack((matrix + matrix.T) / 2)
+    return theta
+
+
+class ConstrainedStep:
+    """Moves a controller's θ by a fit under every constraint on θ.
+
+    `scale` (n_θ,) are the coordinates of the fits: the layout's, or ones where the configuration
+    says `scaled = false`, or `scale` where it is given. The least eigenvalue that the Hessians may
+    have is the configuration's, or half of the start's where that is less: an economically tuned
+    cost is flat. Raises DivergenceError on a step that is not finite.
+    """
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        configuration: Configuration,
+        *,
+        scaled: bool = True,
+        scale: Vector | None = None,
+    ) -> None:
+        self._controller = controller
+        blocks = controller.parameters.blocks
+        if scale is not None:
+            self.blocks = rescaled(blocks, scale)
+        else:
+            self.blocks = blocks if scaled else rescaled(blocks, np.ones(blocks.size))
+        self.scale: Vector = self.blocks.scale
+        kind = (
+            CholeskyParametrisation
+            if configuration.definiteness == "cholesky"
+            else LinearMatrixInequality
+        )
+        self._enforce = kind(self.blocks, least_eigenvalue(configuration, controller.parameters))
+        self._least = {block.name: np.array(block.least) for block in blocks if block.least}
+        if (chosen := configuration.slack_linear_minimum) is not None and "w_sigma" in blocks:
+            self._least["w_sigma"] = np.full(blocks.block("w_sigma").size, chosen)
+
+    def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
+        """The new θ that a fit leads to, and its certificate; the controller stays as it is.
+
+        A step that definiteness corrects beyond the fit's cap or trust region is scaled back: the
+        θ with definite Hessians are a convex set, in which the whole way lies.
+        """
+        theta = self._controller.theta
+        if not np.isfinite(fit.minimiser).all():
+            raise DivergenceError("the step of θ is not finite")
+        new, vouched = self._enforce(theta, fit)
+        new = self._admissible(new)
+        reach = 0.0 if fit.reach is None else fit.reach((new - theta) / self.scale)
+        if reach > 1.0:
+            new = theta + (new - theta) / reach
+            vouched = replace(certificate(self.blocks, new), corrected=vouched.corrected)
+        lower, upper = self.blocks.slices["x_l"], self.blocks.slices["x_u"]
+        if not (new[lower] < new[upper]).all():
+            return theta, replace(certificate(self.blocks, theta), corrected=True, refused=True)
+        return new, vouched
+
+    def take(self, fit: Fit, td_error: float) -> Update:
+        """Set the controller's θ to the fit's proposal and say what happened."""
+        old = self._controller.theta
+        new, vouched = self.proposal(fit)
+        self._controller.theta = new
+        return Update(
+            td_error=td_error,
+            step=float(np.linalg.norm((new - old) / self.scale)),
+            smallest_eigenvalue=vouched.smallest,
+            corrected=vouched.corrected,
+            refused=vouched.refused,
+        )
+
+    def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
+        """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), and say so.
+
+        Nearest in the scaled coordinates where definiteness is kept by the LMI.
+        """
+        step = (theta - self._controller.theta) / self.scale
+        return self.take(Fit(step, step, lambda: np.eye(step.size)), td_error)
+
+    def _admissible(self, theta: Vector) -> Vector:
+        """Keep learned slack weights above what exactness (linear) and convexity ask for."""
+        if not self._least:
+            return theta
+        theta = theta.copy()
+        for name, minimum in self._least.items():
+            where = self.blocks.slices[name]
+            theta[where] = np.maximum(theta[where], minimum)
+        return theta
+
+
+def least_eigenvalue(configuration: Configuration, start: Parameters) -> float:
+    """ε of B ⪰ εI for a run that begins at `start`."""
+    own = certificate(start.blocks, start.theta).smallest
+    chosen = configuration.smallest_eigenvalue
+    return min(chosen, own / 2) if own > 0 else chosen
+
+
+def rescaled(blocks: ThetaBlocks, scale: Vector) -> ThetaBlocks:
+    """The blocks with another learning scale, (n_θ,)."""
+    return ThetaBlocks(
+        tuple(
+            replace(block, scale=tuple(scale[blocks.slices[block.name]].tolist()))
+            for block in blocks
+        )
+    )
+
+
+def prior_deviation(
+    start: Parameters,
+    state_deviation: Vector,
+    error_deviation: Vector,
+    action_deviation: Vector,
+    level: float,
+    width: float,
+) -> Vector:
+    """Standard deviation of each entry of θ about its start, (n_θ,).
+
+    With B a Hessian of the start and D = diag(B)^½: entries of B get `width`·D_i D_j, so that a
+    change keeps B's proportions; gradients `width`·D_i √κ, a shift of the minimum that costs about
+    κ = max_i B_ii σ_i², the dearest typical move, or a share of the gradient that is there. λ_θ,
+    which the policy does not feel, is as wide as V^f_θ or as its own start. Bounds get
+    2·width/0.3 deviations of e, or of a slow state's movement; c_f little, since the mean of e says
+    what it must be; slack weights `width` of themselves. `state_deviation` and `error_deviation`
+    (n,), `action_deviation` (m,) are σ of s, e and the exploration, `level` the size of c_lambda.
+    """
+    move = np.concatenate([np.maximum(state_deviation, error_deviation), action_deviation])
+    stage, terminal = _root_diagonal(start["B_l"]), _root_diagonal(start["B_Vf"])
+    initial = np.maximum(terminal, np.sqrt(np.abs(np.diag(start["B_lambda"]))))
+    dearest = float((stage * move).max())
+    bound = BACK_OFF * width / 0.3 * np.maximum(error_deviation, SLOW * state_deviation)
+    widths = {
+        "B_lambda": width * _packed(initial),
+        "b_lambda": width * np.maximum(terminal * dearest, np.abs(start["b_lambda"])),
+        "c_lambda": np.array([LEVEL * abs(level)]),
+        "B_Vf": width * _packed(terminal),
+        "b_Vf": width * np.maximum(terminal * dearest, GRADIENT * np.abs(start["b_Vf"])),
+        "B_l": width * _packed(stage),
+        "b_l": width * np.maximum(stage * dearest, GRADIENT * np.abs(start["b_l"])),
+        "c_f": OFFSET * error_deviation,
+        "x_l": bound,
+        "x_u": bound,
+    }
+    for name in ("w_sigma", "W_sigma", "p"):
+        if name in start.blocks:
+            widths[name] = width * np.abs(start[name])
+    floor = np.finfo(np.float64).tiny ** 0.25
+    deviation: Vector = np.concatenate([widths[block.name] for block in start.blocks])
+    return np.maximum(deviation, floor)
+
+
+def measured_prior(
+    start: Parameters,
+    states: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    action_deviation: Vector,
+    noise: float,
+    width: float,
+    *,
+    measure_offset: bool,
+) -> tuple[Parameters, Vector]:
+    """Mean and deviation (n_θ,) of the prior by the first samples' states and errors e, (K, n).
+
+    The mean is the start, with `measure_offset` c_f at the mean of e.
+    `noise` is the standard deviation of the TD errors, which c_lambda's level is not below.
+    """
+    if measure_offset:
+        start = start.replace({"c_f": errors.mean(axis=0)})
+    level = max(abs(float(start["c_lambda"])), noise)
+    deviation = prior_deviation(
+        start,
+        states.std(axis=0),
+        errors.std(axis=0),
+        action_deviation,
+        level,
+        width,
+    )
+    return start, deviation
+
+
+def _root_diagonal(matrix: NDArray[np.float64]) -> Vector:
+    root: Vector = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    return root
+
+
+def _packed(root: Vector) -> Vector:
+    """D_i D_j of the upper triangle, row by row."""
+    triangle: Vector = np.outer(root, root)[np.triu_indices(root.size)]
+    return triangle

@@ -1,0 +1,392 @@
+"""The plan of the search on plants whose costs are known: no model, no controller, no rule."""
+
+import numpy as np
+import pytest
+
+from controllers.parameters import Parameters
+from learning.search_plan import (
+    Block,
+    Learn,
+    Learned,
+    LineSearch,
+    PairedComparison,
+    SearchPlan,
+    Settle,
+    Spent,
+    Trial,
+)
+
+BLOCKS = 8
+
+
+class Plant:
+    """Answers with the block costs of each θ, known by the value of c_lambda; counts blocks."""
+
+    def __init__(self, start, costs):
+        self.where = start.blocks.slices["c_lambda"]
+        self.costs, self.episodes, self.run, self.block = costs, [], {}, 0
+
+    def drive(self, plan):
+        """What a generator of requests returns once each has been answered."""
+        try:
+            request = next(plan)
+            while True:
+                request = plan.send(self.answer(request))
+        except StopIteration as end:
+            return end.value
+
+    def answer(self, request):
+        name = float(request.theta[self.where][0])
+        if isinstance(request, Settle):
+            self.episodes.append(request.episode)
+            cost = 0.0
+        else:
+            self.block = 0 if request.begins else self.block + 1
+            cost = self.costs[name][self.block]
+            self.run[name] = self.run.get(name, 0) + 1
+        return Block(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
+
+
+@pytest.fixture
+def start(problem):
+    return Parameters.naive(problem, value_offset=1.0)
+
+
+@pytest.fixture
+def rival(start):
+    return start.replace({"c_lambda": 2.0}).theta
+
+
+def comparison(scenario, start, samples=10_000):
+    return PairedComparison(scenario, start, samples, block=100, blocks=BLOCKS)
+
+
+def settled(scenario, start, costs):
+    plant, made = Plant(start, costs), comparison(scenario, start)
+    plant.drive(made.renew(BLOCKS))
+    return plant, made
+
+
+def test_a_winner_has_run_all_blocks(scenario, start, rival):
+    noise = np.arange(BLOCKS) * 5.0
+    plant, made = settled(scenario, start, {1.0: 100.0 + noise, 2.0: 99.0 + noise})
+    assert plant.drive(made.compare(rival))
+    assert np.array_equal(made.incumbent.theta, rival)
+    assert plant.run[2.0] == BLOCKS
+    assert made.spent == 100 * (1 + 2 * BLOCKS)
+
+
+def test_a_loser_is_given_up_at_once(scenario, start, rival):
+    plant, made = settled(scenario, start, {1.0: [100.0] * BLOCKS, 2.0: [101.0] + [0.0] * 7})
+    assert not plant.drive(made.compare(rival))
+    assert np.array_equal(made.incumbent.theta, start.theta)
+    assert plant.run[2.0] == 1
+
+
+def test_patience_lets_a_rival_mend_what_it_was_left_with(scenario, start, rival):
+    """As a θ must that begins where another one let a slow state drift to."""
+    drifting, mending = 100.0 + 10.0 * np.arange(BLOCKS), 110.0 - 5.0 * np.arange(BLOCKS)
+    plant, made = settled(scenario, start, {1.0: drifting, 2.0: mending})
+    assert not plant.drive(made.compare(rival))
+    assert plant.drive(made.compare(rival, patient=True))
+
+
+def test_patience_ends_where_the_blocks_spread_cannot_explain_the_loss(scenario, start, rival):
+    plant, made = settled(scenario, start, {1.0: 100.0 + np.arange(BLOCKS), 2.0: [1e6] * BLOCKS})
+    assert not plant.drive(made.compare(rival, patient=True))
+    assert plant.run[2.0] == 1
+
+
+def test_the_last_digits_win_nothing(scenario, start, rival):
+    costs = {1.0: [6000.0] * BLOCKS, 2.0: [6000.0 - 1e-10] * BLOCKS}
+    plant, made = settled(scenario, start, costs)
+    assert not plant.drive(made.compare(rival))
+    assert plant.drive(made.screen(rival, made.incumbent.costs)) is None
+
+
+def test_a_gain_within_its_standard_error_wins_nothing(scenario, start, rival):
+    draws = np.array([-9.0, 8.0, -9.0, 8.0, -9.0, 8.0, -9.0, 8.0])
+    plant, made = settled(scenario, start, {1.0: [100.0] * BLOCKS, 2.0: 100.0 + draws})
+    assert not plant.drive(made.compare(rival))
+    assert plant.run[2.0] == BLOCKS
+
+
+def test_a_screening_gives_the_costs_of_what_wins_it(scenario, start, rival):
+    plant, made = settled(scenario, start, {1.0: [100.0] * BLOCKS, 2.0: [90.0] * BLOCKS})
+    costs = plant.drive(made.screen(rival, made.incumbent.costs[:2]))
+    assert costs == pytest.approx([90.0, 90.0])
+    assert np.array_equal(made.incumbent.theta, start.theta), "screening decides nothing"
+
+
+def test_the_final_leaves_the_cheapest_and_begins_anew(scenario, start, rival):
+    third = start.replace({"c_lambda": 3.0}).theta
+    costs = {1.0: 100.0 + np.arange(BLOCKS), 2.0: [1e6] * BLOCKS, 3.0: [99.0] * BLOCKS}
+    plant, made = Plant(start, costs), comparison(scenario, start)
+    plant.drive(made.final([rival, third], BLOCKS, 17))
+    assert plant.episodes == [17]
+    assert np.array_equal(made.incumbent.theta, third)
+    assert plant.run[2.0] == 1, "given up where it cannot win any more"
+
+
+def test_the_budget_is_kept(scenario, start, rival):
+    made = comparison(scenario, start, samples=100 * (1 + BLOCKS) + 250)
+    plant = Plant(start, {1.0: [100.0] * BLOCKS, 2.0: [90.0] * BLOCKS})
+    plant.drive(made.renew(BLOCKS))
+    with pytest.raises(Spent):
+        plant.drive(made.compare(rival))
+    assert made.spent == made.limit - 50
+    assert np.array_equal(made.incumbent.theta, start.theta)
+
+
+@pytest.mark.parametrize(
+    ("block", "value"), [("x_l", [101.0, 40.0]), ("x_u", [24.0, 80.0]), ("b_l", [np.nan, 0, 0, 0])]
+)
+def test_a_theta_that_no_controller_takes_is_not_tried(scenario, start, block, value):
+    made = comparison(scenario, start)
+    theta = start.theta.copy()
+    theta[start.blocks.slices[block]] = value
+    assert made.admissible(theta) is None
+
+
+def test_the_final_leaves_the_start_only_for_what_is_cheaper_by_a_standard_error(
+    scenario, start, rival
+):
+    lucky = np.where(np.arange(BLOCKS) == 0, -2.0, 0.25)
+    for gain, leaves in ((lucky, False), (np.full(BLOCKS, -1.0), True)):
+        plant, made = settled(scenario, start, {1.0: [100.0] * BLOCKS, 2.0: 100.0 + gain})
+        plant.drive(made.final([rival], BLOCKS, 17))
+        assert np.array_equal(made.incumbent.theta, rival if leaves else start.theta)
+
+
+class Bowl:
+    """A plant whose cost wants a back-off of X2 that depends on the inputs' weights.
+
+    6300 + 40 (x_l − 25 − 2.5 − log₁₀ r)² + 10 (log₁₀ r − log₁₀ r*)², r the weight of P100.
+    """
+
+    def __init__(self, start, best):
+        self.start, self.best = start, best
+
+    def cost(self, theta):
+        parameters = self.start.with_theta(theta)
+        decades = np.log10(parameters["B_l"][2, 2])
+        back_off = parameters["x_l"][0] - 27.5 - decades
+        return 6300.0 + 40.0 * back_off**2 + 10.0 * (decades - np.log10(self.best)) ** 2
+
+    def drive(self, plan):
+        try:
+            request = next(plan)
+            while True:
+                cost = 0.0 if isinstance(request, Settle) else self.cost(request.theta)
+                request = plan.send(Block(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None))
+        except StopIteration as end:
+            return end.value
+
+
+@pytest.fixture
+def far(problem):
+    naive = Parameters.naive(problem, value_offset=6e5)
+    return naive.replace({"x_l": naive["x_l"] + [2.5, 0.0], "b_l": [1.0, -2.0, 30.0, 4.0]})
+
+
+@pytest.fixture
+def lines(scenario, far):
+    comparison = PairedComparison(scenario, far, 100_000, block=100, blocks=BLOCKS)
+    lines = LineSearch(comparison, far, 2, np.random.default_rng(0))
+    return comparison, lines
+
+
+def minimiser(parameters):
+    return np.linalg.solve(parameters["B_l"], parameters["b_l"])
+
+
+def test_the_inputs_weights_are_found_each_with_its_own_back_off(lines, far):
+    """With the back-off of before, a tenth of the weight would cost more: 30 > 0."""
+    comparison, lines = lines
+    plant = Bowl(far, 1e-2)
+    same = lines._weighted(0.1)
+    assert plant.cost(same) > plant.cost(far.theta)
+    plant.drive(comparison.renew(BLOCKS))
+    assert plant.drive(lines.rescale(-1.0)) == -1.0
+    found = far.with_theta(comparison.incumbent.theta)
+    assert np.diag(found["B_l"]) == pytest.approx([1.0, 1.0, 1e-2, 1e-2])
+    assert found["x_l"][0] == pytest.approx(25.5, abs=0.5)
+    assert minimiser(found) == pytest.approx(minimiser(far))
+    assert 0 < comparison.least < 1e-2, "smaller weights are admissible from now on"
+
+
+def test_weights_that_do_not_pay_leave_all_as_it_was(lines, far):
+    comparison, lines = lines
+    plant, least = Bowl(far, 1.0), comparison.least
+    plant.drive(comparison.renew(BLOCKS))
+    assert plant.drive(lines.rescale(-1.0)) == pytest.approx(0.7), "shorter, the other way"
+    assert np.array_equal(comparison.incumbent.theta, far.theta)
+    assert comparison.least == least
+
+
+def test_a_line_is_searched_both_ways_in_steps_that_double(lines, far):
+    comparison, lines = lines
+    plant = Bowl(far.replace({}), 1.0)
+    # From 2.5 too high: the first way is the wrong one.
+    high = far.replace({"x_l": far["x_l"] + [2.5, 0.0]})
+    comparison.incumbent.theta = high.theta
+    plant.drive(comparison.renew(BLOCKS))
+    reach = plant.drive(lines.along(lines.tightening(), 1.0))
+    assert reach > 1.0
+    assert plant.cost(comparison.incumbent.theta) < 0.4 * (plant.cost(high.theta) - 6300.0) + 6300.0
+
+
+def test_one_state_is_backed_off_alone(lines, far):
+    _, lines = lines
+    moved = {far.blocks.labels[i] for i in np.flatnonzero(lines.tightening(1))}
+    assert moved == {"x_l[1]", "x_u[1]"}
+    assert np.count_nonzero(lines.tightening()) == 4
+
+
+SAMPLES = 20_000
+
+
+def search(scenario, problem, samples=SAMPLES):
+    start = Parameters.naive(problem, value_offset=6e5)
+    return SearchPlan(
+        scenario, start, np.array([10.0, 10.0]), samples, 7, phase=1000, block=100, blocks=8
+    )
+
+
+class Quadratic:
+    """A plant whose mean cost is ‖(θ−θ*)/σ‖² on some entries, with noise common to a round."""
+
+    def __init__(self, scenario, start, *, noise=5.0, learner=None, seed=0):
+        self.scenario, self.blocks = scenario, start.blocks
+        self.rng = np.random.default_rng(seed)
+        self.best = start.replace({"x_l": start["x_l"] + [2.4, 0.0]}).theta.copy()
+        self.best[start.blocks.slices["b_l"]] = [3.0, 0.0, -20.0, 10.0]
+        self.noise, self.learner = noise, learner or (lambda theta, width: theta)
+        self.samples, self.rounds, self.tried = 0, 0, []
+
+    def cost(self, theta):
+        slices = self.blocks.slices
+        bound = theta[slices["x_l"]] - self.best[slices["x_l"]]
+        slope = (theta[slices["b_l"]] - self.best[slices["b_l"]]) / 10.0
+        return 6300.0 + 30.0 * float(bound @ bound) + 10.0 * float(slope @ slope)
+
+    def answer(self, request):
+        if isinstance(request, Learn):
+            self.samples += request.samples
+            candidate = self.learner(request.theta, request.width)
+            errors = self.rng.uniform(-1, 1, size=(500, 2)) * [2.0, 0.2]
+            return Learned(candidate[None, :], errors, np.array([1.6, 1.5]), errors.std(axis=0))
+        self.samples += 100
+        if isinstance(request, Settle):
+            self.rounds += 1
+            self.draws = np.random.default_rng(self.rounds).normal(size=1000)
+        elif request.begins:
+            self.block = 0
+        metric = None
+        if isinstance(request, Trial):
+            self.tried.append(request.theta)
+            self.block += 1
+            if request.sensitive:
+                jacobian = np.zeros((2, request.theta.size))
+                where = self.blocks.slices["b_l"]
+                jacobian[0, where.stop - 2] = jacobian[1, where.stop - 1] = -0.05
+                metric = jacobian.T @ jacobian
+        draw = self.noise * self.draws[getattr(self, "block", 0)]
+        far = np.full((100, 2), 60.0)
+        return Block(self.cost(request.theta) + draw, 0.0, far, np.zeros((100, 2)), metric)
+
+
+def run(search, plant):
+    plan, results = search.plan(), []
+    request = next(plan)
+    while True:
+        result = plant.answer(request)
+        results.append(result)
+        try:
+            request = plan.send(result)
+        except StopIteration:
+            return results
+
+
+def test_line_searches_alone_come_near_the_best(scenario, problem):
+    sought = search(scenario, problem, 40_000)
+    plant = Quadratic(scenario, sought._start)
+    before = plant.cost(sought._start.theta)
+    run(sought, plant)
+    assert plant.cost(sought.comparison.incumbent.theta) - 6300.0 < 0.05 * (before - 6300.0)
+
+
+def test_the_samples_are_counted_and_never_exceeded(scenario, problem):
+    sought = search(scenario, problem)
+    plant = Quadratic(scenario, sought._start)
+    run(sought, plant)
+    # The last race ends early where nothing comes near the incumbent.
+    assert 0.9 * (1 - sought.FINAL) * SAMPLES < plant.samples <= SAMPLES
+    assert plant.samples == sought.comparison.spent
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rule_that_only_does_harm_loses_nothing(scenario, problem, seed):
+    sought = search(scenario, problem)
+    rng = np.random.default_rng(seed)
+
+    def harm(theta, width):
+        return theta + width * rng.normal(size=theta.size)
+
+    plant = Quadratic(scenario, sought._start, learner=harm, seed=seed)
+    sought.comparison.incumbent.theta = plant.best.copy()
+    sought._start = sought._start.with_theta(plant.best)
+    run(sought, plant)
+    assert plant.cost(sought.comparison.incumbent.theta) < 6300.0 + 0.1
+
+
+def test_what_is_reported_has_won_and_every_win_is_counted(scenario, problem):
+    sought = search(scenario, problem, 40_000)
+    plant = Quadratic(scenario, sought._start, noise=0.0)
+    plan, incumbent = sought.plan(), sought.comparison.incumbent.theta
+    request, costs, changes = next(plan), [plant.cost(incumbent)], 0
+    while True:
+        try:
+            request = plan.send(plant.answer(request))
+        except StopIteration:
+            break
+        changes += not np.array_equal(incumbent, sought.comparison.incumbent.theta)
+        incumbent = sought.comparison.incumbent.theta
+        costs.append(plant.cost(incumbent))
+    assert changes == sought.comparison.accepted > 3
+    assert (np.diff(costs) <= 0).all(), "without noise no winner is dearer than what it beat"
+
+
+def test_a_rule_that_knows_the_way_is_followed(scenario, problem):
+    sought = search(scenario, problem, 4000)
+    plant = Quadratic(scenario, sought._start)
+    plant.learner = lambda theta, width: plant.best
+    run(sought, plant)
+    assert plant.cost(sought.comparison.incumbent.theta) == pytest.approx(6300.0, abs=0.1)
+
+
+def test_the_same_results_lead_to_the_same_plan(scenario, problem):
+    first, second = search(scenario, problem), search(scenario, problem)
+    results = run(first, Quadratic(scenario, first._start))
+    plan = second.plan()
+    next(plan)
+    for result in results[:-1]:
+        plan.send(result)
+    with pytest.raises(StopIteration):
+        plan.send(results[-1])
+    assert np.array_equal(first.comparison.incumbent.theta, second.comparison.incumbent.theta)
+
+
+def test_only_admissible_theta_are_tried(scenario, problem):
+    sought = search(scenario, problem)
+
+    def wild(theta, width):
+        theta = theta.copy()
+        theta[sought._start.blocks.slices["B_l"]] = -5.0
+        return theta
+
+    plant = Quadratic(scenario, sought._start, learner=wild)
+    run(sought, plant)
+    for theta in plant.tried:
+        matrix = sought._start.with_theta(theta)["B_l"]
+        assert np.linalg.eigvalsh(matrix)[0] > 0

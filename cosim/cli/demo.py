@@ -48,7 +48,8 @@ def demo(
         folder = open_folder(out)
         out_.note(scenario.description)
         backed_off = _train(scenario, "backoff", "tuned", BACKOFF_SAMPLES, seed, out_)
-        learnt = _train(scenario, "q-learning", "naive", samples, seed, out_)
+        settings = {"rule": "q-learning"}
+        learnt = _train(scenario, "search", "naive", samples, seed, out_, settings)
         trained = {BACKED_OFF: backed_off, LEARNT: learnt}
         runs = _simulate(scenario, _controllers(scenario, trained), steps, seed, out_)
         rows = _table(runs, trained)
@@ -75,7 +76,13 @@ def demo(
 
 
 def _train(
-    scenario: Scenario, algorithm: str, start: str, samples: int, seed: int, output: Output
+    scenario: Scenario,
+    algorithm: str,
+    start: str,
+    samples: int,
+    seed: int,
+    output: Output,
+    settings: Mapping[str, Any] = {},
 ) -> Training:
     from learning.training import train
 
@@ -85,6 +92,7 @@ def _train(
             algorithm,
             scenario,
             samples,
+            settings=settings,
             seed=seed,
             start=start,
             progress=_remark(scenario, progress),

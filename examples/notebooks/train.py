@@ -7,7 +7,8 @@ from learning import train
 
 SAMPLES = 20_000
 out = Path("notebook-train")
-training = train("q-learning", "fouled", samples=SAMPLES, seed=0, evaluate_every=1000)
+rule = {"rule": "q-learning"}
+training = train("search", "fouled", SAMPLES, seed=0, settings=rule, evaluate_every=1000)
 print(f"{training.status}: J = {training.J:.1f}, regret {100 * training.regret:.2f} %")
 
 # %% The learning curve: cost of training and of the greedy policy, violations, TD error, θ

@@ -22,7 +22,6 @@ REPETITIONS = 20
 SETTLING = 1000
 """Samples before the clock starts: warm-up of the rule, caches, and the naive θ's worst QPs."""
 EXPLORATION = {"exploration_probability": 0.3, "exploration_deviation": [10.0]}
-PLAIN = {"rule": "gauss-newton", "globalisation": "none", **EXPLORATION}
 INTERPRETER = "interpreter"
 
 
@@ -39,12 +38,10 @@ class Case(NamedTuple):
 
 
 CASES = (
-    Case("q-learning, Gauss–Newton", "q-learning", PLAIN, True),
-    Case("actor-critic, rule alone", "actor-critic", PLAIN, True),
-    Case("batch-q-learning, Gauss–Newton", "batch-q-learning", PLAIN, True),
-    Case("q-learning", "q-learning", {}, False),
-    Case("actor-critic", "actor-critic", {}, False),
-    Case("batch-q-learning", "batch-q-learning", {}, False),
+    Case("q-learning", "q-learning", EXPLORATION, True),
+    Case("actor-critic", "actor-critic", EXPLORATION, True),
+    Case("batch-q-learning", "batch-q-learning", EXPLORATION, True),
+    Case("search", "search", {}, False),
 )
 
 

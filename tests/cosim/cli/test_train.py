@@ -60,7 +60,7 @@ def test_the_regret_is_known_without_naming_the_optimum(cosim, tmp_path):
 
 
 def test_training_starts_from_tuned_and_from_a_file(cosim, tmp_path):
-    slow = (*SHORT, "--set", "gain=1e-3", "--set", "gain_end=1e-3")
+    slow = (*SHORT, "--set", "prior_width=1e-3")
     code, out, _ = cosim(*slow, "--start", "tuned", "--out", "one", "--json")
     assert code == 0 and json.loads(out)["start"] == "tuned"
     assert cosim(*slow, "--start", "one/parameters.toml", "--out", "two", "--json")[0] == 0
@@ -83,8 +83,8 @@ def test_explain_lists_every_hyperparameter(cosim):
     ("arguments", "message"),
     [
         (("-a", "q-lerning"), "did you mean 'q-learning'"),
-        (("-a", "q-learning", "--set", "gian=1"), "did you mean 'gain'"),
-        (("-a", "q-learning", "--set", "gain=2"), "gain"),
+        (("-a", "q-learning", "--set", "prior_widht=1"), "did you mean 'prior_width'"),
+        (("-a", "q-learning", "--set", "prior_width=-2"), "prior_width"),
         (("-a", "q-learning", "--resume"), "there is no checkpoint to resume from"),
         (("-a", "q-learning", "--controller", "mpc"), "no learnable controller 'mpc'"),
         (("-a", "q-learning", "--evaluate-every", "70"), "multiple of log_every"),

@@ -1,0 +1,104 @@
+"""README and docs/: every block runs, every link and every file that a page names is there."""
+
+import importlib
+import importlib.util
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tests.helpers.code_blocks import COVERED, FENCE, ROOT, Session, blocks, is_slow, pages
+
+PAGES = {str(page.relative_to(ROOT)): page for page in pages()}
+FOLDERS = "cosim|controllers|learning|fmus|tests|results|examples|benchmarks|docs"
+
+
+def parameters():
+    for name, page in PAGES.items():
+        if blocks(page):
+            yield pytest.param(page, id=name, marks=pytest.mark.slow if is_slow(page) else ())
+
+
+@pytest.mark.parametrize("page", list(parameters()))
+def test_the_page_does_what_it_says(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    session = Session(page, tmp_path)
+    before = set(sys.modules)
+    try:
+        for block in blocks(page):
+            session.follow(block)
+    finally:
+        # Modules that a page wrote are not those of the next page.
+        for name in set(sys.modules) - before:
+            if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+                del sys.modules[name]
+
+
+def test_no_fence_escapes_the_collector():
+    for name, page in PAGES.items():
+        fences = [line for line in page.read_text().splitlines() if line.startswith("```")]
+        assert len(fences) == 2 * len(FENCE.findall(page.read_text())), name
+
+
+def test_what_is_not_typed_is_on_a_page():
+    text = "".join(page.read_text() for page in pages())
+    assert [command for command in COVERED if f"$ {command}" not in text] == []
+
+
+def anchors(page):
+    """Anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_link_resolves(name):
+    page, missing = PAGES[name], []
+    for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", page.read_text()):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        known = anchors(target) if anchor and target.suffix == ".md" else {anchor}
+        if not target.exists() or anchor not in known:
+            missing.append(link)
+    assert missing == []
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_file_that_the_page_names_is_there(name):
+    named = re.findall(rf"(?<![\w/.])((?:{FOLDERS})/[\w./-]+\.\w+)", PAGES[name].read_text())
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_every_module_on_the_architectures_screen_is_there():
+    page, missing = (ROOT / "docs" / "architecture.md").read_text(), []
+    for line in page.split("```text")[2].split("```")[0].splitlines():
+        if not line.strip():
+            continue
+        package, names = re.match(r"(\S*) +(.+?) {2,}", line).groups()
+        for name in names.split():
+            path = f"{package}{name}".strip("/").replace("/", ".")
+            if importlib.util.find_spec(path) is None:
+                missing.append(path)
+    assert missing == []
+
+
+def test_every_module_of_the_reference_is_there():
+    text = "".join(page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md"))
+    for name in re.findall(r"^::: (\S+)$", text, re.MULTILINE):
+        importlib.import_module(name)
+    for package in ("fmus", "cosim", "controllers", "learning"):
+        module = importlib.import_module(package)
+        assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
+def test_every_page_is_in_the_navigation():
+    listed = set(re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert listed == {name.removeprefix("docs/") for name in PAGES} - {"README.md"}
+
+
+@pytest.mark.slow
+def test_the_site_builds_strictly(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)

@@ -9,21 +9,21 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
 from cosim.errors import RecordingError
-from cosim.files import write_atomically
-from cosim.guarded import end_guarded, start_guarded
+from cosim.files import replacing
+from cosim.processes import child_process
 from cosim.recording.read import telling_moment
 from cosim.recording.stream import SAMPLE, TIME
 
 LOOPBACK = "127.0.0.1"
 _NOWHERE = f"http://{LOOPBACK}:9"
 _PROXIES = ("http_proxy", "https_proxy", "all_proxy")
-_LOUD = ("FORCE_RERUN_ANALYTICS",)
 _NO_DRIVER = ("No graphics adapter", "Failed to get render context")
 
 
@@ -37,11 +37,8 @@ def open_viewer(path: str | Path) -> None:
     command = [*_viewer(), "--port", "auto", str(_existing(path))]
     if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
         raise RecordingError(f"no display to show {path} on; draw it with --png FILE instead")
-    viewer = start_guarded(command, env={"RUST_LOG": "warn"} | _silent())
-    try:
+    with child_process(command, env=_silent("warn")) as viewer:
         code = viewer.wait()
-    finally:
-        end_guarded(viewer)
     if code not in (0, 130):
         raise RecordingError(f"the viewer could not show {path}; its messages are above")
 
@@ -56,8 +53,8 @@ def render(
 ) -> None:
     """Draw a recording to a PNG without a screen, with the time cursor at `at`.
 
-    `at` is in seconds of the run, or a sample's number where there is no time (a training); without
-    it the cursor stands where there is most to see (`telling_moment`).
+    `at` is in seconds of the run, or a sample's number where there is no time (a training); default
+    is the worst violation of a run, or the end.
 
     Raises
     ------
@@ -69,27 +66,40 @@ def render(
     if at is None:
         at = telling_moment(path)
     deadline = time.monotonic() + timeout
-    with _headless(size, deadline) as client:
-        client.open(str(path.resolve()))
-        _wait(lambda: not client.get_state().loading, deadline, f"loading {path}")
-        if at is not None:
-            _set_cursor(client, at)
-        image = _settled(client, deadline)
-        for view in client.get_state().views:
-            for report in view.reports:
-                raise RecordingError(f"view '{view.name}' of {path}: {report.summary}")
     try:
-        write_atomically(png, image)
+        with replacing(png) as target:
+            target.write_bytes(_drawn(path, at, size, deadline))
     except OSError as error:
         raise RecordingError(f"cannot write {png}: {error.strerror}") from None
 
 
-def _set_cursor(client: ViewerClient, at: float) -> None:
-    timelines = {t.name for recording in client.get_state().recordings for t in recording.timelines}
-    if TIME in timelines:
-        client.set_time(TIME, duration=at, play_state="paused")
-    else:
-        client.set_time(SAMPLE, sequence=round(at), play_state="paused")
+def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float) -> bytes:
+    try:
+        with _headless(size, deadline) as client:
+            client.open(str(path.resolve()))
+            _wait(lambda: not client.get_state().loading, deadline, f"loading {path}")
+            recordings = client.get_state().recordings
+            known = {line.name for recording in recordings for line in recording.timelines}
+            if at is not None and TIME in known:
+                client.set_time(TIME, duration=at, play_state="paused")
+            elif at is not None:
+                client.set_time(SAMPLE, sequence=round(at), play_state="paused")
+            shots = [b"", client.take_screenshot()]
+
+            def unchanged() -> bool:
+                shots[:] = [shots[1], client.take_screenshot()]
+                return shots[0] == shots[1]
+
+            # Chunks are fetched after loading has ended: two pictures in a row must be equal.
+            _wait(unchanged, deadline, "drawing")
+            for view in client.get_state().views:
+                for report in view.reports:
+                    raise RecordingError(f"view '{view.name}' of {path}: {report.summary}")
+    except TimeoutError as error:
+        raise RecordingError(
+            "the viewer did not answer in time; the machine may be busy: try again"
+        ) from error
+    return shots[1]
 
 
 def _existing(path: str | Path) -> Path:
@@ -100,33 +110,41 @@ def _existing(path: str | Path) -> Path:
 
 
 def _viewer() -> list[str]:
-    return [sys.executable, "-m", "rerun", "--bind", LOOPBACK]
+    """The viewer's own program: `python -m rerun` would start it as a grandchild."""
+    found = find_spec("rerun_cli")
+    if found is None or found.origin is None:
+        raise RecordingError("the viewer is not installed; install rerun-sdk")
+    folder = Path(found.origin).parent
+    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
+    program = folder / ("rerun.exe" if os.name == "nt" else "rerun")
+    return [str(bundled if bundled.exists() else program), "--bind", LOOPBACK]
 
 
-def _silent() -> dict[str, str]:
-    """Environment in which the viewer calls nobody.
+def _silent(level: str) -> dict[str, str]:
+    """Environment in which the viewer opens no connection and prints messages from a level on.
 
     Its usage statistics are off where it finds itself in continuous integration; its look for a
     newer version has no switch, but goes through a proxy, and nothing listens at this one.
     """
-    environment = {name: value for name, value in os.environ.items() if name not in _LOUD}
+    kept = {name: value for name, value in os.environ.items() if name != "FORCE_RERUN_ANALYTICS"}
     proxies = dict.fromkeys((*_PROXIES, *(name.upper() for name in _PROXIES)), _NOWHERE)
-    return environment | proxies | {"CI": "true", "NO_PROXY": LOOPBACK, "no_proxy": LOOPBACK}
+    local = {"NO_PROXY": LOOPBACK, "no_proxy": LOOPBACK}
+    return kept | proxies | local | {"CI": "true", "RUST_LOG": level}
 
 
 @contextmanager
 def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
     """A viewer process without a window, ended on exit."""
-    port = _free_port()
-    options = ["--headless", "--hide-welcome-screen", "--port", str(port)]
-    window = ["--window-size", f"{size[0]}x{size[1]}"]
-    with tempfile.TemporaryFile() as log:
-        process = start_guarded(
-            [*_viewer(), *options, *window],
-            log=log,
-            # Messages below an error would be drawn over the views.
-            env=_silent() | {"RUST_LOG": "error"},
-        )
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        port = int(probe.getsockname()[1])
+    command = [*_viewer(), "--headless", "--hide-welcome-screen", "--port", str(port)]
+    command += ["--window-size", f"{size[0]}x{size[1]}"]
+    # Messages below an error would be drawn over the views.
+    with (
+        tempfile.TemporaryFile() as log,
+        child_process(command, log=log, env=_silent("error")) as process,
+    ):
 
         def answers() -> bool:
             if process.poll() is not None:
@@ -134,30 +152,11 @@ def _headless(size: tuple[int, int], deadline: float) -> Iterator[ViewerClient]:
             with socket.socket() as probe:
                 return probe.connect_ex((LOOPBACK, port)) == 0
 
+        _wait(answers, deadline, "starting the viewer")
         try:
-            _wait(answers, deadline, "starting the viewer")
-            try:
-                yield ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
-            except TimeoutError as error:
-                raise RecordingError(
-                    "the viewer did not answer in time; the machine may be busy: try again"
-                ) from error
-            except (ConnectionError, RuntimeError) as error:
-                raise RecordingError(_complaint(log.fileno())) from error
-        finally:
-            end_guarded(process)
-
-
-def _settled(client: ViewerClient, deadline: float) -> bytes:
-    """Screenshot taken when two in a row are equal: chunks are fetched after loading has ended."""
-    shots = [b"", client.take_screenshot()]
-
-    def unchanged() -> bool:
-        shots[:] = [shots[1], client.take_screenshot()]
-        return shots[0] == shots[1]
-
-    _wait(unchanged, deadline, "drawing")
-    return shots[1]
+            yield ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+        except (ConnectionError, RuntimeError) as error:
+            raise RecordingError(_complaint(log.fileno())) from error
 
 
 def _wait(done: Callable[[], bool], deadline: float, task: str) -> None:
@@ -167,14 +166,8 @@ def _wait(done: Callable[[], bool], deadline: float, task: str) -> None:
         time.sleep(0.1)
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])
-
-
 def _complaint(log: int) -> str:
-    """What the viewer's log says about its end."""
+    """The reason of the viewer's end, from its log."""
     text = os.pread(log, 1 << 20, 0).decode(errors="replace")
     if any(sign in text for sign in _NO_DRIVER):
         return (

@@ -25,7 +25,6 @@ COVERED = {
     ". .venv/bin/activate": "tests/packaging installs into an empty environment",
     "pip install .": "tests/packaging installs the wheel into an empty environment",
     "pip install '.[cluster]'": "installed by `make test`",
-    "pip install '.[fmi-check]'": "installed by `make check`",
     "cosim view demo/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim view run/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim optimum --scenario paper": "minutes; tests/cosim/cli/test_optimum.py",
@@ -33,7 +32,6 @@ COVERED = {
     "cosim study run study.toml --out study": "a synopsis; docs/how-to/study.md",
     "cosim study report study": "a synopsis; docs/how-to/study.md",
     "cosim compare run other-run": "a synopsis; tests/cosim/cli/test_compare.py",
-    "cosim benchmark plant|controllers|learning": "a synopsis; tests/cosim/test_cli.py",
     "cosim fmu info|check|build": "a synopsis; tests/cosim/cli/test_fmu.py",
     "cosim results check|update": "a synopsis; tests/cosim/study/test_stored.py",
 }

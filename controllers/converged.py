@@ -153,7 +153,7 @@ class ConvergedNmpc(RtiNmpc):
         iterations: int = 100,
     ) -> None:
         """Build the functions; see the class."""
-        self._tolerance, self._iterations = tolerance, iterations
+        self._tolerance, self._patience = tolerance, iterations
         self._merit = merit(problem, parameters.blocks)
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
@@ -183,12 +183,12 @@ class ConvergedNmpc(RtiNmpc):
     def _solve_qp(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         """Solve the prepared QP; the lifted one in its place where it is not convex."""
         try:
-            return super()._solve(s, a)
+            return super()._solve_qp(s, a)
         except QpError as error:
             if error.status != NOT_CONVEX or self._lifts:
                 raise
         self._linearise_as(lifts=True)
-        return super()._solve(s, a)
+        return super()._solve_qp(s, a)
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         solution = self._solve_qp(s, a)
@@ -197,7 +197,7 @@ class ConvergedNmpc(RtiNmpc):
         at = np.vstack([np.asarray(s, dtype=np.float64), x[1:], solution.predicted_states[-1:]])
         controls = u if a is None else np.vstack([a, u[1:]])
         weight, measured = 0.0, None
-        for _ in range(self._iterations):
+        for _ in range(self._patience):
             weight = max(weight, 1.5 * float(np.abs(solution.costates).max()))
             states, actions = solution.predicted_states, solution.predicted_actions
             if measured is None:
@@ -219,7 +219,7 @@ class ConvergedNmpc(RtiNmpc):
             if change < self._tolerance:
                 return self._read_out(s, a, solution) if self._lifts else solution
         raise QpError(
-            f"SQP did not converge in {self._iterations} iterations at s = {at[0]}; "
+            f"SQP did not converge in {self._patience} iterations at s = {at[0]}; "
             f"last change {change:.1e}",
             status="not converged",
             qp=solution.qp.copy(),
@@ -263,7 +263,7 @@ class ConvergedNmpc(RtiNmpc):
         backend, self._backend = self._backend, _Known(solution.multipliers)
         try:
             self._linearise_at(solution.unshifted)
-            return super()._solve(s, a)
+            return super()._solve_qp(s, a)
         finally:
             self._backend = backend
             self._linearise_as(lifts=True)

@@ -5,14 +5,13 @@ These are the package's entry points of the group `cosim.controllers`.
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from controllers.converged import ConvergedNmpc
 from controllers.errors import ControllerError
 from controllers.problem import Problem
-from controllers.rti import IteratedNmpc, RtiNmpc
+from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim.scenario import Scenario
 
@@ -32,9 +31,12 @@ def nmpc(scenario: Scenario, parameters: Parameters, kind: str = "rti") -> RtiNm
         return ConvergedNmpc(problem, parameters, backend=settings.backend)
     if kind != "rti":
         raise ControllerError(f"there is no NMPC '{kind}'; there are rti and converged")
-    make = partial(IteratedNmpc, iterations=settings.iterations)
-    return (RtiNmpc if settings.iterations == 1 else make)(
-        problem, parameters, hessian=settings.hessian, backend=settings.backend
+    return RtiNmpc(
+        problem,
+        parameters,
+        hessian=settings.hessian,
+        backend=settings.backend,
+        iterations=settings.iterations,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,28 +20,6 @@ NOT_CONVEX = "not convex"
 
 
 @dataclass
-class Stages:
-    """The same QP stage by stage, before the states are eliminated.
-
-    ξ_{k+1} = A_k ξ_k + B_k v_k + r_k from ξ_0 = `initial`; stage costs ½wᵀL_k w + q_kᵀw with
-    w = (ξ, v), terminal ½ξᵀL_N ξ + q_Nᵀξ. Shapes: A (N, n, n), B (N, n, m), r (N, n),
-    L (N, n+m, n+m), q (N, n+m), L_N (n, n), q_N (n,), state_lower and state_upper (n,), the
-    limits on ξ_1…ξ_N.
-    """
-
-    A: Matrix
-    B: Matrix
-    r: Matrix
-    L: Matrix
-    q: Matrix
-    L_N: Matrix
-    q_N: Vector
-    initial: Vector
-    state_lower: Vector
-    state_upper: Vector
-
-
-@dataclass
 class SoftQp:
     """A strictly convex QP with hard bounds on its variables and soft bounds on its rows.
 
@@ -50,10 +28,10 @@ class SoftQp:
 
     The stacked controls V = (v_0, …, v_{N−1}) are the variables, the predicted states Γ V the
     rows; paper.tex eq. param_nlp_qp with the dynamics eliminated. `lower = upper` fixes a variable,
-    which is how u_0 = a is enforced. `stages`, where given, holds the QP with the dynamics;
-    `factor`, where given, makes [T; ΓT] (d + c, d) of a T with TᵀHT = I from the data as they are,
-    cheaper than H is factorised, its first row not finite where H is not positive definite. Shapes
-    for d variables and c rows: H (d, d), f, lower and upper (d,), rows Γ (c, d), else w, W: (c,).
+    which is how u_0 = a is enforced. `factor`, where given, makes [T; ΓT] (d + c, d) of a T with
+    TᵀHT = I from the data as they are, cheaper than H is factorised, its first row not finite where
+    H is not positive definite. Shapes for d variables and c rows: H (d, d), f, lower and upper
+    (d,), rows Γ (c, d), else w, W: (c,).
     """
 
     H: Matrix
@@ -65,14 +43,14 @@ class SoftQp:
     row_upper: Vector
     w: Vector
     W: Vector
-    stages: Stages | None = None
     factor: Callable[[], Matrix] | None = None
 
     def copy(self) -> SoftQp:
         """Deep copy, for a QP that is kept beyond the next sample; without `factor`."""
-        copied: SoftQp = _copied(self)
-        copied.factor = None
-        return copied
+        arrays: dict[str, Any] = {
+            name: value.copy() for name, value in vars(self).items() if name != "factor"
+        }
+        return SoftQp(**arrays)
 
     def require_convex(self) -> None:
         """Raise QpError where H is not positive definite; for backends that do not notice."""
@@ -92,20 +70,6 @@ class SoftQp:
         """Objective at v with the least slack."""
         t = self.slack(v)
         return float(0.5 * v @ self.H @ v + self.f @ v + self.w @ t + self.W @ (t * t))
-
-
-def _copied(data: Any) -> Any:
-    values = {}
-    for entry in fields(data):
-        value = getattr(data, entry.name)
-        values[entry.name] = (
-            value.copy()
-            if isinstance(value, np.ndarray)
-            else _copied(value)
-            if is_dataclass(value)
-            else value
-        )
-    return type(data)(**values)
 
 
 class Residuals(NamedTuple):

@@ -43,6 +43,11 @@ class RtiNmpc:
     it, then `feedback(s)`. A second `prepare()` without a feedback in between changes nothing, and
     `feedback(s, a)` after `feedback(s)` uses the same QP data.
 
+    With `iterations` above 1 a feedback solves that many QPs, each linearised at the solution of
+    the last, full steps at the measured state: many end at `ConvergedNmpc`. Value, policy and
+    derivatives are then those of the last QP at its own point of linearisation; what `prepare`
+    prepared stays for the sample's other feedbacks, so that Q(s, π(s)) = V(s), and for replay.
+
     `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
     or a function that makes a `QpBackend`; `functions` says whether the CasADi functions are
     `interpreted` or `compiled`, which changes no bit (see `compile_functions`). Raises
@@ -60,8 +65,12 @@ class RtiNmpc:
         *,
         hessian: str = "gauss-newton",
         backend: str | Callable[[], QpBackend] = "daqp",
+        iterations: int = 1,
     ) -> None:
         """Build the CasADi functions and the workspace of the backend; see the class."""
+        if iterations < 1:
+            raise ControllerError(f"iterations must be at least 1, not {iterations}")
+        self._iterations = iterations
         self.problem = problem
         blocks = parameters.blocks
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
@@ -76,7 +85,7 @@ class RtiNmpc:
             problem, self._prepare, self._embed, self._readout, gradient, policy
         )
         self._riccati = riccati(problem, self._prepare) if horizon * m >= LEAST_CONTROLS else None
-        self._qp, self._stages = qp_in_memory(problem, self._prepare, self._embed)
+        self._qp = qp_in_memory(problem, self._prepare, self._embed)
         if self._riccati is not None:
             self._qp.factor = partial(limits_of, self._riccati)
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)
@@ -131,15 +140,12 @@ class RtiNmpc:
                 f"{', '.join(parameters.blocks.slices)}; build a new controller for it"
             )
         parameters.require_well_posed()
-        problem = self.problem
         self._parameters = parameters
         self._hessian.set_parameters(parameters)
         self._blocks: tuple[Vector, Vector] | None = None  # that are kept; Gauss–Newton's stay
         self._prepare.inputs["theta"][:] = parameters.theta
         if "w_sigma" in parameters.blocks:
             self._weigh(parameters["w_sigma"], parameters["W_sigma"])
-        self._stages.state_lower[:] = parameters["x_l"] - problem.reference_state
-        self._stages.state_upper[:] = parameters["x_u"] - problem.reference_state
         self._prepared: Prepared | None = None
 
     @property
@@ -251,13 +257,24 @@ class RtiNmpc:
         return solution
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
+        solution = self._solve_qp(s, a)
+        if self._iterations > 1:
+            prepared = self.linearisation_point
+            try:
+                for _ in range(self._iterations - 1):
+                    self._linearise_at(solution.unshifted)
+                    solution = self._solve_qp(s, a)
+            finally:
+                self._linearise_at(prepared)
+        return solution
+
+    def _solve_qp(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         problem = self.problem
         s = _vector("state", s, problem.n_states)
         if self._prepared is None:
             self.prepare()
         prepared, qp = self._prepared, self._qp
         assert prepared is not None
-        np.subtract(s, problem.reference_state, out=self._stages.initial)
         self._embed.inputs["s"][:] = s
         self._embed()
         known = self._embed.finite()

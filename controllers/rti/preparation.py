@@ -14,7 +14,7 @@ from controllers.dynamics import stage_curvature, stage_function, stage_linearis
 from controllers.errors import ControllerError
 from controllers.functions import BufferedFunction, StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.qp import SoftQp, Stages
+from controllers.qp import SoftQp
 from controllers.theta import Parameters, ThetaBlocks
 
 Vector = NDArray[np.float64]
@@ -150,28 +150,14 @@ def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     return positions
 
 
-def qp_in_memory(
-    problem: Problem, prepared: StackedFunction, embedded: StackedFunction
-) -> tuple[SoftQp, Stages]:
-    """The QP whose data are the memory of the preparation and the embedding, and its stages.
+def qp_in_memory(problem: Problem, prepared: StackedFunction, embedded: StackedFunction) -> SoftQp:
+    """The QP whose data are the memory of the preparation and the embedding.
 
     Calling the two functions rewrites it in place. The inputs' bounds and the sizes stand; the
-    initial state, the state's bounds and the slack weights are the caller's to write.
+    slack weights are the caller's to write.
     """
-    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    stages = Stages(
-        A=prepared.part("A").reshape(horizon, n, n),
-        B=prepared.part("B").reshape(horizon, n, m),
-        r=prepared.part("r"),
-        L=prepared.inputs["L"].reshape(horizon, n + m, n + m),
-        q=prepared.inputs["q"].reshape(horizon, n + m),
-        L_N=prepared.inputs["L_N"].reshape(n, n),
-        q_N=prepared.inputs["q_N"],
-        initial=np.zeros(n),
-        state_lower=np.zeros(n),
-        state_upper=np.zeros(n),
-    )
-    qp = SoftQp(
+    n, horizon = problem.n_states, problem.horizon
+    return SoftQp(
         H=prepared.part("H"),
         f=embedded.part("f"),
         lower=np.tile(problem.action_lower - problem.reference_action, horizon),
@@ -181,9 +167,7 @@ def qp_in_memory(
         row_upper=embedded.part("upper"),
         w=np.zeros(n * horizon),
         W=np.zeros(n * horizon),
-        stages=stages,
     )
-    return qp, stages
 
 
 LEAST_CONTROLS = 60

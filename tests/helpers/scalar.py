@@ -1,26 +1,14 @@
-"""A QP in one variable with a closed-form solution, with its stages for full-space backends."""
+"""A QP in one variable with a closed-form solution."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from controllers.qp import QpSolution, SoftQp, Stages
+from controllers.qp import QpSolution, SoftQp
 
 
 def scalar_qp(f: float, *, w: float = 1.0, W: float = 1.0, limit: float = 1.0) -> SoftQp:
-    """min ½v² + fv + wt + Wt², |v| ≤ 10, v ≤ limit + t, as a stage ξ_1 = v sharing the cost."""
-    stages = Stages(
-        A=np.zeros((1, 1, 1)),
-        B=np.ones((1, 1, 1)),
-        r=np.zeros((1, 1)),
-        L=np.diag([1.0, 0.5])[None],
-        q=np.array([[0.0, f]]),
-        L_N=np.array([[0.5]]),
-        q_N=np.zeros(1),
-        initial=np.zeros(1),
-        state_lower=np.array([-100.0]),
-        state_upper=np.array([limit]),
-    )
+    """min ½v² + fv + wt + Wt², |v| ≤ 10, v ≤ limit + t."""
     return SoftQp(
         H=np.eye(1),
         f=np.array([f]),
@@ -31,7 +19,6 @@ def scalar_qp(f: float, *, w: float = 1.0, W: float = 1.0, limit: float = 1.0) -
         row_upper=np.array([limit]),
         w=np.array([w]),
         W=np.array([W]),
-        stages=stages,
     )
 
 

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from controllers import ConvergedNmpc, Parameters, Problem, RtiNmpc
+from controllers import ConvergedNmpc, Parameters, Problem
 from controllers.errors import ParameterError
 from controllers.factories import converged, from_file, naive
-from controllers.rti import IteratedNmpc
 from cosim import Scenario
 
 
@@ -58,5 +57,6 @@ def test_a_missing_file_is_named(paper):
 
 
 def test_the_scenario_says_how_many_qps_a_sample_has(paper):
-    assert type(naive(paper)) is RtiNmpc
-    assert type(naive(changed(paper, iterations=3))) is IteratedNmpc
+    s = [27.0, 52.0]
+    one, three = (naive(changed(paper, iterations=k)).feedback(s).value for k in (1, 3))
+    assert one == naive(paper).feedback(s).value != three

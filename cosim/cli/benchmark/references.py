@@ -15,7 +15,7 @@ from controllers.factories import naive_parameters
 from controllers.ipopt import IpoptNmpc
 from controllers.qp import QpBackend, QpSolution, SoftQp
 from controllers.qp.daqp_backend import DaqpBackend
-from controllers.qp.qpsolvers_backend import full_space
+from controllers.qp.explicit_slack import qpsolvers_problem
 from cosim.cli.benchmark.figures import clock
 from cosim.scenario import Scenario
 
@@ -68,7 +68,7 @@ class _Keeper:
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Keep and solve."""
-        self.problem, _ = full_space(qp, dense=True)
+        self.problem = qpsolvers_problem(qp)
         return self._solver.solve(qp)
 
 

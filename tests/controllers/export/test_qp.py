@@ -11,7 +11,7 @@ from controllers.errors import QpError
 from controllers.qp import SoftQp
 from controllers.qp.active_set import polish
 from controllers.qp.daqp_backend import DaqpBackend
-from controllers.qp.proxqp_backend import ProxQpBackend
+from controllers.qp.explicit_slack import ProxQpBackend
 from tests.helpers.compiled import FAMILIES, CompiledQpSolver, random_qps
 
 RESIDUAL = 1e-9

@@ -118,7 +118,7 @@ def test_an_infeasible_qp_raises_and_is_carried(backend):
 @pytest.mark.parametrize("backend", EVERY)
 def test_a_qp_that_is_not_convex_raises_and_is_carried(backend):
     qp = scalar_qp(-1.0)
-    qp.H[:], qp.stages.L[0, 1, 1] = -1.0, -1.5
+    qp.H[:] = -1.0
     solver = make_backend(backend)
     with pytest.raises(QpError, match="convex") as caught:
         solver.load(qp)
@@ -147,10 +147,3 @@ def test_a_backend_recovers_from_a_failure(backend):
 def test_an_unknown_backend_is_refused_with_the_choices(name):
     with pytest.raises(ControllerError, match=r"(choose daqp, proxqp or|it has clarabel)"):
         make_backend(name)
-
-
-def test_a_full_space_backend_says_that_it_needs_the_stages():
-    qp = scalar_qp(-1.0)
-    qp.stages = None
-    with pytest.raises(ControllerError, match="needs the QP's stages"):
-        make_backend("qpsolvers:daqp").solve(qp)

@@ -3,7 +3,6 @@ import pytest
 
 from controllers import ConvergedNmpc, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import ControllerError
-from controllers.rti import IteratedNmpc
 from tests.helpers.differences import Feedback, assert_close, derivative, natural_scale
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_state
 
@@ -19,7 +18,7 @@ def off(number):
 
 @pytest.mark.parametrize("number", range(4))
 def test_one_qp_is_the_real_time_iteration(number):
-    one, rti = IteratedNmpc(PROBLEM, NAIVE, iterations=1), RtiNmpc(PROBLEM, NAIVE)
+    one, rti = RtiNmpc(PROBLEM, NAIVE, iterations=1), RtiNmpc(PROBLEM, NAIVE)
     s = off(number)
     assert one.feedback(s).value == rti.feedback(s).value
     assert np.array_equal(one.feedback(s).action, rti.feedback(s).action)
@@ -30,12 +29,12 @@ def test_many_qps_end_at_the_converged_solution(number):
     s = off(number)
     converged = ConvergedNmpc(PROBLEM, NAIVE).feedback(s)
     errors = [
-        np.abs(IteratedNmpc(PROBLEM, NAIVE, iterations=k).feedback(s).action - converged.action)
+        np.abs(RtiNmpc(PROBLEM, NAIVE, iterations=k).feedback(s).action - converged.action)
         for k in (1, 2, 4, 30)
     ]
     assert errors[-1].max() < 1e-6
     assert errors[2].max() <= errors[0].max() + 1e-9
-    value = IteratedNmpc(PROBLEM, NAIVE, iterations=30).feedback(s).value
+    value = RtiNmpc(PROBLEM, NAIVE, iterations=30).feedback(s).value
     assert value == pytest.approx(converged.value, rel=1e-9)
 
 
@@ -43,7 +42,7 @@ def test_many_qps_end_at_the_converged_solution(number):
 def test_derivatives_are_those_of_the_last_qp(number):
     rng = np.random.default_rng(number)
     theta, s = random_parameters(PROBLEM, BLOCKS, rng), random_state(PROBLEM, rng)
-    solution = IteratedNmpc(PROBLEM, theta, iterations=3).feedback(s)
+    solution = RtiNmpc(PROBLEM, theta, iterations=3).feedback(s)
     step = Feedback(RtiNmpc(PROBLEM, theta), theta.theta, solution.prepared.point, s)
     assert step().value == pytest.approx(solution.value, rel=1e-12)
     by_theta = derivative(lambda x: step(theta=x), theta.theta, natural_scale(theta))
@@ -53,7 +52,7 @@ def test_derivatives_are_those_of_the_last_qp(number):
 
 
 def test_q_at_the_policy_is_v_and_the_sample_begins_anew():
-    nmpc = IteratedNmpc(PROBLEM, NAIVE, iterations=3)
+    nmpc = RtiNmpc(PROBLEM, NAIVE, iterations=3)
     nmpc.prepare()
     point = nmpc.linearisation_point
     s = off(1)
@@ -66,7 +65,7 @@ def test_q_at_the_policy_is_v_and_the_sample_begins_anew():
 
 
 def test_the_next_sample_starts_from_the_last_qps_solution():
-    nmpc = IteratedNmpc(PROBLEM, NAIVE, iterations=3)
+    nmpc = RtiNmpc(PROBLEM, NAIVE, iterations=3)
     solution = nmpc.feedback(off(2))
     nmpc.prepare()
     for one, other in zip(nmpc.linearisation_point, solution.shifted, strict=True):
@@ -75,4 +74,4 @@ def test_the_next_sample_starts_from_the_last_qps_solution():
 
 def test_no_qp_is_refused():
     with pytest.raises(ControllerError, match="iterations must be at least 1, not 0"):
-        IteratedNmpc(PROBLEM, NAIVE, iterations=0)
+        RtiNmpc(PROBLEM, NAIVE, iterations=0)

@@ -33,6 +33,8 @@ PARAMETERS = EntryPoint("toml", "controllers.factories:from_file", FILES)
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 OURS = ("fmus", "cosim", "controllers", "learning")
 """The packages of this distribution; any other is a user's."""
+ROOT = Path(__file__).absolute().parents[1]
+"""Folder that holds them."""
 
 _folders: list[str] = []
 
@@ -46,11 +48,11 @@ def import_from(folder: str | Path) -> None:
 @contextmanager
 def _importable() -> Iterator[None]:
     """Search the folders of `import_from` and the working directory after all other places."""
-    added = [folder for folder in (*_folders, str(Path.cwd())) if folder not in sys.path]
+    here = [folder for folder in (*_folders, str(Path.cwd())) if Path(folder) != ROOT]
+    added = [folder for folder in here if folder not in sys.path]
     for package in OURS:  # a folder of such a name would be found before an editable install
-        if any(
-            (Path(folder) / f"{package}{end}").exists() for folder in added for end in ("", ".py")
-        ):
+        names = [Path(folder) / f"{package}{end}" for folder in added for end in ("", ".py")]
+        if any(name.exists() for name in names):
             importlib.import_module(package)
     sys.path.extend(added)
     importlib.invalidate_caches()
@@ -298,8 +300,7 @@ def _is_foreign(folder: str) -> bool:
     path = Path(folder).absolute()
     if {"site-packages", "dist-packages"} & set(path.parts):
         return False
-    root = Path(__file__).absolute().parents[1]
-    own = [root / package for package in OURS]
+    own = [ROOT / package for package in OURS]
     python = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
     return not any(path.is_relative_to(place) for place in (*own, *python))
 
@@ -318,10 +319,9 @@ def versions() -> str:
 def code_hash(packages: tuple[str, ...] = EVALUATING) -> str:
     """First 16 hex digits of the SHA-256 of the code that results depend on, FMUs included."""
     digest = hashlib.sha256()
-    root = Path(__file__).parents[1]
     for package in packages:
-        for path in sorted((root / package).rglob("*")):
-            relative = path.relative_to(root)
+        for path in sorted((ROOT / package).rglob("*")):
+            relative = path.relative_to(ROOT)
             if path.suffix in SUFFIXES and not ASIDE & set(relative.parts) and path.is_file():
                 digest.update(f"{relative.as_posix()}\0".encode())
                 digest.update(hashlib.sha256(path.read_bytes()).digest())

@@ -98,7 +98,9 @@ app.command("optimum")(optimum.optimum)
 app.command("tuning")(tuning.tuning)
 app.command("export")(export.export)
 app.add_typer(scenario.app, name="scenario")
-app.add_typer(benchmark.app, name="benchmark")
+app.command(
+    "benchmark", context_settings={"ignore_unknown_options": True, "help_option_names": []}
+)(benchmark.benchmark)
 app.add_typer(study.app, name="study")
 app.command("reproduce")(reproduce.reproduce)
 app.add_typer(results.app, name="results")

@@ -230,7 +230,6 @@ BAD_INPUT = {
     "not a recording": (["view", "corrupt.fmu", "--json"], ["corrupt.fmu"]),
     "unknown command": (["simulat"], ["simulat"]),
     "unknown option": (["simulate", "--sed", "1"], ["--sed"]),
-    "benchmark, missing FMU": (["benchmark", "plant", "--fmu", "no.fmu"], ["no.fmu"]),
     "scenario, unknown": (["scenario", "papper"], ["papper", "paper"]),
 }
 

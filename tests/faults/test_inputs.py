@@ -281,7 +281,6 @@ WRONG = [
     "fmu info blocked",
     "fmu check missing.fmu",
     "fmu build",
-    "benchmark plant --fmu missing.fmu",
     "results check nothing",
     "results check --results nowhere",
     "results update --results nowhere",
@@ -310,7 +309,6 @@ def test_a_wrong_name_is_one_line_and_exit_code_2(monkeypatch, capfd, tmp_path, 
         "train --algorithm q-learning --samples 20 --log-every 20 --evaluate-every 20",
         "optimum",
         "tuning",
-        "benchmark controllers",
     ],
 )
 def test_a_command_that_needs_the_model_left_out_says_so(monkeypatch, capfd, tmp_path, files, line):

@@ -188,16 +188,6 @@ def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
     assert errors[1] < 0.6 * errors[0]
 
 
-@pytest.mark.slow
-def test_the_benchmark_times_both_and_compares_their_actions(cosim):
-    code, out, _ = cosim("benchmark", "export", "--steps", "100", "--json")
-    document = json.loads(out)
-    assert code == 0
-    assert document["largest_difference"] < ACTION
-    fmu, python = document["rows"]
-    assert (fmu["name"], fmu["reference"]) == ("exported FMU", python["name"])
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -52,6 +52,13 @@ class SteadyState:
         """Eigenvalues of `hessian`, ascending."""
         return np.linalg.eigvalsh(self.hessian).astype(np.float64)
 
+    def __str__(self) -> str:
+        """Point, cost and active bounds, in one line."""
+        return (
+            f"optimal steady state: x = {_short(self.x)}, u = {_short(self.u)}, "
+            f"cost {self.cost:.6g}, active: {', '.join(self.active) or 'no bound'}"
+        )
+
 
 def optimal_steady_state(problem: Problem) -> SteadyState:
     """Solve for the optimal steady state with IPOPT, started from the problem's reference.
@@ -264,9 +271,9 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     )
     if z is None or not z[0] > 0:
         raise TuningError(
-            f"no convex cost has the local optimum of the economic one (Clarabel: {status}) with "
-            f"{n_c} active constraint{'' if n_c == 1 else 's'}: the steady state is not optimally "
-            "operated under them"
+            f"no convex cost has the local optimum of the economic one with {n_c} active "
+            f"constraint{'' if n_c == 1 else 's'} (Clarabel: {status}): it is not optimal to stay at "
+            "the steady state"
         )
     alpha = float(z[0])
     delta_P = sum_of(z[1 : count - n_F], n) / alpha
@@ -366,9 +373,15 @@ def tune(
         dataclasses.replace(problem, substeps=accurate_substeps(problem, accuracy))
     )
     n, A, B = problem.n_states, steady.A, steady.B
-    economic = local_feedback(A, B, steady.hessian, steady.C)
-    convex = convexify(A, B, steady.hessian, steady.C, weight)
-    tuned = local_feedback(A, B, convex.hessian, steady.C)
+    try:
+        economic = local_feedback(A, B, steady.hessian, steady.C)
+        convex = convexify(A, B, steady.hessian, steady.C, weight)
+        tuned = local_feedback(A, B, convex.hessian, steady.C)
+    except TuningError as error:
+        raise TuningError(
+            f"{error}. {steady}. Change the bounds so that the cost has a minimum with other "
+            "bounds active, or the model's economic cost so that it has one inside them"
+        ) from error
     P, dynamics = tuned.value, np.hstack([A, B])
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
     q, C_x = steady.gradient, steady.C[:, :n]

@@ -261,30 +261,9 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_TWICE: lambda a: a + a,
     ca.OP_SQ: lambda a: a * a,
     ca.OP_INV: lambda a: 1.0 / a,
-    ca.OP_EXP: np.exp,
-    ca.OP_LOG: np.log,
-    ca.OP_LOG1P: np.log1p,
-    ca.OP_EXPM1: np.expm1,
     ca.OP_POW: np.power,
     ca.OP_CONSTPOW: np.power,
-    ca.OP_SQRT: np.sqrt,
-    ca.OP_HYPOT: np.hypot,
-    ca.OP_SIN: np.sin,
-    ca.OP_COS: np.cos,
-    ca.OP_TAN: np.tan,
-    ca.OP_ASIN: np.arcsin,
-    ca.OP_ACOS: np.arccos,
-    ca.OP_ATAN: np.arctan,
-    ca.OP_ATAN2: np.arctan2,
-    ca.OP_SINH: np.sinh,
-    ca.OP_COSH: np.cosh,
-    ca.OP_TANH: np.tanh,
     ca.OP_FABS: np.abs,
-    ca.OP_SIGN: np.sign,
-    ca.OP_FLOOR: np.floor,
-    ca.OP_CEIL: np.ceil,
-    ca.OP_FMIN: np.fmin,
-    ca.OP_FMAX: np.fmax,
     ca.OP_LT: lambda a, b: np.where(a < b, 1.0, 0.0),
     ca.OP_LE: lambda a, b: np.where(a <= b, 1.0, 0.0),
     ca.OP_EQ: lambda a, b: np.where(a == b, 1.0, 0.0),
@@ -293,6 +272,17 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_AND: lambda a, b: np.where((a != 0) & (b != 0), 1.0, 0.0),
     ca.OP_OR: lambda a, b: np.where((a != 0) | (b != 0), 1.0, 0.0),
     ca.OP_IF_ELSE_ZERO: lambda a, b: np.where(a != 0, b, 0.0),
+    **{
+        getattr(ca, f"OP_{name.upper()}"): getattr(np, name)
+        for name in (
+            *("exp", "log", "log1p", "expm1", "sqrt", "hypot", "sign", "floor", "ceil"),
+            *("sin", "cos", "tan", "sinh", "cosh", "tanh", "fmin", "fmax"),
+        )
+    },
+    **{
+        getattr(ca, f"OP_A{name.upper()}"): getattr(np, f"arc{name}")
+        for name in ("sin", "cos", "tan", "tan2")
+    },
 }
 
 

@@ -23,16 +23,6 @@ from controllers.model import discretise, economic_cost
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class SimulatedCost:
-    """Mean cost per sample over independent paths, with the half width of its 95 % interval."""
-
-    mean: float
-    half_width: float
-    paths: int
-    steps: int
-
-
 def simulate_policy(
     plant: PlantProblem,
     optimum: Optimum,
@@ -41,11 +31,12 @@ def simulate_policy(
     steps: int = 5000,
     burn_in: int = 300,
     seed: int = 0,
-) -> SimulatedCost:
-    """Run the policy of a solution on the plant's model, interpolated as the controller does it.
+) -> tuple[float, float]:
+    """Mean cost per sample of a solution's policy on the plant's model, and half its 95 % interval.
 
-    Each path starts in a state drawn from the solution's stationary distribution, and its first
-    `burn_in` samples are left out. The interval is that of the mean of independent paths.
+    The policy is interpolated as the controller does it. Each path starts in a state drawn from the
+    solution's stationary distribution, and its first `burn_in` samples are left out. The interval
+    is that of the mean of independent paths.
     """
     generator = np.random.default_rng(seed)
     problem = plant.problem
@@ -61,17 +52,15 @@ def simulate_policy(
         d = list(plant.law.draw(generator, paths).T)
         if k >= burn_in:
             total += cost(x, u, d, plant.parameters)[0]
-            for i, entry in enumerate(x):
-                violation = np.maximum(
-                    np.maximum(problem.state_lower[i] - entry, entry - problem.state_upper[i]), 0.0
-                )
-                total += (
-                    problem.penalty_linear[i] + problem.penalty_quadratic[i] * violation
-                ) * violation
+            violations = problem.penalty.violation(np.stack(x, axis=1)).T
+            for v, linear, quadratic in zip(
+                violations, problem.penalty_linear, problem.penalty_quadratic, strict=True
+            ):
+                total += (linear + quadratic * v) * v
         x = [np.broadcast_to(entry, paths) for entry in step(x, u, d, plant.parameters)]
     means = total / steps
     half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
-    return SimulatedCost(float(means.mean()), float(half_width), paths, steps)
+    return float(means.mean()), float(half_width)
 
 
 STABLE = 1e-3
@@ -131,13 +120,11 @@ def certify(
     simulation is that of its policy, by `simulate_policy`.
     """
     solution, refinement = rows[0].optimum, rows[1].optimum
-    found = simulate_policy(plant, refinement, paths=paths, steps=steps)
+    mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
     figures = (
         Figure("solution", solution.gain, solution.lower, solution.upper),
         Figure("refinement", refinement.gain, refinement.lower, refinement.upper),
-        Figure(
-            "simulation", found.mean, found.mean - found.half_width, found.mean + found.half_width
-        ),
+        Figure("simulation", mean, mean - half_width, mean + half_width),
     )
     return replace(refinement, certificate=Certificate(figures))
 

@@ -109,8 +109,7 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     )
 
 
-@dataclass(frozen=True)
-class Feature:
+class Feature(NamedTuple):
     """An interval of an axis whose cells shall be no wider than `spacing`."""
 
     first: float
@@ -140,28 +139,25 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
 
 def finer_grid(
     operator: BellmanOperator,
-    grid: Grid,
-    actions: Array,
-    distribution: Array,
+    found: Iterate,
     settings: Settings,
     level: int,
     *,
     smooth: bool = True,
 ) -> Grid:
-    """Grid that resolves the support of a distribution with cells·2^level cells a state.
+    """Grid that resolves the support of a policy's distribution with cells·2^level cells a state.
 
-    At a bound that the closed loop of `actions` (G, m) touches, whose stationary `distribution`
-    is (G,), the cells are 2^-level of the standard deviation of one sample's disturbance: the
-    penalty's kink reaches the value of a slow state smoothed by no more than that. It extends as
-    far again beyond the support on either side, and at least a twentieth of the bounds' span:
-    farther states are so rare that the policy at the box's edge serves them. Without disturbance
-    the support is a point, which says nothing of that, and the box stays. `smooth`: cubic
-    interpolation within the support, else linear everywhere.
+    At a bound that the closed loop touches the cells are 2^-level of the standard deviation of one
+    sample's disturbance: the penalty's kink reaches the value of a slow state smoothed by no more
+    than that. The grid extends as far again beyond the support on either side, and at least a
+    twentieth of the bounds' span: farther states are so rare that the policy at the box's edge
+    serves them. Without disturbance the support is a point, which says nothing of that, and the box
+    stays. `smooth`: cubic interpolation within the support, else linear everywhere.
     """
     problem = operator.problem
     span = problem.state_upper - problem.state_lower
-    mass = np.maximum(distribution, 0.0)
-    mean = mass @ np.column_stack([grid.points, actions]) / mass.sum()
+    grid, mass = found.grid, np.maximum(found.distribution, 0.0)
+    mean = mass @ np.column_stack([grid.points, found.actions]) / mass.sum()
     deviation = operator.deviation(mean[: problem.n_states], mean[problem.n_states :])
     mass = mass.reshape(grid.shape)
     axes, intervals = [], []
@@ -334,11 +330,6 @@ class Iterate:
     lower: float = -np.inf
     upper: float = np.inf
 
-    @property
-    def spread(self) -> float:
-        """Width of the enclosure, upper − lower."""
-        return self.upper - self.lower
-
 
 def evaluate(
     operator: BellmanOperator, grid: Grid, actions: Array, anchor: int
@@ -414,34 +405,7 @@ def improve(
     )
 
 
-def iterate_policy(
-    operator: BellmanOperator,
-    start: Iterate,
-    *,
-    rounds: int,
-    scan_points: int,
-    enough: Callable[[Iterate, Iterate], bool],
-    report: Callable[[Iterate, int], None],
-) -> Iterate:
-    """Howard's policy iteration until `enough(before, after)`, at most `rounds` rounds.
-
-    Each round scans `scan_points` actions per dimension and ends with a call of `report`.
-    """
-    iterate = start
-    anchor = start.grid.nearest(operator.problem.reference_state)
-    for k in range(rounds):
-        before = iterate
-        improved = improve(operator, before, scan_points)
-        W, gain, distribution = evaluate(operator, improved.grid, improved.actions, anchor)
-        iterate = replace(improved, W=W, gain=gain, distribution=distribution)
-        report(iterate, k)
-        if enough(before, iterate):
-            break
-    return iterate
-
-
-@dataclass(frozen=True)
-class Progress:
+class Progress(NamedTuple):
     """Where the solver is: grid level, round on it, size of the grid, gain and its bounds."""
 
     level: int
@@ -565,19 +529,19 @@ def solve(
         for how in (accuracy.draft(), accuracy)
     )
     grid = first_grid(problem, draft, settings)
-    actions = np.tile(problem.reference_action, (grid.size, 1))
-    iterate = begin(draft, grid, actions)
-    report = _Reporter(progress)
+    iterate = begin(draft, grid, np.tile(problem.reference_action, (grid.size, 1)))
+    howard = _Howard(settings, progress)
     # Linear interpolation is monotone, so that it finds its way from anywhere, and it smears the
     # closed loop over its cells, so that the support is known only once these are fine.
     for level, smooth in ((1, False), *((k + 1, True) for k in range(settings.level))):
         if settings.level:
-            iterate = _approach(draft, iterate, settings, report)
-            grid = _finer(draft, iterate, settings, level, smooth=smooth)
+            iterate = howard.approach(draft, iterate)
+            grid = finer_grid(draft, iterate, settings, level, smooth=smooth)
             iterate = _transfer(draft, iterate, grid)
-            report.level = level
-    iterate = _scan(draft, _approach(draft, iterate, settings, report), report)
-    return _optimum(_converge(operator, iterate, settings, report), operator, accuracy)
+            howard.level = level
+    # One round that looks for better actions in the whole action box.
+    iterate = howard(draft, howard.approach(draft, iterate), 9, enough=lambda *_: True, rounds=1)
+    return _optimum(howard.converge(operator, iterate), operator, accuracy)
 
 
 def refine(
@@ -597,26 +561,73 @@ def refine(
     accuracy = accuracy or optimum.accuracy
     operator = BellmanOperator(plant, accuracy, discount=optimum.discount, workers=workers)
     start = begin(operator, optimum.grid, optimum.actions)
-    report = _Reporter(progress)
-    report.level = settings.level if level is None else level
-    grid = optimum.grid if level is None else _finer(operator, start, settings, level)
-    iterate = _converge(operator, _transfer(operator, start, grid), settings, report)
+    howard = _Howard(settings, progress)
+    howard.level = settings.level if level is None else level
+    grid = optimum.grid if level is None else finer_grid(operator, start, settings, level)
+    iterate = howard.converge(operator, _transfer(operator, start, grid))
     return _optimum(iterate, operator, accuracy)
 
 
+class _Howard:
+    """Policy iteration as the settings say, telling its progress on the grid of a `level`."""
+
+    def __init__(self, settings: Settings, progress: Callable[[Progress], None] | None) -> None:
+        self.settings, self.level, self._progress = settings, 0, progress
+
+    def __call__(
+        self,
+        operator: BellmanOperator,
+        start: Iterate,
+        scan_points: int,
+        enough: Callable[[Iterate, Iterate], bool],
+        rounds: int | None = None,
+    ) -> Iterate:
+        """Improve and evaluate until `enough(before, after)`, at most `rounds` rounds."""
+        iterate, anchor = start, start.grid.nearest(operator.problem.reference_state)
+        for k in range(rounds or self.settings.rounds):
+            before = iterate
+            better = improve(operator, before, scan_points)
+            W, gain, distribution = evaluate(operator, better.grid, better.actions, anchor)
+            iterate = replace(better, W=W, gain=gain, distribution=distribution)
+            if self._progress is not None:
+                self._progress(
+                    Progress(self.level, k, iterate.grid.size, gain, iterate.lower, iterate.upper)
+                )
+            if enough(before, iterate):
+                break
+        return iterate
+
+    def approach(self, operator: BellmanOperator, iterate: Iterate) -> Iterate:
+        """Iterate until the gain falls no more: a start for the next grid needs no bounds."""
+        return self(
+            operator, iterate, 5, lambda old, new: old.gain - new.gain <= 1e-4 * abs(new.gain)
+        )
+
+    def converge(self, operator: BellmanOperator, iterate: Iterate) -> Iterate:
+        """Iterate until the bounds meet."""
+        tolerance = self.settings.tolerance
+        return self(
+            operator, iterate, 3, lambda _, new: new.upper - new.lower <= tolerance * abs(new.gain)
+        )
+
+
 def _optimum(iterate: Iterate, operator: BellmanOperator, accuracy: Accuracy) -> Optimum:
+    average, gain = operator.discount == 1.0, iterate.gain
+    lower = min(iterate.lower, gain) if average else iterate.lower
+    upper = max(iterate.upper, gain) if average else iterate.upper
+    distribution = np.maximum(iterate.distribution, 0.0)
     optimum = Optimum(
         iterate.grid,
         iterate.actions,
         iterate.W,
-        iterate.gain,
-        min(iterate.lower, iterate.gain) if operator.discount == 1.0 else iterate.lower,
-        max(iterate.upper, iterate.gain) if operator.discount == 1.0 else iterate.upper,
-        np.maximum(iterate.distribution, 0.0),
+        gain,
+        lower,
+        upper,
+        distribution,
         operator.discount,
         accuracy,
     )
-    if iterate.spread > 0.01 * abs(iterate.gain):
+    if iterate.upper - iterate.lower > 0.01 * abs(gain):
         raise OptimumError(
             f"policy iteration: the bounds of the gain, {iterate.lower:.6g} and "
             f"{iterate.upper:.6g}, are more than 1 % apart; allow more rounds or another grid"
@@ -629,76 +640,6 @@ def _optimum(iterate: Iterate, operator: BellmanOperator, accuracy: Accuracy) ->
     return optimum
 
 
-class _Reporter:
-    """Passes iterates on to the caller's progress function."""
-
-    def __init__(self, progress: Callable[[Progress], None] | None) -> None:
-        self.level = 0
-        self._progress = progress
-
-    def __call__(self, iterate: Iterate, k: int) -> None:
-        if self._progress is not None:
-            size = iterate.grid.size
-            self._progress(
-                Progress(self.level, k, size, iterate.gain, iterate.lower, iterate.upper)
-            )
-
-
-def _approach(
-    operator: BellmanOperator, iterate: Iterate, settings: Settings, report: _Reporter
-) -> Iterate:
-    """Iterate until the gain falls no more: a start for the next grid needs no bounds."""
-    return iterate_policy(
-        operator,
-        iterate,
-        rounds=settings.rounds,
-        scan_points=5,
-        enough=lambda before, after: before.gain - after.gain <= 1e-4 * abs(after.gain),
-        report=report,
-    )
-
-
-def _scan(operator: BellmanOperator, iterate: Iterate, report: _Reporter) -> Iterate:
-    """One round that looks for better actions in the whole action box."""
-    return iterate_policy(
-        operator, iterate, rounds=1, scan_points=9, enough=lambda *_: True, report=report
-    )
-
-
-def _converge(
-    operator: BellmanOperator, iterate: Iterate, settings: Settings, report: _Reporter
-) -> Iterate:
-    """Iterate until the bounds meet."""
-    return iterate_policy(
-        operator,
-        iterate,
-        rounds=settings.rounds,
-        scan_points=3,
-        enough=lambda _, after: after.spread <= settings.tolerance * abs(after.gain),
-        report=report,
-    )
-
-
-def _finer(
-    operator: BellmanOperator,
-    found: Iterate,
-    settings: Settings,
-    level: int,
-    *,
-    smooth: bool = True,
-) -> Grid:
-    return finer_grid(
-        operator,
-        found.grid,
-        found.actions,
-        found.distribution,
-        settings,
-        level,
-        smooth=smooth,
-    )
-
-
 def _transfer(operator: BellmanOperator, iterate: Iterate, grid: Grid) -> Iterate:
-    actions = iterate.grid.resample(iterate.actions, grid)
-    start = begin(operator, grid, actions)
+    start = begin(operator, grid, iterate.grid.resample(iterate.actions, grid))
     return replace(start, step=0.1 * start.step)

@@ -272,8 +272,8 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     if z is None or not z[0] > 0:
         raise TuningError(
             f"no convex cost has the local optimum of the economic one with {n_c} active "
-            f"constraint{'' if n_c == 1 else 's'} (Clarabel: {status}): it is not optimal to stay at "
-            "the steady state"
+            f"constraint{'' if n_c == 1 else 's'} (Clarabel: {status}): staying at the "
+            "steady state is not optimal"
         )
     alpha = float(z[0])
     delta_P = sum_of(z[1 : count - n_F], n) / alpha

@@ -121,7 +121,7 @@ def test_a_model_that_no_step_resolves_is_refused():
 def test_without_the_active_constraint_there_is_no_solution():
     steady = optimal_steady_state(PROBLEMS["paper"])
     none = np.zeros((0, 4))
-    with pytest.raises(TuningError, match=r"PrimalInfeasible.* with 0 active constraints"):
+    with pytest.raises(TuningError):
         convexify(steady.A, steady.B, steady.hessian, none)
 
 

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from cosim.scenario import Scenario as Scenario
     from cosim.simulation import simulate as simulate
     from cosim.study.engine import Study as Study
-    from cosim.study.outcome import StudyOutcome as StudyOutcome
     from cosim.study.outcome import run_study as run_study
     from cosim.study.results import StudyResults as StudyResults
     from cosim.trajectory import Trajectory as Trajectory
@@ -28,7 +27,6 @@ _HOMES = {
     "FmuPlant": "cosim.plant",
     "Scenario": "cosim.scenario",
     "Study": "cosim.study.engine",
-    "StudyOutcome": "cosim.study.outcome",
     "StudyResults": "cosim.study.results",
     "Training": "learning.training",
     "Trajectory": "cosim.trajectory",
@@ -42,7 +40,6 @@ __all__ = [
     "FmuPlant",
     "Scenario",
     "Study",
-    "StudyOutcome",
     "StudyResults",
     "Training",
     "Trajectory",

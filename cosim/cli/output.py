@@ -64,7 +64,10 @@ class Output:
         for number, column in enumerate(header):
             numeric = all(_is_number(row[number]) for row in rows)
             table.add_column(
-                escape(column), justify="right" if numeric else "left", overflow="fold"
+                escape(column),
+                justify="right" if numeric else "left",
+                overflow="fold",
+                no_wrap=numeric,
             )
         for row in rows:
             table.add_row(*map(escape, row))

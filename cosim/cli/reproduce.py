@@ -39,8 +39,6 @@ def reproduce(
     tables of `cosim study run`. Run again with the same --out to go on after an interruption.
     """
     with output(json) as out_:
-        from cosim.study.paper import comparison
-        from cosim.study.report import write_report
         from cosim.study.stored import stored_results
 
         name = "reproduce" if budget is BudgetName.quick else "reproduce-full"
@@ -49,8 +47,8 @@ def reproduce(
 
         results = StudyResults.load(out)
         summary = write_summary(results)
-        page = write_report(results)
+        page = results.report()
         show(results, out_)
-        out_.table(*comparison(results))
+        out_.table(*results.paper())
         out_.note(f"the report is {page.resolve()}")
         out_.json(summary)

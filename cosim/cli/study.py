@@ -16,6 +16,15 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--columns",
+        help="Columns of the printed tables, by comma, or `all`: case, samples, finished, regret, "
+        "worst, iqm, J, J-worst, gap, economic, violation, violating.",
+        show_default="case,regret,worst,finished,J",
+    ),
+]
 FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 
 
@@ -25,6 +34,7 @@ def run(
     out: OutOption = Path("cosim-study"),
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
+    columns: ColumnsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Train and evaluate every case on every scenario with every training seed.
@@ -36,7 +46,7 @@ def run(
     with output(json) as out_:
         results = execute(file, out, out_, jobs=jobs, scheduler=scheduler)
         summary = write_summary(results)
-        show(results, out_)
+        show(results, out_, columns)
         out_.note(f"tables are in {out.resolve()}; cosim study report {out} draws them")
         out_.json(summary)
 
@@ -122,6 +132,7 @@ def plan(file: FileArgument, json: JsonOption = False) -> None:
 @app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of a study.", show_default=False)],
+    columns: ColumnsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
@@ -129,12 +140,11 @@ def report(
     A study that is not finished, or a stored one, is reported with what it has.
     """
     with output(json) as out_:
-        from cosim.study.report import write_report
         from cosim.study.results import StudyResults
 
         results = StudyResults.load(folder)
-        page = write_report(results)
-        show(results, out_)
+        page = results.report()
+        show(results, out_, columns)
         out_.note(f"the report is {page.resolve()}")
         out_.json({"report": str(page), "runs": len(results.runs)})
 
@@ -151,31 +161,27 @@ def _thousands(samples: int) -> int:
 
 def write_summary(results: StudyResults) -> dict[str, Any]:
     """Write summary.json and return what it says; `timing` is what timing.csv says of each run."""
-    from cosim.errors import StudyError
     from cosim.files import write_atomically
-    from cosim.study.summary import aggregate_rows, summary_rows
-    from cosim.study.tables import TIMING
-    from cosim.text_tables import read_records
+    from cosim.study.results import TIMING
+    from cosim.study.tables import read_table
 
     document = {
         **results.about,
-        "summary": summary_rows(results),
-        "aggregate": aggregate_rows(results),
+        "summary": results.summary.to_dict("records"),
+        "aggregate": results.aggregate.to_dict("records"),
         "timing": {
-            row["run"]: {
-                "training_seconds": float(row["training_seconds"]),
-                "functions": row["functions"] or None,
-            }
-            for row in read_records(results.folder / TIMING, StudyError)
+            row["run"]: {"training_seconds": float(row["training_seconds"])}
+            for row in read_table(results.folder / TIMING, types={"run": str}).to_dict("records")
         },
     }
     write_atomically(results.folder / "summary.json", dump(document))
     return document
 
 
-def show(results: StudyResults, out_: Output) -> None:
-    """Print a table for each scenario."""
-    from cosim.study.formatting import HEADER, lines
+def show(results: StudyResults, out_: Output, columns: str | None = None) -> None:
+    """Print a table for each scenario, with the columns that `--columns` names."""
+    from cosim.study.results import COLUMNS, SHORT
 
+    chosen = COLUMNS if columns == "all" else columns.split(",") if columns else SHORT
     for scenario in results.scenarios:
-        out_.table(f"{results.name}: {scenario}", HEADER, lines(results, scenario))
+        out_.table(f"{results.name}: {scenario}", *results.lines(scenario, tuple(chosen)))

@@ -37,10 +37,13 @@ _KNOWN = {
     "tuned": "#E69F00",
     "converged": "#CC79A7",
     "optimal": "#111111",
+    "q-learning": "#0072B2",
+    "batch-q-learning": "#009E73",
+    "actor-critic": "#D55E00",
+    "search": "#882255",
 }
 _OTHERS = (
-    "#0072B2", "#D55E00", "#009E73", "#56B4E9", "#882255", "#332288", "#999933", "#44AA99",
-    "#AA4499", "#117733",
+    "#56B4E9", "#332288", "#999933", "#44AA99", "#AA4499", "#117733", "#661100", "#6699CC",
 )  # fmt: skip
 _LINES: Any = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
@@ -118,7 +121,7 @@ def palette(names: Sequence[str]) -> dict[str, Look]:
     """A look for each controller or case, in the order given.
 
     Cases that differ in their settings only, `rule(start=naive)` and `rule(start=tuned)`, share a
-    colour and differ in their line style. Known controllers have colours of their own.
+    colour and differ in their line style. Known controllers and rules have colours of their own.
     """
     heads = dict.fromkeys(name.partition("(")[0] for name in names)
     others = cycle(_OTHERS)

@@ -14,8 +14,9 @@ from cosim.errors import ResultsError
 from cosim.files import read_toml
 from cosim.study.document import Table
 from cosim.study.keyed import KeyedTable, read
-from cosim.study.tables import CURVES, EVALUATION
-from cosim.study.traces import LOGS, TRAJECTORIES
+from cosim.study.pictures import LOGS, TRAJECTORIES
+from cosim.study.results import CURVES
+from cosim.study.store import EVALUATION
 from cosim.validation import describe
 
 TOLERANCES = "tolerances.toml"

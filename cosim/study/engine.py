@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from cosim.errors import FailedRunsError
-from cosim.study import collecting
 from cosim.study.definition import Definition
 from cosim.study.plan import Plan, plan
 from cosim.study.results import StudyResults
@@ -51,8 +50,8 @@ class Study(Definition):
         planned = planned or self.plan()
         runner = Runner(planned, folder, report)
         runner.go(jobs, scheduler)
-        results = collecting.collect(planned, folder, runner.stores)
-        collecting.write(results, planned, runner.stores, figures)
+        results = StudyResults.collect(planned, folder)
+        results.write(planned, figures=figures)
         if runner.failures:
             name, failure = next(iter(runner.failures.items()))
             more = len(runner.failures) - 1

@@ -1,143 +1,186 @@
-"""What the runs of a study cost themselves: regret of their own samples, and how it goes on."""
+"""Cost of a study's runs themselves, exploration included: its table and its figure."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
-from cosim.figures.online import Course, plot_online
+from cosim.figures.style import (
+    REFERENCE,
+    EndLabel,
+    Look,
+    figure,
+    label,
+    label_ends,
+    plain,
+    regret_axis,
+)
 from cosim.statistics import regret, regret_terms, regrets, shown
-from cosim.study.document import OnlineTable
-from cosim.study.plan import Plan, Run
-from cosim.study.records import RunResult
-from cosim.study.results import StudyResults
-from cosim.study.store import RunKey, RunStore, safe
-from cosim.study.tables import KEYS, read_numbers, to_csv
-from cosim.study.traces import LOGS
-from cosim.text_tables import read_records
+from cosim.study.store import ONLINE
+from cosim.study.tables import read_table
 from cosim.validation import suggestion
 
+if TYPE_CHECKING:
+    from cosim.study.plan import Run
+
 Array = NDArray[np.float64]
-Costs = dict[str, dict[int, Array]]
-"""Mean costs of the blocks (K,) of each run, by case and training seed."""
-ONLINE = "online.csv"
-TITLE = "The runs' own samples on `{}`: regret in %, exploration's cost included"
+Course = tuple[Array, Array, Array]
+"""Samples (K,) at the blocks' ends, mean costs (R, K) of the runs, and the optimum's (R, K)."""
+HEADER = ("case", "runs", "regret %, mean [95 %]", "median", "worst")
+COLUMNS = ["scenario", "case", "training_seed", "samples", "J"]
 
 
-def online_csv(plan: Plan, runs: Iterable[RunResult], stores: Mapping[str, RunStore]) -> str:
-    """A row for each block of each run: the samples at its end and its mean cost."""
-    planned = {run.key: run for run in plan.runs}
-    rows: list[dict[str, Any]] = []
-    for result in runs:
-        run = planned[RunKey(*result.key)]
-        for seed, samples, costs in _blocks(run, result, stores[str(run.key)]):
-            key = {"scenario": result.scenario, "case": result.case, "training_seed": seed}
-            rows += [
-                key | {"samples": int(done), "J": float(cost)}
-                for done, cost in zip(samples, costs, strict=True)
-            ]
-    return to_csv((*KEYS, "samples", "J"), rows)
+def finished(run: Run, out: Path) -> bool:
+    """Whether a controller has run beside every training that it accompanies."""
+    assert run.online is not None
+    return set(run.online.seeds) <= set(_blocks(run, out).seed)
 
 
-def _blocks(run: Run, result: RunResult, store: RunStore) -> list[tuple[int, Array, Array]]:
-    if result.seed is not None:
-        # The first row of a log is θ at the start; it has no cost.
-        known = ~np.isnan(result.curve["J"])
-        return [(result.seed, result.curve["samples"][known], result.curve["J"][known])]
-    if run.online is None:
-        return []
-    steps, block = run.online.steps, run.online.block
-    found = store.online(run.online).items()
-    return [
-        (seed, np.minimum(block * np.arange(1, len(costs) + 1), steps), np.array(costs))
-        for seed, costs in found
-    ]
+def _blocks(run: Run, out: Path) -> pd.DataFrame:
+    """Rows of a controller's online.csv that are of the plan's steps and block."""
+    path, online = out / run.key.folder / ONLINE, run.online
+    if online is None or not path.is_file():
+        return pd.DataFrame(columns=["seed", "steps", "block", "J"])
+    rows = read_table(path, types={"seed": int, "steps": int, "block": int})
+    return rows[(rows.steps == online.steps) & (rows.block == online.block)]
 
 
-def tables(results: StudyResults) -> list[tuple[str, tuple[str, ...], list[list[str]]]]:
-    """Title, header and rows for each scenario: regret of the run, and of each of its periods.
+def collected(runs: Sequence[Run], curves: pd.DataFrame, out: Path) -> pd.DataFrame:
+    """A row for each block of each run: the samples at its end, and its mean cost.
 
-    Against the optimum's own run on the same noise, paired over the training seeds.
+    A training's blocks are the rows of its log, in `curves`; the first, θ at the start, has no
+    cost.
     """
-    if results.about.get("online") is None:
-        return []
-    return [_table(results, scenario) for scenario in results.scenarios]
+    found = []
+    for run in runs:
+        key = {"scenario": run.key.scenario, "case": run.key.case}
+        if run.training is not None:
+            own = (curves[list(key)] == key).all(axis=1) & (curves.training_seed == run.key.seed)
+            found.append(curves[own].dropna(subset="J")[COLUMNS])
+        elif run.online is not None:
+            rows = _blocks(run, out)
+            ends = run.online.block * (rows.groupby("seed").cumcount() + 1)
+            values = {
+                "training_seed": rows.seed.astype("Int64"),
+                "samples": np.minimum(ends, run.online.steps).astype("Int64"),
+                "J": rows.J,
+            }
+            found.append(pd.DataFrame(values).assign(**key)[COLUMNS])
+    return pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=COLUMNS)
 
 
-def _table(results: StudyResults, scenario: str) -> tuple[str, tuple[str, ...], list[list[str]]]:
-    settings = OnlineTable.model_validate(results.about["online"])
-    costs, best = _costs(results, scenario)
-    each = settings.period // settings.block
-    periods = max((len(run) // each for run in best.values()), default=0)
-    rows: list[tuple[float, list[str]]] = []
+def courses(online: pd.DataFrame, optimum: str) -> dict[str, Course]:
+    """The course of each case on a scenario, over the training seeds that the optimum ran, too."""
+    costs: dict[str, dict[int, Array]] = {}
+    samples: dict[str, Array] = {}
+    for (case, seed), rows in online.groupby(["case", "training_seed"], sort=False):
+        costs.setdefault(case, {})[seed] = rows.J.to_numpy()
+        samples.setdefault(case, rows.samples.to_numpy(dtype=np.float64))
+    best = costs.get(optimum, {})
+    found = {}
     for case, runs in costs.items():
-        seeds = sorted(seed for seed in runs if seed in best and len(runs[seed]) == len(best[seed]))
-        if not seeds:
-            continue
-        own = np.array([runs[seed] for seed in seeds])
-        optimum = np.array([best[seed] for seed in seeds])
-        found = regret(own.mean(axis=1), optimum.mean(axis=1))
-        single = regrets(own.mean(axis=1), optimum.mean(axis=1))
+        seeds = sorted(s for s in runs if s in best and len(runs[s]) == len(best[s]))
+        if seeds:
+            own, other = (np.array([which[s] for s in seeds]) for which in (runs, best))
+            found[case] = (samples[case], own, other)
+    return found
+
+
+def table(
+    online: pd.DataFrame, scenario: str, optimum: str, settings: Mapping[str, Any]
+) -> tuple[str, Sequence[str], list[list[str]]]:
+    """Title, header and rows: regret of each case's runs, and of each period; least first.
+
+    Against the optimum's own run on the same noise, paired over the training seeds. `settings` are
+    the study's table `[online]`.
+    """
+    each = settings["period"] // settings["block"]
+    found = courses(online, optimum)
+    periods = max((best.shape[1] // each for _, _, best in found.values()), default=0)
+    rows = []
+    for case, (_, own, best) in found.items():
+        mean = regret(own.mean(axis=1), best.mean(axis=1))
+        single = regrets(own.mean(axis=1), best.mean(axis=1))
         cut = [slice(i * each, (i + 1) * each) for i in range(periods)]
-        parts = [regret(own[:, c].mean(axis=1), optimum[:, c].mean(axis=1)) for c in cut]
-        by_period = [shown(part.value, None, 100, 3) for part in parts]
-        line = [case, str(len(seeds)), shown(found.value, found.t, 100, 3)]
+        parts = [regret(own[:, c].mean(axis=1), best[:, c].mean(axis=1)).value for c in cut]
+        line = [case, str(len(own)), shown(mean.value, mean.t, 100, 3)]
         line += [shown(float(f(single)), None, 100, 3) for f in (np.median, np.max)]
-        rows.append((found.value, [*line, *by_period]))
-    header = ("case", "runs", "regret %, mean [95 %]", "median", "worst")
-    periods_header = tuple(f"period {i + 1}" for i in range(periods))
-    lines = [line for _, line in sorted(rows, key=lambda row: row[0])]
-    return TITLE.format(scenario), (*header, *periods_header), lines
+        rows.append((mean.value, [*line, *(shown(part, None, 100, 3) for part in parts)]))
+    header = (*HEADER, *(f"period {i + 1}" for i in range(periods)))
+    title = f"The runs' own samples on `{scenario}`: regret in %, exploration's cost included"
+    return title, header, [line for _, line in sorted(rows, key=lambda row: row[0])]
 
 
-def _costs(results: StudyResults, scenario: str) -> tuple[Costs, dict[int, Array]]:
-    """Costs by case and seed, and the optimum's; none where the scenario has no optimum."""
-    found: dict[str, dict[int, list[float]]] = {}
-    for row in read_records(results.folder / ONLINE, StudyError):
-        if row["scenario"] == scenario:
-            runs = found.setdefault(row["case"], {})
-            runs.setdefault(int(row["training_seed"]), []).append(float(row["J"]))
-    costs = {case: {s: np.array(v) for s, v in runs.items()} for case, runs in found.items()}
-    order = [case for case in results.cases if case in costs]
-    costs = {case: costs[case] for case in order}
-    return costs, costs.get(results.about["optimum"].get(scenario, ""), {})
+def online_figure(
+    courses: Mapping[str, Course],
+    logs: Mapping[str, pd.DataFrame],
+    looks: Mapping[str, Look],
+    settings: Mapping[str, Any],
+    optimum: str,
+) -> Figure:
+    """A panel for each signal of the logs; below the mean regret of each block and since the start.
+
+    `logs` are those of the first training seed by case. Vertical lines stand at multiples of the
+    period. Raises StudyError for a signal that no log has.
+    """
+    names = list(settings["signals"]) if logs else []
+    known = list(dict.fromkeys(column for log in logs.values() for column in log))
+    for name in names:
+        if name not in known:
+            raise StudyError(
+                f"online.signals: no log has a column '{name}'{suggestion(name, known)}"
+            )
+    shown_cases = {case: course for case, course in courses.items() if case != optimum}
+    blocks = {
+        case: np.mean([100 * regret_terms(a, b) for a, b in zip(own, best, strict=True)], axis=0)
+        for case, (_, own, best) in shown_cases.items()
+    }
+    so_far = {c: np.cumsum(v) / np.arange(1, len(v) + 1) for c, v in blocks.items()}
+    with figure(1.25 * (len(names) + 2) + 1.2) as drawn:
+        ratios = [1.0] * len(names) + [1.7, 1.7]
+        grid = drawn.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)
+        panels = [axes for (axes,) in grid]
+        end = max(float(samples[-1]) for samples, *_ in shown_cases.values())
+        for axes in panels:
+            for edge in np.arange(settings["period"], end, settings["period"]):
+                axes.axvline(edge, color=REFERENCE, linewidth=0.6, linestyle=(0, (1, 2)))
+        for axes, name in zip(panels, names, strict=False):
+            _signal(axes, name, {c: log for c, log in logs.items() if name in log}, looks)
+        titles = ("regret % of the block", "regret % since the start")
+        for axes, means, title in zip(panels[-2:], (blocks, so_far), titles, strict=True):
+            for case, values in means.items():
+                color, line = looks[case]
+                axes.plot(shown_cases[case][0], values, color=color, linestyle=line, linewidth=1.2)
+            regret_axis(axes, "y", np.concatenate([[0.0], *means.values()]), 0.1)
+            axes.set_ylabel(title)
+        panels[-1].set_xlim(0.0, end)
+        panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
+        panels[-1].set_xlabel("samples of the run")
+        drawn.draw_without_rendering()
+        ends = [EndLabel(plain(c), float(so_far[c][-1]), looks[c].color) for c in so_far]
+        label_ends(panels[-1], ends)
+    return drawn
 
 
-def draw(results: StudyResults, scenario: str, target: Path, suffixes: Iterable[str]) -> list[str]:
-    """Draw the course of regret under the logs' signals; returns the figure's name."""
-    settings = OnlineTable.model_validate(results.about["online"])
-    costs, best = _costs(results, scenario)
-    courses = {}
-    for case, runs in costs.items():
-        if runs is best:
-            continue
-        seeds = [s for s in runs if s in best and len(runs[s]) == len(best[s])]
-        values = [100 * regret_terms(runs[s], best[s]) for s in seeds]
-        if values:
-            samples = settings.block * np.arange(1, len(values[0]) + 1, dtype=np.float64)
-            courses[case] = Course(samples, np.array(values))
-    if not courses:
-        return []
-    signals: dict[str, dict[str, tuple[Array, Array]]] = {}
-    columns: list[str] = []
-    for case in courses:
-        path = results.folder / LOGS / f"{safe(scenario)}-{safe(case)}.csv"
-        if path.is_file():
-            log = read_numbers(path)
-            columns = list(log)
-            for name in settings.signals:
-                if name in log:
-                    signals.setdefault(name, {})[case] = (log["samples"], log[name])
-    if columns and (unknown := [name for name in settings.signals if name not in signals]):
-        raise StudyError(
-            f"online.signals: no log has a column '{unknown[0]}'{suggestion(unknown[0], columns)}"
-        )
-    name = f"online-{safe(scenario)}"
-    for suffix in suffixes:
-        plot_online(courses, signals, settings.period, target / f"{name}.{suffix}")
-    return [name]
+def _signal(
+    axes: Axes, name: str, logs: Mapping[str, pd.DataFrame], looks: Mapping[str, Look]
+) -> None:
+    """A line for each case, or one where the signal is the same in all."""
+    lines = {case: log[["samples", name]].dropna().to_numpy().T for case, log in logs.items()}
+    first = next(iter(lines.values()))
+    if all(np.array_equal(line, first) for line in lines.values()):
+        axes.plot(*first, color=REFERENCE, linewidth=1.2)
+    else:
+        for case, line in lines.items():
+            color, style = looks[case]
+            axes.plot(*line, color=color, linestyle=style, linewidth=1.2)
+    axes.set_ylabel(label(name.removeprefix("theta "), ""))

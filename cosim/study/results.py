@@ -1,42 +1,90 @@
-"""What a study measured: its runs, typed, from the runner or read back from the tables."""
+"""Measurements of a study: frames of runs, evaluations and curves, and all that is made of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
-from cosim.files import read_json
-from cosim.statistics import Estimate, gap_closed, regret
-from cosim.study.records import CaseResult, RunResult
-from cosim.study.tables import read_runs
+from cosim.figures.style import palette, save
+from cosim.files import read_json, write_atomically
+from cosim.statistics import Estimate, gap_closed, over_runs, regret, regrets, shown
+from cosim.study import figures, online, paper, report, theta
+from cosim.study.store import EVALUATION, GREEDY, INDICATORS, LOG, ONLINE, RUN, safe
+from cosim.study.tables import KEYS, WHERE, read_table, to_csv
+from cosim.text_tables import markdown_table
+from cosim.validation import suggestion
+
+if TYPE_CHECKING:
+    from cosim.study.plan import Plan, Run
 
 Array = NDArray[np.float64]
-ABOUT = "study.json"
-SCHEMA = 1
+
+ABOUT, SCHEMA = "study.json", 1
+CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
+THETA, TIMING, LOGS = "theta.csv", "timing.csv", "logs"
+EVALUATED, SUFFIXES = "evaluated", ("svg", "png")
+BASELINES = "baselines"
+LEVELS = 4
+"""Baselines that are lines in a figure of curves, at most."""
+
+STATE = [*KEYS, "status", "samples", "plant_samples"]
+CURVE = ["samples", "J", "greedy_J", "td_error"]
+MEANS = ["economic_cost", "mean_violation", "violating_share"]
+RUN_COLUMNS = [
+    *STATE, "J", "regret", "regret_low", "regret_high", "gap_closed", *MEANS, "failures",
+]  # fmt: skip
+SUMMARY_COLUMNS = [
+    *WHERE, "samples", "plant_samples", "finished", "runs", "regret_median",
+    "regret_median_low", "regret_median_high", "regret_worst", "regret_iqm", "regret_iqm_low",
+    "regret_iqm_high", "J_median", "J_worst", "J_iqm", "gap_closed_median", *MEANS, "failures",
+]  # fmt: skip
+AGGREGATE_COLUMNS = [
+    "case", "scenarios", "runs", "regret_median", "regret_worst", "regret_iqm", "regret_iqm_low",
+    "regret_iqm_high",
+]  # fmt: skip
+COLUMNS = {
+    "case": "case", "samples": "plant samples", "finished": "finished",
+    "regret": "regret %, median [95 %]", "worst": "worst", "iqm": "IQM [95 %]",
+    "J": "J, median", "J-worst": "J, worst", "gap": "gap closed %", "economic": "economic cost",
+    "violation": "violation", "violating": "violating %",
+}  # fmt: skip
+"""Headers of the columns of a scenario's table, by the names that options take."""
+SHORT = ("case", "regret", "worst", "finished", "J")
+"""Columns that fit a terminal of 80 characters."""
+AGGREGATE_HEADER = ("case", "runs", "regret %, IQM [95 %]", "median", "worst")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StudyResults:
-    """What a study measured, in `folder`.
+    """Measurements of a study in `folder`, as pandas frames of its finished runs.
 
-    `about` says what the study is and what it was made with; `runs` are those that are finished.
+    `about` is the document study.json: cases, scenarios, and the versions that made them.
+    `state` has a row for each run (scenario, case, training_seed, status, samples,
+    plant_samples), `evaluation` one for each run and noise seed, `curves` one for each row of a
+    training's log and one, without samples, for each controller on the noise of the curves.
     """
 
     folder: Path
     about: Mapping[str, Any]
-    runs: Sequence[RunResult]
+    state: pd.DataFrame
+    evaluation: pd.DataFrame
+    curves: pd.DataFrame
 
     @classmethod
     def load(cls, folder: str | Path) -> StudyResults:
         """Read a study's folder, or a stored one; raises StudyError."""
-        path = Path(folder) / ABOUT
+        folder = Path(folder)
+        path = folder / ABOUT
         if not path.exists():
             raise StudyError(
                 f"'{folder}' holds no study ({ABOUT}); give the --out of a cosim study run"
@@ -44,84 +92,645 @@ class StudyResults:
         about = read_json(path, f"'{path}'", StudyError)
         if about.get("schema") != SCHEMA:
             raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
-        return cls(Path(folder), about, read_runs(Path(folder)))
+        return cls(
+            folder,
+            about,
+            read_table(folder / RUNS, STATE, {"samples": int, "plant_samples": int}),
+            read_table(
+                folder / EVALUATION,
+                [*KEYS, "seed", "steps", *INDICATORS],
+                {"seed": int, "steps": int},
+            ),
+            read_table(folder / CURVES, [*KEYS, *CURVE], {"samples": "Int64"}),
+        )
+
+    @classmethod
+    def collect(cls, plan: Plan, folder: Path) -> StudyResults:
+        """Read the finished runs of a plan from their folders, by scenario, case and seed.
+
+        Raises StudyError where a file of a run is damaged.
+        """
+        runs = _ordered(plan)
+        found = [frames for run in runs if (frames := _collected(run, folder)) is not None]
+        columns = (STATE, [*KEYS, "seed", "steps", *INDICATORS], [*KEYS, *CURVE])
+        state, evaluation, curves = (
+            pd.concat([one[i] for one in found if len(one[i])], ignore_index=True)
+            if any(len(one[i]) for one in found)
+            else pd.DataFrame(columns=header)
+            for i, header in enumerate(columns)
+        )
+        return cls(folder, _about(plan), state, evaluation, curves)
+
+    def write(self, plan: Plan, *, figures: bool = True) -> None:
+        """Write the study's tables and kept files; study.json last, so that its word is true.
+
+        `figures` draws the kept trajectories and logs, too.
+        """
+        from cosim.study import pictures  # noqa: PLC0415 - needs controllers
+
+        out = self.folder
+        pictures.keep(plan, out)
+        drawn = pictures.draw(plan, out) if figures else []
+        known = self.state[KEYS].astype(object).where(self.state[KEYS].notna(), None)
+        done = set(known.itertuples(index=False, name=None))
+        runs = [r for r in _ordered(plan) if (r.key.scenario, r.key.case, r.key.seed) in done]
+        tables = {
+            EVALUATION: self.evaluation,
+            CURVES: self.curves,
+            RUNS: self.runs,
+            SUMMARY: self.summary,
+            TIMING: _timing(plan, out),
+        }
+        if self.about["online"] is not None:
+            tables[ONLINE] = online.collected(runs, self.curves, out)
+        if "theta" in self.about:
+            tables[THETA] = theta.collected(runs, out)
+        if len(self.aggregate):
+            tables[AGGREGATE] = self.aggregate
+        for name, table in tables.items():
+            write_atomically(out / name, to_csv(table))
+        about = json.dumps(dict(self.about) | {"pictures": drawn}, indent=1, sort_keys=True)
+        write_atomically(out / ABOUT, about + "\n")
 
     @property
     def name(self) -> str:
         """The study's name."""
         return str(self.about["name"])
 
-    @cached_property
+    @property
     def scenarios(self) -> list[str]:
         """Scenarios, in the study's order."""
         return list(self.about["scenarios"])
 
     @cached_property
-    def cases(self) -> dict[str, CaseResult]:
-        """Cases by name, in the study's order."""
-        return {case["name"]: CaseResult(**case) for case in self.about["cases"]}
+    def cases(self) -> dict[str, dict[str, Any]]:
+        """Cases by name, in the study's order: group, target, trained, samples, settings, …."""
+        return {case["name"]: case for case in self.about["cases"]}
 
     @cached_property
-    def _by_case(self) -> dict[tuple[str, str], list[RunResult]]:
-        found: dict[tuple[str, str], list[RunResult]] = {}
-        for run in self.runs:
-            found.setdefault((run.scenario, run.case), []).append(run)
+    def _arrays(self) -> dict[tuple[str, str], dict[str, Array]]:
+        """Seeds, steps and indicators (R, S) by scenario and case."""
+        found: dict[tuple[str, str], dict[str, Array]] = {}
+        rows = self.state[KEYS].merge(self.evaluation, on=KEYS, how="left")
+        for where, runs in self.state.groupby(WHERE, sort=False):
+            own = rows[(rows.scenario == where[0]) & (rows.case == where[1])]
+            if own.seed.isna().any() or len(own) % len(runs):
+                raise StudyError(f"the tables in '{self.folder}' are damaged: {where}")
+            found[where] = {
+                name: own[name].to_numpy(dtype=np.float64).reshape(len(runs), -1)
+                for name in ("seed", "steps", *INDICATORS)
+            }
         return found
 
-    def of(self, case: str, scenario: str) -> list[RunResult]:
-        """The finished runs of a case on a scenario, by training seed; [] if there are none."""
-        return self._by_case.get((scenario, case), [])
+    def indicator(self, case: str, scenario: str, name: str = "J") -> Array:
+        """An indicator of a case's runs over the noise seeds, (R, S); (0, 0) without runs."""
+        own = self._arrays.get((scenario, case))
+        return np.zeros((0, 0)) if own is None else own[name]
 
-    def _reference(self, kind: str, scenario: str) -> RunResult | None:
-        name = self.about[kind].get(scenario)
-        found = [] if name is None else self.of(name, scenario)
-        return found[0] if found else None
+    def of(self, case: str, scenario: str) -> pd.DataFrame:
+        """Rows of `runs` of a case on a scenario, by training seed."""
+        return self.runs[(self.runs.scenario == scenario) & (self.runs.case == case)]
 
-    def optimum(self, scenario: str) -> RunResult | None:
-        """The run that gives J* on a scenario, None if there is none."""
-        return self._reference("optimum", scenario)
+    def reference(self, kind: str, scenario: str) -> Array | None:
+        """J (S,) of the case that is a scenario's `optimum` or `naive`; None if there is none."""
+        cost = self.indicator(self.about[kind].get(scenario, ""), scenario)
+        return cost[0] if len(cost) else None
 
-    def naive(self, scenario: str) -> RunResult | None:
-        """The run that the gap closed starts from, None if there is none."""
-        return self._reference("naive", scenario)
+    def _paired(self, case: str, scenario: str) -> Array:
+        """J (R, S); raises StudyError where it was measured on other noise than the optimum's."""
+        own = self._arrays[scenario, case]
+        best = self._arrays.get((scenario, self.about["optimum"].get(scenario, "")))
+        for name in ("seed", "steps") if best is not None else ():
+            if (
+                best is None
+                or own[name].shape[1] != best[name].shape[1]
+                or (own[name] != best[name][0]).any()
+            ):
+                raise StudyError(
+                    f"{case} and {self.about['optimum'][scenario]} on {scenario} were evaluated on "
+                    "different noise; run the study again"
+                )
+        return own["J"]
 
-    def regret(self, *runs: RunResult) -> Estimate:
+    def regret(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
         """(J − J*)/|J*| of a run, or of the mean of several, paired over the noise seeds.
 
-        NaN where the scenario has no known optimum.
+        `runs` counts the case's runs from 0. NaN where the scenario has no known optimum.
         """
-        optimum = self.optimum(runs[0].scenario)
-        if optimum is None:
+        best = self.reference("optimum", scenario)
+        if best is None:
             return Estimate(float("nan"))
-        cost = np.mean([_paired(run, optimum) for run in runs], axis=0)
-        return regret(cost, optimum.indicators["J"])
+        return regret(self._paired(case, scenario)[list(runs)].mean(axis=0), best)
+
+    def gap_closed(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
+        """(J_naive − J)/(J_naive − J*), likewise."""
+        best, naive = (self.reference(kind, scenario) for kind in ("optimum", "naive"))
+        if best is None or naive is None:
+            return Estimate(float("nan"))
+        return gap_closed(self._paired(case, scenario)[list(runs)].mean(axis=0), naive, best)
 
     @cached_property
-    def regrets(self) -> dict[tuple[str, str, int | None], float]:
-        """Regret of every run by scenario, case and training seed; infinite where J is no number.
+    def runs(self) -> pd.DataFrame:
+        """A row for each run: its state, J, regret with its interval over noise, indicators."""
+        rows = []
+        for (scenario, case), state in self.state.groupby(WHERE, sort=False):
+            own = self._arrays[scenario, case]
+            for run, known in enumerate(state.to_dict("records")):
+                found = self.regret(case, scenario, [run])
+                rows.append(
+                    known
+                    | {"J": _finite(np.mean(own["J"][run])), "regret": found.value}
+                    | _ends("regret", found.t)
+                    | {"gap_closed": self.gap_closed(case, scenario, [run]).value}
+                    | {name: float(np.mean(own[name][run])) for name in MEANS}
+                    | {"failures": int(np.sum(own["failures"][run]))}
+                )
+        frame = pd.DataFrame(rows, columns=RUN_COLUMNS)
+        return frame.astype({"training_seed": "Int64"})
 
-        Scenarios whose J* is not known are not there.
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """A row for each scenario and case, the least median J first.
+
+        Medians are those of the middle runs (of both, where their number is even), so that the
+        interval of the median regret is that of real runs.
         """
+        rows: list[dict[str, Any]] = []
+        for scenario in self.scenarios:
+            known = [
+                self._summary(case, scenario) for case in self.cases if len(self.of(case, scenario))
+            ]
+            rows += sorted(known, key=lambda row: float(row["J_median"]))
+        return pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
+
+    def _summary(self, case: str, scenario: str) -> dict[str, Any]:
+        runs, own = self.of(case, scenario), self._arrays[scenario, case]
+        cost, values = runs.J.to_numpy(), self.regrets(case, scenario)
+        order = np.argsort(cost, kind="stable")
+        middle = order[(len(order) - 1) // 2 : len(order) // 2 + 1]
+        median = self.regret(case, scenario, list(middle))
+        spread = over_runs([values[order]]) if len(runs) > 1 else Estimate(float(values[0]))
         return {
-            run.key: self.regret(run).value if np.isfinite(run.J) else float("inf")
-            for run in self.runs
-            if self.optimum(run.scenario) is not None
+            "scenario": scenario,
+            "case": case,
+            "samples": runs.samples.max(),
+            "plant_samples": runs.plant_samples.max(),
+            "finished": int((~runs.status.str.startswith("diverged")).sum()),
+            "runs": len(runs),
+            "regret_median": median.value,
+            **_ends("regret_median", median.t),
+            "regret_worst": float(values[order[-1]]),
+            "regret_iqm": spread.value,
+            **_ends("regret_iqm", spread.bootstrap),
+            "J_median": float(np.median(cost)),
+            "J_worst": float(cost[order[-1]]),
+            "J_iqm": over_runs([cost[order]]).value,
+            "gap_closed_median": self.gap_closed(case, scenario, list(middle)).value,
+            **{name: float(np.median(runs[name])) for name in MEANS},
+            "failures": int(own["failures"].sum()),
         }
 
-    def gap_closed(self, *runs: RunResult) -> Estimate:
-        """(J_naive − J)/(J_naive − J*), likewise."""
-        optimum, naive = self.optimum(runs[0].scenario), self.naive(runs[0].scenario)
-        if optimum is None or naive is None:
-            return Estimate(float("nan"))
-        cost = np.mean([_paired(run, optimum) for run in runs], axis=0)
-        return gap_closed(cost, _paired(naive, optimum), optimum.indicators["J"])
+    def regrets(self, case: str, scenario: str) -> Array:
+        """Regret of each run, (R,), infinite where J is not finite; NaN where J* is not known."""
+        runs = self.of(case, scenario)
+        if self.reference("optimum", scenario) is None:
+            return np.full(len(runs), np.nan)
+        return np.where(np.isfinite(runs.J), runs.regret, np.inf)
 
+    @property
+    def known(self) -> list[str]:
+        """Scenarios whose J* is known."""
+        return [s for s in self.scenarios if self.reference("optimum", s) is not None]
 
-def _paired(run: RunResult, other: RunResult) -> Array:
-    """J (S,) of a run; raises StudyError where it met other noise than the other one."""
-    if run.seeds != other.seeds or run.steps != other.steps:
-        raise StudyError(
-            f"{run.case} and {other.case} on {run.scenario} were evaluated on different noise; run "
-            "the study again"
+    @cached_property
+    def aggregate(self) -> pd.DataFrame:
+        """Cases that ran on every scenario whose J* is known, if several: regret over all runs.
+
+        The bootstrap is stratified: runs are resampled within their scenario.
+        """
+        rows: list[dict[str, Any]] = []
+        for case in self.cases if len(self.known) > 1 else ():
+            strata = [self.regrets(case, scenario) for scenario in self.known]
+            if not all(map(len, strata)):
+                continue
+            spread, everything = over_runs(strata), np.concatenate(strata)
+            rows.append(
+                {
+                    "case": case,
+                    "scenarios": len(strata),
+                    "runs": len(everything),
+                    "regret_median": float(np.median(everything)),
+                    "regret_worst": float(everything.max()),
+                    "regret_iqm": spread.value,
+                    **_ends("regret_iqm", spread.bootstrap),
+                }
+            )
+        rows.sort(key=lambda row: float(row["regret_iqm"]))
+        return pd.DataFrame(rows, columns=AGGREGATE_COLUMNS)
+
+    def to_pandas(self) -> dict[str, pd.DataFrame]:
+        """The frames by name: runs, evaluation, curves, summary, aggregate."""
+        names = ("runs", "evaluation", "curves", "summary", "aggregate")
+        return {name: getattr(self, name) for name in names}
+
+    def log(self, case: str, scenario: str) -> pd.DataFrame | None:
+        """Log of a case's first training seed, None where it was not kept; raises StudyError."""
+        path = self.folder / LOGS / f"{safe(scenario)}-{safe(case)}.csv"
+        return read_table(path) if path.is_file() else None
+
+    @cached_property
+    def online(self) -> pd.DataFrame | None:
+        """Mean costs of the blocks of each run, None where the study does not measure them."""
+        if self.about.get("online") is None:
+            return None
+        return read_table(self.folder / ONLINE)
+
+    def lines(
+        self, scenario: str, columns: Sequence[str] = tuple(COLUMNS)
+    ) -> tuple[Sequence[str], list[list[str]]]:
+        """Header and rows of a scenario's table as texts; `columns` are keys of `COLUMNS`.
+
+        Raises StudyError for another column.
+        """
+        for name in columns:
+            if name not in COLUMNS:
+                raise StudyError(
+                    f"a study's table has no column '{name}'{suggestion(name, COLUMNS)}; it has "
+                    f"{', '.join(COLUMNS)}"
+                )
+        own = self.summary[self.summary.scenario == scenario]
+        texts = [dict(zip(COLUMNS, _texts(row), strict=True)) for row in own.to_dict("records")]
+        header = [COLUMNS[name] for name in columns]
+        return header, [[row[name] for name in columns] for row in texts]
+
+    def table(self, scenario: str) -> str:
+        """A scenario's table as Markdown, least J first."""
+        return markdown_table(*self.lines(scenario))
+
+    def _repr_html_(self) -> str:
+        """Tables of all scenarios, for notebooks."""
+        return report.tables_html([(name, *self.lines(name, SHORT)) for name in self.scenarios])
+
+    def further(self) -> list[tuple[str, Sequence[str], list[list[str]]]]:
+        """Title, header and rows of the tables that the study asks for beside its summary."""
+        found = []
+        if self.online is not None:
+            for scenario in self.scenarios:
+                optimum = self.about["optimum"].get(scenario, "")
+                own = self.online[self.online.scenario == scenario]
+                found.append(online.table(own, scenario, optimum, self.about["online"]))
+        if self.about.get("theta") is not None:
+            frame = read_table(self.folder / THETA)
+            trained = [name for name, case in self.cases.items() if case["trained"]]
+            found += theta.tables(frame, self.runs, trained, **self.about["theta"])
+        if "paper" in self.about["tables"]:
+            found.append(self.paper())
+        return found
+
+    def paper(self) -> tuple[str, Sequence[str], list[list[str]]]:
+        """Title, header and rows: the gains that the paper's text states, beside the study's."""
+        trained = [name for name, case in self.cases.items() if case["trained"]]
+        return paper.comparison(self.scenarios, trained, self.indicator)
+
+    def figure(self, name: str) -> Figure:
+        """Draw `curves`, `regret`, `profile` or `online` of a scenario: `curves-paper`, say.
+
+        `profile` alone is that of all scenarios. Raises StudyError for another name, and where
+        there is nothing to draw.
+        """
+        kind, _, scenario = name.partition("-")
+        makers = {
+            "curves": self._curves,
+            "regret": self._regret,
+            "online": self._online,
+            "profile": self._profile,
+        }
+        fits = kind in makers and scenario in (*self.scenarios, *[""] * (kind == "profile"))
+        drawn = makers[kind](scenario) if fits else None
+        if drawn is None:
+            raise StudyError(f"there is no figure '{name}' of this study")
+        return drawn
+
+    def draw(self, folder: Path) -> dict[str, list[str]]:
+        """Draw all figures into a folder; returns their names by scenario, "" for all."""
+        folder.mkdir(parents=True, exist_ok=True)
+        names: dict[str, list[str]] = {}
+        for scenario in (*self.scenarios, ""):
+            makers = (
+                {"profile": self._profile}
+                if not scenario
+                else {
+                    "curves": self._curves, "regret": self._regret, "online": self._online,
+                    "profile": self._profile,
+                }
+            )  # fmt: skip
+            names[scenario] = []
+            for kind, maker in makers.items():
+                if (drawn := maker(scenario)) is not None:
+                    stem = f"{kind}-{safe(scenario)}" if scenario else kind
+                    names[scenario].append(stem)
+                    for suffix in SUFFIXES:
+                        save(drawn, folder / f"{stem}.{suffix}")
+        return names
+
+    @cached_property
+    def _looks(self) -> Mapping[str, Any]:
+        return palette(list(self.cases))
+
+    def _regret(self, scenario: str) -> Figure | None:
+        if self.reference("optimum", scenario) is None:
+            return None
+        rows = []
+        for row in self.summary[self.summary.scenario == scenario].to_dict("records"):
+            case = str(row["case"])
+            if case != self.about["optimum"][scenario]:
+                kind = "regret_iqm" if row["runs"] > 1 else "regret_median"
+                middle, low, high = (100 * row[f"{kind}{end}"] for end in ("", "_low", "_high"))
+                lost = self.of(case, scenario).status.str.startswith("diverged").to_numpy()
+                values = 100 * self.regrets(case, scenario)
+                rows.append(figures.Dots(case, values, ~lost, middle, low, high))
+        return figures.regret_figure(rows, self._looks) if rows else None
+
+    def _curves(self, scenario: str) -> Figure | None:
+        """None where no training was evaluated more than once: a point is no curve."""
+        own = self.curves[self.curves.scenario == scenario]
+        levels = own[own.training_seed.isna()].set_index("case").greedy_J
+        trained = own[own.training_seed.notna()]
+        if not (trained.dropna(subset="greedy_J").groupby(KEYS).size() > 1).any():
+            return None
+        best = float(levels.get(self.about["optimum"].get(scenario), np.nan))
+        known = np.isfinite(best)
+        curves = {
+            str(case): figures.learning_curve(rows, best if known else None)
+            for case, rows in trained.groupby("case", sort=False)
+            if self.cases[case]["group"] != BASELINES
+        }
+        ends = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J.last()
+        ends = ends.groupby("case").median()
+        first = self.about["naive"].get(scenario)
+        marks = {
+            name: float(level)
+            for name, level in pd.concat([levels, ends]).items()
+            if self.cases[name]["group"] == BASELINES and np.isfinite(level)
+            and name != self.about["optimum"].get(scenario)
+        }  # fmt: skip
+        # Naive stays: it is where the curves begin.
+        chosen = sorted(marks, key=lambda name: (name != first, marks[name]))[:LEVELS]
+        if known:
+            marks = {name: float(100 * regrets(np.array(marks[name]), best)) for name in chosen}
+        return figures.curves_figure(
+            curves, {name: marks[name] for name in chosen}, self._looks, relative=bool(known)
         )
-    return run.indicators["J"]
+
+    def _online(self, scenario: str) -> Figure | None:
+        if self.online is None:
+            return None
+        own = self.online[self.online.scenario == scenario]
+        optimum = self.about["optimum"].get(scenario, "")
+        courses = online.courses(own, optimum)
+        if not courses:
+            return None
+        logs = {case: log for case in courses if (log := self.log(case, scenario)) is not None}
+        return online.online_figure(courses, logs, self._looks, self.about["online"], optimum)
+
+    def _profile(self, scenario: str) -> Figure | None:
+        """Of one scenario, or, for "", of all whose J* is known, where they are several."""
+        scenarios = self.known if not scenario else [s for s in self.known if s == scenario]
+        if not scenarios or (not scenario and len(scenarios) < 2):
+            return None
+        strata = {
+            name: [100 * self.regrets(name, one) for one in scenarios]
+            for name, case in self.cases.items()
+            if case["trained"]
+        }
+        strata = {
+            name: runs for name, runs in strata.items()
+            if all(map(len, runs)) and sum(map(len, runs)) > 1
+        }  # fmt: skip
+        return figures.profile_figure(strata, self._looks) if strata else None
+
+    def report(self, folder: Path | None = None) -> Path:
+        """Write report.html, report.md and figures/ into the study's folder; returns the page."""
+        target = self.folder if folder is None else folder
+        drawn = self.draw(target / report.FOLDER)
+        return report.write(self._page(drawn), target, self.folder)
+
+    def _page(self, drawn: Mapping[str, list[str]]) -> dict[str, Any]:
+        """The report's sections, for its templates."""
+        sections: list[dict[str, Any]] = []
+        for scenario in self.scenarios:
+            table = ("", *self.lines(scenario))
+            section = {"title": f"Scenario {scenario}", "note": self._noise(scenario)}
+            sections.append(section | {"tables": [table], "figures": drawn[scenario]})
+        if len(self.aggregate):
+            rows = [
+                [row["case"], str(row["runs"]), *(
+                    _percent(row, name) for name in ("regret_iqm", "regret_median", "regret_worst")
+                )]
+                for row in self.aggregate.to_dict("records")
+            ]  # fmt: skip
+            table = ("", AGGREGATE_HEADER, rows)
+            sections.append({"title": "All scenarios", "tables": [table], "figures": drawn[""]})
+        for title, header, rows in self.further():
+            sections.append({"title": title, "tables": [("", header, rows)]})
+        if self.about["pictures"]:
+            sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
+        sections.append({"title": "Cases", "tables": [("", *self._settings())]})
+        made = self.about["made_with"]
+        return {
+            "title": self.about["title"] or self.name,
+            "description": self.about["description"],
+            "runs": len(self.state),
+            "missing": self.about["runs"] - len(self.state),
+            "sections": sections,
+            "every": self._every(),
+            "command": ["cosim", "study", "run", self.about.get("file") or f"{self.name}.toml"],
+            "made": f"Made with {made['versions']}; code {made['code_hash']}"
+            + (f"; commit {made['commit']}" if made.get("commit") else ""),
+            "date": report.date(self.folder / TIMING),
+        }
+
+    def _noise(self, scenario: str) -> str:
+        """The noise that a scenario's figures were measured on."""
+        own = self.evaluation[self.evaluation.scenario == scenario]
+        if own.empty:
+            return "No run is finished."
+        text = f"Table, regret and profile: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
+        text += "samples."
+        if noise := self.about.get("curves", {}).get(scenario):
+            text += f" Learning curves: {noise[0]} other seeds × {noise[1]} samples."
+        else:
+            text += " Learning curves: other noise, and fewer samples."
+        return text + " Regrets of a case differ between the two."
+
+    def _settings(self) -> tuple[Sequence[str], list[list[str]]]:
+        header = ("case", "algorithm or controller", "samples", "start", "NMPC", "settings")
+        rows = [
+            [
+                name, case["target"], str(case["samples"] or ""), case["start"], case["nmpc"],
+                ", ".join(f"{key} = {json.dumps(v)}" for key, v in case["settings"].items()),
+            ]
+            for name, case in self.cases.items()
+        ]  # fmt: skip
+        return header, rows
+
+    def _every(self) -> tuple[Sequence[str], list[list[str]]]:
+        """Header and rows of every run."""
+        header = ("case", "scenario", "seed", "status", "plant samples", "regret % [95 %]", "J")
+        rows = [
+            [
+                row["case"], row["scenario"],
+                "" if pd.isna(row["training_seed"]) else str(row["training_seed"]), row["status"],
+                str(row["plant_samples"] or ""), _percent(row, "regret"), _number(row["J"]),
+            ]
+            for row in self.runs.to_dict("records")
+        ]  # fmt: skip
+        return header, rows
+
+
+def _ordered(plan: Plan) -> list[Run]:
+    """The runs by scenario, case and training seed, in the study's order."""
+    definition = plan.definition
+    names = [case.name for case in (*definition.references, *definition.cases)]
+    scenarios = list(definition.scenarios)
+    return sorted(
+        plan.runs,
+        key=lambda run: (
+            scenarios.index(run.key.scenario),
+            names.index(run.key.case),
+            -1 if run.key.seed is None else run.key.seed,
+        ),
+    )
+
+
+def _about(plan: Plan) -> dict[str, Any]:
+    """The document study.json of a plan."""
+    definition = plan.definition
+    cases = [*definition.references, *definition.cases]
+    scenarios = list(definition.scenarios)
+    sizes = {name: definition.sizes(name) for name in scenarios}
+    about = {
+        "schema": SCHEMA,
+        "name": definition.name,
+        "title": definition.table.title,
+        "description": definition.table.description,
+        "scenarios": scenarios,
+        "cases": [
+            {
+                "name": case.name,
+                "group": case.group,
+                "target": definition.relative(case.target),
+                "trained": case.algorithm is not None,
+                "samples": case.samples,
+                "start": definition.relative(case.start),
+                "nmpc": case.nmpc,
+                "settings": dict(case.settings),
+                "scenarios": list(case.scenarios),
+            }
+            for case in cases
+        ],
+        "optimum": definition.optima,
+        "naive": dict.fromkeys(scenarios, definition.naive),
+        "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},
+        "online": None if definition.table.online is None else definition.table.online.model_dump(),
+        "runs": len(plan.runs),
+        "tables": list(definition.table.tables),
+        "pictures": [],
+        "made_with": dict(plan.provenance) | {"commit": report.commit()},
+    }
+    if (settings := definition.table.theta) is not None:
+        about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
+    document: dict[str, Any] = json.loads(json.dumps(about))
+    return document
+
+
+def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | None:
+    """State, evaluation and curves of a run; None while it is not finished."""
+    folder = out / run.key.folder
+    noise = {}
+    for file, (seeds, steps) in run.noise.items():
+        path = folder / file
+        rows = (
+            read_table(path, (), {"seed": int, "steps": int})
+            if path.is_file()
+            else pd.DataFrame(columns=["seed", "steps"])
+        )
+        rows = rows[rows.steps == steps].drop_duplicates("seed").set_index("seed")
+        if not set(seeds) <= set(rows.index):
+            return None
+        noise[file] = rows.loc[list(seeds)].reset_index()
+    if run.online is not None and not online.finished(run, out):
+        return None
+    document = read_json(folder / RUN, f"'{folder / RUN}'", StudyError)
+    if run.training is not None and not document.get("status"):
+        return None
+    key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}
+    state = key | {
+        "status": document.get("status") or EVALUATED,
+        "samples": int(document.get("samples", 0)),
+        "plant_samples": int(document.get("plant_samples", 0)),
+    }
+    curve = pd.DataFrame(columns=CURVE)
+    if run.training is not None:
+        curve = read_table(folder / LOG).reindex(columns=CURVE)
+    elif run.greedy:
+        curve = pd.DataFrame([{"greedy_J": float(np.mean(noise[GREEDY].J))}], columns=CURVE)
+    found = pd.DataFrame([state]), noise[EVALUATION][["seed", "steps", *INDICATORS]], curve
+    one, other, third = (frame.assign(**key) for frame in found)
+    types = {"training_seed": "Int64"}
+    return (
+        one[STATE].astype(types),
+        other[[*KEYS, "seed", "steps", *INDICATORS]].astype(
+            types | dict.fromkeys(INDICATORS, float)
+        ),
+        third[[*KEYS, *CURVE]].astype(types | dict.fromkeys(CURVE, float) | {"samples": "Int64"}),
+    )
+
+
+def _timing(plan: Plan, out: Path) -> pd.DataFrame:
+    rows = []
+    for run in plan.runs:
+        path = out / run.key.folder / RUN
+        document = read_json(path, f"'{path}'", StudyError) if path.is_file() else {}
+        seconds = document.get("timing", {}).get("wall_seconds", 0.0)
+        rows.append({"run": str(run.key), "training_seconds": float(seconds)})
+    return pd.DataFrame(rows, columns=["run", "training_seconds"])
+
+
+def _texts(row: Mapping[str, Any]) -> Iterator[str]:
+    """Texts of a row of the summary, in the order of `COLUMNS`."""
+    several = row["runs"] > 1
+    gap = row["gap_closed_median"]
+    yield str(row["case"])
+    yield str(row["plant_samples"] or "")
+    yield f"{row['finished']}/{row['runs']}" if row["samples"] else ""
+    yield _percent(row, "regret_median")
+    yield _percent(row, "regret_worst") if several else ""
+    yield _percent(row, "regret_iqm") if several else ""
+    yield _number(row["J_median"])
+    yield _number(row["J_worst"]) if several else ""
+    yield "" if np.isnan(gap) else shown(gap, None, 100.0, 4)
+    yield _number(row["economic_cost"])
+    yield f"{row['mean_violation']:.5f}"
+    yield f"{100 * row['violating_share']:.2f}"
+
+
+def _percent(row: Mapping[str, Any], name: str) -> str:
+    """A share in per cent with its interval, where it has one; nothing where it is undefined."""
+    ends = (float(row.get(f"{name}_low", np.nan)), float(row.get(f"{name}_high", np.nan)))
+    if np.isnan(row[name]):
+        return ""
+    return shown(float(row[name]), None if np.isnan(ends[0]) else ends, 100.0, 3)
+
+
+def _number(value: float) -> str:
+    return shown(float(value), None, 1.0, 6)
+
+
+def _finite(value: Any) -> float:
+    return float(value) if np.isfinite(value) else float("inf")
+
+
+def _ends(name: str, interval: tuple[float, float] | None) -> dict[str, float]:
+    low, high = interval or (float("nan"), float("nan"))
+    return {f"{name}_low": low, f"{name}_high": high}

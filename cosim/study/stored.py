@@ -8,17 +8,13 @@ from pathlib import Path
 
 from cosim.errors import ResultsError
 from cosim.files import write_atomically
-from cosim.study.charts import draw
 from cosim.study.check import TOLERANCES
 from cosim.study.document import StudyTable
 from cosim.study.document import read as read_study
-from cosim.study.formatting import HEADER, lines
 from cosim.study.keyed import rounded_csv
-from cosim.study.report import TABLES, report_markdown
-from cosim.study.results import ABOUT, StudyResults
+from cosim.study.report import TABLES
+from cosim.study.results import ABOUT, TIMING, StudyResults
 from cosim.study.store import RUNS
-from cosim.study.tables import TIMING
-from cosim.text_tables import markdown_table
 from cosim.validation import suggestion
 
 WORK = ".work"
@@ -96,8 +92,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
 
 def report(out: Path) -> None:
     """Draw a study's figures and write its report as Markdown."""
-    results = StudyResults.load(out)
-    write_atomically(out / TABLES, report_markdown(results, draw(results, out)))
+    StudyResults.load(out).report()
 
 
 def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
@@ -113,7 +108,7 @@ def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
             continue
         results = StudyResults.load(folder / name)
         for scenario in results.scenarios:
-            parts += [f"Scenario `{scenario}`:\n", markdown_table(HEADER, lines(results, scenario))]
+            parts += [f"Scenario `{scenario}`:\n", results.table(scenario)]
         made = results.about["made_with"]
         parts.append(
             f"[Report]({name}/{TABLES}) · made with {made['versions']}; code {made['code_hash']}.\n"

@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
-from cosim.study.document import ThetaTable
-from cosim.study.plan import Plan
-from cosim.study.records import RunResult
-from cosim.study.results import StudyResults
-from cosim.study.store import RunKey, RunStore
-from cosim.study.tables import KEYS, to_csv
-from cosim.study.traces import THETA
-from cosim.text_tables import parse_records, read_records
+from cosim.study.store import LOG
+from cosim.study.tables import read_table
 from cosim.validation import suggestion
 
+if TYPE_CHECKING:
+    from cosim.study.plan import Plan, Run
+
 Array = NDArray[np.float64]
-Lines = list[list[str]]
+Table = tuple[str, Sequence[str], list[list[str]]]
 Where = tuple[str, str]
 """Scenario and case."""
 
-FILE = "theta.csv"
+PREFIX = "theta "
 SHARES = (0.0, 0.5, 0.8, 1.0)
 """Shares of a training's samples at which θ is kept."""
-COURSE = "Where θ went"
-APART = "How far θ and J of two cases are apart, training seed by training seed"
 CONVERGED = 0.05
 """Movement in the last fifth of a training, as a share of the way, below which it converged."""
 
@@ -45,151 +41,142 @@ def scales(plan: Plan) -> dict[str, float]:
     return found
 
 
-def theta_csv(runs: Iterable[RunResult], stores: Mapping[str, RunStore]) -> str:
+def collected(runs: Sequence[Run], out: Path) -> pd.DataFrame:
     """A row for each training and share of its samples: θ as the log has it there."""
-    rows: list[dict[str, Any]] = []
+    rows = []
     for run in runs:
-        if run.seed is None:
+        if run.training is None:
             continue
-        log = parse_records(stores[str(RunKey(*run.key))].progress().log)
-        samples = np.array([float(row["samples"]) for row in log])
+        log = read_table(out / run.key.folder / LOG)
         for share in SHARES:
-            row = log[int(np.flatnonzero(samples <= share * samples[-1] + 0.5)[-1])]
-            entries = {k: float(v) for k, v in row.items() if k.startswith(THETA)}
-            key = dict(zip(KEYS, run.key, strict=True))
-            rows.append(key | {"share": share, "samples": int(float(row["samples"]))} | entries)
-    names = list(dict.fromkeys(name for row in rows for name in row if name.startswith(THETA)))
-    return to_csv((*KEYS, "share", "samples", *names), rows)
+            known = log[log.samples <= share * log.samples.iloc[-1] + 0.5].iloc[[-1]]
+            entries = known[[name for name in log if name.startswith(PREFIX)]].astype(float)
+            entries.insert(0, "samples", known.samples.astype(int))
+            for name, value in (
+                ("share", share), ("training_seed", run.key.seed), ("case", run.key.case),
+                ("scenario", run.key.scenario),
+            ):  # fmt: skip
+                entries.insert(0, name, value)
+            rows.append(entries)
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
 
 
-@dataclass(frozen=True)
-class Course:
+class Course(NamedTuple):
     """θ of the trainings of a case, in scaled entries: `theta` (runs, shares, entries)."""
 
-    seeds: tuple[int, ...]
+    seeds: list[int]
     theta: Array
 
     def of(self, seeds: Sequence[int]) -> Course:
-        """That of these seeds alone."""
-        return Course(tuple(seeds), self.theta[[self.seeds.index(seed) for seed in seeds]])
+        """The course of these seeds alone."""
+        return Course(list(seeds), self.theta[[self.seeds.index(seed) for seed in seeds]])
 
     @property
     def end(self) -> Array:
-        """Where they ended, (runs, entries)."""
-        last: Array = self.theta[:, -1]
-        return last
-
-    def moved(self, share: float) -> Array:
-        """‖θ_K − θ_share·K‖ as a share of the way ‖θ_K − θ_0‖, (runs,)."""
-        late = np.linalg.norm(self.end - self.theta[:, SHARES.index(share)], axis=1)
-        moved: Array = late / np.maximum(self.way, np.finfo(np.float64).tiny)
-        return moved
+        """θ at the end, (runs, entries)."""
+        return np.asarray(self.theta[:, -1])
 
     @property
     def way(self) -> Array:
         """‖θ_K − θ_0‖, (runs,)."""
-        way: Array = np.linalg.norm(self.end - self.theta[:, 0], axis=1)
-        return way
+        return np.asarray(np.linalg.norm(self.end - self.theta[:, 0], axis=1))
 
-    @property
-    def between_seeds(self) -> float:
-        """Median distance of two trainings' ends; there must be two."""
-        distances = [float(np.linalg.norm(a - b)) for a, b in combinations(self.end, 2)]
-        return float(np.median(distances))
+    def moved(self, share: float) -> Array:
+        """‖θ_K − θ_share·K‖ as a share of the way, (runs,)."""
+        late = np.linalg.norm(self.end - self.theta[:, SHARES.index(share)], axis=1)
+        return np.asarray(late / np.maximum(self.way, np.finfo(np.float64).tiny))
 
 
-def tables(results: StudyResults) -> list[tuple[str, tuple[str, ...], Lines]]:
+def tables(
+    frame: pd.DataFrame,
+    runs: pd.DataFrame,
+    trained: Sequence[str],
+    settings: Mapping[str, Any],
+    scales: Mapping[str, float],
+) -> list[Table]:
     """Title, header and rows: the course of θ in each case, and every two cases beside each other.
 
-    Distances are Euclidean norms of scaled entries, those of the blocks `without` left out.
+    Distances are Euclidean norms of entries in units of `scales`, those of the blocks `without`
+    left out. `runs` gives J of each training; `settings` are the study's table `[theta]`. Raises
+    StudyError for a block or a case that is not there.
     """
-    if results.about.get("theta") is None:
-        return []
-    settings = ThetaTable.model_validate(results.about["theta"]["settings"])
-    scale: Mapping[str, float] = results.about["theta"]["scales"]
-    records = read_records(results.folder / FILE, StudyError)
-    entries = [name for name in records[0] if name.startswith(THETA)] if records else []
+    entries = [name for name in frame if name.startswith(PREFIX)]
     blocks = list(dict.fromkeys(map(_block, entries)))
-    for name in (*settings.without, *settings.blocks):
+    for name in (*settings["without"], *settings["blocks"]):
         if name not in blocks:
             raise StudyError(
                 f"[theta]: no log has a block '{name}'{suggestion(name, blocks)}; there are "
                 f"{', '.join(blocks)}"
             )
-    counted = [name for name in entries if _block(name) not in settings.without]
-    courses = _courses(records, counted, scale)
-    several = len({scenario for scenario, _ in courses}) > 1
-    shown_entries = [name for name in entries if _block(name) in settings.blocks]
-    title = f"{COURSE}, in scaled entries" + (
-        f" without {', '.join(settings.without)}" if settings.without else ""
-    )
+    counted = [name for name in entries if _block(name) not in settings["without"]]
+    own = [name for name in entries if _block(name) in settings["blocks"]]
+    courses = _courses(frame, counted, scales)
+    costs = {
+        where: dict(zip(rows.training_seed, rows.J, strict=True))
+        for where, rows in runs.groupby(["scenario", "case"], sort=False)
+    }
+    several = frame.scenario.nunique() > 1
+    names = {where: f"{where[1]} on {where[0]}" if several else where[1] for where in courses}
+    title = "Where θ went, in scaled entries"
+    title += f" without {', '.join(settings['without'])}" if settings["without"] else ""
+    pairs = _pairs(trained, settings["pairs"], list(courses))
+    unscaled = _courses(frame, own, {})
     return [
-        (title, *_course_lines(courses, several, settings.late)),
+        (title, *_course_table(courses, names, settings["late"])),
         (
-            APART,
-            *_apart(
-                results,
-                _pairs(results, settings.pairs, courses),
-                courses,
-                _courses(records, shown_entries),
-                shown_entries,
-                several,
-            ),
+            "How far θ and J of two cases are apart, training seed by training seed",
+            *_apart(pairs, courses, unscaled, costs, names, own),
         ),
     ]
 
 
 def _block(entry: str) -> str:
-    return entry.removeprefix(THETA).partition("[")[0]
+    return entry.removeprefix(PREFIX).partition("[")[0]
 
 
 def _courses(
-    records: Sequence[Mapping[str, str]],
-    entries: Sequence[str],
-    scale: Mapping[str, float] | None = None,
+    frame: pd.DataFrame, entries: Sequence[str], scales: Mapping[str, float]
 ) -> dict[Where, Course]:
-    units = np.array([1.0 if scale is None else scale[name] for name in entries])
-    grouped: dict[Where, dict[int, list[Array]]] = {}
-    for row in records:
-        runs = grouped.setdefault((row["scenario"], row["case"]), {})
-        values = np.array([float(row[name] or "nan") for name in entries]) / units
-        runs.setdefault(int(row["training_seed"]), []).append(values)
-    return {
-        where: Course(tuple(runs), np.array(list(runs.values()))) for where, runs in grouped.items()
-    }
+    units = np.array([scales.get(name, 1.0) for name in entries])
+    found = {}
+    for where, rows in frame.groupby(["scenario", "case"], sort=False):
+        theta = rows[list(entries)].to_numpy(dtype=np.float64) / units
+        seeds = [int(seed) for seed in rows.training_seed.iloc[:: len(SHARES)]]
+        found[where] = Course(seeds, theta.reshape(len(seeds), len(SHARES), len(entries)))
+    return found
 
 
-def _course_lines(
-    courses: Mapping[Where, Course], several: bool, late: bool
-) -> tuple[tuple[str, ...], Lines]:
+def _course_table(
+    courses: Mapping[Where, Course], names: Mapping[Where, str], late: bool
+) -> tuple[Sequence[str], list[list[str]]]:
     header: tuple[str, ...] = ("case", "runs", "way, median", "between seeds")
     if late:
         header += (
             "last half / way, median", "worst", "last fifth / way, median", "worst",
             f"converged (< {CONVERGED})",
         )  # fmt: skip
-    lines = []
+    rows = []
     for where, course in courses.items():
-        line = [
-            _name(where, several),
+        apart = [float(np.linalg.norm(a - b)) for a, b in combinations(course.end, 2)]
+        row = [
+            names[where],
             str(len(course.seeds)),
             shown(float(np.median(course.way)), None, 1, 3),
-            shown(course.between_seeds, None, 1, 3) if len(course.seeds) > 1 else "",
         ]
+        row.append(shown(float(np.median(apart)), None, 1, 3) if apart else "")
         if late:
             half, fifth = course.moved(0.5), course.moved(0.8)
-            line += [shown(float(f(half)), None, 1, 2) for f in (np.median, np.max)]
-            line += [shown(float(f(fifth)), None, 1, 2) for f in (np.median, np.max)]
-            line.append(f"{int((fifth < CONVERGED).sum())}/{len(fifth)}")
-        lines.append(line)
-    return header, lines
+            row += [shown(float(f(half)), None, 1, 2) for f in (np.median, np.max)]
+            row += [shown(float(f(fifth)), None, 1, 2) for f in (np.median, np.max)]
+            row.append(f"{int((fifth < CONVERGED).sum())}/{len(fifth)}")
+        rows.append(row)
+    return header, rows
 
 
 def _pairs(
-    results: StudyResults, wanted: Sequence[Sequence[str]], courses: Mapping[Where, Course]
+    trained: Sequence[str], wanted: Sequence[Sequence[str]], courses: Sequence[Where]
 ) -> list[tuple[Where, Where]]:
-    """The wanted pairs, else all; raises StudyError on a name of no trained case."""
-    trained = [name for name, case in results.cases.items() if case.trained]
+    """The wanted pairs, else all."""
     for name in (name for pair in wanted for name in pair):
         if name not in trained:
             raise StudyError(
@@ -205,20 +192,20 @@ def _pairs(
 
 
 def _apart(
-    results: StudyResults,
     pairs: Sequence[tuple[Where, Where]],
     courses: Mapping[Where, Course],
-    shown_courses: Mapping[Where, Course],
+    unscaled: Mapping[Where, Course],
+    costs: Mapping[Where, Mapping[int, float]],
+    names: Mapping[Where, str],
     entries: Sequence[str],
-    several: bool,
-) -> tuple[tuple[str, ...], Lines]:
-    """Of two cases the differences, second less first, over the seeds that both have."""
+) -> tuple[Sequence[str], list[list[str]]]:
+    """Differences of two cases, second less first, over the seeds that both have."""
     header = (
         "cases", "seeds", "ΔJ, mean [95 %]", "‖Δθ‖, median", "of the way", "‖mean Δθ‖",
         "by chance", "entries that differ",
-        *(f"Δ {name.removeprefix(THETA)}, mean [95 %]" for name in entries),
+        *(f"Δ {name.removeprefix(PREFIX)}, mean [95 %]" for name in entries),
     )  # fmt: skip
-    lines = []
+    rows = []
     for first, second in pairs:
         common = [seed for seed in courses[first].seeds if seed in courses[second].seeds]
         if not common:
@@ -226,32 +213,24 @@ def _apart(
         before, after = courses[first].of(common), courses[second].of(common)
         change = after.end - before.end
         size = np.linalg.norm(change, axis=1)
-        moved = shown_courses[second].of(common).end - shown_courses[first].of(common).end
-        lines.append(
+        moved = unscaled[second].of(common).end - unscaled[first].of(common).end
+        cost = np.array([costs[second][seed] - costs[first][seed] for seed in common])
+        # Root of E‖mean‖² of as many differences whose expectation is zero.
+        chance = np.sqrt(change.var(axis=0, ddof=1).sum() / len(change)) if len(change) > 1 else 0
+        rows.append(
             [
-                f"{_name(second, several)} − {_name(first, several)}",
+                f"{names[second]} − {names[first]}",
                 str(len(common)),
-                _shown(mean(_costs(results, second, common) - _costs(results, first, common))),
+                _shown(mean(cost)),
                 shown(float(np.median(size)), None, 1, 3),
                 shown(float(np.median(2 * size / (before.way + after.way))), None, 1, 3),
                 shown(float(np.linalg.norm(change.mean(axis=0))), None, 1, 3),
-                shown(_by_chance(change), None, 1, 3) if len(common) > 1 else "",
+                shown(float(chance), None, 1, 3) if len(common) > 1 else "",
                 f"{sum(_differs(mean(column)) for column in change.T)}/{change.shape[1]}",
                 *(_shown(mean(column)) for column in moved.T),
             ]
         )
-    return header, lines
-
-
-def _costs(results: StudyResults, where: Where, seeds: Sequence[int]) -> Array:
-    """J of a case's trainings, (runs,)."""
-    runs = {run.seed: run.J for run in results.of(where[1], where[0])}
-    return np.array([runs[seed] for seed in seeds])
-
-
-def _by_chance(change: Array) -> float:
-    """Root of E‖mean‖² of as many differences whose expectation is zero, from their variance."""
-    return float(np.sqrt(change.var(axis=0, ddof=1).sum() / len(change)))
+    return header, rows
 
 
 def _differs(estimate: Estimate) -> bool:
@@ -261,8 +240,3 @@ def _differs(estimate: Estimate) -> bool:
 
 def _shown(estimate: Estimate) -> str:
     return shown(estimate.value, estimate.t, 1, 3)
-
-
-def _name(where: Where, several: bool) -> str:
-    scenario, case = where
-    return f"{case} on {scenario}" if several else case

@@ -59,7 +59,7 @@ def test_one_command_makes_the_study_of_policies_that_are_there(tmp_path):
     assert (tmp_path / "study" / "report.html").stat().st_size > 10_000
     results = StudyResults.load(tmp_path / "study")
     assert set(results.cases) >= {"naive", "tuned", "sac", "ppo"}
-    assert results.of("sac", "paper")[0].steps == 100
+    assert set(results.evaluation.steps) == {100}
 
 
 def test_an_outsider_that_nobody_knows_is_named(tmp_path):

@@ -6,19 +6,9 @@ import pytest
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures import (
     Costs,
-    Dots,
-    LearningCurve,
-    Portrait,
-    Profile,
     evaluation_figure,
     overlay_figure,
     parameters_figure,
-    plot_curves,
-    plot_density,
-    plot_phase_portraits,
-    plot_profiles,
-    plot_regret,
-    policy_on_grid,
     save,
     trajectory_figure,
 )
@@ -99,63 +89,24 @@ def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
     assert save(overlay_figure({"one": run}), tmp_path / "b.png").stat().st_size > 10_000
 
 
-def figures(rng, paper):
-    samples = np.arange(0.0, 50_001.0, 1000.0)
-    cloud = rng.normal((25.5, 50.0), 0.5, size=(500, 2))
-    x, y = np.linspace(24.0, 28.0, 7), np.linspace(47.0, 53.0, 6)
-    actions = policy_on_grid(lambda s: np.array([200.0 - s[0], 215.0 + s[1]]), x, y)
-    portraits = [Portrait(name, cloud, actions) for name in ("naive", "$mine", "optimal", "d")]
-    greedy = np.where(np.arange(51) % 5 == 0, rng.random((5, 51)), np.nan)
-    curves = {"$q": LearningCurve(samples, rng.random((5, 51)), greedy)}
-    curves["one"] = LearningCurve(samples, rng.random((1, 51)), greedy[:1] - 0.5)
-    finished = np.array([True, False, True])
-    dots = {"$a": Dots("a", rng.random(3) - 0.2, finished, 0.3, (0.1, 0.9))}
-    dots["b"] = Dots("b", np.array([2.0, 30.0, np.inf]), finished, 16.0, None)
-    shares = np.linspace(0.0, 1.0, 20)
-    profile = Profile(np.geomspace(0.01, 10.0, 20), shares, 0.9 * shares, shares)
+def figures(rng):
+    increments = {"B_l": rng.random((51, 10)), "c_lambda": rng.random((51, 1))}
     cost = {name: Costs(*rng.random((3, 9))) for name in ("naive", "$mine", "tuned")}
-    increments = {
-        "B_l": rng.random((51, 10)),
-        "c_lambda": rng.random((51, 1)),
-        "x_u": np.zeros((51, 2)),
-    }
     return {
-        "phase": lambda path: plot_phase_portraits(portraits, x, y, paper, path),
-        "density": lambda path: plot_density(
-            {"naive": cloud[:, 0], "$mine": cloud[:, 0] + 1}, 25.0, "X2", "%", path
+        "parameters": lambda: parameters_figure(
+            np.arange(51.0), increments | {"x_u": np.zeros((51, 2))}, rng.random(51)
         ),
-        "curves": lambda path: plot_curves(
-            {"$one": curves, "two": curves}, {"naive": 3.0}, path, ylabel="regret %", relative=True
-        ),
-        "curves of J": lambda path: plot_curves(
-            {"one": curves}, {}, path, ylabel="J", relative=False
-        ),
-        "regret": lambda path: plot_regret(dots, path),
-        "profiles": lambda path: plot_profiles({"a": {"$x": profile}, "b": {"y": profile}}, path),
-        "parameters": lambda path: save(
-            parameters_figure(samples, increments, rng.random(51)), path
-        ),
-        "evaluation": lambda path: save(evaluation_figure(cost, title="$t"), path),
+        "evaluation": lambda: evaluation_figure(cost, title="$t"),
     }
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["phase", "density", "curves", "curves of J", "regret", "profiles", "parameters", "evaluation"],
-)
-def test_every_figure_repeats_its_bytes(name, tmp_path, paper):
-    files = []
-    for i in range(2):
-        draw = figures(np.random.default_rng(1), paper)[name]
-        files.append(draw(tmp_path / f"{i}.svg").read_bytes())
-    assert draw(tmp_path / "a.png").stat().st_size > 10_000
-    assert files[0] == files[1]
-
-
-def test_a_policy_is_laid_out_with_rows_of_the_second_state():
-    grid = policy_on_grid(lambda s: s, np.array([1.0, 2.0, 3.0]), np.array([5.0, 6.0]))
-    assert grid.shape == (2, 3, 2)
-    assert grid[1, 2].tolist() == [3.0, 6.0]
+@pytest.mark.parametrize("name", ["parameters", "evaluation"])
+def test_every_figure_repeats_its_bytes(name, tmp_path):
+    one, two = (
+        save(figures(np.random.default_rng(1))[name](), tmp_path / f"{i}.svg").read_bytes()
+        for i in range(2)
+    )
+    assert one == two
 
 
 def test_the_front_is_what_no_other_point_beats(rng):
@@ -167,27 +118,7 @@ def test_the_front_is_what_no_other_point_beats(rng):
     assert nondominated(points).tolist() == expected
 
 
-def test_a_densitys_bins_part_at_the_bound(rng, tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr("cosim.figures.density.save", lambda figure, path: drawn.append(figure))
-    samples = {"a": rng.normal(25.3, 1.0, size=4000), "b": rng.normal(26.0, 0.5, size=300)}
-    plot_density(samples, 25.0, "X2", "%", tmp_path / "a.png")
-    (axes,) = drawn[0].axes
-    for stairs, values in zip(axes.patches[1::2], samples.values(), strict=True):
-        heights, edges, _ = stairs.get_data()
-        assert np.abs(edges - 25.0).min() < 1e-12
-        below = float(np.sum(heights * np.diff(edges) * (edges[1:] <= 25.0 + 1e-9)))
-        shown = (values >= edges[0]) & (values <= edges[-1])
-        assert below == pytest.approx(np.mean((values < 25.0) & shown), abs=1e-12)
-        assert float(np.sum(heights * np.diff(edges))) == pytest.approx(np.mean(shown), abs=1e-12)
-
-
-def test_a_plant_at_rest_draws(tmp_path, paper):
-    rest = np.tile(paper.reference_state, (50, 1))
-    x, y = np.linspace(24.0, 26.0, 3), np.linspace(49.0, 51.0, 3)
-    actions = np.tile(paper.reference_action, (3, 3, 1))
-    plot_phase_portraits([Portrait("rest", rest, actions)], x, y, paper, tmp_path / "a.png")
-    plot_density({"rest": rest[:, 0]}, 25.0, "X2", "%", tmp_path / "b.png")
+def test_a_plant_at_rest_draws(tmp_path):
     rest = {"rest": Costs(np.full(5, 6210.0), np.full(5, 6210.0), np.zeros(5))}
     save(evaluation_figure(rest, title="rest"), tmp_path / "c.png")
 

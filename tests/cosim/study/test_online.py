@@ -1,14 +1,13 @@
 """What the runs of a study cost themselves: blocks, regret by period, and the figure."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import StudyError
-from cosim.study.online import tables
-from cosim.study.report import write_report
 from cosim.study.results import StudyResults
 from tests.helpers.loop import Proportional
 from tests.helpers.toy_trainer import ToyTrainer, study
@@ -50,7 +49,7 @@ def test_a_training_counts_with_its_own_samples(results):
 
 
 def test_the_table_pairs_each_run_with_the_optimum_on_its_noise(results):
-    ((title, header, lines),) = tables(results)
+    ((title, header, lines),) = results.further()
     assert "paper" in title
     own = np.array([float(row["J"]) for row in rows(results, "grow")]).reshape(2, 2).mean(axis=1)
     best = np.array([float(row["J"]) for row in rows(results, "best")]).reshape(2, 2).mean(axis=1)
@@ -63,16 +62,16 @@ def test_the_table_pairs_each_run_with_the_optimum_on_its_noise(results):
 
 
 def test_the_report_has_table_and_figure_and_needs_no_runs(results, tmp_path):
-    page = write_report(StudyResults.load(results.folder), tmp_path).read_text("utf-8")
+    page = StudyResults.load(results.folder).report(tmp_path).read_text("utf-8")
     assert "own samples" in page
-    assert "alt='online-paper" in page
+    assert 'alt="online-paper' in page
 
 
 def test_a_signal_that_no_log_has_is_named(results, tmp_path):
     about = dict(results.about) | {"online": ONLINE | {"signals": ["td_eror"]}}
-    damaged = StudyResults(results.folder, about, results.runs)
+    damaged = replace(results, about=about)
     with pytest.raises(StudyError, match=r"no log has a column 'td_eror'.*'td_error'"):
-        write_report(damaged, tmp_path)
+        damaged.report(tmp_path)
 
 
 @pytest.mark.slow
@@ -90,7 +89,7 @@ def test_a_run_that_goes_on_does_nothing_twice(results, monkeypatch):
 
 def test_a_study_without_it_has_no_such_table(tmp_path):
     plain = study().run(tmp_path)
-    assert tables(plain) == []
+    assert plain.further() == []
     assert not (tmp_path / "online.csv").exists()
 
 
@@ -104,4 +103,4 @@ def test_of_the_references_only_the_optimum_runs_beside(tmp_path):
     found = study(online=ONLINE, case=case).run(tmp_path)
     assert rows(found, "best")
     assert not rows(found, "naive")
-    assert found.of("naive", "paper")
+    assert len(found.of("naive", "paper"))

@@ -3,14 +3,13 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from cosim.study.charts import draw, shortened
-from cosim.study.formatting import HEADER, lines
-from cosim.study.outcome import StudyOutcome
-from cosim.study.report import write_report
 from cosim.study.results import StudyResults
-from cosim.study.summary import aggregate_rows, summary_rows
+from cosim.study.tables import KEYS, to_csv
+from cosim.text_tables import markdown_table
+from tests.docs.test_results import ROOT
 from tests.helpers.toy_trainer import study
 
 CASES = [
@@ -28,7 +27,7 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(results):
-    return write_report(results).read_text("utf-8")
+    return results.report().read_text("utf-8")
 
 
 def test_the_page_needs_nothing_else(page):
@@ -38,68 +37,93 @@ def test_the_page_needs_nothing_else(page):
     assert "http" not in re.sub(r"data:[^'\"]+", "", page)
 
 
-def test_the_page_holds_every_row_and_figure(results, page):
+def test_the_page_holds_every_row_figure_and_definition(results, page):
     for scenario in results.scenarios:
-        assert f"Scenario {scenario}" in page
-        for line in lines(results, scenario):
+        for line in results.lines(scenario)[1]:
             assert "".join(f"<td>{cell}</td>" for cell in line) in page
-        for figure in ("regret", "curves", "profile"):
-            assert f"alt='{figure}-{scenario}" in page
-    assert "10 of 10 runs" not in page
-    assert f"{len(results.runs)} of {len(results.runs)} runs are finished" in page
+        for figure in ("curves", "regret", "profile"):
+            assert f'alt="{figure}-{scenario}"' in page
+    assert page.index("<dt>Regret</dt>") < page.index("<table>")
+    assert "3 noise seeds × 30 samples" in page
+    assert "2 other seeds × 20 samples" in page
+
+
+def test_the_markdown_has_the_same_tables(results, page):
+    text = (results.folder / "report.md").read_text("utf-8")
+    assert all(results.table(scenario) in text for scenario in results.scenarios)
 
 
 @pytest.mark.slow
 def test_the_report_repeats_its_bytes(results, page, tmp_path):
-    again = write_report(StudyResults.load(results.folder), tmp_path).read_text("utf-8")
-    assert again == page
+    again = StudyResults.load(results.folder)
+    assert again.report().read_text("utf-8") == page
+
+
+def test_tables_are_read_and_written_to_the_same_bytes(results):
+    again = StudyResults.load(results.folder)
+    for name in ("runs", "evaluation", "curves", "summary", "aggregate"):
+        written = (results.folder / f"{name}.csv").read_text()
+        assert to_csv(again.to_pandas()[name]) == written, name
+
+
+def test_an_own_reader_finds_the_stored_summary():
+    """Medians and worst runs of a stored study from its evaluation alone."""
+    results = StudyResults.load(ROOT / "results" / "quick")
+    cost = results.evaluation.groupby(KEYS, dropna=False).J.mean().reset_index()
+    for row in results.summary.itertuples():
+        own = cost[(cost.scenario == row.scenario) & (cost.case == row.case)].J
+        best = cost[(cost.scenario == row.scenario) & (cost.case == "optimal")].J.item()
+        assert row.J_median == pytest.approx(own.median(), rel=1e-12)
+        assert row.regret_worst == pytest.approx(own.max() / best - 1, rel=1e-6, abs=1e-9)
 
 
 def test_one_point_is_no_curve(results, tmp_path):
-    runs = [
-        replace(run, curve={name: values[-1:] for name, values in run.curve.items()})
-        for run in results.runs
-    ]
-    drawn = draw(StudyResults(results.folder, results.about, runs), tmp_path)
+    last = results.curves.groupby(KEYS, dropna=False).tail(1)
+    drawn = replace(results, curves=last).draw(tmp_path)
     assert not any(name.startswith("curves") for name in drawn["paper"])
-    assert not list((tmp_path / "figures").glob("curves*"))
+
+
+def test_all_rules_are_in_one_panel_under_the_names_of_the_table(results):
+    _, greedy = results.figure("curves-paper").axes
+    named = {text.get_text() for text in greedy.texts}
+    assert {"grow(rate=1.0)", "grow(rate=9.0)", "lost", "naive"} <= named
+    curve = greedy.lines[0]
+    own = results.curves[(results.curves.case == "grow(rate=1.0)")]
+    own = own[own.scenario == "paper"].dropna(subset="greedy_J")
+    levels = results.curves[results.curves.scenario == "paper"].set_index("case").greedy_J
+    expected = 100 * (own.groupby("samples").greedy_J.median() / levels["best"] - 1)
+    np.testing.assert_allclose(curve.get_xdata(), expected.index)
+    np.testing.assert_allclose(curve.get_ydata(), expected, rtol=1e-9)
 
 
 def test_diverged_runs_are_counted_in_the_table(results):
-    row = next(row for row in summary_rows(results, "paper") if row["case"] == "lost")
-    assert (row["finished"], row["runs"]) == (0, 2)
-    line = next(line for line in lines(results, "paper") if line[0] == "lost")
-    assert line[HEADER.index("finished")] == "0/2"
+    row = results.summary.set_index(["scenario", "case"]).loc["paper", "lost"]
+    assert (row.finished, row.runs) == (0, 2)
+    _, lines = results.lines("paper", ["case", "finished"])
+    assert ["lost", "0/2"] in lines
 
 
 def test_the_worst_is_of_all_runs_and_the_interval_encloses_the_middle(results):
-    for row in summary_rows(results):
-        regrets = [results.regrets[run.key] for run in results.of(row["case"], row["scenario"])]
-        assert row["regret_worst"] == max(regrets)
+    for row in results.summary.itertuples():
+        regrets = results.regrets(row.case, row.scenario)
+        assert row.regret_worst == max(regrets)
         if len(regrets) > 1:
-            assert row["regret_iqm_low"] <= row["regret_iqm"] <= row["regret_iqm_high"]
-            assert row["regret_median"] == pytest.approx(sum(regrets) / 2, rel=1e-9)
+            assert row.regret_iqm_low <= row.regret_iqm <= row.regret_iqm_high
+            assert row.regret_median == pytest.approx(sum(regrets) / 2, rel=1e-9)
 
 
 def test_cases_are_compared_over_all_scenarios(results):
-    found = {row["case"]: row for row in aggregate_rows(results)}
-    assert found["grow(rate=9.0)"]["runs"] == 4
-    assert found["best"]["regret_iqm"] == 0.0
+    found = results.aggregate.set_index("case")
+    assert found.runs["grow(rate=9.0)"] == 4
+    assert found.regret_iqm["best"] == 0.0
 
 
 def test_an_unfinished_study_is_reported_with_what_it_has(results, tmp_path):
-    part = StudyOutcome(tmp_path, results.about | {"runs": 99}, results.runs[:3])
-    assert part.report() == tmp_path / "report.html"
-    text = (tmp_path / "report.html").read_text("utf-8")
-    assert "3 of 99 runs are finished; 96 are missing here" in text
+    part = replace(
+        results, folder=tmp_path, about=results.about | {"runs": 99}, state=results.state[:3]
+    )
+    assert "3 of 99 runs are finished; 96 are missing" in part.report().read_text("utf-8")
 
 
-def test_a_start_is_told_from_the_baseline_of_its_name():
-    cases = ["q(start=naive gain=0.1)", "q(start=tuned gain=0.1)"]
-    assert list(shortened(cases).values()) == ["from naive gain=0.1", "from tuned gain=0.1"]
-
-
-def test_an_outcome_has_its_tables(results):
-    outcome = StudyOutcome(results.folder, results.about, results.runs)
-    assert outcome.table("paper").splitlines()[0].startswith("| case |")
-    assert len(outcome.table("paper").splitlines()) == 2 + len(lines(results, "paper"))
+def test_a_scenarios_table_is_markdown(results):
+    assert results.table("paper") == markdown_table(*results.lines("paper"))

@@ -14,7 +14,7 @@ from cosim.study.document import read
 from cosim.study.keyed import rounded_csv
 from cosim.study.results import StudyResults
 from cosim.study.stored import stored_studies
-from cosim.study.tables import read_numbers
+from cosim.study.tables import read_table
 
 STORED = Path(__file__).parents[3] / "results"
 MINIMAL = """\
@@ -94,7 +94,7 @@ def test_stored_tables_are_read_by_the_project_s_own_readers():
             assert len(load_run(folder / table)) > 100
         for table in tables:
             if table.startswith("logs/"):
-                assert read_numbers(folder / table)["samples"][-1] > 1000
+                assert read_table(folder / table).samples.iloc[-1] > 1000
 
 
 @pytest.mark.slow
@@ -228,5 +228,5 @@ def test_the_reproduction_is_a_study_with_the_paper_s_table_and_figure(tmp_path,
     for name in ("parameters-paper-q", "parameters-cheap-q"):
         assert (out / "figures" / f"{name}.png").stat().st_size > 10_000
         assert f"alt='{name}'" in (out / "report.html").read_text()
-    log = read_numbers(out / "logs" / "paper-q.csv")
+    log = read_table(out / "logs" / "paper-q.csv")
     assert log["samples"][0] == 0, "increments of θ are counted from its start"

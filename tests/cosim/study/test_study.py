@@ -118,15 +118,15 @@ def test_what_is_finished_is_not_done_again_and_more_seeds_are_added(tmp_path):
     results = results.run(tmp_path)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(results.runs) == 2 + 2 * 3
-    assert all(len(run.seeds) == 4 for run in results.runs)
+    assert results.indicator("grow(rate=1.0)", "paper").shape == (3, 4)
 
 
 def test_a_changed_setting_is_trained_anew(tmp_path):
     def one(rate):
         return study(case=[{"name": "g", "algorithm": "grow", "samples": 600, "settings": rate}])
 
-    first = one({"rate": 1.0}).run(tmp_path).of("g", "paper")[0].J
-    second = one({"rate": 30.0}).run(tmp_path).of("g", "paper")[0].J
+    first = one({"rate": 1.0}).run(tmp_path).of("g", "paper").J.iloc[0]
+    second = one({"rate": 30.0}).run(tmp_path).of("g", "paper").J.iloc[0]
     assert first != second
 
 
@@ -151,7 +151,7 @@ def test_a_failing_case_is_told_at_once_and_the_others_are_done(tmp_path):
     assert any(line.startswith("failed: broken on paper, seed 0") for line in lines)
     results = StudyResults.load(tmp_path)
     assert len(results.of("grow", "paper")) == 2
-    assert not results.of("broken", "paper")
+    assert results.of("broken", "paper").empty
     trace = next(tmp_path.glob("runs/paper/broken/0/failure.txt")).read_text()
     assert "toy_trainer.py" in trace
 
@@ -161,7 +161,8 @@ def test_sizes_may_differ_by_scenario(tmp_path):
     results = study(
         scenarios=["paper", "nominal"], evaluation=evaluation, case=[{"controller": "naive"}]
     ).run(tmp_path)
-    sizes = {run.scenario: (len(run.seeds), run.steps) for run in results.runs}
+    own = results.evaluation[results.evaluation.case == "naive"].groupby("scenario")
+    sizes = {name: (len(rows), rows.steps.iloc[0]) for name, rows in own}
     assert sizes == {"paper": (2, 10), "nominal": (1, 15)}
 
 
@@ -169,7 +170,7 @@ def test_a_scenario_may_be_written_in_the_study(tmp_path):
     own = [{"extends": "paper", "name": "cheap", "penalty": {"linear": [1e3, 1e3]}}]
     results = study(scenarios=["paper", "cheap"], scenario=own, case=[{"controller": "naive"}])
     assert results.scenarios["cheap"].penalty.linear == (1e3, 1e3)
-    assert [run.scenario for run in results.run(tmp_path).runs] == ["paper"] * 2 + ["cheap"] * 2
+    assert list(results.run(tmp_path).runs.scenario) == ["paper"] * 2 + ["cheap"] * 2
 
 
 @pytest.mark.parametrize(

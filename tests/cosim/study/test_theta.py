@@ -8,9 +8,7 @@ import pytest
 
 from cosim import Study
 from cosim.errors import StudyError
-from cosim.study.report import write_report
 from cosim.study.results import StudyResults
-from cosim.study.theta import tables
 from tests.helpers.toy_trainer import ToyTrainer, document
 
 ROWS = {0: 0.0, 200: 3.0, 500: 6.0, 700: 7.0, 800: 9.0, 1000: 10.0}
@@ -48,7 +46,7 @@ def results(tmp_path_factory):
 
 
 def lines_of(results, number):
-    _, header, lines = tables(results)[number]
+    _, header, lines = results.further()[number]
     return [dict(zip(header, line, strict=True)) for line in lines]
 
 
@@ -79,13 +77,13 @@ def test_two_cases_are_paired_by_training_seed(results):
     assert float(line["‖mean Δθ‖"]) == pytest.approx(15.0)
     assert float(line["by chance"]) == pytest.approx(np.std([10, 20], ddof=1) / 2**0.5, rel=1e-2)
     assert float(line["Δ h[0], mean [95 %]"].split()[0]) == 0
-    cost = [[run.J for run in results.of(f"go(rate={rate})", "paper")] for rate in ("1.0", "3.0")]
+    cost = [results.of(f"go(rate={rate})", "paper").J.to_numpy() for rate in ("1.0", "3.0")]
     expected = np.mean(np.subtract(cost[1], cost[0]))
     assert float(line["ΔJ, mean [95 %]"].split()[0]) == pytest.approx(expected, rel=5e-2)
 
 
 def test_the_report_has_both_tables_and_needs_no_runs(results, tmp_path):
-    page = write_report(StudyResults.load(results.folder), tmp_path).read_text("utf-8")
+    page = StudyResults.load(results.folder).report(tmp_path).read_text("utf-8")
     assert "Where θ went, in scaled entries without h" in page
     assert "training seed by training seed" in page
 
@@ -93,7 +91,7 @@ def test_the_report_has_both_tables_and_needs_no_runs(results, tmp_path):
 def test_a_block_that_no_log_has_is_named(tmp_path):
     found = wandering(without=["hh"]).run(tmp_path)
     with pytest.raises(StudyError, match=r"no log has a block 'hh'.*'h'.*there are g, h"):
-        tables(found)
+        found.further()
 
 
 def test_pairs_are_the_study_s_in_its_order(results):
@@ -104,10 +102,10 @@ def test_pairs_are_the_study_s_in_its_order(results):
         ([["go(rate=3.0)", "go(rate=1)"]], None),
     ):
         about["theta"] = dict(about["theta"]) | {"settings": settings | {"pairs": pairs}}
-        other = StudyResults(results.folder, about, results.runs)
+        other = replace(results, about=about)
         if expected is None:
             with pytest.raises(StudyError, match=r"no trained case 'go\(rate=1\)'"):
-                tables(other)
+                other.further()
         else:
             assert [line["cases"] for line in lines_of(other, 1)] == [expected]
 
@@ -116,5 +114,5 @@ def test_how_far_it_went_late_is_left_out_where_the_study_says_so(results):
     about = dict(results.about)
     settings = dict(about["theta"]["settings"]) | {"late": False}
     about["theta"] = dict(about["theta"]) | {"settings": settings}
-    _, header, _ = tables(StudyResults(results.folder, about, results.runs))[0]
+    _, header, _ = replace(results, about=about).further()[0]
     assert header == ("case", "runs", "way, median", "between seeds")

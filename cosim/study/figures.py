@@ -1,0 +1,193 @@
+"""Figures of a study, all rules in one panel: regret of each run, learning curves, profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, FuncFormatter
+from numpy.typing import NDArray
+
+from cosim.figures.style import (
+    DASHED,
+    FLOOR,
+    REFERENCE,
+    EndLabel,
+    Look,
+    cost_axis,
+    figure,
+    label_ends,
+    percent,
+    plain,
+    regret_axis,
+)
+from cosim.statistics import LEVEL, regrets
+
+Array = NDArray[np.float64]
+BANDED = 6
+"""Curves of a panel, at most, that have bands: more bands cannot be told apart."""
+INK = "#222222"
+
+
+class Dots(NamedTuple):
+    """Runs of a case: regrets in % (R,), whether each finished, a middle and its interval in %."""
+
+    case: str
+    values: Array
+    finished: NDArray[np.bool_]
+    middle: float
+    low: float
+    high: float
+
+
+def regret_figure(rows: Sequence[Dots], looks: Mapping[str, Look]) -> Figure:
+    """A row for each case: its runs, their interquartile mean and its 95 % interval.
+
+    A run that diverged is a cross; the axis is logarithmic above 0.01 %.
+    """
+    with figure(0.21 * len(rows) + 0.9) as drawn:
+        axes = drawn.subplots()
+        for row, dots in enumerate(rows):
+            count = len(dots.values)
+            y = row + (np.linspace(-0.18, 0.18, count) if count > 1 else np.zeros(1))
+            for marker, chosen in (("o", dots.finished), ("x", ~dots.finished)):
+                axes.scatter(
+                    dots.values[chosen], y[chosen], marker=marker, s=13, alpha=0.55, zorder=3,
+                    color=looks[dots.case].color, linewidths=0 if marker == "o" else 0.9,
+                )  # fmt: skip
+            if np.isfinite([dots.low, dots.high]).all():
+                axes.hlines(row, dots.low, dots.high, color=INK, linewidth=1.1, zorder=4)
+            axes.vlines(dots.middle, row - 0.3, row + 0.3, color=INK, linewidth=1.4, zorder=5)
+        axes.set_yticks(range(len(rows)), [plain(dots.case) for dots in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.grid(axis="y", visible=False)
+        regret_axis(axes, "x", np.concatenate([[0.0], *(dots.values for dots in rows)]))
+        axes.set_xlabel("regret % of runs (crosses diverged); interquartile mean, 95 % interval")
+    return drawn
+
+
+class LearningCurve(NamedTuple):
+    """Curves of R runs at K samples: `samples` (K,), `training` and `greedy` (R, K).
+
+    `training` is the mean cost of the training samples since the point before, `greedy` that of
+    the policy learnt so far.
+    """
+
+    samples: Array
+    training: Array
+    greedy: Array
+
+
+def learning_curve(log: pd.DataFrame, best: float | None) -> LearningCurve:
+    """The runs of a case at their greedy evaluations, as regret in % where J* is known.
+
+    `log` has rows (training_seed, samples, J, greedy_J). A run that diverged is held at its last
+    point.
+    """
+    runs = []
+    for _, rows in log.groupby("training_seed", sort=False):
+        # Rows up to a greedy evaluation belong to it.
+        point = -rows.greedy_J.notna()[::-1].cumsum()[::-1]
+        at = rows[rows.greedy_J.notna()]
+        costs = rows.J.groupby(point).mean().iloc[: len(at)]
+        runs.append(np.array([at.samples, costs, at.greedy_J], dtype=np.float64))
+    longest = max(runs, key=lambda run: run.shape[1])
+    count = longest.shape[1]
+    held = np.array([np.pad(run, ((0, 0), (0, count - run.shape[1])), mode="edge") for run in runs])
+    shown = held[:, 1:] if best is None else 100 * regrets(held[:, 1:], best)
+    return LearningCurve(longest[0], shown[:, 0], shown[:, 1])
+
+
+def curves_figure(
+    curves: Mapping[str, LearningCurve],
+    levels: Mapping[str, float],
+    looks: Mapping[str, Look],
+    *,
+    relative: bool,
+) -> Figure:
+    """All cases in two panels: above the cost of the training samples, below the greedy policy's.
+
+    Lines are medians over runs, bands their quartiles, drawn where at most six cases are shown.
+    `levels` are drawn across both panels, by name. `relative` values are regrets in %.
+    """
+    unit = "regret %" if relative else "J"
+    height = max(2.6, 0.135 * (len(curves) + len(levels)))
+    with figure(2 * height + 0.4) as drawn:
+        grid = drawn.subplots(2, 1, sharex=True)
+        ends: list[list[EndLabel]] = []
+        for axes, kind in zip(grid, ("training", "greedy"), strict=True):
+            labels = [EndLabel(plain(name), level, REFERENCE) for name, level in levels.items()]
+            reached = [np.array(list(levels.values()))]
+            for name, curve in curves.items():
+                values: Array = getattr(curve, kind)
+                color, line = looks[name]
+                finite = np.isfinite(values).all(axis=0)
+                samples, values = curve.samples[finite], values[:, finite]
+                if not values.size:
+                    continue
+                low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
+                axes.plot(samples, middle, color=color, linestyle=line, linewidth=1.3)
+                if len(values) > 1 and len(curves) <= BANDED:
+                    axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
+                labels.append(EndLabel(plain(name), float(middle[-1]), color))
+                reached.append(middle)
+            for level in levels.values():
+                axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
+            cost_axis(axes, np.concatenate(reached), relative=relative)
+            axes.set_ylabel(f"{unit} of the {'training samples' if not ends else 'greedy policy'}")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            ends.append(labels)
+        grid[1].set_xlim(0.0, max(float(curve.samples[-1]) for curve in curves.values()))
+        grid[1].set_xlabel("training samples")
+        drawn.draw_without_rendering()
+        for axes, labels in zip(grid, ends, strict=True):
+            label_ends(axes, labels)
+    return drawn
+
+
+def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Look]) -> Figure:
+    """Performance profiles: the share of runs whose regret is at most so much.
+
+    `strata` are a case's regrets in %, an array for each scenario. The 95 % bands are pointwise,
+    a stratified bootstrap over runs; they are drawn where at most six cases are shown.
+    """
+    finite = np.concatenate([runs[np.isfinite(runs)] for each in strata.values() for runs in each])
+    axis = np.geomspace(FLOOR, 1.3 * max(float(finite.max(initial=1.0)), 10 * FLOOR), 200)
+    with figure(max(2.6, 0.16 * len(strata) + 0.6)) as drawn:
+        axes: Axes = drawn.subplots()
+        for name, runs in strata.items():
+            color, line = looks[name]
+            below = [(stratum[:, None] <= axis).astype(float) for stratum in runs]
+            share = np.concatenate(below).mean(axis=0)
+            axes.step(
+                axis, share, where="post", color=color, linestyle=line, linewidth=1.3,
+                label=plain(name),
+            )  # fmt: skip
+            if len(strata) <= BANDED:
+                low, high = _band(below)
+                axes.fill_between(
+                    axis, low, high, step="post", color=color, alpha=0.15, linewidth=0
+                )
+        axes.set_xscale("log")
+        axes.set_xlim(axis[0], axis[-1])
+        axes.set_ylim(-0.02, 1.02)
+        axes.xaxis.set_major_formatter(FuncFormatter(percent))
+        axes.set_xlabel("regret % at most")
+        axes.set_ylabel("share of runs")
+        drawn.legend(loc="outside right upper", handlelength=2.4)
+    return drawn
+
+
+def _band(below: Sequence[Array]) -> tuple[Array, Array]:
+    """Pointwise bootstrap interval of the mean over runs, resampled within each stratum."""
+    rng = np.random.default_rng(0)
+    draws = np.zeros((2000, below[0].shape[1]))
+    for part in below:
+        draws += rng.multinomial(len(part), np.full(len(part), 1 / len(part)), size=2000) @ part
+    draws /= sum(map(len, below))
+    low, high = np.quantile(draws, (0.5 - LEVEL / 2, 0.5 + LEVEL / 2), axis=0)
+    return low, high

@@ -1,0 +1,71 @@
+"""Figures of a study from made-up numbers: what is drawn is what was given."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cosim import FmuPlant, Scenario, simulate
+from cosim.figures import palette
+from cosim.study.figures import Dots, learning_curve, profile_figure, regret_figure
+from cosim.study.pictures import density_figure, increments, phase_figure
+from tests.helpers.loop import Proportional
+
+
+@pytest.fixture(scope="module")
+def runs():
+    paper = Scenario.load("paper")
+    with FmuPlant(paper) as plant:
+        one = simulate(plant, Proportional(paper), 300, 0)
+        return {"naive": one, "$mine": simulate(plant, Proportional(paper), 300, 1)}
+
+
+def test_a_densitys_bins_part_at_the_bound(runs, paper):
+    (axes,) = density_figure(runs, paper).axes
+    for stairs, run in zip(axes.patches[1::2], runs.values(), strict=True):
+        values = run["X2"]
+        heights, edges, _ = stairs.get_data()
+        assert np.abs(edges - 25.0).min() < 1e-12
+        below = float(np.sum(heights * np.diff(edges) * (edges[1:] <= 25.0 + 1e-9)))
+        shown = (values >= edges[0]) & (values <= edges[-1])
+        assert below == pytest.approx(np.mean((values < 25.0) & shown), abs=1e-12)
+        assert float(np.sum(heights * np.diff(edges))) == pytest.approx(np.mean(shown), abs=1e-12)
+
+
+def test_a_portrait_has_an_arrow_for_each_point_of_the_grid(runs, paper):
+    policies = dict.fromkeys(runs, lambda s: np.array([200.0 - s[0], 215.0 + s[1]]))
+    drawn = phase_figure(runs, policies, paper)
+    assert [axes.get_title() for axes in drawn.axes] == ["naive", r"\$mine"]
+
+
+def test_a_curve_averages_training_since_the_point_before_and_holds_diverged_runs():
+    nan = float("nan")
+    log = pd.DataFrame(
+        [
+            (0, 500, 4.0, nan), (0, 1000, 2.0, 9.0), (0, 1500, nan, nan), (0, 2000, 6.0, 8.0),
+            (1, 500, 8.0, nan), (1, 1000, 6.0, 5.0), (1, 1500, 7.0, nan),
+        ],
+        columns=["training_seed", "samples", "J", "greedy_J"],
+    )  # fmt: skip
+    curve = learning_curve(log, None)
+    assert curve.samples.tolist() == [1000, 2000]
+    assert curve.training.tolist() == [[3.0, 6.0], [7.0, 7.0]]
+    assert curve.greedy.tolist() == [[9.0, 8.0], [5.0, 5.0]]
+    assert learning_curve(log, 4.0).greedy[0].tolist() == [125.0, 100.0]
+
+
+def test_a_profile_is_the_share_of_runs_at_most_so_bad():
+    values = np.array([0.1, 1.0, 10.0, np.inf])
+    axes = profile_figure({"q": [values]}, palette(["q"])).axes[0]
+    regret, share = axes.lines[0].get_data()
+    assert share.tolist() == [np.mean(values <= level) for level in regret]
+
+
+def test_a_diverged_run_is_a_cross():
+    dots = Dots("q", np.array([1.0, 2.0]), np.array([True, False]), 1.5, 1.0, 2.0)
+    axes = regret_figure([dots], palette(["q"])).axes[0]
+    assert [len(points.get_offsets()) for points in axes.collections[:2]] == [1, 1]
+
+
+def test_increments_are_of_each_block_since_its_first_row():
+    log = pd.DataFrame({"samples": [0, 1], "theta b[0]": [1.0, 3.0], "theta b[1]": [2.0, 2.0]})
+    assert increments(log)["b"].tolist() == [[0.0, 0.0], [2.0, 0.0]]

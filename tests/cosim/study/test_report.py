@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ import pytest
 from cosim.study.results import StudyResults
 from cosim.study.tables import KEYS, to_csv
 from cosim.text_tables import markdown_table
-from tests.docs.test_results import ROOT
 from tests.helpers.toy_trainer import study
 
+ROOT = Path(__file__).parents[3]
 CASES = [
     {"name": "grow", "algorithm": "grow", "samples": 2000, "settings": {"rate": [1.0, 9.0]}},
     {"name": "lost", "algorithm": "diverge", "samples": 2000, "group": "others"},

@@ -153,6 +153,9 @@ COMPILER_FLAGS = (
     "-fPIC",
     "-fno-ident",
     "-fvisibility=hidden",
+    # A library's functions have FMI's own names, whatever prefix the sources define.
+    "-DFMI2_OVERRIDE_FUNCTION_PREFIX",
+    "-DFMI3_OVERRIDE_FUNCTION_PREFIX",
 )
 WARNINGS = ("-Wall", "-Wextra")
 _LINKER_FLAGS = {
@@ -179,9 +182,10 @@ class Compiler:
     @property
     def version(self) -> str:
         """What it says of itself, one line."""
-        result = subprocess.run(
-            [*self.command, "--version"], capture_output=True, text=True, check=True
-        )
+        with temporary_folder("cosim-") as folder:  # Zig leaves a file where it is called
+            result = subprocess.run(
+                [*self.command, "--version"], cwd=folder, capture_output=True, text=True, check=True
+            )
         return result.stdout.splitlines()[0]
 
     def library(
@@ -354,7 +358,8 @@ def sources_of(
     paths += [PLANT_SOURCES / name for name in WITHOUT_DERIVATIVES]
     files = {path.name: path.read_bytes() for path in paths} | dict(own)
     variables = model.variables if rows is None else rows
-    header = c_header(_token(model, version, files), variables, f"from the table of {model.name}")
+    token = _token(model, version, files)
+    header = c_header(token, model.identifier, variables, f"from the table of {model.name}")
     files["variables.h"] = header.encode()
     files["buildDescription.xml"] = build_description(version, model).encode()
     return files

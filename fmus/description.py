@@ -69,7 +69,11 @@ def build_description(version: FmiVersion, model: Model) -> str:
         description="Shared library; -ffp-contract=off keeps the results bit-identical",
     )
     sources = ElementTree.SubElement(
-        build, "SourceFileSet", language="C99", compilerOptions="-O2 -ffp-contract=off"
+        build,
+        "SourceFileSet",
+        language="C99",
+        compiler="gcc",
+        compilerOptions="-O2 -ffp-contract=off",
     )
     ElementTree.SubElement(sources, "SourceFile", name=f"fmi{version}.c")
     ElementTree.SubElement(build, "Library", name="m")
@@ -209,6 +213,8 @@ def _variable2(parent: ElementTree.Element, variable: Variable, model: Model) ->
         )
     elif variable.type in (Type.SEED, Type.SEED_HIGH):
         ElementTree.SubElement(scalar, "Integer", min=_INT32[0], max=_INT32[1], start="0")
+    elif variable.type is Type.LAW_NUMBER:
+        ElementTree.SubElement(scalar, "Integer", min="0", max="2", start="0")
     else:
         attributes = _real_attributes(variable)
         if variable.kind is Kind.DERIVATIVE:
@@ -300,6 +306,7 @@ _TYPES = {
     Type.LAW: "LAW",
     Type.SEED: "SEED",
     Type.SEED_HIGH: "SEED_HIGH",
+    Type.LAW_NUMBER: "LAW_NUMBER",
 }
 _KINDS = {
     Kind.INDEPENDENT: "INDEPENDENT",
@@ -313,14 +320,25 @@ _KINDS = {
 _SEED_MAX = 4294967295.0
 
 
-def c_header(token: str, variables: Sequence[Variable], origin: str) -> str:
-    """The header's text: value references, types, starts and ranges, and the model's `token`."""
+def c_header(token: str, identifier: str, variables: Sequence[Variable], origin: str) -> str:
+    """The header's text: value references, types, starts and ranges, and the model's `token`.
+
+    With it FMI's functions are called ``identifier_fmi2…`` and so on, so that several models link
+    into one program; whoever builds a library defines FMI2_ or FMI3_OVERRIDE_FUNCTION_PREFIX.
+    """
     references = "\n".join(f"    VR_{v.identifier} = {i}," for i, v in enumerate(variables))
     rows = "\n".join(f"    {_row(variable)}," for variable in variables)
     return f"""\
 /* Generated {origin}; do not edit. */
 #ifndef VARIABLES_H
 #define VARIABLES_H
+
+#ifndef FMI2_FUNCTION_PREFIX
+#define FMI2_FUNCTION_PREFIX {identifier}_
+#endif
+#ifndef FMI3_FUNCTION_PREFIX
+#define FMI3_FUNCTION_PREFIX {identifier}_
+#endif
 
 #define MODEL_TOKEN "{token}"
 

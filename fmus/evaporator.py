@@ -24,7 +24,7 @@ from fmus.build import (
     write_archive,
 )
 from fmus.description import LICENSE, build_description, c_header, model_description
-from fmus.model import SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
+from fmus.model import LAW_NUMBER, SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
 
 UNITS = (
     Unit("1"),
@@ -51,7 +51,16 @@ UNITS = (
 DISTURBANCES = ("X1", "F1", "T1", "T200")
 STATES = ("X2", "P2")
 
-_SWITCHES = ("stochastic", "override", "law", "seed", "seedHigh", "sampling_time", "time")
+_SWITCHES = (
+    "stochastic",
+    "override",
+    "law",
+    "law_number",
+    "seed",
+    "seedHigh",
+    "sampling_time",
+    "time",
+)
 
 
 def _input(name: str, unit: str, start: float, low: float, high: float, text: str) -> Variable:
@@ -182,6 +191,7 @@ VARIABLES: tuple[Variable, ...] = (
             "present heat transfer of the condenser: UA2 while it is clean",
             "UA2 fouling_rate fouling_floor cleaning_period sampling_time time"),
     _switch("saturate", Kind.FIXED, False, SATURATE),
+    Variable("law_number", Kind.FIXED, Type.LAW_NUMBER, "", 0.0, 0.0, 2.0, None, LAW_NUMBER),
 )  # fmt: skip
 
 EVAPORATOR = Model(
@@ -245,7 +255,8 @@ def hand_written_sources() -> dict[str, bytes]:
 
 def header(token: str) -> str:
     """The text of `variables.h` with the model's `token`."""
-    return c_header(token, VARIABLES, "from fmus/variables.py by `cosim fmu build --in-place`")
+    origin = "from fmus/evaporator.py by `cosim fmu build --in-place`"
+    return c_header(token, EVAPORATOR.identifier, VARIABLES, origin)
 
 
 def model_token() -> str:

@@ -25,13 +25,18 @@ class Kind(StrEnum):
 
 
 class Type(StrEnum):
-    """Value type; `SEED_HIGH` is the upper half of the seed and exists in FMI 2.0 alone."""
+    """Value type.
+
+    FMI 2.0 alone has `SEED_HIGH`, the upper half of the seed, and `LAW_NUMBER`, the law as an
+    integer for tools that do not set enumerations (libcosim ignores them).
+    """
 
     REAL = "Real"
     BOOLEAN = "Boolean"
     LAW = "Law"
     SEED = "Seed"
     SEED_HIGH = "SeedHigh"
+    LAW_NUMBER = "LawNumber"
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,7 @@ LAWS = (
 )
 
 
+LAW_NUMBER = "law of the disturbances as an integer; 0: as the enumeration law says"
 SATURATE = "an input beyond its range acts at the bound, as an actuator at its stop; false: refused"
 
 
@@ -121,7 +127,7 @@ class Model:
         """
         if version == 2:
             return [v for v in self.variables if v.kind is not Kind.INDEPENDENT]
-        return [v for v in self.variables if v.type is not Type.SEED_HIGH]
+        return [v for v in self.variables if v.type not in (Type.SEED_HIGH, Type.LAW_NUMBER)]
 
 
 _CALCULATED = (Kind.OUTPUT, Kind.DERIVATIVE)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fmus.build import PLANT_SOURCES, SOURCES, assemble, sources_of
-from fmus.model import SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
+from fmus.model import LAW_NUMBER, SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (
@@ -48,11 +48,12 @@ def plant_model(
 
     Each state x has a derivative ``der(x)`` (in C ``VR_der_x``) and a start parameter ``x_start``,
     each disturbance d a mean ``d_nominal`` and a ``d_range``; beside them are the switches
-    ``stochastic``, ``law`` (1 uniform, 2 normal), ``seed``, ``seedHigh`` (FMI 2.0),
-    ``sampling_time`` [s], whose multiples are when the disturbances are drawn anew, and
-    ``saturate``, with which an input beyond its range acts at the bound.
+    ``stochastic``, ``law`` (1 uniform, 2 normal; FMI 2.0 has an integer ``law_number``, too),
+    ``seed``, ``seedHigh`` (FMI 2.0), ``sampling_time`` [s], whose multiples are when the
+    disturbances are drawn anew, and ``saturate``, with which an input beyond its range acts at the
+    bound.
     """
-    drawn = ["stochastic", "law", "seed", "seedHigh", "sampling_time", "time"]
+    drawn = ["stochastic", "law", "law_number", "seed", "seedHigh", "sampling_time", "time"]
     known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
     table = [Variable("time", Kind.INDEPENDENT, Type.REAL, "s", None, None, None, None, "time")]
     table += [_row(s, Kind.STATE, start=None, uses=(f"{s.name}_start",)) for s in states] + [
@@ -159,6 +160,7 @@ def _switches(sampling_time: float) -> list[Variable]:
         Variable("sampling_time", fixed, Type.REAL, "s", sampling_time, 0.01, 86400.0,
                  sampling_time, "the disturbances are redrawn at its multiples and held between"),
         Variable("saturate", fixed, Type.BOOLEAN, "", 0.0, 0.0, 1.0, None, SATURATE),
+        Variable("law_number", fixed, Type.LAW_NUMBER, "", 0.0, 0.0, 2.0, None, LAW_NUMBER),
     ]  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from cosim.scenario import Scenario
 from fmus.model import FmiVersion
 from fmus.sampled import SampledSystem, Signal, build_sampled
 
-IDENTIFIER = "rti_nmpc"
 RECORD = "extra/org.rti-cosim/controller.json"
 
 
@@ -34,6 +34,7 @@ def sampled_controller(
 ) -> SampledSystem:
     """The controller as a sampled system; raises ControllerError where it cannot be exported."""
     hessian = scenario.controller.hessian
+    origin = f"{scenario.hash} {hessian} {controller.parameters.hash}"
     exported = core(controller.problem, controller.parameters, hessian)
     plant = scenario.plant
     variables = table(
@@ -43,7 +44,7 @@ def sampled_controller(
     )
     return SampledSystem(
         name=f"RTI-NMPC {scenario.name}",
-        identifier=IDENTIFIER,
+        identifier=f"rti_nmpc_{hashlib.sha256(origin.encode()).hexdigest()[:12]}",
         description=(
             f"Real-time-iteration NMPC for {scenario.name}: horizon {exported.problem.horizon}, "
             f"{hessian} Hessian, θ {controller.parameters.hash}"

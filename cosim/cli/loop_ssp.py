@@ -26,8 +26,14 @@ def write_loop(controller: Path, scenario: Scenario, seed: int, target: Path) ->
     plant_seed, _ = spawn_seeds(seed)
     starts = start_values(scenario, plant_seed)
     archive = unpack(plant.fmu)
-    if SATURATE in {variable.name for variable in archive.description.modelVariables}:
+    types = {variable.name: variable.type for variable in archive.description.modelVariables}
+    if SATURATE in types:
         starts[SATURATE] = ("Boolean", 1.0)
+    for name, (kind, value) in list(starts.items()):
+        # libcosim ignores enumerations of FMI 2.0; our plants have an integer beside theirs.
+        if kind == "Enumeration" and types.get(f"{name}_number") == "Integer":
+            del starts[name]
+            starts[f"{name}_number"] = ("Integer", value)
     return write_ssp(
         target,
         "loop",

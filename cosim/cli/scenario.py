@@ -88,7 +88,7 @@ def init(
         from cosim.cli.compose import announce_fmu
         from cosim.errors import CosimError
         from cosim.files import write_atomically
-        from cosim.plant.draft import draft_scenario
+        from cosim.plant.draft import NO_NOISE, draft_scenario
         from cosim.scenario import Scenario
 
         target = (out or Path(f"{Path(fmu).stem}.toml")).absolute()
@@ -111,6 +111,8 @@ def init(
         drafted = Scenario.load(target)
         if not json:
             print(text, end="")
+        if drafted.disturbance.law == "none":
+            out_.note(NO_NOISE)
         out_.note(f"written to {target}: read the lines with CHECK")
         out_.json({"file": str(target), **drafted.to_dict(), "hash": drafted.hash})
 

@@ -16,10 +16,16 @@ from numpy.typing import NDArray
 from cosim.errors import PlantError
 from cosim.plant.archive import SHIPPED, UnpackedFmu, unpack
 from cosim.plant.fmu_plant import FmuPlant
+from cosim.plant.wiring import has_start
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
 Array = NDArray[np.float64]
+TUNABLE = "tunable"
+NO_NOISE = (
+    "no noise was found (no output NAME with parameters NAME_nominal and NAME_range): the plant is "
+    "taken as undisturbed"
+)
 SAMPLES = 500
 """Samples of the FMU's own experiment, where it states no step."""
 
@@ -206,6 +212,7 @@ def _text(document: dict[str, Any], fmu: str, roles: Roles, units: dict[str, str
         *(f"{key} = {_value(value)}" for key, value in plant["mapping"].items()),
         "",
         "[disturbance]",
+        *([f"# CHECK: {NO_NOISE}"] if noise["law"] == "none" else []),
         *(f"{key} = {_value(value)}" for key, value in noise.items()),
         "",
         "[bounds]  # from min and max; states are bounded softly, by the penalty, actions hard",
@@ -249,7 +256,7 @@ CODES = (*INTEGERS, "Enumeration")
 COSTS = ("cost", "loss", "objective")
 LAWS = ("uniform", "normal")
 SEEDS = (("seed",), ("seed", "seedHigh"), ("seed", "seed_high"), ("random_seed",), ("rng_seed",))
-SAMPLINGS = ("sampling_time", "sample_time", "samplingTime", "sampleTime")
+SAMPLINGS = ("sampling_time", "sample_time", "samplingTime", "sampleTime", "Ts", "T_s", "ts")
 SWITCHES = ("stochastic", "noise", "noisy")
 
 
@@ -304,9 +311,12 @@ def guess_roles(
         if len(found_actions) < len(inputs):
             reasons["actions"] += ", but for those that replace a disturbance"
     if not found_actions:
+        tunable = [
+            name for name in _reals(known, "parameter") if known[name].variability == TUNABLE
+        ]
         raise PlantError(
-            f"FMU '{fmu.path.name}' has no real input to act on; name tunable parameters by "
-            "--actions"
+            f"FMU '{fmu.path.name}' has no real input to act on"
+            + (f"; give --actions A,B,…, of its tunable {', '.join(tunable)}" if tunable else "")
         )
     mapping = _mapping(known, found_states, noise)
     return Roles(found_states, found_actions, noise, cost, mapping, reasons)
@@ -322,13 +332,15 @@ def _reals(known: Mapping[str, Any], causality: str) -> list[str]:
 
 def _cost(fmu: UnpackedFmu, known: Mapping[str, Any]) -> str:
     outputs = _reals(known, "output")
+    if not outputs:
+        raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output: it cannot be a plant")
     found = [name for name in outputs if any(word in name.lower() for word in COSTS)]
     if len(found) == 1:
         return found[0]
     which = f"{' and '.join(found)} could be" if found else "none is called a cost"
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say which output is the stage cost ({which}); give "
-        f"--cost NAME, one of {', '.join(outputs) or 'no outputs'}"
+        f"--cost NAME, one of {', '.join(outputs)}"
     )
 
 
@@ -349,7 +361,7 @@ def _states(
         return tuple(started), "outputs that have a parameter NAME_start"
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no parameters "
-        f"NAME_start); give --states A,B,…, of {', '.join(outputs) or 'no outputs'}"
+        f"NAME_start); give --states A,B,…, of {', '.join(_reals(known, 'output'))}"
     )
 
 
@@ -365,7 +377,7 @@ def _mapping(
     starts = [f"{name}_start" for name in states]
     if all(of(name, REALS) for name in starts):
         table["initial_state"] = starts
-    elif all(known[name].initial in ("exact", "approx") for name in states):
+    elif all(has_start(known[name]) for name in states):
         table["initial_state"] = list(states)
     seeds = [words for words in SEEDS if all(of(word, INTEGERS) for word in words)]
     if seeds:

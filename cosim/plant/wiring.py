@@ -50,34 +50,31 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
 
 
 def check_step(fmu: UnpackedFmu, sampling_time: float) -> None:
-    """Raise PlantError where the FMU's communication step is fixed and not the sampling time [s].
+    """Raise PlantError where the sampling time [s] is no multiple of a fixed internal step.
 
-    Such an FMU steps by the step size of its default experiment (FMI 2.0), or by a multiple of
-    its fixed internal step (FMI 3.0).
+    canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
     """
-    simulation, name = fmu.description.coSimulation, f"FMU '{fmu.path}'"
-    internal = simulation.fixedInternalStepSize
-    if internal is not None and float(internal) > 0:
-        count = sampling_time / float(internal)
-        if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
-            raise PlantError(
-                f"{name} steps by multiples of {float(internal):g} s (fixedInternalStepSize), and "
-                f"the sampling time of {sampling_time:g} s is none"
-            )
-    if simulation.canHandleVariableCommunicationStepSize:
+    internal = fmu.description.coSimulation.fixedInternalStepSize
+    if internal is None or float(internal) <= 0:
         return
-    experiment = fmu.description.defaultExperiment
-    size = getattr(experiment, "stepSize", None)
-    if size is None or internal is not None:
-        return
-    if abs(float(size) - sampling_time) > 1e-9 * sampling_time:
+    count = sampling_time / float(internal)
+    if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
         raise PlantError(
-            f"{name} steps by {float(size):g} s alone (canHandleVariableCommunicationStepSize is "
-            f"false), but the sampling time is {sampling_time:g} s"
+            f"FMU '{fmu.path}' steps by multiples of {float(internal):g} s "
+            f"(fixedInternalStepSize), and the sampling time of {sampling_time:g} s is none"
         )
 
 
 _WIDE = ("Int64", "UInt64")
+
+
+def has_start(variable: Any) -> bool:
+    """Whether an importer may set the variable's start value, by FMI's causality and `initial`."""
+    if variable.variability == "constant":
+        return False
+    if variable.causality in ("output", "local"):
+        return variable.initial in ("exact", "approx")
+    return variable.causality not in ("calculatedParameter", "independent")
 
 
 class SeedWord(NamedTuple):
@@ -171,10 +168,10 @@ class Wirer:
             raise self._misfit(name, table, f"is {_a(variable.type)}, which cannot be set here")
         if variable.type not in ("Real", "Float64", "Float32") and value != int(value):
             raise self._misfit(name, table, f"is {_a(variable.type)} and cannot take {value}")
-        if variable.causality in ("output", "calculatedParameter", "independent"):
-            raise self._misfit(name, table, f"is {_a(variable.causality)}: it has no start to set")
         if variable.variability == "constant":
             raise self._misfit(name, table, "is a constant")
+        if not has_start(variable):
+            raise self._misfit(name, table, f"is {_a(variable.causality)} without a start to set")
         return StartValue(int(variable.valueReference), variable.type, value)
 
     def _seed_type(self, name: str) -> str:

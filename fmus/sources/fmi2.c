@@ -1,4 +1,6 @@
 /* The FMI 2.0 face of a model: co-simulation, and model exchange where it offers that. */
+#include "variables.h"
+
 #include "fmi2Functions.h"
 
 #include "derivatives.h"
@@ -88,15 +90,19 @@ fmi2Status fmi2Reset(fmi2Component c) {
 
 /* Getting and setting variable values */
 
-/* Integers: the enumeration and the halves of the seed, whose bits are kept. */
+static int is_half_of_seed(unsigned vr) {
+    return VARIABLES[vr].type == SEED || VARIABLES[vr].type == SEED_HIGH;
+}
+
+/* Integers: the law, as an enumeration and as a number, and the halves of the seed. */
 static Status check_integer(const Instance *instance, const char *function, unsigned vr) {
-    if (vr < N_VARIABLES && (VARIABLES[vr].type == SEED || VARIABLES[vr].type == SEED_HIGH))
-        return OK;
+    if (vr < N_VARIABLES && (is_half_of_seed(vr) || VARIABLES[vr].type == LAW_NUMBER)) return OK;
     return check_reference(instance, function, vr, LAW);
 }
 
+/* The seed's bits are kept. */
 static double integer_value(unsigned vr, int32_t value) {
-    return VARIABLES[vr].type == LAW ? (double)value : (double)(uint32_t)value;
+    return is_half_of_seed(vr) ? (double)(uint32_t)value : (double)value;
 }
 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr,

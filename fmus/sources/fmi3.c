@@ -1,4 +1,6 @@
 /* The FMI 3.0 face of a model: co-simulation, and model exchange where it offers that. */
+#include "variables.h"
+
 #include "fmi3Functions.h"
 
 #include "adjoint.h"

@@ -32,7 +32,8 @@ static void realise_disturbances(State *state) {
     }
     if (!state->model.drawn) {
         const uint32_t key[2] = {(uint32_t)v[VR_seed], (uint32_t)v[VR_seedHigh]};
-        standard_draws(key, state->sample, (int)v[VR_law], state->model.draws);
+        const double law = v[VR_law_number] != 0.0 ? v[VR_law_number] : v[VR_law];
+        standard_draws(key, state->sample, (int)law, state->model.draws);
         state->model.drawn = 1;
     }
     for (int i = 0; i < N_DISTURBANCES; i++)

@@ -1,11 +1,18 @@
-/* Generated from fmus/variables.py by `cosim fmu build --in-place`; do not edit. */
+/* Generated from fmus/evaporator.py by `cosim fmu build --in-place`; do not edit. */
 #ifndef VARIABLES_H
 #define VARIABLES_H
 
-#define MODEL_TOKEN "{6f0538ec-4fed-52ae-afd9-7e5c74c373f6}"
+#ifndef FMI2_FUNCTION_PREFIX
+#define FMI2_FUNCTION_PREFIX evaporator_
+#endif
+#ifndef FMI3_FUNCTION_PREFIX
+#define FMI3_FUNCTION_PREFIX evaporator_
+#endif
+
+#define MODEL_TOKEN "{5334973b-4686-5024-8a8b-66f9603a0ac8}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
-#define LAYOUT_DIGEST UINT64_C(0x43d906ea3b553c06)
+#define LAYOUT_DIGEST UINT64_C(0x9bf4eee7a86d70a1)
 
 enum {
     VR_time = 0,
@@ -70,10 +77,11 @@ enum {
     VR_cleaning_period = 59,
     VR_UA2_present = 60,
     VR_saturate = 61,
-    N_VARIABLES = 62
+    VR_law_number = 62,
+    N_VARIABLES = 63
 };
 
-typedef enum { REAL, BOOLEAN, LAW, SEED, SEED_HIGH } VariableType;
+typedef enum { REAL, BOOLEAN, LAW, SEED, SEED_HIGH, LAW_NUMBER } VariableType;
 
 typedef enum { INDEPENDENT, INPUT, STATE, DERIVATIVE, OUTPUT, FIXED, TUNABLE } VariableKind;
 
@@ -147,6 +155,7 @@ static const VariableInfo VARIABLES[N_VARIABLES] = {
     {"cleaning_period", REAL, TUNABLE, 6.0, 0.0, 100000.0, 6.0},
     {"UA2_present", REAL, OUTPUT, 0.0, 0.0, 1000.0, 6.84},
     {"saturate", BOOLEAN, FIXED, 0.0, 0.0, 1.0, 1.0},
+    {"law_number", LAW_NUMBER, FIXED, 0.0, 0.0, 2.0, 1.0},
 };
 
 #endif

@@ -1,5 +1,6 @@
 """Foreign FMUs of many kinds and both FMI versions: they run, or are refused with a reason."""
 
+import re
 import zipfile
 
 import numpy as np
@@ -12,6 +13,7 @@ from cosim.plant.archive import unpack
 from cosim.plant.fmi import library_path
 from cosim.plant.wiring import refusals
 from tests.helpers.kinds import REALS, build_kind, scenario_for, write_fmi1
+from tests.helpers.tank import edited
 
 CS = 'CoSimulation modelIdentifier="kinds" '
 VARIABLE_STEP = 'canHandleVariableCommunicationStepSize="true"'
@@ -126,13 +128,28 @@ def test_a_tunable_parameter_serves_as_action(tmp_path, version):
     assert trajectory(scenario_for(tmp_path, fmu)) == expected()
 
 
-def test_a_fixed_step_runs_at_its_own_and_is_refused_at_another(tmp_path, version):
-    experiment = '<DefaultExperiment stepSize="0.5"/>'
+@pytest.mark.parametrize("size", ["0.5", "0.125"])
+def test_a_constant_step_may_have_any_size(tmp_path, version, size):
+    """canHandleVariableCommunicationStepSize, false by default, forbids that the size changes."""
+    experiment = f'<DefaultExperiment stepSize="{size}"/>'
     fmu = build_kind(tmp_path, version, face=CS, experiment=experiment)
     assert trajectory(scenario_for(tmp_path, fmu)) == expected()
-    words = r"steps by 0\.5 s alone .*but the sampling time is 0\.25 s"
-    with pytest.raises(PlantError, match=words):
-        FmuPlant(scenario_for(tmp_path, fmu, sampling_time=0.25))
+
+
+def test_an_output_that_starts_exactly_is_its_own_start_parameter(tmp_path, version):
+    plain = build_kind(tmp_path, version)
+    path = scenario_for(tmp_path, tmp_path / f"exact{version}.fmu")
+    path.write_text(path.read_text().replace('"x_start"', '"x"'))
+    with pytest.raises(PlantError, match="without a start"):
+        FmuPlant(Scenario.load(path).replace({"plant": {"fmu": str(plain)}}))
+    reals = re.sub(r"(?m)^(x +1 .* )-", r"\g<1>1", REALS)
+    exact = 'name="x" initial="exact"'
+    edited(
+        build_kind(tmp_path, version, reals=reals),
+        tmp_path / f"exact{version}.fmu",
+        lambda text: text.replace('name="x"', exact),
+    )
+    FmuPlant(path).close()
 
 
 def test_a_fixed_internal_step_takes_its_multiples(tmp_path):

@@ -97,6 +97,7 @@ class Instance:
             Type.LAW: ("Integer", "Int64"),
             Type.SEED: ("Integer", "UInt64"),
             Type.SEED_HIGH: ("Integer", "UInt64"),
+            Type.LAW_NUMBER: ("Integer", "Int64"),
         }
         return suffixes[BY_NAME[name].type][self.version - 2]
 

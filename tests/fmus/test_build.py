@@ -99,7 +99,10 @@ def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
     folder = tmp_path / "unzipped"
     fmpy.extract(str(fmus.path(name)), str(folder))
     shutil.rmtree(folder / "binaries")
-    options = {"CMAKE_C_FLAGS:STRING": "-ffp-contract=off", "CMAKE_C_STANDARD_LIBRARIES": "-lm"}
+    options = {
+        "CMAKE_C_FLAGS:STRING": f"-ffp-contract=off -DFMI{fmi}_OVERRIDE_FUNCTION_PREFIX",
+        "CMAKE_C_STANDARD_LIBRARIES": "-lm",
+    }
     old = os.environ["PATH"]
     os.environ["PATH"] = search
     try:

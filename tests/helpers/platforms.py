@@ -19,7 +19,7 @@ import pytest
 import fmus
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario
-from cosim.cli.controller_fmu import IDENTIFIER, rti_controller, sampled_controller, write_fmu
+from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from fmus.build import PLATFORMS, SOURCES, Platform, cross_compiler
 from fmus.evaporator import EVAPORATOR, HEADER
 from fmus.model import FmiVersion
@@ -138,7 +138,7 @@ def hosted_controller(version: FmiVersion, folder: Path) -> Hosted:
     sources = sampled_sources(system, version)
     headers = {name: sources[name] for name in ("variables.h", "system.h")}
     importer = Importer("controller_host.c", headers, folder / f"host{version}")
-    return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, IDENTIFIER)
+    return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, system.identifier)
 
 
 @cache

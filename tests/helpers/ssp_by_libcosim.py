@@ -1,4 +1,4 @@
-"""Run an SSP by libcosim: python ssp_by_libcosim.py loop.ssp STEP SAMPLES prints X2, P2.
+"""Run an SSP by libcosim: python ssp_by_libcosim.py loop.ssp STEP SAMPLES prints X2, P2, X1.
 
 Its lines begin with "row", since libcosim logs to the same place.
 """
@@ -27,7 +27,7 @@ def main(path: str, step: float, samples: int) -> None:
     description = fmpy.read_model_description(f"{folder}/resources/plant.fmu")
     reference = {v.name: v.valueReference for v in description.modelVariables}
     for _ in range(samples):
-        state = observer.last_real_values(plant, [reference["X2"], reference["P2"]])
+        state = observer.last_real_values(plant, [reference[name] for name in ("X2", "P2", "X1")])
         print("row", ",".join(map(repr, state)))
         for _ in range(round(SAMPLE / step)):
             execution.step()

@@ -188,6 +188,24 @@ def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
     assert errors[1] < 0.6 * errors[0]
 
 
+def test_libcosim_draws_from_the_scenarios_law(tmp_path):
+    """It ignores FMI 2.0's enumerations: the SSP sets the integer beside the law's."""
+    pytest.importorskip("libcosimpy.CosimExecution", exc_type=Exception)
+    normal = Scenario.load("paper").replace({"disturbance": {"law": "normal"}})
+    (tmp_path / "normal.toml").write_text(normal.to_toml())
+    words = "export tuned -s normal.toml -o c.fmu --ssp l.ssp --seed 3 --local"
+    run_cosim(*words.split(), folder=tmp_path, check=True)
+    with FmuPlant(normal) as plant:
+        expected = simulate(plant, tuned(normal), 5, 3)
+    code = Path(__file__).parents[2] / "helpers" / "ssp_by_libcosim.py"
+    result = subprocess.run(
+        [sys.executable, code, tmp_path / "l.ssp", "6.0", "5"], capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    lines = [line.split()[1] for line in result.stdout.splitlines() if line[:4] == "row "]
+    assert [float(line.split(",")[2]) for line in lines[1:]] == expected["X1"][1:].tolist()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario
+from cosim.plant.archive import unpack
+from cosim.plant.draft import guess_roles
 from fmus.plant import build_plant
 from tests.helpers.tank import build_tank, edited
 
@@ -91,6 +93,7 @@ def test_what_cannot_be_guessed_is_asked_for(cosim, tank, tmp_path):
         ('name="x"', 'name="other_cost"', "other_cost and cost could be"),
         ('name="x_start"', 'name="x0"', "--states A,B"),
         ('"input"><Real start="0"', '"local"><Real', "no real input"),
+        ('causality="output"', 'causality="local"', "no scalar real output"),
     ):
         code, _, err = cosim("scenario", "init", changed(old, new), "--sampling-time", 0.5)
         assert code == 2, err
@@ -122,3 +125,20 @@ def test_a_plant_that_starts_where_it_likes_is_left_to_settle(cosim, tank, tmp_p
         for _ in range(400):
             s = plant.step([2.0]).s
     assert drafted["controller"]["reference_state"] == pytest.approx(s, rel=1e-6)
+
+
+def test_a_plant_without_noise_is_said_to_have_none(cosim, tank, tmp_path):
+    code, _, err = cosim("scenario", "init", tank, "--sampling-time", 0.5, "--out", "quiet.toml")
+    assert code == 0
+    assert "no noise was found" in err
+    assert "# CHECK: no noise was found" in (tmp_path / "quiet.toml").read_text()
+
+
+def test_a_sampling_time_called_ts_is_found(cosim, tank, tmp_path):
+    parameter = '<ScalarVariable name="Ts" valueReference="77" causality="parameter" variability='
+    parameter += '"fixed"><Real start="0.5"/></ScalarVariable></ModelVariables>'
+    other = edited(
+        tank, tmp_path / "o.fmu", lambda text: text.replace("</ModelVariables>", parameter)
+    )
+    roles = guess_roles(unpack(other))
+    assert roles.mapping["sampling_time"] == "Ts"

@@ -17,7 +17,7 @@ COMPILER = os.environ.get("CC", "cc")
 FLAGS = (
     "-std=c99", "-g", "-O1", "-Wall", "-Wextra", "-Werror", "-Wno-cast-function-type",
     "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all",
-    "-fno-omit-frame-pointer",
+    "-fno-omit-frame-pointer", "-DFMI2_OVERRIDE_FUNCTION_PREFIX", "-DFMI3_OVERRIDE_FUNCTION_PREFIX",
 )  # fmt: skip
 CALLS = 300_000
 SECONDS = 60

@@ -103,3 +103,12 @@ def draws_at_six_seconds(plant) -> list[list[float]]:
         rows.append(plant.get("X1"))
         plant.step(2.0 * k, 2.0)
     return rows
+
+
+def test_the_laws_number_is_the_law_where_it_is_given(open_fmu) -> None:
+    """FMI 2.0's tools that set no enumeration; 0 leaves it to the enumeration."""
+    rows = [
+        open_fmu(2).initialise(seed=3, **laws).run(5)
+        for laws in ({"law": 2}, {"law_number": 2}, {"law": 1, "law_number": 2}, {"law": 1})
+    ]
+    assert rows[0] == rows[1] == rows[2] != rows[3]

@@ -1,10 +1,24 @@
-"""Reinforcement learning rules that tune an NMPC from plant data."""
+"""Learning of an NMPC's θ from plant data: the rules, and all that an own one needs."""
 
 from typing import TYPE_CHECKING
 
 from cosim.lazy import on_first_use
 from learning.actor_critic import ActorCritic
+from learning.algorithm import Algorithm, LearnableController, Transition, Update, algorithms
 from learning.batch_q_learning import BatchQLearning
+from learning.checkpoint import arrays_of, take_up
+from learning.configuration import Configuration
+from learning.constrained_step import ConstrainedStep
+from learning.errors import (
+    AlgorithmLookupError,
+    CheckpointError,
+    ConfigurationError,
+    DefinitenessError,
+    DivergenceError,
+    LearningError,
+    PrivilegeError,
+)
+from learning.exploration import Strategy
 from learning.q_learning import QLearning
 
 if TYPE_CHECKING:
@@ -17,4 +31,27 @@ __getattr__, __dir__ = on_first_use(
     {"Training": "learning.training", "train": "learning.training"},
 )
 
-__all__ = ["ActorCritic", "BatchQLearning", "QLearning", "Training", "train"]
+__all__ = [
+    "ActorCritic",
+    "Algorithm",
+    "AlgorithmLookupError",
+    "BatchQLearning",
+    "CheckpointError",
+    "Configuration",
+    "ConfigurationError",
+    "ConstrainedStep",
+    "DefinitenessError",
+    "DivergenceError",
+    "LearnableController",
+    "LearningError",
+    "PrivilegeError",
+    "QLearning",
+    "Strategy",
+    "Training",
+    "Transition",
+    "Update",
+    "algorithms",
+    "arrays_of",
+    "take_up",
+    "train",
+]

@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +89,22 @@ def prefixed(prefix: str, arrays: Mapping[str, Array]) -> dict[str, Array]:
 def group(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
     """What `prefixed` gave, found among others."""
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def arrays_of(state: Any) -> dict[str, Array]:
+    """The fields of a dataclass, each an array or a number, as arrays by name."""
+    return {item.name: np.asarray(getattr(state, item.name)) for item in fields(state)}
+
+
+def take_up(state: Any, arrays: Mapping[str, Array]) -> None:
+    """Set a dataclass's fields to what `arrays_of` gave; a number keeps its present type.
+
+    Raises KeyError where one is missing, TypeError or ValueError where it has another form.
+    """
+    for item in fields(state):
+        values, present = arrays[item.name], getattr(state, item.name)
+        is_array = isinstance(present, np.ndarray)
+        setattr(state, item.name, values if is_array else type(present)(values.item()))
 
 
 def _entries(path: Path) -> dict[str, Array]:

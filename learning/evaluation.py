@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
 from typing import Any
@@ -13,9 +12,12 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.yardstick import yardstick
+from cosim.plant.archive import SHIPPED
 from cosim.protocols import Controller, Plant
+from cosim.scenario import Scenario
 from cosim.simulation import simulate
-from cosim.statistics import Estimate, gap_closed, regret
+from cosim.statistics import gap_closed, regret
 from learning.training_run import TrainingRun, build_controller
 
 Array = NDArray[np.float64]
@@ -32,33 +34,6 @@ def held_out_costs(
     return {name: np.array([float(run[name]) for run in runs]) for name in FIGURES}
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """A greedy policy on the held-out runs: means of its figures, regret and gap closed.
-
-    `regret` has its 95 % interval over the runs; it and `gap_closed` are NaN where J* is not known.
-    """
-
-    means: dict[str, float]
-    regret: Estimate
-    gap_closed: float
-
-    def row(self) -> dict[str, float]:
-        """The columns of a training's log."""
-        row = {f"greedy_{name}": value for name, value in self.means.items()}
-        return row | {"regret": self.regret.value, "gap_closed": self.gap_closed}
-
-    def summary(self) -> dict[str, Any]:
-        """The keys of a training's summary; None for what is not known."""
-        known = isfinite(self.regret.value)
-        relative = {
-            "regret": self.regret.value if known else None,
-            "regret_interval": self.regret.t,
-            "gap_closed": self.gap_closed if known else None,
-        }
-        return {**self.means, **relative}
-
-
 class Judge:
     """Judges a run's θ by its greedy policy on the held-out seeds.
 
@@ -73,16 +48,22 @@ class Judge:
         self._problem = Problem.from_scenario(run.scenario)
         self._controller = build_controller(run.controller, run.scenario, start)
 
-    def verdict(self, theta: Array) -> Verdict:
-        """The greedy policy at θ (n_θ,), judged."""
+    def verdict(self, theta: Array) -> dict[str, Any]:
+        """The greedy policy at θ (n_θ,): means of `FIGURES`, `regret`, `gap_closed`.
+
+        `regret_interval` is its 95 % interval over the runs; `failures` is a sum; None is unknown.
+        """
         costs = self._costs(theta)
-        means: dict[str, float] = {name: float(values.mean()) for name, values in costs.items()}
-        means["failures"] = int(costs["failures"].sum())
-        return Verdict(
-            means,
-            regret(costs["J"], self._optimal_cost),
-            gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value,
-        )
+        means: dict[str, Any] = {name: float(values.mean()) for name, values in costs.items()}
+        beyond = regret(costs["J"], self._optimal_cost)
+        gap = gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value
+        known = isfinite(beyond.value)
+        return means | {
+            "failures": int(costs["failures"].sum()),
+            "regret": beyond.value if known else None,
+            "regret_interval": beyond.t,
+            "gap_closed": gap if known else None,
+        }
 
     @property
     def baselines(self) -> dict[str, float]:
@@ -126,3 +107,14 @@ class Judge:
         if self._optimum is None:
             return np.full(self._run.evaluation_seeds, np.nan)
         return self._costs(self._optimum)["J"]
+
+
+def stored_optimum(scenario: Scenario) -> str | None:
+    """`optimal` where it is the scenario's yardstick and can be had without solving anything.
+
+    A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
+    scenario names the plant's own model.
+    """
+    if scenario.plant.fmu not in SHIPPED and scenario.plant.model is None:
+        return None
+    return None if yardstick(scenario) is None else "optimal"

@@ -18,8 +18,8 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.study.protocols import Progress, Training
 from learning.errors import ConfigurationError
+from learning.evaluation import stored_optimum
 from learning.log import COLUMNS, LogRow, to_csv
-from learning.optimum import stored_optimum
 from learning.registry import GROUP as ALGORITHMS
 from learning.registry import load_algorithm
 from learning.starting_point import build_controller, starting_parameters

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from controllers import compile_functions
 from controllers.parameters import Parameters
 from cosim.errors import CapabilityError, PlantError
-from cosim.files import write_atomically
+from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import functions_of
@@ -29,10 +29,9 @@ from learning.checkpoint import Checkpoint
 from learning.configuration import Configuration
 from learning.drift import Drift
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
-from learning.evaluation import Judge
+from learning.evaluation import FIGURES, Judge, stored_optimum
 from learning.log import COLUMNS, LogRow, Totals, late_movement, to_csv
 from learning.loop import TrainingLoop, begin
-from learning.optimum import stored_optimum
 from learning.step import certificate
 from learning.training_run import TrainingRun, prepare
 from learning.training_run import build_controller as build_learnt
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
+LOG, PARAMETERS = "learning.csv", "parameters.toml"
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Training:
     """A training that has ended.
 
     `parameters` are θ as the run hands it over, `rows` its log. `evaluation` is the greedy policy
-    on held-out noise (`Verdict.summary`); `start` is θ where it started and `start_J` its greedy J,
+    on held-out noise (`Judge.verdict`); `start` is θ where it started and `start_J` its greedy J,
     `baselines` that of `naive` and, where it is known, `optimal` on the same noise. `status` is
     `finished` or `diverged: …`, which changes nothing of what θ is. `functions` says whether the
     controller's were `interpreted` or `compiled`; `without_checkpoint` why there is none, if there
@@ -122,8 +122,8 @@ class Training:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / "learning.csv", to_csv(self.rows))
-        self.parameters.save(folder / "parameters.toml")
+        write_atomically(folder / LOG, to_csv(self.rows))
+        self.parameters.save(folder / PARAMETERS)
         write_atomically(folder / "scenario.toml", self.run.scenario.to_toml())
         if self.rows:
             self.plot(folder / FIGURE)
@@ -222,6 +222,9 @@ def run_training(
     clock = time.perf_counter()
     best = build_controller(optimum, run.scenario) if optimum else None
     folder = None if out is None else Path(out)
+    for name in (LOG, PARAMETERS, CHECKPOINT):
+        if folder is not None:
+            check_target(folder / name)
     with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
         session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
         compile_functions(session.loop.controller, run.samples)
@@ -236,7 +239,7 @@ def run_training(
             run=run,
             parameters=parameters,
             rows=session.rows,
-            evaluation=judge.verdict(parameters.theta).summary(),
+            evaluation=judge.verdict(parameters.theta),
             status=status,
             plant_samples=session.loop.counts.number,
             start=session.start,
@@ -306,7 +309,10 @@ class _Session:
         if self.drift is not None:
             figures |= self.drift.row(self.plant.time)
         if judge is not None:
-            figures |= judge.verdict(answer.theta).row()
+            verdict = judge.verdict(answer.theta)
+            figures |= {f"greedy_{name}": verdict[name] for name in FIGURES}
+            known = {name: verdict[name] for name in ("regret", "gap_closed")}
+            figures |= {name: value for name, value in known.items() if value is not None}
         self.totals = Totals()
         return LogRow(figures, answer)
 
@@ -330,8 +336,8 @@ class _Session:
         self.loop.restart()
         if self.out is None:
             return
-        write_atomically(self.out / "learning.csv", to_csv(self.rows))
-        self.loop.parameters.save(self.out / "parameters.toml")
+        write_atomically(self.out / LOG, to_csv(self.rows))
+        self.loop.parameters.save(self.out / PARAMETERS)
         try:
             plant = self.plant.serialise(self.plant.snapshot())
             values, arrays = self.loop.state()

@@ -54,7 +54,7 @@ def evaluate(
         from cosim.kpis import comes_to_rest
         from cosim.lookup import build_controller
         from cosim.scenario import Scenario
-        from learning.optimum import stored_optimum
+        from learning.evaluation import stored_optimum
 
         task = Scenario.load(scenario)
         named = named_controllers(controllers)

@@ -174,7 +174,7 @@ def _execute(
     run: TrainingRun, folder: Path, optimum: str | None, resume: bool, output: Output
 ) -> Training:
     from cosim.cli.compose import announce
-    from learning.optimum import stored_optimum
+    from learning.evaluation import stored_optimum
     from learning.training import CHECKPOINT, run_training
 
     announce(run.scenario, output)

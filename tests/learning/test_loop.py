@@ -1,5 +1,7 @@
 import dataclasses
 import itertools
+from types import ModuleType
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,8 +12,11 @@ from cosim import FmuPlant, simulate
 from cosim.simulation import spawn_seeds
 from learning import QLearning
 from learning.algorithm import Update
+from learning.errors import PrivilegeError
+from learning.evaluation import HELD_OUT
 from learning.exploration import build_strategy
-from learning.loop import TrainingLoop, begin
+from learning.loop import PlantInOperation, TrainingLoop, begin
+from learning.training import run_training
 from learning.training_run import TrainingRun, starting_parameters
 
 
@@ -171,3 +176,100 @@ def test_a_rule_that_rests_neither_moves_nor_explores(plant):
     assert [loop.advance()[1] for _ in range(40)] == [None] * 40
     np.testing.assert_array_equal(loop.controller.theta, theta)
     assert loop.counts.explored == explored
+
+
+class Asking(QLearning):
+    """Says on every fifth sample what it was told to say, and moves nothing."""
+
+    asks_for = "operation"
+    says: ClassVar = {}
+
+    def observe(self, sample):
+        if sample.number % 5 < 4:
+            return None
+        return Update(td_error=0.0, step=0.0, smallest_eigenvalue=1.0, **self.says)
+
+
+class Privileged(Asking):
+    asks_for = "simulator"
+
+
+def asking(plant, base, **says):
+    return begin(make_run(plant.scenario), type("Own", (base,), {"says": says}), plant)
+
+
+@pytest.mark.parametrize("says", [{"episode": 7}, {"mark": True}, {"rewind": True}])
+def test_a_plant_in_operation_is_never_reset_nor_put_back(plant, says):
+    loop = asking(plant, Asking, **says)
+    for _ in range(4):
+        loop.advance()
+    before = plant.time
+    with pytest.raises(PrivilegeError) as caught:
+        loop.advance()
+    assert "\n" not in str(caught.value) and next(iter(says)) in str(caught.value)
+    assert plant.time > before
+
+
+def test_a_first_episode_is_a_simulators_too(plant):
+    with pytest.raises(PrivilegeError):
+        begin(make_run(plant.scenario), type("Own", (Asking,), {"first_episode": 3}), plant)
+    begin(make_run(plant.scenario), type("Own", (Privileged,), {"first_episode": 3}), plant)
+    first = plant.reset(3), plant.step(plant.scenario.reference_action).s
+    assert np.array_equal(first[0], plant.scenario.initial_state)
+
+
+def test_a_simulator_is_reset_marked_and_put_back(plant):
+    loop = asking(plant, Privileged, episode=7)
+    for _ in range(5):
+        loop.advance()
+    assert np.array_equal(loop.s, plant.scenario.initial_state) and plant.time == 0.0
+    loop = asking(plant, Privileged, mark=True)
+    for _ in range(5):
+        loop.advance()
+    marked, time = loop.s, plant.time
+    loop.algorithm.says = {"rewind": True}
+    for _ in range(5):
+        loop.advance()
+    assert np.array_equal(loop.s, marked) and plant.time == time
+
+
+def reachable(root):
+    """All objects that attributes, items and bound methods lead to."""
+    seen, todo = {}, [root]
+    while todo:
+        item = todo.pop()
+        if id(item) in seen or isinstance(item, type | ModuleType):
+            continue
+        seen[id(item)] = item
+        todo += vars(item).values() if hasattr(item, "__dict__") else []
+        todo += item.values() if isinstance(item, dict) else []
+        todo += item if isinstance(item, list | tuple | set) else []
+        todo += [item.__self__] if hasattr(item, "__self__") else []
+    return seen.values()
+
+
+def test_nothing_of_a_plant_in_operation_but_its_samples_can_be_had(plant):
+    loop = asking(plant, Asking)
+    for held in (loop, loop.algorithm):
+        assert not any(isinstance(item, FmuPlant) for item in reachable(held))
+    left = {name for name in dir(PlantInOperation(plant)) if not name.startswith("_")}
+    assert left == {"scenario", "step"}
+    assert any(isinstance(item, FmuPlant) for item in reachable(asking(plant, Privileged)))
+
+
+def test_a_plant_in_operation_is_started_once_even_through_checkpoints(scenario, monkeypatch):
+    resets = []
+    reset = FmuPlant.reset
+
+    def counted(self, seed):
+        resets.append(seed)
+        return reset(self, seed)
+
+    monkeypatch.setattr(FmuPlant, "reset", counted)
+    run = dataclasses.replace(
+        make_run(scenario), log_every=20, evaluate_every=20, checkpoint_every=20,
+        evaluation_seeds=1, evaluation_steps=5,
+    )  # fmt: skip
+    run_training(run, rule=Asking)
+    judged = spawn_seeds(HELD_OUT)[0]
+    assert [seed for seed in resets if seed != judged] == [spawn_seeds(run.seed)[0]]

@@ -1,7 +1,17 @@
+from dataclasses import dataclass, field
+
 import numpy as np
 import pytest
 
-from learning.checkpoint import Checkpoint, generator_state, load, restore_generator, save
+from learning.checkpoint import (
+    Checkpoint,
+    arrays_of,
+    generator_state,
+    load,
+    restore_generator,
+    save,
+    take_up,
+)
 from learning.errors import CheckpointError
 
 RUN = {"algorithm": "actor-critic", "seed": 3, "deviation": (5.0,)}
@@ -25,11 +35,6 @@ def test_another_runs_checkpoint_is_refused_by_the_field_that_differs(stored):
         load(stored, {**RUN, "seed": 4})
 
 
-def test_a_missing_checkpoint_says_what_to_do(tmp_path):
-    with pytest.raises(CheckpointError, match="without --resume"):
-        load(tmp_path / "checkpoint.npz")
-
-
 @pytest.mark.parametrize("position", range(0, 1200, 97))
 def test_damage_anywhere_is_refused(stored, position):
     data = bytearray(stored.read_bytes())
@@ -44,24 +49,18 @@ def test_damage_anywhere_is_refused(stored, position):
     assert found.state == {"number": 7}
 
 
-def test_half_a_file_is_refused(stored):
-    stored.write_bytes(stored.read_bytes()[:200])
-    with pytest.raises(CheckpointError, match="not a readable checkpoint"):
-        load(stored, RUN)
-
-
-def test_a_pickle_is_refused(tmp_path):
-    path = tmp_path / "checkpoint.npz"
-    np.savez(path, about=np.array([{"a": 1}], dtype=object))
+def test_a_missing_file_half_a_file_and_a_pickle_are_refused(stored):
+    for content in (None, stored.read_bytes()[:200]):
+        stored.unlink()
+        if content is not None:
+            stored.write_bytes(content)
+        with pytest.raises(CheckpointError):
+            load(stored)
+    np.savez(stored, about=np.array([{"a": 1}], dtype=object))
     with pytest.raises(CheckpointError):
-        load(path)
-
-
-def test_python_objects_are_not_stored(tmp_path):
-    entries = {"x": np.array([object()])}
-    with pytest.raises(CheckpointError, match="'x' holds Python objects"):
-        save(tmp_path / "checkpoint.npz", Checkpoint(RUN, {}, entries))
-    assert list(tmp_path.iterdir()) == []
+        load(stored)
+    with pytest.raises(CheckpointError):
+        save(stored, Checkpoint(RUN, {}, {"x": np.array([object()])}))
 
 
 def test_a_generator_goes_on_where_it_was():
@@ -70,9 +69,24 @@ def test_a_generator_goes_on_where_it_was():
     other = np.random.default_rng(2)
     restore_generator(other, generator_state(rng))
     assert np.array_equal(rng.random(5), other.random(5))
-
-
-def test_another_generators_state_is_refused():
-    rng = np.random.default_rng(1)
-    with pytest.raises(CheckpointError, match="cannot be restored"):
+    with pytest.raises(CheckpointError):
         restore_generator(rng, {"bit_generator": "MT19937"})
+
+
+@dataclass
+class Memory:
+    number: int = 0
+    mean: float = 0.0
+    began: bool = False
+    weights: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+
+def test_a_dataclass_goes_through_arrays_with_the_types_that_it_had():
+    arrays = arrays_of(Memory(3, 0.1, True, np.arange(4.0)))
+    found = Memory()
+    take_up(found, arrays)
+    assert (found.number, found.mean, found.began) == (3, 0.1, True)
+    assert (type(found.number), type(found.began)) == (int, bool)
+    assert found.weights.tolist() == [0.0, 1.0, 2.0, 3.0]
+    with pytest.raises(KeyError):
+        take_up(found, {})

@@ -50,12 +50,12 @@ def test_damage_anywhere_is_refused(stored, position):
 
 
 def test_a_missing_file_half_a_file_and_a_pickle_are_refused(stored):
-    for content in (None, stored.read_bytes()[:200]):
-        stored.unlink()
-        if content is not None:
-            stored.write_bytes(content)
-        with pytest.raises(CheckpointError):
-            load(stored)
+    stored.write_bytes(stored.read_bytes()[:200])
+    with pytest.raises(CheckpointError):
+        load(stored)
+    stored.unlink()
+    with pytest.raises(CheckpointError):
+        load(stored)
     np.savez(stored, about=np.array([{"a": 1}], dtype=object))
     with pytest.raises(CheckpointError):
         load(stored)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from controllers.parameters import Parameters
 from controllers.rti.prepared import LinearisationPoint
-from cosim.plugins import load_plugin
+from cosim.plugins import ALGORITHMS, load_plugin
 from cosim.protocols import Controller, Solution
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -25,8 +25,6 @@ from learning.exploration import Strategy
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Privilege = Literal["operation", "simulator"]
-GROUP = "cosim.algorithms"
-"""Entry points by which algorithms have names."""
 
 
 class LearnableSolution(Solution, Protocol):
@@ -182,22 +180,16 @@ class Algorithm(Rule, Protocol):
 
 def algorithms() -> list[str]:
     """Names of the algorithms that are registered."""
-    return sorted(point.name for point in entry_points(group=GROUP))
-
-
-def algorithm_target(name: str) -> str:
-    """The `module:Class` of a registered name; any other text as it is."""
-    return next((point.value for point in entry_points(group=GROUP) if point.name == name), name)
+    return sorted(point.name for point in entry_points(group=ALGORITHMS))
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
     """Class of an algorithm by registered name or `module:Class`; raises AlgorithmLookupError."""
-    target = algorithm_target(name)
-    if ":" not in target:
-        known = algorithms()
+    known = {point.name: point.value for point in entry_points(group=ALGORITHMS)}
+    if (target := known.get(name, name)) == name and ":" not in name:
         raise AlgorithmLookupError(
             f"unknown algorithm '{name}'{suggestion(name, known)}; registered are "
-            f"{', '.join(known)}, or give module:Class"
+            f"{', '.join(sorted(known))}, or give module:Class"
         )
     found = load_plugin(target, f"algorithm '{name}'", AlgorithmLookupError)
     needed = ("Configuration", "observe", "state", "restore")

@@ -71,14 +71,21 @@ def load(
     found: dict[str, Any] = about["run"]
     if run is not None:
         # Both sides through JSON, where tuples are lists.
-        wanted = json.loads(json.dumps(dict(run)))
-        for key in sorted((wanted.keys() | found.keys()) - set(but)):
-            if wanted.get(key) != found.get(key):
+        there, here = _flat(found), _flat(json.loads(json.dumps(dict(run))))
+        for key in sorted((there.keys() | here.keys()) - set(but)):
+            if there.get(key) != here.get(key):
                 raise CheckpointError(
-                    f"{path}: the checkpoint is of another run: {key} is {found.get(key)!r} there "
-                    f"and {wanted.get(key)!r} here; use another --out or the same settings"
+                    f"{path}: the checkpoint is of another run: {key} is {there.get(key)!r} there "
+                    f"and {here.get(key)!r} here; use another --out or the same settings"
                 )
     return Checkpoint(found, about["state"], entries)
+
+
+def _flat(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Each value by its name, those of an inner table as `table of name`."""
+    tables = {key: value for key, value in run.items() if isinstance(value, dict)}
+    inner = {f"{key} of {name}": v for key, table in tables.items() for name, v in table.items()}
+    return {key: value for key, value in run.items() if key not in tables} | inner
 
 
 def prefixed(prefix: str, arrays: Mapping[str, Array]) -> dict[str, Array]:

@@ -14,14 +14,14 @@ from cosim.files import temporary_folder
 from cosim.lookup import GROUP as CONTROLLERS
 from cosim.lookup import build_controller as controller_by_name
 from cosim.lookup import import_from_here
+from cosim.plugins import ALGORITHMS
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.study.protocols import Progress, Training
+from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.evaluation import stored_optimum
 from learning.log import COLUMNS, LogRow, to_csv
-from learning.registry import GROUP as ALGORITHMS
-from learning.registry import load_algorithm
 from learning.starting_point import build_controller, starting_parameters
 from learning.training import CHECKPOINT, run_training
 from learning.training_run import TrainingRun, prepare

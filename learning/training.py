@@ -262,6 +262,7 @@ class _Session:
         self, run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant, out: Path | None
     ) -> None:
         self.run, self.plant, self.out = run, plant, out
+        self.identity = run.identity()
         self.loop: TrainingLoop = begin(run, algorithm, plant)
         self.start = self.loop.start_parameters
         self.rows: list[LogRow] = []
@@ -353,14 +354,14 @@ class _Session:
             "rows": np.array([list(row.values()) for row in self.rows]),
             "row_thetas": np.array([row.parameters.theta for row in self.rows]),
         }
-        checkpoint.save(self.out / CHECKPOINT, Checkpoint(self.run.identity(), values, arrays))
+        checkpoint.save(self.out / CHECKPOINT, Checkpoint(self.identity, values, arrays))
 
     def load(self) -> None:
         """Take up the folder's checkpoint; raises CheckpointError where there is none that fits."""
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
         path = self.out / CHECKPOINT
-        found = checkpoint.load(path, self.run.identity(), but=("samples",))
+        found = checkpoint.load(path, self.identity, but=("samples",))
         try:
             self._require_same_beginning(path, int(found.run["samples"]))
             columns, arrays = found.state["columns"], found.arrays

@@ -16,9 +16,9 @@ from controllers.factories import nmpc
 from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.theta import ThetaBlocks
-from cosim.evaluation.provenance import source_hashes
+from cosim.plugins import OURS, depends_on
 from cosim.scenario import Scenario
-from learning.algorithm import LearnableController, algorithm_target, load_algorithm
+from learning.algorithm import LearnableController, load_algorithm
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 
@@ -89,16 +89,13 @@ class TrainingRun:
                 )
 
     def identity(self) -> dict[str, Any]:
-        """The run as JSON-ready values, with the hash of each foreign source file behind it."""
+        """The run as JSON-ready values, with the hashes of all code that its result depends on."""
         values = {option.name: getattr(self, option.name) for option in fields(self)}
         values["scenario"] = self.scenario.hash
         values["configuration"] = self.configuration.model_dump(mode="json")
         if (file := Path(self.start)).is_file():
             values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-        targets = (algorithm_target(self.algorithm), self.scenario.controller.model)
-        for target in filter(None, targets):
-            for file_name, digest in source_hashes(target).items():
-                values[f"source of {file_name}"] = digest
+        values["source"] = depends_on(self.scenario, self.algorithm, packages=OURS)
         return values
 
     def algorithm_rng(self) -> np.random.Generator:

@@ -19,8 +19,8 @@ from cosim import Scenario
 from cosim.cli import main
 from cosim.cli.main import app
 from cosim.errors import ScenarioError
+from learning.algorithm import algorithms, load_algorithm
 from learning.errors import ConfigurationError
-from learning.registry import algorithms, load_algorithm
 
 # What `paper` leaves open is stated, so that every field has a place.
 STATED = {

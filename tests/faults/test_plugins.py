@@ -7,8 +7,8 @@ import pytest
 from cosim import Scenario
 from cosim.errors import ControllerLookupError
 from cosim.plugins import build_controller, load_plugin
+from learning.algorithm import load_algorithm
 from learning.errors import AlgorithmLookupError
-from learning.registry import load_algorithm
 from tests.helpers.command import run_cosim
 
 PAPER = Scenario.load("paper")

@@ -2,6 +2,8 @@ import json
 
 import pytest
 
+from tests.helpers.command import run_cosim
+
 SHORT = (
     "train", "-a", "q-learning", "-n", 200, "--log-every", 50, "--evaluate-every", 100,
     "--checkpoint-every", 100, "--evaluation-seeds", 1, "--evaluation-steps", 30,
@@ -106,3 +108,25 @@ def test_divergence_ends_with_exit_code_1_and_says_why(cosim, tmp_path):
     assert code == 1
     assert json.loads(out)["status"].startswith("diverged: ")
     assert (tmp_path / "run/parameters.toml").exists()
+
+
+OWN = """
+import helper_of_mine
+from learning import QLearning
+
+class Mine(QLearning):
+    asks_for = "operation"
+"""
+
+
+def test_a_run_whose_algorithm_was_edited_is_not_resumed(cosim, tmp_path):
+    (tmp_path / "mine.py").write_text(OWN)
+    (tmp_path / "helper_of_mine.py").write_text("X = 1\n")
+    own = ("train", "-a", "mine:Mine", *SHORT[3:], "--out", "run")
+    assert cosim(*own)[0] == 0
+    assert json.loads((tmp_path / "run/summary.json").read_text())["asks_for"] == "operation"
+    assert cosim(*own, "--resume")[0] == 0
+    (tmp_path / "helper_of_mine.py").write_text("X = 2\n")
+    ended = run_cosim(*own, "--resume", folder=tmp_path)
+    assert ended.returncode == 2 and "helper_of_mine.py" in ended.stderr
+    assert len(ended.stderr.strip().splitlines()) == 1

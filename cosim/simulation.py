@@ -21,7 +21,7 @@ from cosim.protocols import (
     recover,
 )
 from cosim.scenario import Scenario
-from cosim.signal_columns import SignalColumns
+from cosim.signals import SignalColumns
 from cosim.trajectory import FALLBACK, Signal, Trajectory
 
 Array = NDArray[np.float64]

@@ -38,8 +38,7 @@ def show(
 ) -> None:
     """List the presets, or print a scenario with every field written out, as TOML."""
     with output(json) as out_:
-        from cosim.scenario import Scenario
-        from cosim.scenario.loading import presets
+        from cosim.scenario import Scenario, presets
 
         if name is None:
             loaded = [Scenario.load(preset) for preset in presets()]

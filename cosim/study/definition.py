@@ -10,8 +10,7 @@ from typing import Any, Self
 
 from cosim.errors import StudyError
 from cosim.lookup import import_from
-from cosim.scenario import Scenario
-from cosim.scenario.loading import resolved
+from cosim.scenario import Scenario, resolved
 from cosim.study.cases import BASELINES, Case, expand
 from cosim.study.document import DEFAULT, PerScenario, StudyTable, read, validate
 from cosim.study.protocols import Trainer, Training, registered_trainer

@@ -18,8 +18,7 @@ from controllers import (
     functions,
 )
 from controllers.functions import BufferedFunction, bind_compiled, description, find_compiler
-from cosim.scenario import Scenario
-from cosim.scenario.loading import presets
+from cosim.scenario import Scenario, presets
 from tests.helpers.command import run_cosim
 from tests.helpers.sampling import evaporator_problem
 

@@ -6,8 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cosim.errors import ScenarioError
-from cosim.scenario import Scenario
-from cosim.scenario.loading import presets
+from cosim.scenario import Scenario, presets
 
 
 def test_presets_are_those_that_the_design_names():

@@ -10,7 +10,7 @@ from controllers.errors import ParameterError
 from cosim import Scenario, Study
 from cosim.errors import ScenarioError, StudyError
 from cosim.files import DEEPEST, LARGEST, parse_toml
-from cosim.scenario.loading import LONGEST
+from cosim.scenario import LONGEST
 
 
 def theta(path):

@@ -366,8 +366,8 @@ def tune(
     need, makes P and its feedback those of the discounted problem as well, for any γ and horizon.
     Without it a discounted NMPC would act as if what it postpones were cheaper. λ_θ undoes both
     rotations, so that V_θ is to second order the economic value. `value_offset` is c_λ where it
-    shall not be ℓ_s. Raises TuningError where steady state, local optimum or convexification do
-    not exist.
+    shall not be ℓ_s. θ is rounded to six digits. Raises TuningError where steady state, local
+    optimum or convexification do not exist.
     """
     steady = optimal_steady_state(
         dataclasses.replace(problem, substeps=accurate_substeps(problem, accuracy))
@@ -392,12 +392,12 @@ def tune(
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
     parameters = Parameters.naive(problem, blocks, value_offset=value_offset).replace(
         {
-            "B_l": _symmetric(0.5 * M),
-            "b_l": q + M @ shift,
-            "B_Vf": _symmetric(0.5 * P),
-            "b_Vf": q[:n] + P @ shift[:n],
-            "B_lambda": _symmetric(0.5 * initial),
-            "b_lambda": steady.costate + initial @ shift[:n],
+            "B_l": _rounded(_symmetric(0.5 * M)),
+            "b_l": _rounded(q + M @ shift),
+            "B_Vf": _rounded(_symmetric(0.5 * P)),
+            "b_Vf": _rounded(q[:n] + P @ shift[:n]),
+            "B_lambda": _rounded(_symmetric(0.5 * initial)),
+            "b_lambda": _rounded(steady.costate + initial @ shift[:n]),
         }
     )
     return EconomicTuning(
@@ -441,6 +441,13 @@ def accurate_substeps(problem: Problem, accuracy: float) -> int:
         f"model '{model.name}' cannot be integrated to {accuracy:g} over a sample of "
         f"{problem.sampling_time:g} s"
     )
+
+
+def _rounded(block: Array) -> Array:
+    """Entries to six digits, 0 below 1e-9 of the largest: a solver's last bits choose nothing."""
+    least = 1e-9 * float(np.abs(block).max(initial=0.0))
+    kept = [float(f"{x:.6g}") if abs(x) > least else 0.0 for x in block.flat]
+    return np.array(kept).reshape(block.shape)
 
 
 def _symmetric(matrix: Array) -> Array:

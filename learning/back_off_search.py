@@ -22,6 +22,8 @@ PHASES = ((3, (0.0, 2.0, 4.0)), (5, (-0.5, 0.0, 0.5)), (8, (-0.25, 0.25)))
 REACH = 1.0
 """How far, in κ, a sample speaks for another back-off; twice that in the coarse first round."""
 RESOLUTION = 0.01
+PLATEAU = 1e-6
+"""Estimated costs that differ by this share are one, so that no last digit decides."""
 SEGMENTS = 16
 """The budget has that many of the first round's stretches."""
 BINDING = 0.05
@@ -48,7 +50,13 @@ class BackOffSearch:
     moves with it: mean stage cost and the mean of the other states linearly, the bounded state
     with its bound. The known penalty is then that of the very states that were seen, moved so.
     Every sample near it thus serves each κ; to compare costs alone would take many times the
-    samples, since one violation in a thousand decides.
+    samples, since one violation in a thousand decides. The fit is within the rounds, whose noise is
+    common on a simulator.
+
+    No true bound is loosened: x_l stays at or above the scenario's, x_u at or below. Of back-offs
+    whose estimates differ by less than `PLATEAU` the smallest is taken. Where the estimate falls
+    up to the end of what the samples speak for, the best back-off that was run is taken, and the
+    next round is about it.
 
     Raises ConfigurationError on a budget that is too small to see anything.
     """
@@ -71,6 +79,7 @@ class BackOffSearch:
         self._settling = problem.horizon
         n, self._actions = problem.n_states, problem.n_actions
         self._n = n
+        self._true = (scenario.state_lower, scenario.state_upper)
         self._seeds = rng.integers(2**63, size=2 * n * len(PHASES)).tolist()
         self.kappa = np.zeros(2 * n)
         """Best back-offs found, of lower then upper bounds, (2n,)."""
@@ -103,9 +112,9 @@ class BackOffSearch:
         return self._segment >= len(self._plan)
 
     def at(self, kappa: Vector) -> Parameters:
-        """θ with its bounds κ (2n,) backed off, x_l kept below x_u."""
-        lower = self.start["x_l"] + kappa[: self._n] * self._unit
-        upper = self.start["x_u"] - kappa[self._n :] * self._unit
+        """θ with its bounds κ (2n,) backed off, within the true bounds, x_l kept below x_u."""
+        lower = np.maximum(self.start["x_l"] + kappa[: self._n] * self._unit, self._true[0])
+        upper = np.minimum(self.start["x_u"] - kappa[self._n :] * self._unit, self._true[1])
         crossed = lower >= upper
         middle = (lower + upper) / 2
         lower[crossed], upper[crossed] = middle[crossed] - 1e-6, middle[crossed] + 1e-6
@@ -168,8 +177,22 @@ class BackOffSearch:
         left = 13 / sum(PHASES[later][0] for _, later in self._schedule[1:]) if number else 1.0
         steps = int(self._budget * left * share / (SEGMENTS * len(offsets)))
         steps = max(steps, self._settling + 1)
-        direction = np.eye(self.kappa.size)[bound]
-        return [Segment(number, steps, self.kappa + offset * direction) for offset in offsets]
+        if phase == 0 and (least := max(self._least(bound), -offsets[-1])) < -1.0:
+            offsets = (0.0, least, least / 2)  # of a start that is backed off, look for less
+        kappas = [self.kappa.copy() for _ in offsets]
+        for kappa, offset in zip(kappas, offsets, strict=True):
+            kappa[bound] = max(kappa[bound] + offset, self._least(bound))
+        return [Segment(number, steps, kappa) for kappa in kappas]
+
+    def _least(self, bound: int) -> float:
+        """κ at which a bound is the true one, at most 0 for a start that loosens none."""
+        state, upper = bound % self._n, bound >= self._n
+        room = (
+            self.start["x_u"][state] - self._true[1][state]
+            if upper
+            else self._true[0][state] - self.start["x_l"][state]
+        )
+        return float(room / self._unit[state]) if self._unit[state] > 0 else 0.0
 
     def _best(self, number: int) -> float:
         """κ of least estimated cost of a round's bound, from this round and the second one."""
@@ -182,14 +205,26 @@ class BackOffSearch:
         slope = self._slopes(rows[:, 0], kappa, np.column_stack([rows[:, 1], states]))
         slope[1 + bound % n] = self._unit[bound % n] * (1 if bound < n else -1)
         reach = REACH * (2 if phase == 0 else 1)
-        low, high = kappa.min() - reach, kappa.max() + reach
-        grid = np.linspace(low, high, round((high - low) / RESOLUTION) + 1)
-        estimates = np.full(grid.size, np.inf)
-        for i, value in enumerate(grid):
+
+        def estimate(value: float) -> float:
             near = np.abs(kappa - value) < reach + RESOLUTION / 2
             moved = states[near] + np.outer(value - kappa[near], slope[1:])
-            estimates[i] = slope[0] * value + self._penalty(moved).mean()
-        return float(grid[int(np.argmin(estimates))])
+            return float(slope[0] * value + self._penalty(moved).mean())
+
+        def best_of(values: Vector) -> float:
+            costs = mean + np.array([estimate(value) for value in values])
+            plateau = values[costs <= costs.min() + PLATEAU * abs(costs.min())]
+            return float(plateau[np.argmin(np.abs(plateau))])
+
+        mean, least = float(rows[:, 1].mean()), self._least(bound)
+        low, high = max(kappa.min() - reach, least), kappa.max() + reach
+        # Multiples of the resolution, so that a start in its last digits has the same grid.
+        steps = np.arange(np.ceil(low / RESOLUTION), np.floor(high / RESOLUTION) + 1)
+        grid = RESOLUTION * steps
+        found = best_of(grid)
+        if found == grid[-1] or (found == grid[0] and low > least):
+            return best_of(np.unique(kappa))
+        return found
 
     @staticmethod
     def _slopes(rounds: Vector, kappa: Vector, values: Matrix) -> Vector:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from cmaes import CMA
@@ -13,9 +13,9 @@ from scipy.linalg import expm
 from controllers.parameters import Parameters
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, Transition, Update
+from learning.baselines import GreedyConfiguration
 from learning.configuration import Configuration, Count, Positive
 from learning.exploration import Strategy
-from learning.greedy_configuration import GreedyConfiguration
 from learning.step import HESSIANS, certificate
 
 Vector = NDArray[np.float64]
@@ -78,13 +78,17 @@ class Coordinates:
 
 
 class PolicySearch:
-    """CMA-ES (Hansen) on the mean cost of episodes; the candidates of a generation meet one noise.
+    """CMA-ES (Hansen) on the mean cost of stretches of operation, one for each candidate.
 
-    An episode begins at the scenario's initial state. The mean of the search distribution is what
-    the run hands over; the part of a generation that the budget leaves over changes nothing.
+    A stretch begins where the last one ended; its first samples, as many as the horizon has, settle
+    and do not count. The mean of the search distribution is what the run hands over; the part of a
+    generation that the budget leaves over changes nothing.
     """
 
     Configuration: ClassVar[type[Configuration]] = PolicySearchConfiguration
+    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
+    needs_action_value = False
+    needs_points = False
 
     def __init__(
         self,
@@ -103,10 +107,15 @@ class PolicySearch:
         self._population: list[Vector] = []
         self._costs: list[float] = []
         self._sum, self._step = 0.0, 0
-        self.needs_action_value = False
-        self.needs_points = False
-        self.first_episode = self._begin_generation()
+        horizon = scenario.controller.horizon
+        self._settling = 0 if self._simulated else min(horizon, configuration.episode - 1)
+        seed = self._begin_generation()
+        self.first_episode = seed if self._simulated else None
         controller.theta = self._coordinates.theta(self._population[0]).theta
+
+    @property
+    def _simulated(self) -> bool:
+        return self.asks_for == "simulator"
 
     def _new_search(self) -> CMA:
         return CMA(
@@ -140,11 +149,11 @@ class PolicySearch:
         return self._take(cost)
 
     def _take(self, cost: float) -> Update | None:
-        self._sum += cost
+        self._sum += cost if self._step >= self._settling else 0.0
         self._step += 1
         if self._step < self._configuration.episode:
             return None
-        self._costs.append(self._sum / self._step)
+        self._costs.append(self._sum / (self._step - self._settling))
         self._sum, self._step = 0.0, 0
         before = self.theta
         if len(self._costs) == len(self._population):
@@ -157,7 +166,7 @@ class PolicySearch:
             td_error=float("nan"),
             step=float(np.linalg.norm((self.theta - before) / blocks.scale)),
             smallest_eigenvalue=certificate(blocks, candidate.theta).smallest,
-            episode=self._noise,
+            episode=self._noise if self._simulated else None,
         )
 
     def _tell(self, population: NDArray[np.float64], costs: list[float]) -> None:
@@ -184,6 +193,15 @@ class PolicySearch:
         self._costs = state["costs"].tolist()
         self._noise = int(state["noise"][0])
         self._sum, self._step = float(state["episode"][0]), int(state["episode"][1])
+
+
+class PolicySearchSimulator(PolicySearch):
+    """`PolicySearch` on a plant that is put back: a generation's candidates meet one noise.
+
+    Each episode begins at the scenario's initial state.
+    """
+
+    asks_for = "simulator"
 
 
 def _unit(lower: Vector, upper: Vector, reference: Vector, width: float) -> Vector:

@@ -96,3 +96,44 @@ def test_the_candidates_of_a_round_meet_the_same_noise(problem, scenario, start)
         search.observe(loop.transition(search, rng))
     assert len(seeds) == 3 and all(len(each) == 1 for each in seeds.values())
     assert len(set.union(*seeds.values())) == 3
+
+
+def test_no_true_bound_is_loosened_and_on_a_plateau_nothing_moves(problem, scenario, start):
+    """The upper bound of P2 is active here, and what is kept of it changes no cost."""
+    loop = Loop(problem, scenario, both=True)
+    transition = loop.transition
+
+    def indifferent(search, rng):
+        sample = transition(search, rng)
+        sample.s = np.array([30.0, 60.0]) + rng.uniform(-1.0, 1.0, 2)
+        sample.stage_cost = 6000.0 * (1 + 1e-12 * rng.standard_normal())
+        return sample
+
+    loop.transition = indifferent
+    search = search_of(problem, scenario, start)
+    least, most = start["x_l"], start["x_u"]
+    while not search.done:
+        rng, begins = np.random.default_rng(search.seed), False
+        while not begins and not search.done:
+            assert (search.candidate["x_l"] >= scenario.state_lower).all()
+            assert (search.candidate["x_u"] <= scenario.state_upper).all()
+            begins = search.observe(loop.transition(search, rng))
+    assert not search.kappa.any(), search.kappa
+    assert np.array_equal(search.theta["x_l"], least)
+    assert np.array_equal(search.theta["x_u"], most)
+
+
+def test_the_end_of_what_was_seen_is_not_taken_for_the_best(problem, scenario, start):
+    """A cost that falls with κ without end leaves, round by round, a back-off that was run."""
+    loop = Loop(problem, scenario)
+    transition = loop.transition
+
+    def falling(search, rng):
+        sample = transition(search, rng)
+        sample.stage_cost = 6000.0 - 10.0 * sample.s[0]
+        return sample
+
+    loop.transition = falling
+    search = loop.run(search_of(problem, scenario, start), None)
+    run = {segment.kappa[0] for segment in search._plan}
+    assert search.kappa[0] in run and search.kappa[0] >= 4.0

@@ -14,6 +14,7 @@ from cosim import FmuPlant, Scenario, simulate
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.log import to_csv
+from learning.loop import begin
 from learning.policy_search import Coordinates
 from learning.prediction_errors import OneStepModel
 from tests.helpers import training
@@ -25,6 +26,7 @@ SETTINGS = {
     "identified": {},
     "policy-search": {"population": 4, "episode": 20},
 }
+SETTINGS |= {f"{name}-simulator": settings for name, settings in SETTINGS.items()}
 
 
 def make_run(name, scenario="paper", **changes):
@@ -37,7 +39,9 @@ def make_run(name, scenario="paper", **changes):
     "name",
     [
         "offset-free",
+        "offset-free-simulator",
         "policy-search",
+        "policy-search-simulator",
         pytest.param("backoff", marks=pytest.mark.slow),
         pytest.param("identified", marks=pytest.mark.slow),
     ],
@@ -55,6 +59,36 @@ def test_a_baseline_resumed_after_a_kill_ends_in_the_same_digits(name, tmp_path)
 def test_the_seed_gives_the_noise_of_a_search():
     J = [train(make_run("backoff", samples=320, seed=k)).rows[0]["J"] for k in (3, 3, 4)]
     assert J[0] == J[1] != J[2]
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_only_the_simulators_forms_put_the_plant_back(name, scenario):
+    run = make_run(name)
+    with FmuPlant(scenario) as plant:
+        loop, resets = begin(run, load_algorithm(name), plant), 0
+        reset = plant.reset
+
+        def counted(seed):
+            nonlocal resets
+            resets += 1
+            return reset(seed)
+
+        plant.reset = counted
+        for _ in range(450):
+            loop.advance()
+    assert (resets > 0) == name.endswith("-simulator") == (loop.algorithm.asks_for == "simulator")
+    assert (loop.parameters["x_l"] >= scenario.state_lower).all() or "policy" in name
+
+
+@pytest.mark.parametrize("name", ["backoff", "backoff-simulator"])
+def test_the_last_digits_of_the_start_choose_nothing(name, problem, tmp_path):
+    """As those of the tuned θ, which a conic solver gives to 1e-10."""
+    J, tuned, rng = [], tune(problem).parameters, np.random.default_rng(0)
+    for size in (0.0, 1e-10, 1e-10):
+        theta = tuned.theta * (1 + size * rng.uniform(-1, 1, tuned.theta.size))
+        start = tuned.with_theta(theta).save(tmp_path / "start.toml")
+        J.append(train(make_run(name, "fouled", samples=2000, start=str(start))).J)
+    assert J[1:] == pytest.approx([J[0], J[0]], rel=1e-6)
 
 
 @pytest.mark.slow
@@ -127,7 +161,7 @@ def test_identification_again_and_again_follows_a_parameter():
 
 
 def test_the_policy_search_hands_over_the_mean_and_improves(scenario, problem):
-    run = make_run("policy-search", samples=13 * 60 * 3, start="naive")
+    run = make_run("policy-search-simulator", samples=13 * 60 * 3, start="naive")
     configuration = load_algorithm("policy-search").Configuration.from_dict({"episode": 60})
     run = dataclasses.replace(
         run, configuration=configuration, log_every=780, evaluate_every=2340, checkpoint_every=2340
@@ -153,5 +187,5 @@ def test_coordinates_begin_at_the_start_and_stay_definite(scenario, problem, rng
 
 
 def test_too_few_samples_for_a_search_are_refused():
-    with pytest.raises(ConfigurationError, match="needs at least 320 samples, it has 100"):
+    with pytest.raises(ConfigurationError):
         train(make_run("backoff", samples=100))

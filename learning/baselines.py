@@ -1,0 +1,388 @@
+"""What a practitioner would do: an estimate from plant data, then a search of the back-off.
+
+Each baseline has two forms. In operation the plant goes on from stretch to stretch as it is; on a
+simulator (`…Simulator`) it is put back before each, and the stretches of a round meet the same
+noise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.optimize import least_squares
+
+from controllers.economic import tune
+from controllers.errors import TuningError
+from controllers.model import Model
+from controllers.parameters import Parameters
+from controllers.problem import Problem
+from cosim.scenario import Scenario
+from learning.algorithm import LearnableController, Transition, Update
+from learning.back_off_search import BackOffSearch
+from learning.checkpoint import group, prefixed
+from learning.configuration import Configuration, Count, Share
+from learning.errors import DivergenceError
+from learning.exploration import Strategy
+from learning.prediction_errors import OneStepModel
+from learning.step import certificate
+
+Vector = NDArray[np.float64]
+BackOffToo = Annotated[bool, Field(description="search the back-off of the active bounds")]
+EstimationShare = Annotated[Share, Field(description="share of the samples for the estimate")]
+SHARED_OUT = "samples (shared out among the stages)"
+
+
+class GreedyConfiguration(Configuration):
+    """Hyperparameters of a rule whose samples are greedy and whose θ comes from no fit."""
+
+    exploration: Literal["none"] = Field(
+        "none", description="none: it is θ that is tried, not actions"
+    )
+
+    def for_scenario(self, scenario: Scenario) -> Self:
+        """Copy with what the scenario states of c_lambda's start; its exploration has no part."""
+        own = {name: getattr(self, name) for name in type(self).model_fields if "explor" in name}
+        return super().for_scenario(scenario).model_copy(update=own)
+
+    def without_part(self) -> Mapping[str, str]:
+        """What is of exploration and of steps."""
+        explored = [name for name in type(self).model_fields if name.startswith("exploration_")]
+        stepped = ["definiteness", "smallest_eigenvalue", "slack_linear_minimum"]
+        return dict.fromkeys([*explored, *stepped], "a rule that tries θ, not actions")
+
+
+class BackOffConfiguration(GreedyConfiguration):
+    """Settings of the back-off search: none but where it starts."""
+
+    def depends_on_samples(self) -> list[str]:
+        """The shares of the samples that each round has."""
+        return [SHARED_OUT]
+
+
+class OffsetFreeConfiguration(GreedyConfiguration):
+    """Settings of the offset-free baseline."""
+
+    back_off: BackOffToo = True
+    estimation_share: EstimationShare = 0.25
+    update_every: Count = Field(10, description="samples between two steps of c_f")
+    memory: Count = Field(
+        1000, description="samples of the filter: a running mean over fewer, exponential beyond"
+    )
+
+    def depends_on_samples(self) -> list[str]:
+        """The shares of the samples that each stage has."""
+        return [SHARED_OUT]
+
+
+class IdentifiedConfiguration(GreedyConfiguration):
+    """Settings of the identified baseline."""
+
+    back_off: BackOffToo = True
+    estimation_share: EstimationShare = 0.25
+    model_parameters: tuple[str, ...] = Field(
+        (), description="parameters to fit; the model's uncertain ones if not given"
+    )
+    every: Count | None = Field(
+        None,
+        description="fit again after so many samples, to these; once, at the end of the estimate, "
+        "if not given",
+    )
+    retune: bool = Field(True, description="tune the cost by economics with the fitted model")
+
+    def learned_parameters(self, model: Model) -> tuple[str, ...]:
+        """The parameters to fit."""
+        return self.model_parameters or model.uncertain
+
+    def depends_on_samples(self) -> list[str]:
+        """The shares of the samples that each stage has."""
+        return [SHARED_OUT]
+
+
+class Baseline:
+    """First an estimate, on `estimation_share` of the samples, then a `BackOffSearch` from it.
+
+    A subclass says how it `learn`s from a transition and how it `conclude`s; it reports θ with the
+    best back-off found so far, whatever it is trying.
+    """
+
+    Configuration: ClassVar[type[Configuration]]
+    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
+    budget: ClassVar[int] = 8000
+    """Samples of a run where the user says nothing."""
+    needs_action_value = False
+    needs_points = False
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: Any,
+        samples: int,
+        strategy: Strategy,
+        rng: np.random.Generator,
+    ) -> None:
+        self._controller, self._scenario, self._configuration = controller, scenario, configuration
+        self._problem = Problem.from_scenario(scenario)
+        self._rng, self._samples = rng, samples
+        self._estimation = self.estimation_samples()
+        self._count = 0
+        self._search: BackOffSearch | None = None
+        self._reported: Parameters = controller.parameters
+        if not self._estimation:
+            self._begin_search(self._reported)
+
+    @property
+    def _searches(self) -> bool:
+        """Whether a search of the back-off follows the estimate."""
+        return bool(getattr(self._configuration, "back_off", True))
+
+    def estimation_samples(self) -> int:
+        """Samples before the search begins."""
+        share = self._configuration.estimation_share if self._searches else 1.0
+        return max(round(share * self._samples), 1)
+
+    def learn(self, transition: Transition) -> Parameters | None:
+        """Take a sample of the estimation; the θ to go on with, or None."""
+        raise NotImplementedError
+
+    def conclude(self) -> Parameters:
+        """θ at the end of the estimation."""
+        raise NotImplementedError
+
+    @property
+    def theta(self) -> Vector:
+        """The θ found so far, (n_θ,)."""
+        return self._reported.theta
+
+    @property
+    def first_episode(self) -> int | None:
+        """Seed of the search's first round, where it begins at once on a simulator."""
+        return None if self._search is None or self._count else self._episode(self._search)
+
+    def _episode(self, search: BackOffSearch) -> int | None:
+        """Seed of the noise of a stretch's episode; None in operation, which simply goes on."""
+        return search.seed if self.asks_for == "simulator" else None
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Take one sample of the estimation or of the search."""
+        return self._advance(transition)
+
+    def failed(self, cost: float) -> Update | None:
+        """Take a sample at which the controller failed: it counts, and says nothing."""
+        return self._advance(None)
+
+    def _advance(self, transition: Transition | None) -> Update | None:
+        self._count += 1
+        if self._search is not None:
+            return self._searched(self._search, transition)
+        moved = None if transition is None else self.learn(transition)
+        if self._count == self._estimation:
+            moved = self._reported = self.conclude()
+            if self._searches:
+                search = self._begin_search(moved)
+                return self._move(search.candidate, self._episode(search))
+        if moved is None:
+            return None
+        self._reported = moved
+        return self._move(moved)
+
+    def _begin_search(self, start: Parameters) -> BackOffSearch:
+        budget = self._samples - self._count
+        self._search = BackOffSearch(start, self._problem, self._scenario, budget, self._rng)
+        return self._search
+
+    def _searched(self, search: BackOffSearch, transition: Transition | None) -> Update | None:
+        was_done, begins = search.done, search.observe(transition)
+        if begins:
+            self._reported = search.theta
+            return self._move(search.candidate, self._episode(search))
+        if search.done and not was_done:
+            self._reported = search.theta
+            return self._move(search.theta)
+        return None
+
+    def _move(self, parameters: Parameters, episode: int | None = None) -> Update:
+        step = parameters.theta - self._controller.theta
+        self._controller.theta = parameters.theta
+        return Update(
+            td_error=float("nan"),
+            step=float(np.linalg.norm(step / parameters.blocks.scale)),
+            smallest_eigenvalue=certificate(parameters.blocks, parameters.theta).smallest,
+            episode=episode,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The count, θ as reported, and the search."""
+        kept: dict[str, NDArray[Any]] = {
+            "count": np.array(self._count),
+            "reported": self._reported.theta,
+        }
+        if self._search is not None:
+            kept |= prefixed("search_", self._search.state())
+            kept["search_start"] = self._search.start.theta
+        return kept
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._count = int(state["count"])
+        self._reported = self._reported.with_theta(state["reported"])
+        if "search_start" in state:
+            rng = np.random.default_rng(0)  # its seeds are restored too
+            start = self._reported.with_theta(state["search_start"])
+            budget = self._samples - (self._estimation if self._estimation else 0)
+            self._search = BackOffSearch(start, self._problem, self._scenario, budget, rng)
+            self._search.restore(group(state, "search_"))
+
+
+class BackOff(Baseline):
+    """One number κ a bound that binds, found by a line search: the engineer's first remedy.
+
+    From any start (`--start`), all else of θ stays; see `BackOffSearch`.
+    """
+
+    Configuration = BackOffConfiguration
+
+    def estimation_samples(self) -> int:
+        """None: the search begins at once."""
+        return 0
+
+
+class BackOffSimulator(BackOff):
+    """`BackOff` on a plant that is put back before each stretch."""
+
+    asks_for = "simulator"
+
+
+class OffsetFree(Baseline):
+    """c_f ← mean of s₊ − f(s, a), the integrating disturbance model of offset-free MPC.
+
+    With `back_off` the bounds are then backed off on the rest of the samples, c_f held.
+    """
+
+    Configuration = OffsetFreeConfiguration
+    _configuration: OffsetFreeConfiguration
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._model = OneStepModel(self._scenario)
+        self._parameters = self._model.parameters(self._reported)
+        self._offset = self._reported["c_f"]
+        self._seen = 0
+
+    def learn(self, transition: Transition) -> Parameters | None:
+        """Filter the error of one prediction."""
+        predicted = self._model.predict(transition.s, transition.a, self._parameters)[0]
+        self._seen += 1
+        weight = 1.0 / min(self._seen, self._configuration.memory)
+        self._offset = self._offset + weight * (transition.next_s - predicted - self._offset)
+        return None if self._seen % self._configuration.update_every else self.conclude()
+
+    def conclude(self) -> Parameters:
+        """θ with the offset as it is."""
+        return self._reported.replace({"c_f": self._offset})
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The filter too."""
+        return super().state() | {"offset": np.append(self._offset, self._seen)}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        super().restore(state)
+        self._offset, self._seen = state["offset"][:-1], int(state["offset"][-1])
+
+
+class OffsetFreeSimulator(OffsetFree):
+    """`OffsetFree` on a plant that is put back before each stretch of the search."""
+
+    asks_for = "simulator"
+
+
+class Identified(Baseline):
+    """p̂ = argmin Σ ‖(s₊ − f(s, a; p))/σ‖², the prediction-error method, carried in θ's block p.
+
+    σ is the standard deviation of the errors at the start's parameters. Then the cost is tuned at
+    the fitted model's optimal steady state and the bounds are backed off: what a practitioner does
+    who knows which parameters of the plant have drifted. With `every` he does so again and again.
+    """
+
+    Configuration = IdentifiedConfiguration
+    _configuration: IdentifiedConfiguration
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._model = OneStepModel(self._scenario)
+        self._rows: list[Vector] = []
+
+    def learn(self, transition: Transition) -> Parameters | None:
+        """Keep a transition; the last of every `every` gives a new fit."""
+        self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
+        if len(self._rows) != self._configuration.every:
+            return None
+        fitted = self.conclude()
+        self._rows.clear()
+        return fitted
+
+    def conclude(self) -> Parameters:
+        """θ with the fitted p and, unless told otherwise, the cost tuned with it.
+
+        Raises DivergenceError where the fitted model has no economically optimal steady state.
+        """
+        start = self._reported
+        if "p" not in start.blocks or not self._rows:
+            return start
+        fitted = start.replace({"p": self._fit()})
+        if not self._configuration.retune:
+            return fitted
+        model = self._problem.model
+        values = self._model.parameters(fitted)
+        quantities = tuple(
+            dataclasses.replace(quantity, nominal=float(value))
+            for quantity, value in zip(model.parameters, values, strict=True)
+        )
+        identified = dataclasses.replace(model, parameters=quantities)
+        problem = dataclasses.replace(self._problem, model=identified)
+        try:
+            tuned = tune(problem, start.blocks).parameters
+        except TuningError as error:
+            raise DivergenceError(f"the fitted model cannot be tuned ({error})") from error
+        kept = ("c_lambda", "c_f", "x_l", "x_u", "w_sigma", "W_sigma")
+        return tuned.replace({name: start[name] for name in kept if name in start.blocks})
+
+    def _fit(self) -> Vector:
+        """p̂, (n_p,), positive where its nominal value is."""
+        n, start, rows = self._problem.n_states, self._reported, np.array(self._rows)
+        states, actions, following = rows[:, :n], rows[:, n:-n], rows[:, -n:]
+        indices = self._problem.model.parameter_indices(start.blocks.block("p").labels)
+        values, nominal = self._model.parameters(start), self._problem.model.nominal_parameters
+        unit = np.where(nominal[indices] != 0, np.abs(nominal[indices]), 1.0)
+        sigma = self._model.errors(states, actions, following, start).std(axis=0)
+        sigma = np.maximum(sigma, np.finfo(float).tiny)
+
+        def residuals(scaled: Vector) -> Vector:
+            values[indices] = scaled * unit
+            predicted = self._model.predict(states, actions, values) + start["c_f"]
+            errors: Vector = ((following - predicted) / sigma).reshape(-1)
+            return errors
+
+        found: Vector = least_squares(residuals, start["p"] / unit).x * unit
+        return found
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The transitions too."""
+        return super().state() | {"rows": np.array(self._rows)}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        super().restore(state)
+        self._rows = list(state["rows"])
+
+
+class IdentifiedSimulator(Identified):
+    """`Identified` on a plant that is put back before each stretch of the search."""
+
+    asks_for = "simulator"

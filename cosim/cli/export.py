@@ -71,7 +71,7 @@ def export(
             "sampling_time": loaded.sampling_time,
         }
         if ssp is not None:
-            from cosim.cli.loop_ssp import write_loop
+            from cosim.cli.controller_fmu import write_loop
 
             document["ssp"] = str(write_loop(path, loaded, seed, ssp))
             out_.note(f"wrote {ssp}")

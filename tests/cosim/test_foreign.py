@@ -1,13 +1,12 @@
 """FMUs that this project did not write, or that misbehave."""
 
 import json
-import math
 
 import numpy as np
 import pytest
 
 import fmus
-from cosim import FmuPlant, Scenario, simulate
+from cosim import FmuPlant, simulate
 from cosim.errors import CapabilityError, PlantError
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Hold
@@ -74,20 +73,6 @@ def test_an_fmu_that_declares_no_state_saving_still_steps(tmp_path, paper, name)
             plain.snapshot()
 
 
-def test_one_instance_per_process_is_kept_to(tmp_path, paper):
-    def only_once(text):
-        flag = 'canBeInstantiatedOnlyOncePerProcess="{}"'
-        assert flag.format("false") in text
-        return text.replace(flag.format("false"), flag.format("true"))
-
-    path = edited(fmus.path(), tmp_path / "single.fmu", only_once)
-    with FmuPlant(paper, path) as plant:
-        plant.reset(0)
-        with pytest.raises(CapabilityError, match="only once per process"):
-            FmuPlant(paper, path)
-    FmuPlant(paper, path).close()
-
-
 def test_returned_nan_is_an_error_that_names_variable_and_step(tanks, tmp_path):
     with FmuPlant(write_scenario(tmp_path, tanks[True], fault=1)) as plant:
         plant.reset(0)
@@ -130,12 +115,3 @@ def test_a_chatty_fmu_does_not_spoil_json(tanks, tmp_path):
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["samples"] == 3
     assert "a chatty FMU" in result.stderr
-
-
-def test_the_tank_follows_its_equation(tanks, tmp_path):
-    with FmuPlant(Scenario.load(write_scenario(tmp_path, tanks[False]))) as plant:
-        s = plant.reset(0, [2.5])
-        assert s.tolist() == [2.5]
-        step = plant.step([0.5])
-        assert step.s[0] == pytest.approx(0.5 + 2.0 * math.exp(-0.5 / 4.0), rel=1e-14)
-        assert step.stage_cost == 0.25

@@ -3,16 +3,15 @@
 import re
 import zipfile
 
-import numpy as np
 import pytest
 
 import fmus
 from cosim import FmuPlant, Scenario
-from cosim.errors import CapabilityError, PlantError, ScenarioError
+from cosim.errors import CapabilityError, PlantError
 from cosim.plant.archive import unpack
 from cosim.plant.fmi import library_path
 from cosim.plant.wiring import refusals
-from tests.helpers.kinds import REALS, build_kind, scenario_for, write_fmi1
+from tests.helpers.kinds import REALS, build_kind, scenario_for
 from tests.helpers.tank import edited
 
 CS = 'CoSimulation modelIdentifier="kinds" '
@@ -257,26 +256,6 @@ def test_a_backslash_leads_nowhere_else(tmp_path, version, entry):
         FmuPlant(scenario_for(tmp_path, fmu))
 
 
-def test_fmi1_is_named(tmp_path):
-    fmu = write_fmi1(tmp_path / "one.fmu")
-    with pytest.raises(PlantError, match=r"is FMI 1\.0; 2\.0 and 3\.0 are supported"):
-        FmuPlant(scenario_for(tmp_path, fmu))
-
-
-def test_a_plant_without_actions_is_no_scenario(tmp_path, version):
-    path = scenario_for(tmp_path, build_kind(tmp_path, version))
-    with pytest.raises(ScenarioError):
-        Scenario.load(path).replace({"plant": {"actions": []}})
-
-
-def test_snapshots_are_refused_where_they_are_not_offered(tmp_path, version):
-    with FmuPlant(scenario_for(tmp_path, build_kind(tmp_path, version))) as plant:
-        plant.reset(0)
-        np.testing.assert_array_equal(plant.step([2.0]).s, [1.5])
-        with pytest.raises(CapabilityError, match="canGetAndSetFMUstate"):
-            plant.snapshot()
-
-
 @pytest.mark.parametrize(
     ("machine", "place", "library"),
     [
@@ -296,13 +275,3 @@ def test_on_arm_the_folder_of_fmi3_or_of_x86_serves(tmp_path, monkeypatch, machi
         data = shipped.read(f"binaries/{library}")
     fmu = unpack(build_kind(tmp_path, 2, place=place, data=data))
     assert library_path(fmu).parent.name == place
-
-
-def test_on_arm_a_library_for_x86_is_named(tmp_path, monkeypatch):
-    from fmus.build import PLATFORMS
-
-    platform = next(p for p in PLATFORMS if p.tuple == "aarch64-linux")
-    fmu = unpack(build_kind(tmp_path, 2, place="linux64"))
-    monkeypatch.setattr("cosim.plant.fmi.present", lambda: platform)
-    with pytest.raises(PlantError, match=r"no binary for aarch64-linux .*made for x86_64-linux"):
-        library_path(fmu)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import fmus
-from fmus import BuildError, build, crosscheck, evaporator
-from fmus.build import PLATFORMS, compilers, present, write_archive
+from fmus import build, crosscheck, evaporator
+from fmus.build import compilers, present
 from fmus.evaporator import EVAPORATOR
 
 HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
@@ -131,47 +131,10 @@ def test_every_member_but_the_binary_is_up_to_date(version: int) -> None:
         assert container.read("documentation/index.html") == page
 
 
-def test_archive_is_sorted_with_fixed_dates(version: int) -> None:
-    with zipfile.ZipFile(fmus.path(fmus.NAMES[version - 2])) as container:
-        entries = container.infolist()
-    assert [e.filename for e in entries] == sorted(e.filename for e in entries)
-    assert {e.date_time for e in entries} == {(1980, 1, 1, 0, 0, 0)}
-
-
 def test_fmi2_file_has_no_terminals_and_no_header_of_the_standard() -> None:
     with zipfile.ZipFile(fmus.path()) as container:
         names = container.namelist()
     assert not [n for n in names if "terminals" in n or Path(n).name.startswith("fmi2F")]
-
-
-def test_record_names_the_compiler() -> None:
-    record = shipped_record()
-    assert list(record["platforms"]) == [platform.tuple for platform in PLATFORMS]
-    assert all("clang" in entry["compiler"] for entry in record["platforms"].values())
-    assert "-ffp-contract=off" in record["compiler_flags"]
-    assert record["model_token"] == evaporator.model_token()
-
-
-def test_missing_compiler_is_an_error_that_says_what_to_do(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.raises(BuildError, match="install gcc or set CC"):
-        evaporator.build(tmp_path)
-    assert list(tmp_path.iterdir()) == []
-
-
-@needs_compiler
-def test_compiler_error_is_told(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(build, "COMPILER_FLAGS", ("--no-such-flag",))
-    with pytest.raises(BuildError, match="no-such-flag"):
-        evaporator.build(tmp_path)
-
-
-def test_difference_names_the_member(tmp_path: Path) -> None:
-    write_archive({"a": b"1", "b": b"2"}, tmp_path / "one")
-    write_archive({"a": b"1", "b": b"3", "c": b""}, tmp_path / "two")
-    assert evaporator.differences(tmp_path / "one", tmp_path / "two") == ["b", "c"]
-    with pytest.raises(BuildError, match="missing"):
-        evaporator.differences(tmp_path / "one", tmp_path / "three")
 
 
 def test_committed_header_is_not_stale() -> None:

@@ -1,12 +1,8 @@
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
-
-import pytest
 
 import fmus
-from fmus import FmuError
 from fmus.build import PLATFORMS
 from fmus.information import information
 
@@ -31,11 +27,3 @@ def test_tells_what_is_in_the_file(version: int) -> None:
     assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     (pressure,) = [v for v in data["variables"] if v["name"] == "P100"]
     assert [pressure[key] for key in ("causality", "unit", "min")] == ["input", "kPa", "100.0"]
-
-
-def test_missing_and_corrupt_files_are_errors(tmp_path: Path) -> None:
-    with pytest.raises(FmuError, match="there is no file"):
-        information(tmp_path / "missing.fmu")
-    (tmp_path / "corrupt.fmu").write_bytes(b"not a zip")
-    with pytest.raises(FmuError, match="is not an FMU"):
-        information(tmp_path / "corrupt.fmu")

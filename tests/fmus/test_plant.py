@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fmus import BuildError
-from fmus.build import PLATFORMS, build_fmu, build_folder, present
+from fmus.build import PLATFORMS, build_folder, present
 from fmus.model import Kind
 from fmus.plant import Signal, build_plant, plant_model
 
@@ -105,11 +105,6 @@ def test_a_folder_becomes_an_fmu_for_this_platform(folder: Path, tmp_path: Path)
     assert result["x"][-1] == pytest.approx(0.6065306597126334)
 
 
-def test_two_builds_are_byte_identical(folder: Path, tmp_path: Path) -> None:
-    first, second = (build_folder(folder, tmp_path / name) for name in ("one.fmu", "two.fmu"))
-    assert first.read_bytes() == second.read_bytes()
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(
     importlib.util.find_spec("ziglang") is None, reason="the extra 'cross' is not installed"
@@ -120,13 +115,6 @@ def test_a_folder_becomes_an_fmu_for_every_platform(folder: Path, tmp_path: Path
     assert libraries <= members(fmu)
     result = fmpy.simulate_fmu(str(fmu), stop_time=1.0, output_interval=0.5, output=["x"])
     assert result["x"][-1] == pytest.approx(0.6065306597126334)
-
-
-def test_further_files_go_along(folder: Path, tmp_path: Path) -> None:
-    sources = {"tank.c": (folder / "tank.c").read_bytes()}
-    text = (folder / "modelDescription.xml").read_text()
-    fmu = build_fmu(tmp_path / "a.fmu", sources, text, files={"resources/data.csv": b"1"})
-    assert "resources/data.csv" in members(fmu)
 
 
 @pytest.mark.parametrize(
@@ -146,18 +134,3 @@ def test_a_description_that_names_no_model_is_refused(
     with pytest.raises(BuildError, match=words):
         build_folder(folder, tmp_path / "tank.fmu")
     assert not (tmp_path / "tank.fmu").exists()
-
-
-@pytest.mark.parametrize(
-    ("missing", "words"), [("tank.c", "no C source"), ("modelDescription.xml", "No such file")]
-)
-def test_a_missing_file_is_told(folder: Path, tmp_path: Path, missing: str, words: str) -> None:
-    (folder / missing).unlink()
-    with pytest.raises(BuildError, match=words):
-        build_folder(folder, tmp_path / "tank.fmu")
-
-
-def test_what_the_compiler_says_is_told(folder: Path, tmp_path: Path) -> None:
-    (folder / "tank.c").write_text("int main(void) { return nothing; }\n")
-    with pytest.raises(BuildError, match="nothing"):
-        build_folder(folder, tmp_path / "tank.fmu")

@@ -48,12 +48,3 @@ def test_inner_products_agree(open_fmu) -> None:
     forward, reverse = rng.normal(size=len(KNOWNS)), rng.normal(size=len(UNKNOWNS))
     left = reverse @ np.array(instance.directional(UNKNOWNS, KNOWNS, list(forward)))
     assert forward @ adjoint(instance, reverse) == pytest.approx(left, rel=1e-12)
-
-
-def test_repeated_references_add_up(open_fmu) -> None:
-    instance = open_fmu(3).initialise()
-    once = list(instance.fmu.getAdjointDerivative(references(["F2"]), references(["P2"]), [2.0]))
-    twice = instance.fmu.getAdjointDerivative(
-        references(["F2", "F2"]), references(["P2"]), [1.0, 1.0], nSensitivity=1
-    )
-    assert list(twice) == once

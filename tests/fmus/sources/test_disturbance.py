@@ -51,11 +51,6 @@ def test_normal_draws_are_box_and_muller_of_the_uniform_ones(open_fmu, version: 
         np.testing.assert_allclose(normal[:, first : first + 2], expected, rtol=0, atol=1e-12)
 
 
-def test_nominal_plant_has_nominal_disturbances(plant) -> None:
-    plant.initialise(stochastic=False, X1_nominal=4.5)
-    assert plant.get(*NAMES) == [4.5, 10.0, 40.0, 25.0]
-
-
 def test_override_takes_the_given_disturbances_even_when_stochastic(plant) -> None:
     plant.initialise(override=True, X1_in=6.0, F1_in=9.0, T1_in=41.0, T200_in=22.0)
     assert plant.get(*NAMES) == [6.0, 9.0, 41.0, 22.0]

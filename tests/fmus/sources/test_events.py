@@ -73,24 +73,6 @@ def test_states_are_readable_nominal_and_settable_by_reference(model) -> None:
     assert model.get("X2", "P2") == [26.0, 51.0]
 
 
-def test_non_finite_state_is_an_error(model) -> None:
-    model.initialise()
-    model.start_continuous_time()
-    with pytest.raises(FMICallException) as caught:
-        model.set_states([np.nan, 50.0])
-    assert caught.value.status == 3
-    assert "X2 is not finite" in model.messages[-1][2]
-
-
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_state_vector_of_another_length_is_an_error(model, count: int) -> None:
-    model.initialise()
-    model.start_continuous_time()
-    with pytest.raises(FMICallException):
-        model.set_states([25.0] * count)
-    assert "needs an array of 2" in model.messages[-1][2]
-
-
 def test_trial_times_past_the_stop_time_pass_but_steps_do_not(model) -> None:
     model.initialise(stop=100.0)
     model.start_continuous_time()
@@ -100,11 +82,3 @@ def test_trial_times_past_the_stop_time_pass_but_steps_do_not(model) -> None:
     assert "past the stop time" in model.messages[-1][2]
     model.fmu.setTime(100.0)
     assert tuple(bool(flag) for flag in model.fmu.completedIntegratorStep()) == (False, False)
-
-
-@pytest.mark.parametrize("time", [np.nan, np.inf, 1e300])
-def test_impossible_time_is_an_error(model, time: float) -> None:
-    model.initialise()
-    model.start_continuous_time()
-    with pytest.raises(FMICallException):
-        model.fmu.setTime(time)

@@ -78,33 +78,12 @@ def test_initialisation_needs_an_experiment(open_fmu) -> None:
     assert "call fmi2SetupExperiment first" in instance.messages[-1][2]
 
 
-@pytest.mark.parametrize("kind", ["", "Real", "Integer", "Boolean", "String"])
-def test_there_is_no_pending_step_to_ask_for(open_fmu, kind: str) -> None:
-    instance = open_fmu(2).initialise()
-    status = getattr(instance.fmu.dll, f"fmi2Get{kind}Status")(instance.handle, 0, None)
-    assert status == DISCARD
-    assert "doStep is synchronous" in instance.messages[-1][2]
-
-
 def test_last_successful_time(open_fmu) -> None:
     instance = open_fmu(2).initialise()
     instance.step(0.0, 90.0)
     time = c_double()
     instance.fmu.dll.fmi2GetRealStatus(instance.handle, 2, byref(time))
     assert time.value == 90.0
-
-
-@pytest.mark.parametrize("function", ["SetRealInputDerivatives", "GetRealOutputDerivatives"])
-def test_interpolation_is_refused_with_a_message(open_fmu, function: str) -> None:
-    instance = open_fmu(2).initialise()
-    call = getattr(instance.fmu.dll, f"fmi2{function}")
-    assert call(instance.handle, none, c_size_t(0), None, None) == ERROR
-    assert function in instance.messages[-1][2]
-
-
-def test_versions_are_told(open_fmu) -> None:
-    fmu = open_fmu(2).fmu
-    assert (fmu.getVersion(), fmu.getTypesPlatform()) == ("2.0", "default")
 
 
 def test_time_is_no_variable(open_fmu) -> None:

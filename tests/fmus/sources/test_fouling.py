@@ -26,15 +26,6 @@ def run(plant, steps: int, size: float = 60.0) -> np.ndarray:
     return np.array(rows)
 
 
-def test_by_default_nothing_fouls(open_fmu, version: int) -> None:
-    plant, other = open_fmu(version).initialise(seed=1), open_fmu(version)
-    assert plant.run(0) == plant.run(0)
-    assert np.all(run(plant, 20) == 6.84)
-    other.initialise(seed=1, fouling_rate=0.0, fouling_floor=0.1, cleaning_period=0.01)
-    run(other, 20)
-    assert other.get("X2", "P2", "UA2_present") == plant.get("X2", "P2", "UA2_present")
-
-
 def test_follows_the_law_over_three_cleanings(plant) -> None:
     plant.initialise(seed=1, **FAST)
     values = run(plant, 220)
@@ -123,11 +114,6 @@ def test_before_time_zero_the_cycle_goes_on(plant) -> None:
 def test_period_zero_is_never_cleaned(plant) -> None:
     plant.initialise(start=100 * DAY, **(ON | {"cleaning_period": 0.0}))
     assert plant.get("UA2_present")[0] == pytest.approx(0.7 * 6.84, rel=1e-12)
-
-
-def test_enormous_rates_and_times_end_at_the_floor(plant) -> None:
-    plant.initialise(start=1e10, fouling_rate=1e3, fouling_floor=0.5, cleaning_period=0.0)
-    assert plant.get("UA2_present") == [3.42]
 
 
 def test_parameters_act_at_once(plant) -> None:

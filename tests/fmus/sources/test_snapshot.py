@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from ctypes import c_void_p
 
 import pytest
 
@@ -128,18 +127,6 @@ def fnv1a(data: bytes) -> int:
     return value
 
 
-def test_state_of_the_other_interface_is_an_error(refused, open_fmu, version: int) -> None:
-    plant, model = open_fmu(version), open_fmu(version, exchange=True)
-    state = plant.save()
-    assert "other interface" in refused(model, lambda: model.restore(state))[1]
-    plant.free(state)
-
-
-def test_null_state_is_an_error_and_freeing_it_is_not(refused, plant) -> None:
-    assert "null state" in refused(plant, lambda: plant.restore(c_void_p()))[1]
-    plant.free(c_void_p())
-
-
 @pytest.mark.slow
 def test_a_million_snapshots_leave_memory_flat(plant) -> None:
     import psutil
@@ -153,29 +140,6 @@ def test_a_million_snapshots_leave_memory_flat(plant) -> None:
         plant.restore(state)
         plant.free(state)
     assert process.memory_info().rss - before < 2**20
-
-
-@pytest.mark.slow
-def test_a_hundred_thousand_instances_leave_memory_flat(open_fmu, version: int) -> None:
-    import psutil
-
-    plant = open_fmu(version)
-    fmu = plant.fmu
-    free = fmu.fmi2FreeInstance if version == 2 else fmu.fmi3FreeInstance
-
-    def cycle() -> None:
-        free(fmu.component)
-        arguments = {"callbacks": fmu.callbacks} if version == 2 else {"logMessage": plant._log3}
-        fmu.instantiate(**arguments)
-        plant.initialise()
-        plant.step(0.0, 60.0)
-
-    for _ in range(1000):
-        cycle()
-    before = psutil.Process().memory_info().rss
-    for _ in range(100_000):
-        cycle()
-    assert psutil.Process().memory_info().rss - before < 2**20
 
 
 def test_state_of_one_fmi_version_continues_in_the_other(open_fmu) -> None:

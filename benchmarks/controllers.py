@@ -11,10 +11,10 @@ from importlib.util import find_spec
 import numpy as np
 import qpsolvers
 
+from benchmarks.ipopt import IpoptNmpc
 from benchmarks.measuring import clock, figure
 from controllers import Problem, RtiNmpc, compile_functions
 from controllers.factories import naive_parameters
-from controllers.ipopt import IpoptNmpc
 from controllers.qp.daqp_backend import DaqpBackend
 from controllers.qp.explicit_slack import qpsolvers_problem
 from cosim import FmuPlant
@@ -171,7 +171,7 @@ def ipopt(scenario, visits):
 
 def mpcrl(scenario, visits):
     """mpcrl's Q-learning on the transitions: Q(s, a), its gradient and V(s₊), by IPOPT."""
-    from controllers.mpcrl_nmpc import q_learning_agent
+    from examples.outsiders.mpcrl_nmpc import q_learning_agent
 
     # No update: θ stays the naive one, as everybody else's here.
     agent = q_learning_agent(Problem.from_scenario(scenario), len(visits) + 1)

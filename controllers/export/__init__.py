@@ -1,5 +1,5 @@
 """The RTI-NMPC as C code that needs no Python: what an FMU of the controller is made of."""
 
-from controllers.export.core import STATUSES, Core, Entry, Table, core, table
+from controllers.export.core import STATUSES, Core, core
 
-__all__ = ["STATUSES", "Core", "Entry", "Table", "core", "table"]
+__all__ = ["STATUSES", "Core", "core"]

@@ -70,7 +70,7 @@ class RtiNmpc:
         """Build the CasADi functions and the workspace of the backend; see the class."""
         if iterations < 1:
             raise ControllerError(f"iterations must be at least 1, not {iterations}")
-        self._iterations = iterations
+        self.iterations = iterations
         self.problem = problem
         blocks = parameters.blocks
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
@@ -258,10 +258,10 @@ class RtiNmpc:
 
     def _solve(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         solution = self._solve_qp(s, a)
-        if self._iterations > 1:
+        if self.iterations > 1:
             prepared = self.linearisation_point
             try:
-                for _ in range(self._iterations - 1):
+                for _ in range(self.iterations - 1):
                     self._linearise_at(solution.unshifted)
                     solution = self._solve_qp(s, a)
             finally:

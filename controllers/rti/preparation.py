@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -297,22 +296,12 @@ Lift = Spectrum | Unlifted
 """What P did to the blocks of an exact Hessian."""
 
 
-class HessianRule(Protocol):
-    """Fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation."""
-
-    spectrum: Lift | None
-    functions: Sequence[BufferedFunction]
-    """The CasADi functions that it calls."""
-
-    def set_parameters(self, parameters: Parameters) -> None:
-        """Take over a new θ."""
-
-    def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
-        """Write L and q for the linearisation points (N, n), (N, m); return the constant."""
-
-
 class GaussNewton:
-    """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is."""
+    """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is.
+
+    It fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation; `functions` are
+    the CasADi functions that it calls.
+    """
 
     spectrum: Lift | None = None
     functions: Sequence[BufferedFunction] = ()
@@ -326,18 +315,18 @@ class GaussNewton:
         self._L_N, self._q_N = prepared.inputs["L_N"], prepared.inputs["q_N"]
 
     def set_parameters(self, parameters: Parameters) -> None:
-        """Write the costs of θ, which no linearisation point changes."""
+        """Take over a new θ: its costs, which no linearisation point changes here."""
         self.L[:] = 2 * self.discounts[:, None, None] * parameters["B_l"]
         self.q[:] = self.discounts[:, None] * parameters["b_l"]
         self._L_N[:] = 2 * self._end * parameters["B_Vf"].reshape(-1)
         self._q_N[:] = self._end * parameters["b_Vf"]
 
     def fill(self, x: Vector, u: Vector, costates: Vector) -> float:
-        """Leave all as it is."""
+        """Write L and q for the points (N, n), (N, m); return the cost's constant."""
         return 0.0
 
 
-class Exact:
+class Exact(GaussNewton):
     """L_k = P(2γᵏB_l + D_k), D_k the curvature of χ̄_{k+1}ᵀf at the linearisation point.
 
     P lifts the eigenvalues of each stage's block to at least γᵏ·`FLOOR`, so that the QP keeps its
@@ -347,7 +336,6 @@ class Exact:
     """
 
     FLOOR = 1e-3
-    spectrum: Lift | None = None
 
     def __init__(
         self,
@@ -357,8 +345,8 @@ class Exact:
         *,
         lifts: bool = True,
     ) -> None:
+        super().__init__(problem, prepared)
         self.lifts = lifts
-        self._cost = GaussNewton(problem, prepared)
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = np.concatenate([problem.reference_state, problem.reference_action])
         given = {
@@ -370,11 +358,11 @@ class Exact:
         *point, theta = given.values()
         D = stage_curvature(problem, blocks).map(horizon)(*point, ca.repmat(theta, 1, horizon))
         self._curvature = stacked("curvature", given, {"D": D})
-        self.functions: Sequence[BufferedFunction] = (self._curvature,)
+        self.functions = (self._curvature,)
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over the costs of θ."""
-        self._cost.set_parameters(parameters)
+        super().set_parameters(parameters)
         self._B, self._b = parameters["B_l"], parameters["b_l"]
         self._curvature.inputs["theta"][:] = parameters.theta
 
@@ -384,7 +372,7 @@ class Exact:
         for name, value in (("x", x), ("u", u), ("guess", costates)):
             call.inputs[name][:] = value.reshape(-1)
         call()
-        L, q, discounts = self._cost.L, self._cost.q, self._cost.discounts
+        L, q, discounts = self.L, self.q, self.discounts
         raw = 2 * discounts[:, None, None] * self._B + call.part("D").reshape(L.shape)
         if not np.isfinite(raw).all():
             # The controller refuses the QP; an eigenvalue solver would raise its own error.
@@ -408,7 +396,7 @@ class Exact:
 
 def make_hessian(
     name: str, problem: Problem, blocks: ThetaBlocks, prepared: BufferedFunction
-) -> HessianRule:
+) -> GaussNewton:
     """Rule by name; raises ControllerError on an unknown one.
 
     `exact-unlifted` leaves an indefinite Hessian as it is: right for the sensitivities of a

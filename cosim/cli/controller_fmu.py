@@ -1,4 +1,4 @@
-"""The controller's C and its table of variables, put into an FMU; the loop put into an SSP."""
+"""The controller's C and its variables, put into an FMU."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from controllers import RtiNmpc
-from controllers.export import Entry, core, table
+from controllers.export import STATUSES, core
 from cosim.errors import ControllerLookupError
 from cosim.plant.archive import unpack
 from cosim.plant.wiring import start_values
@@ -28,10 +28,10 @@ RECORD = "extra/org.rti-cosim/controller.json"
 def rti_controller(name: str, scenario: Scenario) -> RtiNmpc:
     """The controller `name`; raises ControllerLookupError where it is no RTI-NMPC."""
     found: Any = build_controller(name, scenario)
-    if type(found) is not RtiNmpc:
+    if type(found) is not RtiNmpc or found.iterations != 1:
         raise ControllerLookupError(
-            f"controller '{name}' is no RTI-NMPC and cannot be exported; give naive, tuned or a "
-            "parameters file (.toml) of a training"
+            f"controller '{name}' is no RTI-NMPC and cannot be exported; give "
+            "naive, tuned or a parameters file (.toml) of a training"
         )
     return found
 
@@ -39,33 +39,68 @@ def rti_controller(name: str, scenario: Scenario) -> RtiNmpc:
 def sampled_controller(
     controller: RtiNmpc, scenario: Scenario, units: dict[str, str]
 ) -> SampledSystem:
-    """The controller as a sampled system; raises ControllerError where it cannot be exported."""
+    """The controller as a sampled system; raises ControllerError where it cannot be exported.
+
+    `units` are those of the plant's variables by name.
+    """
     hessian = scenario.controller.hessian
     origin = f"{scenario.hash} {hessian} {controller.parameters.hash}"
-    exported = core(controller.problem, controller.parameters, hessian)
-    plant = scenario.plant
-    variables = table(
-        exported,
-        [(name, units.get(name, "")) for name in plant.states],
-        [(name, units.get(name, "")) for name in plant.actions],
-    )
+    problem, parameters = controller.problem, controller.parameters
+    exported, blocks = core(problem, parameters, hessian), parameters.blocks
+    states = [(name, units.get(name, "")) for name in scenario.plant.states]
+    actions = [(name, units.get(name, "")) for name in scenario.plant.actions]
+    predicted = [(states, k) for k in range(problem.horizon + 1)]
+    predicted += [(actions, k) for k in range(problem.horizon)]
+    bounds = zip(problem.action_lower.tolist(), problem.action_upper.tolist(), strict=True)
+    codes = ", ".join(f"{code} {text}" for code, text in enumerate(STATUSES))
     return SampledSystem(
         name=f"RTI-NMPC {scenario.name}",
         identifier=f"rti_nmpc_{hashlib.sha256(origin.encode()).hexdigest()[:12]}",
         description=(
-            f"Real-time-iteration NMPC for {scenario.name}: horizon {exported.problem.horizon}, "
-            f"{hessian} Hessian, θ {controller.parameters.hash}"
+            f"Real-time-iteration NMPC for {scenario.name}: horizon {problem.horizon}, "
+            f"{hessian} Hessian, θ {parameters.hash}"
         ),
         sampling_time=scenario.sampling_time,
-        inputs=tuple(map(_signal, variables.inputs)),
-        outputs=tuple(map(_signal, variables.outputs)),
-        parameters=tuple(map(_signal, variables.parameters)),
+        inputs=tuple(
+            Signal(name, unit, "measured state", start)
+            for (name, unit), start in zip(states, problem.reference_state.tolist(), strict=True)
+        ),
+        outputs=(
+            *(
+                Signal(name, unit, "action, within its bounds", None, low, high)
+                for (name, unit), (low, high) in zip(actions, bounds, strict=True)
+            ),
+            Signal("value", "", "value V(s) of the state"),
+            Signal("qp_status", "", f"of the present sample: {codes}"),
+            Signal("kkt_residual", "", "largest KKT residual of the last QP that was solved"),
+            Signal("qp_iterations", "", "steps of the QP solver in the last QP that was solved"),
+            Signal(
+                "failures", "", "samples without a solution so far; they repeat the last action"
+            ),
+            *(
+                Signal(f"predicted.{name}[{k}]", unit, f"predicted {name}, {k} samples ahead")
+                for quantities, k in predicted
+                for name, unit in quantities
+            ),
+        ),
+        parameters=tuple(
+            Signal(f"theta.{_structured(label)}", "", meaning, value)
+            for label, meaning, value in zip(
+                blocks.labels,
+                (block.meaning for block in blocks for _ in range(block.size)),
+                parameters.theta.tolist(),
+                strict=True,
+            )
+        ),
         sources=exported.sources,
     )
 
 
-def _signal(entry: Entry) -> Signal:
-    return Signal(entry.name, entry.unit, entry.meaning, entry.start, entry.lower, entry.upper)
+def _structured(label: str) -> str:
+    """A label of θ as FMI's structured names have it: `p[UA2]` becomes `p.UA2`."""
+    block, bracket, rest = label.partition("[")
+    inner = rest.removesuffix("]")
+    return label if not bracket or inner.replace(",", "").isdigit() else f"{block}.{inner}"
 
 
 def write_fmu(

@@ -3,7 +3,7 @@
     pip install 'rti-cosim[outsiders]'
     python examples/outsiders/mpcrl_agent.py --steps 3000 --seed 0
 
-The NMPC is the naive one in mpcrl's own terms (controllers/mpcrl_nmpc.py); what it learns, the
+The NMPC is the naive one in mpcrl's own terms (mpcrl_nmpc.py beside this file); what it learns, the
 model's offset, the lower bound of the predicted states, the stage cost's gradient and the value's
 offset, are blocks of the benchmark's θ. So the result is a parameters file, and it is evaluated by
 `cosim evaluate --controllers naive,mpcrl=examples/outsiders/mpcrl.toml`.
@@ -16,10 +16,10 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 from mpcrl.core.exploration import EpsilonGreedyExploration
+from mpcrl_nmpc import naive_start, q_learning_agent
 
 import cosim.environment  # noqa: F401 (registers the environment)
 from controllers import Parameters, Problem
-from controllers.mpcrl_nmpc import naive_start, q_learning_agent
 from cosim import Scenario
 
 

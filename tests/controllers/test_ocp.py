@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from benchmarks.ipopt import IpoptNmpc
 from controllers import ThetaBlocks
 from controllers.converged import merit
-from controllers.ipopt import IpoptNmpc
 from controllers.model import discretise
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 

@@ -1,6 +1,6 @@
 """The naive NMPC in mpcrl's own terms, and its Q-learning agent: what others' code makes of it.
 
-Needs the extra `outsiders`; nothing else imports this module.
+Needs the extra `outsiders`; the agent beside it and the benchmark use it.
 """
 
 from __future__ import annotations

@@ -52,7 +52,8 @@ class Output:
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print a table, columns of numbers right justified and the others left.
 
-        A file or pipe gets it as wide as it is; a terminal that is too narrow gets folded cells.
+        A file or pipe gets it as wide as it is. On a terminal that is too narrow, columns that do
+        not fit go to further tables below, each with the first column; wide texts are folded.
         """
         if self.as_json:
             return
@@ -60,22 +61,26 @@ class Output:
         from rich.markup import escape
         from rich.table import Table
 
-        table = Table(title=escape(title), title_justify="left", min_width=len(title))
-        for number, column in enumerate(header):
-            numeric = all(_is_number(row[number]) for row in rows)
-            table.add_column(
-                escape(column),
-                justify="right" if numeric else "left",
-                overflow="fold",
-                no_wrap=numeric,
-            )
-        for row in rows:
-            table.add_row(*map(escape, row))
         console = Console()
-        if not console.is_terminal:
-            unlimited = console.options.update(max_width=1000)
-            console.width = max(console.width, console.measure(table, options=unlimited).maximum)
-        console.print(table)
+        columns = [[row[number] for row in rows] for number in range(len(header))]
+        numeric = [all(map(_is_number, column)) for column in columns]
+        widths = [
+            max(map(len, [*(column if number else ()), *name.split(), ""])) + 3
+            for name, column, number in zip(header, columns, numeric, strict=True)
+        ]
+        widths[0] = max(map(len, [header[0], *columns[0]])) + 3
+        for part in _parts(widths, console.width - 1 if console.is_terminal else 1 << 30):
+            table = Table(title=escape(title), title_justify="left", min_width=len(title))
+            for k in part:
+                side = "right" if numeric[k] else "left"
+                table.add_column(escape(header[k]), justify=side, overflow="fold")  # type: ignore[arg-type]
+            for row in rows:
+                table.add_row(*(escape(row[k]) for k in part))
+            if not console.is_terminal:
+                unlimited = console.options.update(max_width=1000)
+                wanted = console.measure(table, options=unlimited).maximum
+                console.width = max(console.width, wanted)
+            console.print(table)
 
     def json(self, document: Mapping[str, Any]) -> None:
         """Print the document if JSON was asked for."""
@@ -114,6 +119,18 @@ class Output:
                 yield update
             finally:
                 self._live = None
+
+
+def _parts(widths: Sequence[int], room: int) -> list[list[int]]:
+    """Columns by table, so that each table fits the room if it can; all have the first column."""
+    if widths[0] > room / 2:
+        return [list(range(len(widths)))]
+    parts = [[0]]
+    for column, width in list(enumerate(widths))[1:]:
+        if len(parts[-1]) > 1 and sum(widths[k] for k in parts[-1]) + width > room:
+            parts.append([0])
+        parts[-1].append(column)
+    return parts
 
 
 def _is_number(cell: str) -> bool:

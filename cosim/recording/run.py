@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from cosim import signals
 from cosim.protocols import Controller, SampleBlock, controller_name
 from cosim.recording.stream import (
     SERIES,
@@ -28,7 +29,7 @@ from cosim.recording.stream import (
     view,
 )
 from cosim.scenario import Scenario
-from cosim.signals import SIGNALS, SignalKind
+from cosim.signals import SignalKind
 
 ALONE = ("states", "actions", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
@@ -180,7 +181,7 @@ class RerunRecorder:
 
 
 def _recorded() -> list[SignalKind]:
-    return [kind for kind in SIGNALS if kind.group is not None]
+    return [kind for kind in signals.SIGNALS if kind.group is not None]
 
 
 def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:

@@ -1,4 +1,5 @@
 import io
+import re
 
 import pytest
 import rich.console
@@ -31,6 +32,14 @@ def test_a_narrow_terminal_gets_folded_cells_without_loss(printed):
     text = printed(terminal=True)
     assert "…" not in text
     assert [text.count(letter) for letter in "xz"] == [40, 40]
+
+
+def test_numbers_are_never_broken_on_a_narrow_terminal(printed):
+    rows = [("actor-critic", *(f"{k}234.56 [1.23, 4.56]" for k in range(1, 8)))]
+    text = printed(True, "t", ("case", *(f"regret {k}" for k in range(7))), rows)
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    assert max(map(len, plain.splitlines())) <= 60
+    assert all(cell in text for cell in rows[0])
 
 
 def test_brackets_are_text(printed):

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from learning.q_learning import QLearning as QLearning
     from learning.search import Search as Search
     from learning.step import ConstrainedStep as ConstrainedStep
+    from learning.step import td_step as td_step
     from learning.training import Training as Training
     from learning.training import train as train
     from learning.training_run import TrainingRun as TrainingRun
@@ -48,7 +49,7 @@ _HOMES = {
     "exploration": ("Strategy",),
     "q_learning": ("QLearning",),
     "search": ("Search",),
-    "step": ("ConstrainedStep",),
+    "step": ("ConstrainedStep", "td_step"),
     "training": ("Training", "train"),
     "training_run": ("TrainingRun",),
 }

@@ -22,9 +22,8 @@ from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.evaluation import stored_optimum
 from learning.log import COLUMNS, LogRow, to_csv
-from learning.starting_point import build_controller, starting_parameters
 from learning.training import CHECKPOINT, run_training
-from learning.training_run import TrainingRun, prepare
+from learning.training_run import TrainingRun, build_controller, prepare, starting_parameters
 
 SEQUENCES = (list, tuple, set, frozenset)
 

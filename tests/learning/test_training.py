@@ -9,7 +9,7 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.rti.solution import RtiSolution
 from cosim import FmuPlant
-from learning.algorithm import load_algorithm
+from learning.algorithm import Update, load_algorithm
 from learning.errors import CheckpointError, ConfigurationError
 from learning.evaluation import HELD_OUT, held_out_costs
 from learning.log import LogRow, late_movement, to_csv
@@ -136,6 +136,29 @@ def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tm
     with FmuPlant(scenario) as plant:
         own = RtiNmpc(Problem.from_scenario(scenario), result.parameters)
         assert result.evaluation["J"] == held_out_costs(plant, own, 20, [HELD_OUT])["J"]
+
+
+class Trying(QLearning):
+    """Hands over its start while the controller carries a candidate without any back-off."""
+
+    def __init__(self, controller, *rest):
+        super().__init__(controller, *rest)
+        self._carrier, self.theta = controller, controller.theta.copy()
+
+    def observe(self, sample):
+        parameters = self._carrier.parameters
+        self._carrier.parameters = parameters.replace({"x_l": [10.0, 20.0]})
+        return Update(td_error=0.0, step=1.0, smallest_eigenvalue=1.0)
+
+
+def test_no_run_ends_as_diverged_by_a_candidate_that_is_tried(scenario, tmp_path):
+    run = make_run(scenario, "q-learning", samples=200, divergence=1.01)
+    result = train(run, tmp_path, rule=Trying)
+    assert result.status == "finished" and result.rows[-1]["J"] > 2 * result.J
+    for row in result.rows:
+        assert np.array_equal(row.parameters.theta, result.start.theta)
+    stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
+    assert np.array_equal(stored.theta, result.start.theta)
 
 
 def test_the_runs_seed_reaches_the_algorithm(scenario):

@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -27,7 +26,6 @@ from learning.search_plan import (
     Block,
     Learn,
     Learned,
-    PairedComparison,
     Request,
     Result,
     SearchPlan,
@@ -196,89 +194,13 @@ class EpisodeData:
             self._rows = list(zip(*(state[f"rows {name}"] for name in ROW), strict=True))
 
 
-class SearchHistory:
-    """The results that a deterministic plan of episodes was sent, in order.
-
-    What the search no longer looks at is left out, so that its memory does not grow with the
-    samples. The predictions of a block give its expected penalty and nothing else: the number takes
-    their place. Of the prediction errors two stretches of `memory` count: the latest, and those
-    before the round began, which are its pool.
-    """
-
-    def __init__(self, memory: int) -> None:
-        self._memory = memory
-        self._results: list[Result] = []
-        self._pool = range(0)
-        self._latest, self._errors = 0, 0
-        """The first result of the latest stretch, and how many errors that holds."""
-
-    def add(self, request: Request | None, result: Result, expected: float) -> None:
-        """Keep the answer to a request; `expected` is the block's expected penalty."""
-        if isinstance(result, Block):
-            none = _no_rows(result.predictions.shape[1])
-            result = result._replace(predictions=none, expected=expected)
-        self._results.append(result)
-        if not _remembered(request):
-            self._drop_errors(len(self._results) - 1)
-        self._errors += len(self._results[-1].errors)
-        while self._errors - len(self._results[self._latest].errors) >= self._memory:
-            self._errors -= len(self._results[self._latest].errors)
-            if self._latest not in self._pool:
-                self._drop_errors(self._latest)
-            self._latest += 1
-        if isinstance(request, Settle):
-            for k in range(self._pool.start, min(self._pool.stop, self._latest)):
-                self._drop_errors(k)
-            self._pool = range(self._latest, len(self._results))
-
-    def _drop_errors(self, k: int) -> None:
-        result = self._results[k]
-        self._results[k] = result._replace(errors=_no_rows(result.errors.shape[1]))
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Everything kept, as arrays."""
-        state = {"results": np.array(len(self._results))}
-        for k, result in enumerate(self._results):
-            for name, part in result._asdict().items():
-                if part is not None and name != "predictions":
-                    state[f"result {k} {name}"] = np.asarray(part)
-        return state
-
-
-def results(state: Mapping[str, NDArray[Any]]) -> Iterator[Result]:
-    """The results of a history's `state`."""
-    for k in range(int(state["results"])):
-        kept = group(state, f"result {k} ")
-        if "candidates" in kept:
-            yield Learned(**kept)
-            continue
-        numbers = {name: float(kept[name]) for name in ("stage_cost", "penalty", "expected")}
-        yield Block(
-            predictions=_no_rows(kept["errors"].shape[1]),
-            errors=kept["errors"],
-            metric=kept.get("metric"),
-            **numbers,
-        )
-
-
-def _remembered(request: Request | None) -> bool:
-    """Whether the errors of the answer go into the pools: not those of runs outside comparisons."""
-    return not (isinstance(request, Settle) or (isinstance(request, Trial) and request.sensitive))
-
-
-@cache
-def _no_rows(width: int) -> NDArray[np.float64]:
-    """No rows, (0, width): one array for all results."""
-    return np.zeros((0, width))
-
-
 class Search:
     """An algorithm that carries a `SearchPlan` out; a rule learns in its phases, or none does.
 
     `theta` is the incumbent: what the run hands over, while the controller carries the θ that is
     being tried. The samples of learning and of comparisons are all the run's. A checkpoint keeps
-    the results that the plan was given, and `restore` gives them once more: the plan is
-    deterministic, so it comes back to where it was.
+    the results that the plan was given, but for prediction errors that no longer count, and
+    `restore` gives them once more: the plan is deterministic, so it comes back to where it was.
     """
 
     Configuration: ClassVar[type[Configuration]] = SearchConfiguration
@@ -316,7 +238,7 @@ class Search:
             blocks=blocks,
         )
         self._plan = self._search.plan()
-        self._history = SearchHistory(PairedComparison.MEMORY)
+        self._results: list[Result] = []
         self._request: Request | None = next(self._plan, None)
         self._open()
 
@@ -425,25 +347,35 @@ class Search:
         )
 
     def _advance(self, result: Result) -> None:
-        answered = self._request
         try:
             self._request = self._plan.send(result)
         except StopIteration:
             self._request = None
-        self._history.add(answered, result, self._search.comparison.expected)
+        none = np.zeros((0, self._states))
+        if isinstance(result, Block):
+            expected = self._search.comparison.expected
+            result = result._replace(predictions=none, expected=expected)
+        self._results.append(result._replace(errors=none))
         self._open()
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Every result so far, the open episode's data and the rule's state."""
-        rule = {} if self._rule is None else prefixed("rule ", self._rule.state())
-        state = rule | self._episode.state()
-        return state | {"learnt": np.array(self._learnt)} | self._history.state()
+        """Every result so far, the errors that count, the open episode's data, the rule's state."""
+        state = self._episode.state() | self._search.comparison.state()
+        state |= {"learnt": np.array(self._learnt), "results": np.array(len(self._results))}
+        for k, result in enumerate(self._results):
+            kept = {name: part for name, part in result._asdict().items() if part is not None}
+            state |= {f"result {k} {name}": np.asarray(part) for name, part in kept.items()}
+        return state | ({} if self._rule is None else prefixed("rule ", self._rule.state()))
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         theta = self._controller.theta
-        for result in results(state):
-            self._advance(result)
+        for k in range(int(state["results"])):
+            kept: dict[str, Any] = group(state, f"result {k} ")
+            for name in kept.keys() & {"stage_cost", "penalty", "expected"}:
+                kept[name] = float(kept[name])
+            self._advance(Learned(**kept) if "candidates" in kept else Block(**kept))
+        self._search.comparison.restore(state)
         self._controller.theta = theta
         self._episode.restore(state)
         self._learnt = int(state["learnt"])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,7 +145,7 @@ class PairedComparison:
         self.expected = float("nan")
         """Penalty expected of the latest block."""
         self._errors: Matrix = np.zeros((0, scenario.state_lower.size))
-        self._pool = SortedErrors(self._errors)
+        self._pooled, self._pool = self._errors, SortedErrors(self._errors)
         self.incumbent = Candidate(start.theta)
         self.base = self.incumbent
         self.accepted = 0
@@ -165,6 +165,15 @@ class PairedComparison:
         if not np.array_equal(candidate.theta, self.incumbent.theta):
             self.accepted += 1
         self.base = self.incumbent = candidate
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The prediction errors that later comparisons count, as arrays."""
+        return {"latest errors": self._errors, "pooled errors": self._pooled}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._errors, self._pooled = state["latest errors"], state["pooled errors"]
+        self._pool = SortedErrors(self._pooled)
 
     def spend(self, samples: int) -> None:
         """Count samples that are asked for; raises Spent where the limit leaves fewer."""
@@ -199,7 +208,7 @@ class PairedComparison:
         self.spend(self.block)
         yield Settle(self.incumbent.theta, episode)
         # One pool for the whole round, or two θ would not be judged alike.
-        self._pool = SortedErrors(self._errors)
+        self._pooled, self._pool = self._errors, SortedErrors(self._errors)
         self.base = self.incumbent = Candidate(self.incumbent.theta)
         for _ in range(blocks):
             yield from self.run(self.incumbent)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from learning.critic import AdvantageRegression, lstdv, quadratic_features
+from learning.actor_critic import AdvantageRegression, lstdv, quadratic_features
 
 
 def chain(rng, count=40_000):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from math import isnan
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -9,8 +11,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
+from controllers.errors import QpError
+from controllers.rti import LinearisationPoint
 from cosim.scenario import Scenario
-from learning.algorithm import LearnableController, Transition, Update
+from learning.algorithm import LearnableController, LearnableSolution, Transition, Update
 from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration, Count, ExplorationProbability, ExplorationShare
 from learning.errors import DivergenceError
@@ -26,11 +30,13 @@ from learning.q_learning import (
     PriorWidth,
     VarianceMemory,
 )
-from learning.replay import ReplayBuffer, Replayed
 from learning.step import ConstrainedStep, Fit, measured_prior
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+POINT = tuple(f"point_{name}" for name in LinearisationPoint._fields)
+NEXT_POINT = tuple(f"next_{name}" for name in POINT)
+COLUMNS = ("number", "s", "a", "explored", "cost", "next_s", *POINT, *NEXT_POINT)
 
 
 class BatchQLearningConfiguration(Configuration):
@@ -89,13 +95,12 @@ class BatchQLearning:
         self._errors = PredictionErrors(scenario, configuration.prediction_errors)
         self._variance = 0.0
         rows, n = max(self._length, configuration.batch_size), scenario.state_lower.size
-        self._buffer = ReplayBuffer(self._controller, self._length)
+        self._buffer = ReplayBuffer(controller, rows)
         self._batch = {
             "states": np.zeros((rows, n)),
             "prediction_errors": np.zeros((rows, n)),
             "corrections": np.zeros(rows),
         }
-        self._filled, self._last = 0, -1
         self._anchor = controller.theta.copy()
         self._adopt(np.ones(controller.theta.size))
         self._information: Matrix = np.eye(controller.theta.size)
@@ -104,21 +109,17 @@ class BatchQLearning:
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
         prediction = self._model(transition.s, transition.a)
-        error, row = transition.next_s - prediction, self._filled
+        error, row = transition.next_s - prediction, len(self._buffer)
         self._errors.add(error)
         batch = self._batch
         batch["states"][row], batch["prediction_errors"][row] = transition.s, error
         expected = self._errors.expected_penalty(prediction)
         batch["corrections"][row] = expected - transition.next_penalty
         self._buffer.add(transition)
-        self._filled, self._last = row + 1, transition.number
-        if self._filled < self._length:
+        if len(self._buffer) < self._length:
             return None
-        self._filled = 0
-        first = self._variance == 0.0
         update = self._update()
-        if first:
-            self._buffer = ReplayBuffer(self._controller, self._length)
+        self._buffer.clear()
         return update
 
     @property
@@ -130,16 +131,15 @@ class BatchQLearning:
 
     def _update(self) -> Update:
         settings, update, failures = self._configuration, None, 0
-        count = self._length
         information = self._information
         for _ in range(settings.relinearisations):
             replayed = self._buffer.replay(self._average_cost)
             failures += replayed.failures
-            if not len(replayed.number):
+            if not len(replayed.rows):
                 break
-            td_error = self._td_error(replayed, count)
+            td_error = self._td_error(replayed)
             if self._variance == 0.0:
-                self._begin(td_error, count)
+                self._begin(td_error)
                 information = self._information
             gradient = replayed.gradient * self._step.scale
             limit = settings.innovation_clip * self._variance**0.5
@@ -158,11 +158,10 @@ class BatchQLearning:
         self._variance += share * (float(squares.mean()) - self._variance)
         return update._replace(failures=failures)
 
-    def _td_error(self, replayed: Replayed, count: int) -> Vector:
-        """δ with the next penalty's expectation in its place, (K,), in a batch of `count`."""
-        rows = count - 1 - (self._last - replayed.number)
-        discount = self._average_cost.discount
-        td_error: Vector = replayed.td_error + discount * self._batch["corrections"][rows]
+    def _td_error(self, replayed: Replayed) -> Vector:
+        """δ with the next penalty's expectation in its place, (K,)."""
+        corrections = self._average_cost.discount * self._batch["corrections"][replayed.rows]
+        td_error: Vector = replayed.td_error + corrections
         if not np.isfinite(td_error).all():
             raise DivergenceError("TD errors are not finite")
         return td_error
@@ -173,9 +172,9 @@ class BatchQLearning:
         present: Vector = (self._controller.theta - self._anchor) / self._step.scale
         return present
 
-    def _begin(self, td_error: Vector, count: int) -> None:
-        """Take the noise, the widths and c_f from the `count` samples of the first batch."""
-        batch = {name: values[:count] for name, values in self._batch.items()}
+    def _begin(self, td_error: Vector) -> None:
+        """Take the noise, the widths and c_f from the samples of the first batch."""
+        batch = {name: values[: len(self._buffer)] for name, values in self._batch.items()}
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
         start, scale = measured_prior(
             self._controller.parameters,
@@ -198,7 +197,7 @@ class BatchQLearning:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Filter, errors and the open batch."""
-        sums = [self._filled, self._last, self._variance, self._average_cost.mean_cost]
+        sums = [self._variance, self._average_cost.mean_cost]
         return {
             **{name: values.copy() for name, values in self._batch.items()},
             **self._errors.state(),
@@ -217,14 +216,148 @@ class BatchQLearning:
         self._adopt(state["scale"].copy())
         self._anchor, self._mean = state["anchor"].copy(), state["mean"].copy()
         self._information = state["information"].copy()
-        filled, last, self._variance, self._average_cost.mean_cost = (
-            float(value) for value in state["sums"]
-        )
-        self._filled, self._last = int(filled), int(last)
-        self._buffer = ReplayBuffer(self._controller, self._length)
+        self._variance, self._average_cost.mean_cost = map(float, state["sums"])
         self._buffer.restore(group(state, "buffer_"))
 
 
 def _newton(information: Matrix, slope: Vector) -> Fit:
     """Step Λ⁻¹b in the metric Λ."""
     return Fit(slope, cho_solve(cho_factor(information), slope), lambda: information)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """K transitions at one θ: `action_value` Q(s, a), `target` ℓ + γV(s₊), both (K,).
+
+    `rows` says which ones of the buffer they are; `gradient` ∇Q, (K, n_θ), is in θ itself.
+    Transitions whose QP failed at this θ are left out; `failures` counts them.
+    """
+
+    rows: NDArray[np.int64]
+    action_value: Vector
+    target: Vector
+    gradient: Matrix
+    failures: int
+
+    @property
+    def td_error(self) -> Vector:
+        """δ = ℓ + γV(s₊) − Q(s, a), (K,)."""
+        return self.target - self.action_value
+
+
+class ReplayBuffer:
+    """Up to `capacity` transitions, each with the linearisation points that belong to it.
+
+    Under real-time iterations V and Q depend on the guess at which the QP is linearised, so a
+    replay linearises where the plant's loop did, with the model and cost of the controller's θ.
+    What the loop or a replay has solved at this very θ is not solved again where the controller is
+    `memoryless`: values are NaN where nothing is known.
+    """
+
+    def __init__(self, controller: LearnableController, capacity: int) -> None:
+        self._controller, self._capacity, self._count = controller, capacity, 0
+        self._columns: dict[str, NDArray[Any]] = {}
+        self._theta = controller.theta
+        self._action_value, self._next_value = np.full((2, capacity), np.nan)
+        self._gradient = np.zeros((capacity, self._theta.size))
+
+    def __len__(self) -> int:
+        """Number of transitions kept."""
+        return self._count
+
+    def clear(self) -> None:
+        """Keep no transition."""
+        self._count = 0
+        self._action_value[:] = self._next_value[:] = np.nan
+
+    def add(self, transition: Transition) -> None:
+        """Keep a transition, solved at the controller's θ."""
+        point, next_point = transition.point, transition.next_point
+        assert point is not None and next_point is not None
+        values = (
+            *(transition.number, transition.s, transition.a, transition.explored),
+            *(transition.cost, transition.next_s, *point, *next_point),
+        )
+        if not self._columns:
+            kept = zip(COLUMNS, map(np.asarray, values), strict=True)
+            self._columns = {
+                name: np.empty((self._capacity, *value.shape), value.dtype) for name, value in kept
+            }
+        row, self._count = self._count, self._count + 1
+        for name, value in zip(COLUMNS, values, strict=True):
+            self._columns[name][row] = value
+        if not self._controller.memoryless:
+            return
+        self._forget_other_theta()
+        self._next_value[row] = transition.next_policy.value
+        if not transition.explored:
+            self._action_value[row] = transition.policy.value
+            self._gradient[row] = transition.policy.value_gradient
+
+    def replay(self, average_cost: AverageCost) -> Replayed:
+        """Q(s, a) and V(s₊) of every transition at the controller's θ, in time's order."""
+        self._forget_other_theta()
+        if not self._controller.memoryless:
+            self._action_value[:] = self._next_value[:] = np.nan
+        rows = np.arange(self._count)
+        self._solve(rows[np.isnan(self._action_value[rows] + self._next_value[rows])])
+        target = average_cost.target(self._columns["cost"][rows], self._next_value[rows])
+        kept = np.isfinite(self._action_value[rows]) & np.isfinite(target)
+        rows = rows[kept]
+        return Replayed(
+            rows,
+            self._action_value[rows],
+            target[kept],
+            self._gradient[rows],
+            int(self._count - kept.sum()),
+        )
+
+    def _forget_other_theta(self) -> None:
+        theta = self._controller.theta
+        if theta is not self._theta and not np.array_equal(theta, self._theta):
+            self._action_value[:] = self._next_value[:] = np.nan
+        self._theta = theta
+
+    def _solve(self, rows: NDArray[np.int64]) -> None:
+        """Solve for what is not known of these rows, which are in time's order.
+
+        A successor shares the linearisation, and where it was greedy the solution too: V(s₊) of one
+        transition is Q of the next. What a failing QP was to give stays NaN.
+        """
+        controller, columns = self._controller, self._columns
+        at: int | None = None
+        value: LearnableSolution | None = None
+        # Plain numbers: reading them one by one out of arrays costs as much as a gradient.
+        numbers, explored = (columns[name][rows].tolist() for name in ("number", "explored"))
+        points, next_points = ([columns[name] for name in names] for names in (POINT, NEXT_POINT))
+        for number, exploring, row in zip(numbers, explored, rows.tolist(), strict=True):
+            try:
+                if isnan(self._action_value[row]):
+                    if at != number:
+                        controller.prepare_at(LinearisationPoint(*(p[row] for p in points)))
+                        value = None
+                    if exploring:
+                        value = controller.feedback(columns["s"][row], columns["a"][row])
+                    elif value is None:
+                        value = controller.feedback(columns["s"][row])
+                    self._action_value[row] = value.value
+                    self._gradient[row] = value.value_gradient
+                if isnan(self._next_value[row]):
+                    controller.prepare_at(LinearisationPoint(*(p[row] for p in next_points)))
+                    at, value = number + 1, controller.feedback(columns["next_s"][row])
+                    self._next_value[row] = value.value
+            except QpError:
+                at = None
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything kept, as arrays."""
+        known = {"action_value": self._action_value, "next_value": self._next_value}
+        known |= {"gradient": self._gradient, "theta": self._theta}
+        known |= {f"column {name}": values for name, values in self._columns.items()}
+        return {"count": np.array(self._count), **{k: v.copy() for k, v in known.items()}}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        self._count, self._theta = int(state["count"]), state["theta"]
+        self._action_value, self._next_value = state["action_value"], state["next_value"]
+        self._gradient, self._columns = state["gradient"], group(state, "column ")

@@ -4,10 +4,10 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import QLearning
+from learning.batch_q_learning import ReplayBuffer
 from learning.exploration import build_strategy
 from learning.loop import TrainingLoop
 from learning.q_learning import AverageCost
-from learning.replay import ReplayBuffer
 from learning.training_run import starting_parameters
 
 
@@ -47,7 +47,7 @@ def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collecte
     replayed = buffer.replay(average_cost(scenario))
     q = [sample.action_value.value for sample in samples]
     target = [sample.cost + scenario.discount * sample.next_policy.value for sample in samples]
-    assert replayed.number.tolist() == list(range(60))
+    assert replayed.rows.tolist() == list(range(60))
     assert replayed.action_value == pytest.approx(q, rel=1e-9)
     assert replayed.target == pytest.approx(target, rel=1e-9)
     assert replayed.gradient == pytest.approx(
@@ -55,13 +55,6 @@ def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collecte
     )
     assert any(sample.explored for sample in samples)
     assert replayed.failures == 0
-
-
-def test_a_full_buffer_forgets_the_oldest(scenario, collected):
-    controller, samples = collected
-    buffer = filled(controller, samples, 20)
-    assert len(buffer) == 20
-    assert buffer.replay(average_cost(scenario)).number.tolist() == list(range(40, 60))
 
 
 def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, collected):
@@ -92,7 +85,7 @@ def test_replay_sees_the_present_theta(scenario, collected):
 
 def test_a_restored_buffer_replays_alike(scenario, collected):
     controller, samples = collected
-    buffer, other = filled(controller, samples[:30], 20), ReplayBuffer(controller, 20)
+    buffer, other = filled(controller, samples[:30]), ReplayBuffer(controller, 100)
     other.restore(buffer.state())
     for sample in samples[30:35]:
         buffer.add(sample)
@@ -100,7 +93,7 @@ def test_a_restored_buffer_replays_alike(scenario, collected):
     first = buffer.replay(average_cost(scenario))
     controller.reset()
     second = other.replay(average_cost(scenario))
-    assert np.array_equal(first.number, second.number)
+    assert np.array_equal(first.rows, second.rows)
     assert first.td_error == pytest.approx(second.td_error, rel=1e-9, abs=1e-6)
 
 
@@ -133,7 +126,7 @@ def replayed(controller, samples, cost):
 
 
 def assert_same(first, second):
-    for name in ("number", "action_value", "target", "gradient", "failures"):
+    for name in ("rows", "action_value", "target", "gradient", "failures"):
         assert np.array_equal(getattr(first, name), getattr(second, name)), name
 
 
@@ -146,40 +139,22 @@ def test_what_the_loop_solved_is_not_solved_again(scenario, collected):
     assert_same(found, replayed(controller, samples, average_cost(scenario)))
 
 
-def test_going_back_to_a_theta_solves_for_what_is_new_only(scenario, collected):
+def test_another_theta_and_a_new_batch_know_nothing_of_the_one_before(scenario, collected):
     controller, samples = collected
-    counting, start = Counting(controller), controller.theta
-    buffer = ReplayBuffer(counting, 100)
+    start = controller.theta
+    buffer = filled(controller, samples)
+    first = buffer.replay(average_cost(scenario))
     try:
-        for sample in samples[:40]:
-            buffer.add(sample)
-        buffer.replay(average_cost(scenario))
-        counting.theta = start + 1e-3
-        for sample in samples[40:]:  # as if they had been taken at this θ
-            buffer.add(sample)
-        buffer.replay(average_cost(scenario))
-    finally:
-        counting.theta = start
-    counting.feedbacks = 0
-    found = buffer.replay(average_cost(scenario))
-    assert 20 <= counting.feedbacks <= 20 + sum(sample.explored for sample in samples)
-    assert_same(found, replayed(controller, samples, average_cost(scenario)))
-
-
-def test_a_row_that_another_transition_takes_is_forgotten_at_every_theta(scenario, collected):
-    controller, samples = collected
-    buffer, start = ReplayBuffer(controller, 20), controller.theta
-    try:
-        for sample in samples[:20]:
-            buffer.add(sample)
-        buffer.replay(average_cost(scenario))
         controller.theta = start + 1e-3
-        for sample in samples[20:30]:
-            buffer.add(sample)
+        assert not np.array_equal(buffer.replay(average_cost(scenario)).gradient, first.gradient)
     finally:
         controller.theta = start
+    assert_same(buffer.replay(average_cost(scenario)), first)
+    buffer.clear()
+    for sample in samples[30:]:
+        buffer.add(sample)
     found = buffer.replay(average_cost(scenario))
-    assert_same(found, replayed(controller, samples[10:30], average_cost(scenario)))
+    assert_same(found, replayed(controller, samples[30:], average_cost(scenario)))
 
 
 def test_a_restored_buffer_remembers_what_was_solved(scenario, collected):

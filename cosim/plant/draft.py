@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, isfinite, log10
 from pathlib import Path
@@ -26,6 +26,9 @@ NO_NOISE = (
     "no noise was found (no output NAME with parameters NAME_nominal and NAME_range): the plant is "
     "taken as undisturbed"
 )
+HEAD = """\
+# Drafted by `cosim scenario init` from the FMU's model description.
+# Lines with CHECK are guesses that only you can confirm."""
 SAMPLES = 500
 """Samples of the FMU's own experiment, where it states no step."""
 
@@ -49,46 +52,36 @@ def draft_scenario(
     archive = unpack(fmu)
     roles = guess_roles(archive, states, actions, stage_cost)
     known = {variable.name: variable for variable in archive.description.modelVariables}
-    x = _start(archive, roles.states, [_of_start(known, roles, n) for n in roles.states], state)
-    u = _start(archive, roles.actions, [known[n].start for n in roles.actions], action, "action")
+    parameters = dict(
+        zip(roles.states, roles.mapping.get("initial_state", roles.states), strict=True)
+    )
+    x = _start([known[parameters[name]] for name in roles.states], state, "state")
+    u = _start([known[name] for name in roles.actions], action, "action")
     document = _document(fmu, archive, roles, known, x, u, sampling_time)
     with FmuPlant(Scenario.from_dict(document | {"disturbance": {"law": "none"}})) as plant:
-        reference = nearest_steady_state(plant, x, u)
+        x, u, cost = nearest_steady_state(plant, x, u)
         units = plant.units
-    weight = 10.0 ** ceil(log10(10 * max(abs(reference[2]), 1.0)) - 0.5)
-    for kind in ("linear", "quadratic"):
-        document["penalty"][kind] = [weight if kind == "linear" else 1.0] * len(roles.states)
-    document["plant"]["initial_state"] = reference[0].tolist()
+    weight = 10.0 ** ceil(log10(10 * max(abs(cost), 1.0)) - 0.5)
+    document["penalty"]["linear"] = [weight] * len(roles.states)
+    document["plant"]["initial_state"] = x.tolist()
     document["controller"] |= {
-        "reference_state": reference[0].tolist(),
-        "reference_action": reference[1].tolist(),
-        "reference_cost": reference[2],
+        "reference_state": x.tolist(),
+        "reference_action": u.tolist(),
+        "reference_cost": cost,
     }
-    name = str(fmu) if str(fmu) in SHIPPED else _relative(archive.path, target)
-    return _text(document, name, roles, units)
+    if str(fmu) in SHIPPED:
+        document["controller"]["model"] = "controllers.evaporator:model"
+    else:
+        document["plant"]["fmu"] = _relative(archive.path, target)
+    lines = _lines(document, _comments(document, roles, units))
+    return "\n".join([HEAD, *lines]) + "\n"
 
 
-def _of_start(known: dict[str, Any], roles: Roles, name: str) -> Any:
-    """Start value of a state: that of its start parameter, else its own."""
-    table = roles.mapping.get("initial_state", [])
-    parameter = dict(zip(roles.states, table, strict=False)).get(name, name)
-    return known[parameter].start
-
-
-def _start(
-    fmu: UnpackedFmu,
-    names: Sequence[str],
-    found: Sequence[Any],
-    given: Sequence[float],
-    kind: str = "state",
-) -> Array:
-    if given:
-        if len(given) != len(names):
-            raise PlantError(
-                f"--{kind} takes {len(names)} numbers ({', '.join(names)}), not {len(given)}"
-            )
-        return np.array(given, dtype=float)
-    return np.array([0.0 if value is None else float(value) for value in found])
+def _start(variables: Sequence[Any], given: Sequence[float], kind: str) -> Array:
+    if given and len(given) != len(variables):
+        names = ", ".join(variable.name for variable in variables)
+        raise PlantError(f"--{kind} takes {len(variables)} numbers ({names}), not {len(given)}")
+    return np.array(given or [float(variable.start or 0.0) for variable in variables], dtype=float)
 
 
 def _document(
@@ -104,15 +97,12 @@ def _document(
         _limits(known[name], value) for name, value in zip(roles.actions, u.tolist(), strict=True)
     ]
     ranges = [(known[name].min, known[name].max) for name in roles.states]
-    mapping = roles.mapping
+    mapping = dict(roles.mapping)
     disturbance: dict[str, Any] = {"law": "none"}
     if "nominal" in mapping and "ranges" in mapping:
-        law = next(iter(mapping.get("law_codes", {"uniform": 1})))
-        disturbance = {
-            "law": law,
-            "nominal": [float(known[name].start) for name in mapping["nominal"]],
-            "ranges": [float(known[name].start) for name in mapping["ranges"]],
-        }
+        disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
+        for field in ("nominal", "ranges"):
+            disturbance[field] = [float(known[name].start) for name in mapping[field]]
     return {
         "schema": 1,
         "name": Path(fmu).stem,
@@ -126,7 +116,7 @@ def _document(
             "disturbances": list(roles.disturbances),
             "stage_cost": roles.stage_cost,
             "initial_state": x.tolist(),
-            "mapping": dict(mapping),
+            "mapping": mapping,
         },
         "disturbance": disturbance,
         "bounds": {
@@ -174,76 +164,54 @@ def _relative(path: Path, target: Path) -> str:
         return path.as_posix()
 
 
-def _text(document: dict[str, Any], fmu: str, roles: Roles, units: dict[str, str]) -> str:
-    plant, controller, bounds = document["plant"], document["controller"], document["bounds"]
+def _comments(document: dict[str, Any], roles: Roles, units: dict[str, str]) -> dict[str, str]:
+    """Comment of each field and table by its dotted name."""
 
     def named(names: Sequence[str]) -> str:
         return ", ".join(f"{n} [{units[n]}]" if units.get(n) else n for n in names)
 
-    free = [
-        name
-        for name, low, high in zip(
-            roles.states, bounds["state_lower"], bounds["state_upper"], strict=True
-        )
-        if not isfinite(low) and not isfinite(high)
-    ]
-    noise = document["disturbance"]
-    lines = [
-        "# Drafted by `cosim scenario init` from the FMU's model description.",
-        "# Lines with CHECK are guesses that only you can confirm.",
-        "schema = 1",
-        f"name = {_value(document['name'])}",
-        f"description = {_value(document['description'])}",
-        f"sampling_time = {_value(document['sampling_time'])}  # s; CHECK",
-        f"discount = {_value(document['discount'])}",
-        "",
-        "[plant]",
-        f"fmu = {_value(fmu)}",
-        f"states = {_value(plant['states'])}  # {roles.reasons['states']}: {named(roles.states)}",
-        f"actions = {_value(plant['actions'])}  # {roles.reasons['actions']}: "
-        f"{named(roles.actions)}",
-        f"disturbances = {_value(plant['disturbances'])}"
-        + (f"  # {roles.reasons['disturbances']}" if roles.disturbances else "  # none was found"),
-        f"stage_cost = {_value(plant['stage_cost'])}  # {roles.reasons['stage_cost']}; CHECK: a "
-        "cost, not a profit",
-        f"initial_state = {_value(plant['initial_state'])}  # the steady state below",
-        "",
-        "[plant.mapping]  # what each reset writes; what the FMU has no parameter for is left out",
-        *(f"{key} = {_value(value)}" for key, value in plant["mapping"].items()),
-        "",
-        "[disturbance]",
-        *([f"# CHECK: {NO_NOISE}"] if noise["law"] == "none" else []),
-        *(f"{key} = {_value(value)}" for key, value in noise.items()),
-        "",
-        "[bounds]  # from min and max; states are bounded softly, by the penalty, actions hard",
-        *(
-            [f"# CHECK: the FMU states no bound of {', '.join(free)}"]
-            if free
-            else ["# CHECK: what a variable can be is not yet what it should be"]
-        ),
-        *(f"{key} = {_value(value)}" for key, value in bounds.items()),
-        "",
-        "[penalty]  # per unit of violation and sample; CHECK: must outweigh what it saves",
-        *(f"{key} = {_value(value)}" for key, value in document["penalty"].items()),
-        "",
-        "[controller]",
-        *(
-            ['model = "controllers.evaporator:model"']
-            if fmu in SHIPPED
-            else ['# model = "my_plant:model"  # the controller\'s own model, in CasADi']
-        ),
-        "# Steady state of the undisturbed plant nearest to its start values, by stepping the FMU.",
-        "# With a model, `cosim tuning` prints the cheapest one within the bounds.",
-        *(f"{key} = {_value(value)}" for key, value in controller.items()),
-    ]
-    return "\n".join(lines) + "\n"
+    bounds, why = document["bounds"], roles.reasons
+    ranges = zip(roles.states, bounds["state_lower"], bounds["state_upper"], strict=True)
+    free = [name for name, low, high in ranges if not isfinite(low) and not isfinite(high)]
+    comments = {
+        "sampling_time": "s; CHECK",
+        "plant.states": f"{why['states']}: {named(roles.states)}",
+        "plant.actions": f"{why['actions']}: {named(roles.actions)}",
+        "plant.disturbances": why.get("disturbances", "none was found"),
+        "plant.stage_cost": f"{why['stage_cost']}; CHECK: a cost, not a profit",
+        "plant.initial_state": "the steady state below",
+        "plant.mapping": "each reset writes these; what the FMU has no parameter for is left out",
+        "bounds": "CHECK: states are bounded softly, by the penalty, actions hard; from min and max"
+        + (f"; CHECK: the FMU states no bound of {', '.join(free)}" if free else ""),
+        "penalty": "per unit of violation and sample; CHECK: must outweigh what it saves",
+        "controller": "the undisturbed plant's steady state nearest to its start values; "
+        "`cosim tuning` prints the cheapest one",
+    }
+    if document["disturbance"]["law"] == "none":
+        comments["disturbance"] = f"CHECK: {NO_NOISE}"
+    if "model" not in document["controller"]:
+        comments["controller"] += '; add model = "my_plant:model", a model in CasADi'
+    return comments
+
+
+def _lines(table: dict[str, Any], comments: dict[str, str], path: str = "") -> Iterator[str]:
+    """The lines of a TOML table, its tables last."""
+
+    def comment(name: str) -> str:
+        return f"  # {comments[name]}" if name in comments else ""
+
+    for key, value in table.items():
+        if not isinstance(value, dict):
+            yield f"{key} = {_value(value)}{comment(path + key)}"
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from ("", f"[{path}{key}]{comment(path + key)}")
+            yield from _lines(value, comments, f"{path}{key}.")
 
 
 def _value(value: Any) -> str:
     """A value as TOML writes it."""
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list | tuple):
+    if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, float):
         return repr(value) if isfinite(value) else ("inf" if value > 0 else "-inf")

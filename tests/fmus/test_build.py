@@ -31,9 +31,10 @@ def shipped_record(name: str = "evaporator") -> dict:
 
 
 def build_elsewhere(root: Path, every_platform: bool) -> Path:
-    """Both FMUs, built by a copy of the package in another folder."""
-    ignored = shutil.ignore_patterns("__pycache__", "*.fmu", "variables.h")
-    shutil.copytree(evaporator.PACKAGE, root / "fmus", ignore=ignored)
+    """Both FMUs, built by a copy of the packages in another folder."""
+    ignored = shutil.ignore_patterns("__pycache__", "*.fmu", "*.npz", "variables.h")
+    for name in ("fmus", "cosim", "controllers", "learning"):  # none may hide another
+        shutil.copytree(evaporator.PACKAGE.parent / name, root / name, ignore=ignored)
     code = (
         "import pathlib, sys, fmus.evaporator as e; e.build(pathlib.Path('out'), len(sys.argv) > 1)"
     )

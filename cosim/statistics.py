@@ -257,3 +257,53 @@ def _resampled(
         rng=np.random.default_rng(0),
     ).confidence_interval
     return float(interval.low), float(interval.high)
+
+
+def two_way(cost: Array, optimum: Array) -> Interval:
+    """Interval of the median over R runs of their regret, over runs and noise together.
+
+    `cost` (R, S) is J of each run and noise seed, `optimum` (S,) J* on the same noise. Runs and
+    noise seeds are resampled independently (percentiles). None for one seed.
+    """
+    return _two_way(cost - optimum, _magnitude(optimum))
+
+
+def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float, Interval, float]:
+    """Median over R pairs of runs of (J − J')/|J*|, its interval over pairs and noise, and p.
+
+    `cost` and `other` are (R, S), `optimum` (S,). p is that of the signed ranks of the pairs'
+    differences when their signs are flipped: all 2^R ways, or 9999 for more than 12 pairs. It is
+    NaN for fewer than two pairs.
+    """
+    below = _magnitude(optimum)
+    each = _finite_or_infinite((cost - other).mean(axis=1)) / below.mean()
+    ranks, count = stats.rankdata(np.abs(each)), len(each)
+    if count > 12:
+        flips = np.random.default_rng(0).choice([-1.0, 1.0], size=(RESAMPLES, count))
+    else:
+        flips = 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1) - 1
+    reached = np.abs(flips @ ranks) >= abs(float(np.sign(each) @ ranks)) - 1e-9
+    p = (1 + reached.sum()) / (1 + len(flips)) if count > 12 else reached.mean()
+    interval = _two_way(cost - other, below)
+    return float(np.median(each)), interval, float(p) if count > 1 else float("nan")
+
+
+def _finite_or_infinite(values: Array) -> Array:
+    """NaN becomes infinite: a cost that is no number is the worst."""
+    return np.where(np.isnan(values), np.inf, values)
+
+
+def _two_way(terms: Array, below: Array) -> Interval:
+    """Percentiles of the median over rows of mean(terms)/mean(below), both axes resampled."""
+    runs, seeds = terms.shape
+    if seeds < 2:
+        return None
+    rng, draws = np.random.default_rng(0), max(1, min(RESAMPLES, AT_ONCE // seeds))
+    weights = rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=draws).T / seeds
+    finite = np.isfinite(terms).all(axis=1)
+    values = np.full((runs, draws), np.inf)
+    values[finite] = terms[finite] @ weights / (below @ weights)
+    rows = rng.integers(runs, size=(runs, draws))
+    middle = np.median(np.take_along_axis(values, rows, axis=0), axis=0)
+    low, high = np.quantile(middle, (0.5 - LEVEL / 2, 0.5 + LEVEL / 2), method="nearest")
+    return float(low), float(high)

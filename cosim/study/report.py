@@ -26,8 +26,15 @@ DEFINITIONS = {
     "Regret": "(J − J*)/|J*|, paired over the noise seeds. It depends on the noise and on the "
     "length of the runs, so regrets of a table and of a learning curve differ; each says below "
     "what it was measured on.",
-    "Median": "regret of the middle training run (the mean of both, where their number is even); "
-    "its interval is over the noise seeds alone. Worst: the run with the largest J.",
+    "Median": "regret of the middle training run (the mean of both, where their number is even). "
+    "Its interval of 95 % is over training seeds and noise together: a bootstrap that resamples "
+    "both. Worst: the run with the largest J.",
+    "Rank": "rows of one rank cannot be told apart from the first of them: the interval of their "
+    "paired difference, over training seeds and noise, does not lie above 0, or "
+    "one of both was trained once. Their order says nothing.",
+    "Difference": "median over training seeds of (J − J')/|J*|, J' that of the case that stands "
+    "under against, with its interval over training seeds and noise, and the p of the signed ranks "
+    "of the pairs, their signs permuted.",
     "IQM": "interquartile mean over training runs; its interval is over training seeds, by a "
     "bootstrap stratified by scenario.",
     "Diverged runs": "count with the cost of the θ that they ended with; finished/runs says how "

@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 from cosim.errors import StudyError
 from cosim.figures.style import palette, save
 from cosim.files import read_json, write_atomically
-from cosim.statistics import Estimate, gap_closed, over_runs, regret, regrets, shown
+from cosim.statistics import (
+    Estimate,
+    gap_closed,
+    over_runs,
+    paired_difference,
+    regret,
+    regrets,
+    shown,
+    two_way,
+)
 from cosim.study import figures, online, paper, report, theta
 from cosim.study.store import EVALUATION, GREEDY, INDICATORS, LOG, ONLINE, RUN, safe
 from cosim.study.tables import KEYS, WHERE, read_table, to_csv
@@ -47,19 +56,22 @@ SUMMARY_COLUMNS = [
     *WHERE, "samples", "plant_samples", "finished", "runs", "regret_median",
     "regret_median_low", "regret_median_high", "regret_worst", "regret_iqm", "regret_iqm_low",
     "regret_iqm_high", "J_median", "J_worst", "J_iqm", "gap_closed_median", *MEANS, "failures",
+    "regret_wide_low", "regret_wide_high", "rank", "against", "difference", "difference_low",
+    "difference_high", "difference_p",
 ]  # fmt: skip
 AGGREGATE_COLUMNS = [
     "case", "scenarios", "runs", "regret_median", "regret_worst", "regret_iqm", "regret_iqm_low",
     "regret_iqm_high",
 ]  # fmt: skip
 COLUMNS = {
-    "case": "case", "samples": "plant samples", "finished": "finished",
+    "case": "case", "rank": "rank", "samples": "plant samples", "finished": "finished",
     "regret": "regret %, median [95 %]", "worst": "worst", "iqm": "IQM [95 %]",
     "J": "J, median", "J-worst": "J, worst", "gap": "gap closed %", "economic": "economic cost",
-    "violation": "violation", "violating": "violating %",
+    "violation": "violation", "violating": "violating %", "against": "against",
+    "difference": "difference % [95 %]", "p": "p",
 }  # fmt: skip
 """Headers of the columns of a scenario's table, by the names that options take."""
-SHORT = ("case", "regret", "worst", "finished", "J")
+SHORT = ("case", "rank", "regret", "worst", "finished")
 """Columns that fit a terminal of 80 characters."""
 AGGREGATE_HEADER = ("case", "runs", "regret %, IQM [95 %]", "median", "worst")
 
@@ -260,7 +272,7 @@ class StudyResults:
             known = [
                 self._summary(case, scenario) for case in self.cases if len(self.of(case, scenario))
             ]
-            rows += sorted(known, key=lambda row: float(row["J_median"]))
+            rows += self._ranked(scenario, sorted(known, key=lambda row: float(row["J_median"])))
         return pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
 
     def _summary(self, case: str, scenario: str) -> dict[str, Any]:
@@ -288,7 +300,61 @@ class StudyResults:
             "gap_closed_median": self.gap_closed(case, scenario, list(middle)).value,
             **{name: float(np.median(runs[name])) for name in MEANS},
             "failures": int(own["failures"].sum()),
+            **self._wide(case, scenario),
+            **self._difference(case, scenario),
         }
+
+    def _single(self, case: str, scenario: str) -> bool:
+        """Whether a case has one training only: nothing is known of its spread."""
+        return bool(self.cases[case]["trained"]) and len(self.indicator(case, scenario)) < 2
+
+    def _wide(self, case: str, scenario: str) -> dict[str, float]:
+        """Interval of the median regret over training seeds and noise together."""
+        best, interval = self.reference("optimum", scenario), None
+        if best is not None and not self._single(case, scenario):
+            interval = two_way(self._paired(case, scenario), best)
+        return _ends("regret_wide", interval)
+
+    def _pairs(self, case: str, other: str, scenario: str) -> tuple[Array, Array]:
+        """J (R, S) of two cases over the training seeds that both have; a controller has any."""
+        costs = [self._paired(name, scenario) for name in (case, other)]
+        seeds = [self.of(name, scenario).training_seed for name in (case, other)]
+        if seeds[0].notna().all() and seeds[1].notna().all():
+            common = sorted(set(seeds[0]) & set(seeds[1]))
+            costs = [
+                cost[[list(own).index(seed) for seed in common]]
+                for cost, own in zip(costs, seeds, strict=True)
+            ]
+        one, two = np.broadcast_arrays(*costs)
+        return one, two
+
+    def _difference(self, case: str, scenario: str) -> dict[str, Any]:
+        """Paired difference of the regrets of a case and of that which it is `against`."""
+        other, best = self.cases[case].get("against"), self.reference("optimum", scenario)
+        found: tuple[float, Any, float] = (float("nan"), None, float("nan"))
+        if other is not None and best is not None and len(self.indicator(other, scenario)):
+            found = paired_difference(*self._pairs(case, other, scenario), best)
+        return {
+            "against": other,
+            "difference": found[0],
+            **_ends("difference", found[1]),
+            "difference_p": found[2],
+        }
+
+    def _ranked(self, scenario: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Give rows that cannot be told from the first of their group its rank."""
+        first = 0
+        for place, row in enumerate(rows):
+            leader = rows[first]["case"]
+            cost, other = self._pairs(row["case"], leader, scenario)
+            below = self.reference("optimum", scenario)
+            below = other.mean(axis=0) if below is None else below
+            alone = any(self._single(case, scenario) for case in (row["case"], leader))
+            interval = None if alone else paired_difference(cost, other, below)[1]
+            if interval is not None and interval[0] > 0:
+                first = place
+            row["rank"] = first + 1
+        return rows
 
     def regrets(self, case: str, scenario: str) -> Array:
         """Regret of each run, (R,), infinite where J is not finite; NaN where J* is not known."""
@@ -346,12 +412,16 @@ class StudyResults:
         return read_table(self.folder / ONLINE)
 
     def lines(
-        self, scenario: str, columns: Sequence[str] = tuple(COLUMNS)
+        self, scenario: str, columns: Sequence[str] | None = None
     ) -> tuple[Sequence[str], list[list[str]]]:
         """Header and rows of a scenario's table as texts; `columns` are keys of `COLUMNS`.
 
-        Raises StudyError for another column.
+        Without them all, differences only where a case has a counterpart. Raises StudyError for
+        another column.
         """
+        if columns is None:
+            paired = any(case.get("against") for case in self.cases.values())
+            columns = list(COLUMNS) if paired else list(COLUMNS)[:-3]
         for name in columns:
             if name not in COLUMNS:
                 raise StudyError(
@@ -626,9 +696,11 @@ def _about(plan: Plan) -> dict[str, Any]:
                 "nmpc": case.nmpc,
                 "settings": dict(case.settings),
                 "scenarios": list(case.scenarios),
+                "against": case.against,
             }
             for case in cases
         ],
+        "file": definition.file,
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.naive),
         "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},
@@ -701,10 +773,14 @@ def _texts(row: Mapping[str, Any]) -> Iterator[str]:
     """Texts of a row of the summary, in the order of `COLUMNS`."""
     several = row["runs"] > 1
     gap = row["gap_closed_median"]
+    wide = {"wide": row["regret_median"]} | {
+        f"wide_{end}": row[f"regret_wide_{end}"] for end in ("low", "high")
+    }
     yield str(row["case"])
+    yield str(row["rank"])
     yield str(row["plant_samples"] or "")
     yield f"{row['finished']}/{row['runs']}" if row["samples"] else ""
-    yield _percent(row, "regret_median")
+    yield _percent(wide, "wide")
     yield _percent(row, "regret_worst") if several else ""
     yield _percent(row, "regret_iqm") if several else ""
     yield _number(row["J_median"])
@@ -713,6 +789,9 @@ def _texts(row: Mapping[str, Any]) -> Iterator[str]:
     yield _number(row["economic_cost"])
     yield f"{row['mean_violation']:.5f}"
     yield f"{100 * row['violating_share']:.2f}"
+    yield row["against"] or ""
+    yield _percent(row, "difference")
+    yield "" if np.isnan(row["difference_p"]) else f"{row['difference_p']:.3f}"
 
 
 def _percent(row: Mapping[str, Any], name: str) -> str:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.stats import trim_mean
+from scipy.stats import trim_mean, wilcoxon
 
 from cosim.statistics import (
     gain,
@@ -8,10 +8,12 @@ from cosim.statistics import (
     interquartile_mean,
     mean,
     over_runs,
+    paired_difference,
     ratio,
     regret,
     shown,
     td_error_mean,
+    two_way,
 )
 
 
@@ -154,3 +156,41 @@ def test_the_bootstrap_over_runs_stays_within_its_strata():
     low, high = over_runs([spread]).bootstrap
     assert low < over_runs([spread]).value < high
     assert (low, high) == over_runs([spread]).bootstrap
+
+
+def test_an_interval_over_runs_and_noise_covers_the_median_of_the_runs_it_was_drawn_from():
+    rng, covered = np.random.default_rng(5), 0
+    for _ in range(60):
+        optimum = 100.0 + rng.normal(0.0, 1.0, 20)
+        runs = 2.0 + rng.normal(0.0, 0.5, (10, 1))
+        low, high = two_way(optimum + runs + rng.normal(0.0, 0.5, (10, 20)), optimum)
+        covered += low <= 0.02 <= high
+    assert covered >= 55
+
+
+def test_an_interval_over_noise_alone_is_too_narrow_where_runs_differ():
+    rng = np.random.default_rng(6)
+    optimum = 100.0 + rng.normal(0.0, 1.0, 20)
+    cost = optimum + rng.normal(3.0, 1.0, (10, 1)) + rng.normal(0.0, 0.1, (10, 20))
+    low, high = two_way(cost, optimum)
+    noise = regret(np.median(cost, axis=0), optimum).t
+    assert high - low > 5 * (noise[1] - noise[0])
+
+
+def test_a_diverged_run_is_the_worst_and_spoils_no_interval():
+    cost = 100.0 + np.arange(1.0, 8.0)[:, None] + np.zeros((7, 4))
+    cost[-1] = np.nan
+    low, high = two_way(cost, np.full(4, 100.0))
+    assert 0.01 <= low < high <= 0.06 + 1e-12
+
+
+@pytest.mark.parametrize("count", [5, 10])
+def test_p_of_paired_differences_is_that_of_the_exact_signed_rank_test(count):
+    rng = np.random.default_rng(count)
+    optimum, other = np.full(6, 10.0), rng.random((count, 6)) + 11.0
+    cost = other + rng.normal(0.2, 0.3, (count, 1))
+    difference, (low, high), p = paired_difference(cost, other, optimum)
+    each = (cost - other).mean(axis=1)
+    assert difference == pytest.approx(np.median(each) / 10.0)
+    assert low <= difference <= high
+    assert p == pytest.approx(wilcoxon(each, method="exact").pvalue, abs=1e-12)

@@ -180,7 +180,7 @@ def write_summary(results: StudyResults) -> dict[str, Any]:
 
 def show(results: StudyResults, out_: Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
-    from cosim.study.results import COLUMNS, SHORT
+    from cosim.study.report import COLUMNS, SHORT
 
     chosen = COLUMNS if columns == "all" else columns.split(",") if columns else SHORT
     for scenario in results.scenarios:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 import shlex
 import subprocess
@@ -11,14 +12,30 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from cosim.files import write_atomically
+from cosim.statistics import shown
 from cosim.text_tables import markdown_table
 
 PAGE, TABLES, FOLDER = "report.html", "report.md", "figures"
+Rows = tuple[Sequence[str], list[list[str]]]
+"""Header and rows of texts."""
 Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
 """Title, header and rows."""
+
+COLUMNS = {
+    "case": "case", "rank": "rank", "samples": "plant samples", "finished": "finished",
+    "regret": "regret %, median [95 %]", "worst": "worst", "iqm": "IQM [95 %]",
+    "J": "J, median", "J-worst": "J, worst", "gap": "gap closed %", "economic": "economic cost",
+    "violation": "violation", "violating": "violating %", "against": "against",
+    "difference": "difference % [95 %]", "p": "p",
+}  # fmt: skip
+"""Headers of the columns of a scenario's table, by the names that options take."""
+SHORT = ("case", "rank", "regret", "worst", "finished")
+"""Columns that fit a terminal of 80 characters."""
 
 DEFINITIONS = {
     "J": "mean of economic cost and penalty per sample; J* is J of the dynamic-programming "
@@ -87,6 +104,73 @@ def write(page: Mapping[str, Any], folder: Path, study: Path) -> Path:
     for name in (TABLES, PAGE):
         write_atomically(folder / name, environment.get_template(name).render(context))
     return folder / PAGE
+
+
+def texts(row: Mapping[str, Any]) -> dict[str, str]:
+    """Texts of a row of a study's summary by the keys of `COLUMNS`."""
+    several, p, gap = row["runs"] > 1, row["difference_p"], row["gap_closed_median"]
+    return {
+        "case": row["case"],
+        "rank": str(row["rank"]),
+        "samples": str(row["plant_samples"] or ""),
+        "finished": f"{row['finished']}/{row['runs']}" if row["samples"] else "",
+        "regret": _percent(row, "regret_median", "regret_wide"),
+        "worst": _percent(row, "regret_worst") if several else "",
+        "iqm": _percent(row, "regret_iqm") if several else "",
+        "J": _number(row["J_median"]),
+        "J-worst": _number(row["J_worst"]) if several else "",
+        "gap": "" if np.isnan(gap) else shown(gap, None, 100.0, 4),
+        "economic": _number(row["economic_cost"]),
+        "violation": f"{row['mean_violation']:.5f}",
+        "violating": f"{100 * row['violating_share']:.2f}",
+        "against": row["against"] if isinstance(row["against"], str) else "",
+        "difference": _percent(row, "difference"),
+        "p": "" if np.isnan(p) else f"{p:.3f}",
+    }
+
+
+def _percent(row: Mapping[str, Any], name: str, ends: str = "") -> str:
+    """A share in per cent with its interval, where it has one; nothing where it is undefined."""
+    low, high = (float(row.get(f"{ends or name}_{end}", np.nan)) for end in ("low", "high"))
+    if np.isnan(row[name]):
+        return ""
+    return shown(float(row[name]), None if np.isnan(low) else (low, high), 100.0, 3)
+
+
+def _number(value: float) -> str:
+    return shown(float(value), None, 1.0, 6)
+
+
+def aggregate_table(aggregate: pd.DataFrame) -> Rows:
+    """Header and rows of the table over all scenarios."""
+    names = ("regret_iqm", "regret_median", "regret_worst")
+    return ("case", "runs", "regret %, IQM [95 %]", "median", "worst"), [
+        [row["case"], str(row["runs"]), *(_percent(row, name) for name in names)]
+        for row in aggregate.to_dict("records")
+    ]
+
+
+def case_table(cases: Mapping[str, Mapping[str, Any]]) -> Rows:
+    """Header and rows of what each case runs."""
+    return ("case", "algorithm or controller", "samples", "start", "NMPC", "settings"), [
+        [
+            name, case["target"], str(case["samples"] or ""), case["start"], case["nmpc"],
+            ", ".join(f"{key} = {json.dumps(v)}" for key, v in case["settings"].items()),
+        ]
+        for name, case in cases.items()
+    ]  # fmt: skip
+
+
+def run_table(runs: pd.DataFrame) -> Rows:
+    """Header and rows of every run."""
+    return ("case", "scenario", "seed", "status", "plant samples", "regret % [95 %]", "J"), [
+        [
+            row["case"], row["scenario"],
+            "" if pd.isna(row["training_seed"]) else str(row["training_seed"]), row["status"],
+            str(row["plant_samples"] or ""), _percent(row, "regret"), _number(row["J"]),
+        ]
+        for row in runs.to_dict("records")
+    ]  # fmt: skip
 
 
 def image(path: Path) -> dict[str, str]:

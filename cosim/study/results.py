@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,30 +24,28 @@ from cosim.statistics import (
     paired_difference,
     regret,
     regrets,
-    shown,
     two_way,
 )
-from cosim.study import figures, online, paper, report, theta
-from cosim.study.store import EVALUATION, GREEDY, INDICATORS, LOG, ONLINE, RUN, safe
-from cosim.study.tables import KEYS, WHERE, read_table, to_csv
+from cosim.study import collect, figures, online, paper, report, theta
+from cosim.study.report import COLUMNS, SHORT
+from cosim.study.store import EVALUATION, INDICATORS, ONLINE, safe
+from cosim.study.tables import CURVE, KEYS, STATE, WHERE, read_table, to_csv
 from cosim.text_tables import markdown_table
 from cosim.validation import suggestion
 
 if TYPE_CHECKING:
-    from cosim.study.plan import Plan, Run
+    from cosim.study.plan import Plan
 
 Array = NDArray[np.float64]
 
-ABOUT, SCHEMA = "study.json", 1
+ABOUT = "study.json"
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
 THETA, TIMING, LOGS = "theta.csv", "timing.csv", "logs"
-EVALUATED, SUFFIXES = "evaluated", ("svg", "png")
+SUFFIXES = ("svg", "png")
 BASELINES = "baselines"
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
-STATE = [*KEYS, "status", "samples", "plant_samples"]
-CURVE = ["samples", "J", "greedy_J", "td_error"]
 MEANS = ["economic_cost", "mean_violation", "violating_share"]
 RUN_COLUMNS = [
     *STATE, "J", "regret", "regret_low", "regret_high", "gap_closed", *MEANS, "failures",
@@ -63,17 +61,6 @@ AGGREGATE_COLUMNS = [
     "case", "scenarios", "runs", "regret_median", "regret_worst", "regret_iqm", "regret_iqm_low",
     "regret_iqm_high",
 ]  # fmt: skip
-COLUMNS = {
-    "case": "case", "rank": "rank", "samples": "plant samples", "finished": "finished",
-    "regret": "regret %, median [95 %]", "worst": "worst", "iqm": "IQM [95 %]",
-    "J": "J, median", "J-worst": "J, worst", "gap": "gap closed %", "economic": "economic cost",
-    "violation": "violation", "violating": "violating %", "against": "against",
-    "difference": "difference % [95 %]", "p": "p",
-}  # fmt: skip
-"""Headers of the columns of a scenario's table, by the names that options take."""
-SHORT = ("case", "rank", "regret", "worst", "finished")
-"""Columns that fit a terminal of 80 characters."""
-AGGREGATE_HEADER = ("case", "runs", "regret %, IQM [95 %]", "median", "worst")
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +89,10 @@ class StudyResults:
                 f"'{folder}' holds no study ({ABOUT}); give the --out of a cosim study run"
             )
         about = read_json(path, f"'{path}'", StudyError)
-        if about.get("schema") != SCHEMA:
-            raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
+        if about.get("schema") != collect.SCHEMA:
+            raise StudyError(
+                f"'{path}' has schema {about.get('schema')!r}; this is {collect.SCHEMA}"
+            )
         return cls(
             folder,
             about,
@@ -122,16 +111,7 @@ class StudyResults:
 
         Raises StudyError where a file of a run is damaged.
         """
-        runs = _ordered(plan)
-        found = [frames for run in runs if (frames := _collected(run, folder)) is not None]
-        columns = (STATE, [*KEYS, "seed", "steps", *INDICATORS], [*KEYS, *CURVE])
-        state, evaluation, curves = (
-            pd.concat([one[i] for one in found if len(one[i])], ignore_index=True)
-            if any(len(one[i]) for one in found)
-            else pd.DataFrame(columns=header)
-            for i, header in enumerate(columns)
-        )
-        return cls(folder, _about(plan), state, evaluation, curves)
+        return cls(folder, collect.document(plan), *collect.frames(plan, folder))
 
     def write(self, plan: Plan, *, figures: bool = True) -> None:
         """Write the study's tables and kept files; study.json last, so that its word is true.
@@ -143,15 +123,13 @@ class StudyResults:
         out = self.folder
         pictures.keep(plan, out)
         drawn = pictures.draw(plan, out) if figures else []
-        known = self.state[KEYS].astype(object).where(self.state[KEYS].notna(), None)
-        done = set(known.itertuples(index=False, name=None))
-        runs = [r for r in _ordered(plan) if (r.key.scenario, r.key.case, r.key.seed) in done]
+        runs = collect.finished(plan, self.state)
         tables = {
             EVALUATION: self.evaluation,
             CURVES: self.curves,
             RUNS: self.runs,
             SUMMARY: self.summary,
-            TIMING: _timing(plan, out),
+            TIMING: collect.timing(plan, out),
         }
         if self.about["online"] is not None:
             tables[ONLINE] = online.collected(runs, self.curves, out)
@@ -429,7 +407,7 @@ class StudyResults:
                     f"{', '.join(COLUMNS)}"
                 )
         own = self.summary[self.summary.scenario == scenario]
-        texts = [dict(zip(COLUMNS, _texts(row), strict=True)) for row in own.to_dict("records")]
+        texts = [report.texts(row) for row in own.to_dict("records")]
         header = [COLUMNS[name] for name in columns]
         return header, [[row[name] for name in columns] for row in texts]
 
@@ -469,38 +447,32 @@ class StudyResults:
         there is nothing to draw.
         """
         kind, _, scenario = name.partition("-")
-        makers = {
+        known = kind in self._makers and scenario in (*self.scenarios, *[""] * (kind == "profile"))
+        drawn = self._makers[kind](scenario) if known else None
+        if drawn is None:
+            raise StudyError(f"there is no figure '{name}' of this study")
+        return drawn
+
+    @property
+    def _makers(self) -> dict[str, Callable[[str], Figure | None]]:
+        return {
             "curves": self._curves,
             "regret": self._regret,
             "online": self._online,
             "profile": self._profile,
         }
-        fits = kind in makers and scenario in (*self.scenarios, *[""] * (kind == "profile"))
-        drawn = makers[kind](scenario) if fits else None
-        if drawn is None:
-            raise StudyError(f"there is no figure '{name}' of this study")
-        return drawn
 
     def draw(self, folder: Path) -> dict[str, list[str]]:
         """Draw all figures into a folder; returns their names by scenario, "" for all."""
         folder.mkdir(parents=True, exist_ok=True)
         names: dict[str, list[str]] = {}
         for scenario in (*self.scenarios, ""):
-            makers = (
-                {"profile": self._profile}
-                if not scenario
-                else {
-                    "curves": self._curves, "regret": self._regret, "online": self._online,
-                    "profile": self._profile,
-                }
-            )  # fmt: skip
             names[scenario] = []
-            for kind, maker in makers.items():
-                if (drawn := maker(scenario)) is not None:
-                    stem = f"{kind}-{safe(scenario)}" if scenario else kind
-                    names[scenario].append(stem)
+            for kind, maker in self._makers.items():
+                if (scenario or kind == "profile") and (drawn := maker(scenario)) is not None:
+                    names[scenario].append(f"{kind}-{safe(scenario)}" if scenario else kind)
                     for suffix in SUFFIXES:
-                        save(drawn, folder / f"{stem}.{suffix}")
+                        save(drawn, folder / f"{names[scenario][-1]}.{suffix}")
         return names
 
     @cached_property
@@ -593,19 +565,13 @@ class StudyResults:
             section = {"title": f"Scenario {scenario}", "note": self._noise(scenario)}
             sections.append(section | {"tables": [table], "figures": drawn[scenario]})
         if len(self.aggregate):
-            rows = [
-                [row["case"], str(row["runs"]), *(
-                    _percent(row, name) for name in ("regret_iqm", "regret_median", "regret_worst")
-                )]
-                for row in self.aggregate.to_dict("records")
-            ]  # fmt: skip
-            table = ("", AGGREGATE_HEADER, rows)
+            table = ("", *report.aggregate_table(self.aggregate))
             sections.append({"title": "All scenarios", "tables": [table], "figures": drawn[""]})
         for title, header, rows in self.further():
             sections.append({"title": title, "tables": [("", header, rows)]})
         if self.about["pictures"]:
             sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
-        sections.append({"title": "Cases", "tables": [("", *self._settings())]})
+        sections.append({"title": "Cases", "tables": [("", *report.case_table(self.cases))]})
         made = self.about["made_with"]
         return {
             "title": self.about["title"] or self.name,
@@ -613,7 +579,7 @@ class StudyResults:
             "runs": len(self.state),
             "missing": self.about["runs"] - len(self.state),
             "sections": sections,
-            "every": self._every(),
+            "every": report.run_table(self.runs),
             "command": ["cosim", "study", "run", self.about.get("file") or f"{self.name}.toml"],
             "made": f"Made with {made['versions']}; code {made['code_hash']}"
             + (f"; commit {made['commit']}" if made.get("commit") else ""),
@@ -632,178 +598,6 @@ class StudyResults:
         else:
             text += " Learning curves: other noise, and fewer samples."
         return text + " Regrets of a case differ between the two."
-
-    def _settings(self) -> tuple[Sequence[str], list[list[str]]]:
-        header = ("case", "algorithm or controller", "samples", "start", "NMPC", "settings")
-        rows = [
-            [
-                name, case["target"], str(case["samples"] or ""), case["start"], case["nmpc"],
-                ", ".join(f"{key} = {json.dumps(v)}" for key, v in case["settings"].items()),
-            ]
-            for name, case in self.cases.items()
-        ]  # fmt: skip
-        return header, rows
-
-    def _every(self) -> tuple[Sequence[str], list[list[str]]]:
-        """Header and rows of every run."""
-        header = ("case", "scenario", "seed", "status", "plant samples", "regret % [95 %]", "J")
-        rows = [
-            [
-                row["case"], row["scenario"],
-                "" if pd.isna(row["training_seed"]) else str(row["training_seed"]), row["status"],
-                str(row["plant_samples"] or ""), _percent(row, "regret"), _number(row["J"]),
-            ]
-            for row in self.runs.to_dict("records")
-        ]  # fmt: skip
-        return header, rows
-
-
-def _ordered(plan: Plan) -> list[Run]:
-    """The runs by scenario, case and training seed, in the study's order."""
-    definition = plan.definition
-    names = [case.name for case in (*definition.references, *definition.cases)]
-    scenarios = list(definition.scenarios)
-    return sorted(
-        plan.runs,
-        key=lambda run: (
-            scenarios.index(run.key.scenario),
-            names.index(run.key.case),
-            -1 if run.key.seed is None else run.key.seed,
-        ),
-    )
-
-
-def _about(plan: Plan) -> dict[str, Any]:
-    """The document study.json of a plan."""
-    definition = plan.definition
-    cases = [*definition.references, *definition.cases]
-    scenarios = list(definition.scenarios)
-    sizes = {name: definition.sizes(name) for name in scenarios}
-    about = {
-        "schema": SCHEMA,
-        "name": definition.name,
-        "title": definition.table.title,
-        "description": definition.table.description,
-        "scenarios": scenarios,
-        "cases": [
-            {
-                "name": case.name,
-                "group": case.group,
-                "target": definition.relative(case.target),
-                "trained": case.algorithm is not None,
-                "samples": case.samples,
-                "start": definition.relative(case.start),
-                "nmpc": case.nmpc,
-                "settings": dict(case.settings),
-                "scenarios": list(case.scenarios),
-                "against": case.against,
-            }
-            for case in cases
-        ],
-        "file": definition.file,
-        "optimum": definition.optima,
-        "naive": dict.fromkeys(scenarios, definition.naive),
-        "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},
-        "online": None if definition.table.online is None else definition.table.online.model_dump(),
-        "runs": len(plan.runs),
-        "tables": list(definition.table.tables),
-        "pictures": [],
-        "made_with": dict(plan.provenance) | {"commit": report.commit()},
-    }
-    if (settings := definition.table.theta) is not None:
-        about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
-    document: dict[str, Any] = json.loads(json.dumps(about))
-    return document
-
-
-def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | None:
-    """State, evaluation and curves of a run; None while it is not finished."""
-    folder = out / run.key.folder
-    noise = {}
-    for file, (seeds, steps) in run.noise.items():
-        path = folder / file
-        rows = (
-            read_table(path, (), {"seed": int, "steps": int})
-            if path.is_file()
-            else pd.DataFrame(columns=["seed", "steps"])
-        )
-        rows = rows[rows.steps == steps].drop_duplicates("seed").set_index("seed")
-        if not set(seeds) <= set(rows.index):
-            return None
-        noise[file] = rows.loc[list(seeds)].reset_index()
-    if run.online is not None and not online.finished(run, out):
-        return None
-    document = read_json(folder / RUN, f"'{folder / RUN}'", StudyError)
-    if run.training is not None and not document.get("status"):
-        return None
-    key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}
-    state = key | {
-        "status": document.get("status") or EVALUATED,
-        "samples": int(document.get("samples", 0)),
-        "plant_samples": int(document.get("plant_samples", 0)),
-    }
-    curve = pd.DataFrame(columns=CURVE)
-    if run.training is not None:
-        curve = read_table(folder / LOG).reindex(columns=CURVE)
-    elif run.greedy:
-        curve = pd.DataFrame([{"greedy_J": float(np.mean(noise[GREEDY].J))}], columns=CURVE)
-    found = pd.DataFrame([state]), noise[EVALUATION][["seed", "steps", *INDICATORS]], curve
-    one, other, third = (frame.assign(**key) for frame in found)
-    types = {"training_seed": "Int64"}
-    return (
-        one[STATE].astype(types),
-        other[[*KEYS, "seed", "steps", *INDICATORS]].astype(
-            types | dict.fromkeys(INDICATORS, float)
-        ),
-        third[[*KEYS, *CURVE]].astype(types | dict.fromkeys(CURVE, float) | {"samples": "Int64"}),
-    )
-
-
-def _timing(plan: Plan, out: Path) -> pd.DataFrame:
-    rows = []
-    for run in plan.runs:
-        path = out / run.key.folder / RUN
-        document = read_json(path, f"'{path}'", StudyError) if path.is_file() else {}
-        seconds = document.get("timing", {}).get("wall_seconds", 0.0)
-        rows.append({"run": str(run.key), "training_seconds": float(seconds)})
-    return pd.DataFrame(rows, columns=["run", "training_seconds"])
-
-
-def _texts(row: Mapping[str, Any]) -> Iterator[str]:
-    """Texts of a row of the summary, in the order of `COLUMNS`."""
-    several = row["runs"] > 1
-    gap = row["gap_closed_median"]
-    wide = {"wide": row["regret_median"]} | {
-        f"wide_{end}": row[f"regret_wide_{end}"] for end in ("low", "high")
-    }
-    yield str(row["case"])
-    yield str(row["rank"])
-    yield str(row["plant_samples"] or "")
-    yield f"{row['finished']}/{row['runs']}" if row["samples"] else ""
-    yield _percent(wide, "wide")
-    yield _percent(row, "regret_worst") if several else ""
-    yield _percent(row, "regret_iqm") if several else ""
-    yield _number(row["J_median"])
-    yield _number(row["J_worst"]) if several else ""
-    yield "" if np.isnan(gap) else shown(gap, None, 100.0, 4)
-    yield _number(row["economic_cost"])
-    yield f"{row['mean_violation']:.5f}"
-    yield f"{100 * row['violating_share']:.2f}"
-    yield row["against"] or ""
-    yield _percent(row, "difference")
-    yield "" if np.isnan(row["difference_p"]) else f"{row['difference_p']:.3f}"
-
-
-def _percent(row: Mapping[str, Any], name: str) -> str:
-    """A share in per cent with its interval, where it has one; nothing where it is undefined."""
-    ends = (float(row.get(f"{name}_low", np.nan)), float(row.get(f"{name}_high", np.nan)))
-    if np.isnan(row[name]):
-        return ""
-    return shown(float(row[name]), None if np.isnan(ends[0]) else ends, 100.0, 3)
-
-
-def _number(value: float) -> str:
-    return shown(float(value), None, 1.0, 6)
 
 
 def _finite(value: Any) -> float:

@@ -14,6 +14,8 @@ from cosim.text_tables import read_csv
 
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
+STATE = [*KEYS, "status", "samples", "plant_samples"]
+CURVE = ["samples", "J", "greedy_J", "td_error"]
 TYPES: dict[str, Any] = {"scenario": str, "case": str, "training_seed": "Int64", "status": str}
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 

@@ -1,0 +1,157 @@
+"""Runs of a plan, from their folders to the document and the frames of a study's results."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from cosim.errors import StudyError
+from cosim.files import read_json
+from cosim.study import online, theta
+from cosim.study.report import commit
+from cosim.study.store import EVALUATION, GREEDY, INDICATORS, LOG, RUN
+from cosim.study.tables import CURVE, KEYS, STATE, read_table
+
+if TYPE_CHECKING:
+    from cosim.study.plan import Plan, Run
+
+SCHEMA = 1
+EVALUATED = "evaluated"
+
+
+def ordered(plan: Plan) -> list[Run]:
+    """The runs by scenario, case and training seed, in the study's order."""
+    definition = plan.definition
+    names = [case.name for case in (*definition.references, *definition.cases)]
+    scenarios = list(definition.scenarios)
+    return sorted(
+        plan.runs,
+        key=lambda run: (
+            scenarios.index(run.key.scenario),
+            names.index(run.key.case),
+            -1 if run.key.seed is None else run.key.seed,
+        ),
+    )
+
+
+def finished(plan: Plan, state: pd.DataFrame) -> list[Run]:
+    """The runs of a plan that `state` has a row for."""
+    known = state[KEYS].astype(object).where(state[KEYS].notna(), None)
+    done = set(known.itertuples(index=False, name=None))
+    return [r for r in ordered(plan) if (r.key.scenario, r.key.case, r.key.seed) in done]
+
+
+def document(plan: Plan) -> dict[str, Any]:
+    """The document study.json of a plan."""
+    definition = plan.definition
+    cases = [*definition.references, *definition.cases]
+    scenarios = list(definition.scenarios)
+    sizes = {name: definition.sizes(name) for name in scenarios}
+    about = {
+        "schema": SCHEMA,
+        "name": definition.name,
+        "title": definition.table.title,
+        "description": definition.table.description,
+        "scenarios": scenarios,
+        "cases": [
+            {
+                "name": case.name,
+                "group": case.group,
+                "target": definition.relative(case.target),
+                "trained": case.algorithm is not None,
+                "samples": case.samples,
+                "start": definition.relative(case.start),
+                "nmpc": case.nmpc,
+                "settings": dict(case.settings),
+                "scenarios": list(case.scenarios),
+                "against": case.against,
+            }
+            for case in cases
+        ],
+        "file": definition.file,
+        "optimum": definition.optima,
+        "naive": dict.fromkeys(scenarios, definition.naive),
+        "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},
+        "online": None if definition.table.online is None else definition.table.online.model_dump(),
+        "runs": len(plan.runs),
+        "tables": list(definition.table.tables),
+        "pictures": [],
+        "made_with": dict(plan.provenance) | {"commit": commit()},
+    }
+    if (settings := definition.table.theta) is not None:
+        about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
+    found: dict[str, Any] = json.loads(json.dumps(about))
+    return found
+
+
+def frames(plan: Plan, out: Path) -> list[pd.DataFrame]:
+    """State, evaluation and curves of the finished runs, by scenario, case and training seed.
+
+    Raises StudyError where a file of a run is damaged.
+    """
+    found = [one for run in ordered(plan) if (one := _collected(run, out)) is not None]
+    columns = (STATE, [*KEYS, "seed", "steps", *INDICATORS], [*KEYS, *CURVE])
+    return [
+        pd.concat([one[i] for one in found if len(one[i])], ignore_index=True)
+        if any(len(one[i]) for one in found)
+        else pd.DataFrame(columns=header)
+        for i, header in enumerate(columns)
+    ]
+
+
+def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | None:
+    """State, evaluation and curves of a run; None while it is not finished."""
+    folder = out / run.key.folder
+    noise = {}
+    for file, (seeds, steps) in run.noise.items():
+        path = folder / file
+        rows = (
+            read_table(path, (), {"seed": int, "steps": int})
+            if path.is_file()
+            else pd.DataFrame(columns=["seed", "steps"])
+        )
+        rows = rows[rows.steps == steps].drop_duplicates("seed").set_index("seed")
+        if not set(seeds) <= set(rows.index):
+            return None
+        noise[file] = rows.loc[list(seeds)].reset_index()
+    if run.online is not None and not online.finished(run, out):
+        return None
+    document = read_json(folder / RUN, f"'{folder / RUN}'", StudyError)
+    if run.training is not None and not document.get("status"):
+        return None
+    key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}
+    state = key | {
+        "status": document.get("status") or EVALUATED,
+        "samples": int(document.get("samples", 0)),
+        "plant_samples": int(document.get("plant_samples", 0)),
+    }
+    curve = pd.DataFrame(columns=CURVE)
+    if run.training is not None:
+        curve = read_table(folder / LOG).reindex(columns=CURVE)
+    elif run.greedy:
+        curve = pd.DataFrame([{"greedy_J": float(np.mean(noise[GREEDY].J))}], columns=CURVE)
+    found = pd.DataFrame([state]), noise[EVALUATION][["seed", "steps", *INDICATORS]], curve
+    one, other, third = (frame.assign(**key) for frame in found)
+    types = {"training_seed": "Int64"}
+    return (
+        one[STATE].astype(types),
+        other[[*KEYS, "seed", "steps", *INDICATORS]].astype(
+            types | dict.fromkeys(INDICATORS, float)
+        ),
+        third[[*KEYS, *CURVE]].astype(types | dict.fromkeys(CURVE, float) | {"samples": "Int64"}),
+    )
+
+
+def timing(plan: Plan, out: Path) -> pd.DataFrame:
+    """Seconds that each run's training took."""
+    rows = []
+    for run in plan.runs:
+        path = out / run.key.folder / RUN
+        document = read_json(path, f"'{path}'", StudyError) if path.is_file() else {}
+        seconds = document.get("timing", {}).get("wall_seconds", 0.0)
+        rows.append({"run": str(run.key), "training_seconds": float(seconds)})
+    return pd.DataFrame(rows, columns=["run", "training_seconds"])

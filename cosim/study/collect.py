@@ -68,11 +68,11 @@ def document(plan: Plan) -> dict[str, Any]:
                 "nmpc": case.nmpc,
                 "settings": dict(case.settings),
                 "scenarios": list(case.scenarios),
-                "against": case.against,
+                "against": getattr(case, "against", None),
             }
             for case in cases
         ],
-        "file": definition.file,
+        "file": getattr(definition, "file", None),
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.naive),
         "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},

@@ -372,10 +372,9 @@ class StudyResults:
         rows.sort(key=lambda row: float(row["regret_iqm"]))
         return pd.DataFrame(rows, columns=AGGREGATE_COLUMNS)
 
-    def to_pandas(self) -> dict[str, pd.DataFrame]:
-        """The frames by name: runs, evaluation, curves, summary, aggregate."""
-        names = ("runs", "evaluation", "curves", "summary", "aggregate")
-        return {name: getattr(self, name) for name in names}
+    def to_pandas(self) -> pd.DataFrame:
+        """A copy of `runs`, a row for each run."""
+        return self.runs.copy()
 
     def log(self, case: str, scenario: str) -> pd.DataFrame | None:
         """Log of a case's first training seed, None where it was not kept; raises StudyError."""

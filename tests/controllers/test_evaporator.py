@@ -60,13 +60,6 @@ def test_a_parameter_given_in_p_is_used(samples):
     np.testing.assert_allclose(np.array(f(x, u, d, changed)).ravel(), rate, rtol=1e-12)
 
 
-def test_the_steady_state_stays_where_it_is():
-    model = evaporator()
-    f = discretise(model, 60.0, 2)
-    x_next = f(X_S, U_S, model.nominal_disturbance, model.nominal_parameters)
-    np.testing.assert_allclose(np.array(x_next).ravel(), X_S, rtol=0, atol=1e-11)
-
-
 def test_the_reference_is_the_least_costly_steady_state_on_the_bound():
     # One degree of freedom is left on X2 = 25: P2; the stationary point is the reference.
     def controls(pressure):

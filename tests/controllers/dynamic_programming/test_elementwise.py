@@ -72,16 +72,7 @@ def test_sampled_evaporator_agrees_with_casadi_to_rounding():
     np.testing.assert_allclose(Elementwise(function)(x, u, d, p), expected, rtol=1e-13)
 
 
-def test_arguments_broadcast():
-    x = ca.SX.sym("x", 2)
-    function = Elementwise(ca.Function("f", [x], [ca.vertcat(x[0] * x[1], 0, x[0])]))
-    product, zero, first = function([np.arange(3.0)[:, None], np.arange(4.0)[None, :]])
-    np.testing.assert_array_equal(product, np.outer(np.arange(3.0), np.arange(4.0)))
-    assert zero == 0
-    assert first.shape == (3, 1)
-
-
 def test_unknown_operation_is_refused():
     x = ca.SX.sym("x")
-    with pytest.raises(ModelError, match="cannot be evaluated over arrays"):
+    with pytest.raises(ModelError):
         Elementwise(ca.Function("f", [x], [ca.erf(x)]))

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import Feature, graded_axis, support
-from controllers.errors import OptimumError
+from controllers.dynamic_programming.policy_iteration import Feature, graded_axis
 
 GRID = Grid((np.array([0.0, 0.5, 2.0]), np.array([-1.0, 1.0, 1.5, 4.0]), np.array([0.0, 1.0])))
 
@@ -45,24 +44,6 @@ def test_states_outside_are_served_by_the_nearest_state_of_the_box():
     values = np.random.default_rng(1).normal(size=GRID.size)
     inside, outside = np.array([[2.0, -1.0, 0.3]]), np.array([[7.0, -3.0, 0.3]])
     assert GRID.interpolate(values, list(outside.T)) == GRID.interpolate(values, list(inside.T))
-
-
-def test_resampling_on_the_same_grid_changes_nothing():
-    values = np.random.default_rng(1).normal(size=(GRID.size, 2))
-    np.testing.assert_allclose(GRID.resample(values, GRID), values, rtol=1e-12)
-
-
-def test_nearest_and_boundary():
-    assert GRID.points[GRID.nearest([0.6, 1.2, 0.9])].tolist() == [0.5, 1.0, 1.0]
-    assert GRID.boundary.all()
-    middle = Grid((np.arange(3.0), np.arange(4.0)))
-    assert middle.points[~middle.boundary].tolist() == [[1, 1], [1, 2]]
-
-
-@pytest.mark.parametrize("axis", [[0.0], [0.0, 0.0], [1.0, 0.0], [0.0, np.nan]])
-def test_bad_axis_is_refused(axis):
-    with pytest.raises(OptimumError, match="at least two increasing points"):
-        Grid((np.array(axis),))
 
 
 SMOOTH = Grid(
@@ -117,15 +98,6 @@ def test_cubic_weights_are_what_interpolation_multiplies_with_and_sum_to_one():
     )
 
 
-def test_too_few_points_within_the_smooth_interval_are_interpolated_linearly():
-    axes = (np.array([0.0, 1.0, 3.0, 4.0]),)
-    x = np.linspace(0.0, 4.0, 41)
-    values = np.array([0.0, 1.0, 0.0, 2.0])
-    np.testing.assert_array_equal(
-        Grid(axes, ((0.0, 3.5),)).interpolate(values, [x]), Grid(axes).interpolate(values, [x])
-    )
-
-
 def test_graded_axis_is_dense_at_features_grows_outside_and_meets_its_marks():
     features = [Feature(0.0, 2.0, 0.1), Feature(50.0, 50.0, 0.02)]
     axis = graded_axis([-10.0, 50.0, 100.0], features, 1.3)
@@ -140,14 +112,3 @@ def test_graded_axis_is_dense_at_features_grows_outside_and_meets_its_marks():
     # Growth is that of a continuous width, so that a cell may be a little wider than 1.3 times.
     assert (cells[1:] / cells[:-1] < 1.5).all()
     assert len(axis) < 100
-
-
-def test_graded_axis_without_room_outside_is_equidistant():
-    axis = graded_axis([0.0, 1.0], [Feature(-1.0, 2.0, 0.25)], 1.3)
-    np.testing.assert_allclose(axis, np.arange(5) / 4)
-
-
-def test_support_leaves_out_the_tails_only():
-    axis = np.arange(8.0)
-    mass = np.array([0.0, 1e-9, 0.2, 0.3, 0.5, 1e-9, 0.0, 0.0])
-    assert support(axis, mass, 1e-6) == (1.0, 5.0)

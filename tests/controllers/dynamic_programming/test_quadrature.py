@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from controllers.dynamic_programming.bellman import DisturbanceLaw, Refinement, lagrange_matrix
-from controllers.errors import OptimumError
+from controllers.dynamic_programming.bellman import DisturbanceLaw, Refinement
 
 LAWS = {
     "uniform": lambda mean, spread: scipy.stats.uniform(mean - spread, 2 * spread),
@@ -41,12 +40,6 @@ def test_draws_have_the_laws_moments(kind):
     np.testing.assert_allclose(draws.var(axis=0), [variance, 0.0], atol=0.02)
 
 
-def test_what_does_not_vary_takes_one_node():
-    rule = DisturbanceLaw("uniform", np.array([5.0, 2.0]), np.array([0.0, 1.0])).rule((7, 3))
-    assert rule.shape == (1, 3)
-    assert DisturbanceLaw("none", np.array([5.0]), np.array([1.0])).rule((7,)).shape == (1,)
-
-
 def test_refinement_reproduces_polynomials_of_the_coarse_degree():
     law = DisturbanceLaw("uniform", np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.5, 2.0]))
     coarse, fine = law.rule((4, 3, 2)), law.rule((9, 8, 5))
@@ -57,30 +50,3 @@ def test_refinement_reproduces_polynomials_of_the_coarse_degree():
 
     carried = Refinement(coarse, fine)(polynomial(coarse.nodes))
     np.testing.assert_allclose(carried, polynomial(fine.nodes), rtol=1e-12, atol=1e-12)
-
-
-def test_lagrange_matrix_is_the_identity_on_its_nodes():
-    nodes = np.array([-1.0, 0.2, 3.0])
-    np.testing.assert_allclose(lagrange_matrix(nodes, nodes), np.eye(3), atol=1e-15)
-
-
-BAD_LAWS = {
-    "unknown kind": ("cauchy", [0.0], [1.0], "law 'cauchy' is not known"),
-    "negative range": ("uniform", [0.0], [-1.0], "no range negative"),
-    "not finite": ("normal", [np.nan], [1.0], "must be finite"),
-    "other length": ("normal", [0.0, 0.0], [1.0], "of one length"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_LAWS)
-def test_bad_law_has_one_clear_error(case):
-    kind, nominal, ranges, message = BAD_LAWS[case]
-    with pytest.raises(OptimumError, match=message):
-        DisturbanceLaw(kind, np.array(nominal), np.array(ranges))
-
-
-def test_bad_numbers_of_nodes_are_refused():
-    law = DisturbanceLaw("uniform", np.zeros(2), np.ones(2))
-    for counts in [(3,), (3, 0)]:
-        with pytest.raises(OptimumError, match="2 disturbances need as many positive numbers"):
-            law.rule(counts)

@@ -41,14 +41,6 @@ def test_elsewhere_the_multipliers_stay_within_their_range(f, expected):
     np.testing.assert_allclose(np.ravel(settled), expected, atol=1e-15)
 
 
-def test_a_saturated_action_keeps_its_own_multiplier():
-    # At the actuator's bound, dQ/da need not vanish, so nothing asks for λ > 0.
-    settled = multipliers_at_kink(
-        enforced(-1.5, 1.0), solution(1.0, 0.2, 0.3), np.array([-10.0]), np.array([1.0])
-    )
-    np.testing.assert_allclose(np.ravel(settled), [1.0, 0.5, 0.0], atol=1e-15)
-
-
 def test_the_action_gradient_lies_between_the_one_sided_derivatives():
     checked = 0
     for nmpc, qp in prepared("daqp", range(0, 480, 8)):

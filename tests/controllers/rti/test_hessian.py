@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 
 from controllers import ThetaBlocks
-from controllers.errors import ControllerError
 from controllers.model import discretise
 from controllers.rti.preparation import Exact, Spectrum, make_hessian, preparation
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point
@@ -127,8 +126,3 @@ def test_contract_holds_for_repeated_eigenvalues(rng):
     below = spectrum_of(np.eye(4) / 2, 1.0).contract(seed[None])[0]
     np.testing.assert_allclose(above, seed, atol=1e-15)
     np.testing.assert_allclose(below, 0, atol=1e-15)
-
-
-def test_an_unknown_rule_is_refused_with_the_choices(prepared, blocks, problem):
-    with pytest.raises(ControllerError, match="no Hessian 'bfgs'; choose gauss-newton or exact"):
-        make_hessian("bfgs", problem, blocks, prepared)

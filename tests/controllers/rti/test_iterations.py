@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from controllers import ConvergedNmpc, Parameters, RtiNmpc, ThetaBlocks
-from controllers.errors import ControllerError
 from tests.helpers.differences import Feedback, assert_close, derivative, natural_scale
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_state
 
@@ -62,16 +61,3 @@ def test_q_at_the_policy_is_v_and_the_sample_begins_anew():
     assert nmpc.feedback(s).value == v.value
     for one, other in zip(point, nmpc.linearisation_point, strict=True):
         assert np.array_equal(one, other)
-
-
-def test_the_next_sample_starts_from_the_last_qps_solution():
-    nmpc = RtiNmpc(PROBLEM, NAIVE, iterations=3)
-    solution = nmpc.feedback(off(2))
-    nmpc.prepare()
-    for one, other in zip(nmpc.linearisation_point, solution.shifted, strict=True):
-        assert one == pytest.approx(other.reshape(one.shape), rel=1e-12)
-
-
-def test_no_qp_is_refused():
-    with pytest.raises(ControllerError, match="iterations must be at least 1, not 0"):
-        RtiNmpc(PROBLEM, NAIVE, iterations=0)

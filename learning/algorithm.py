@@ -12,8 +12,8 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.parameters import Parameters
-from controllers.rti.prepared import LinearisationPoint
+from controllers.rti import LinearisationPoint
+from controllers.theta import Parameters
 from cosim.plugins import ALGORITHMS, load_plugin
 from cosim.protocols import Controller, Solution
 from cosim.scenario import Scenario

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from learning.algorithm import Transition
 from learning.errors import ConfigurationError

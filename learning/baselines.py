@@ -19,8 +19,8 @@ from scipy.optimize import least_squares
 from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.model import Model
-from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, Transition, Update
 from learning.back_off_search import BackOffSearch

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from controllers.quasi_static import DAY, Fouling, QuasiStaticPolicy
+from controllers.optimum import DAY, Fouling, QuasiStaticPolicy
 from cosim.scenario import Scenario
 
 COLUMNS = ("UA2", "reference_J")

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.parameters import Parameters
+from controllers.optimum import yardstick
 from controllers.problem import Problem
-from controllers.yardstick import yardstick
+from controllers.theta import Parameters
 from cosim.plant.archive import SHIPPED
 from cosim.protocols import Controller, Plant
 from cosim.scenario import Scenario

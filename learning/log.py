@@ -8,7 +8,7 @@ from math import inf, isnan
 
 import numpy as np
 
-from controllers.parameters import Parameters
+from controllers.theta import Parameters
 from cosim.text_tables import csv_text
 from learning.algorithm import Update
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.rti.prepared import LinearisationPoint
+from controllers.rti import LinearisationPoint
+from controllers.theta import Parameters
 from cosim.plant import FmuPlant
 from cosim.protocols import Step, recover
 from cosim.simulation import spawn_seeds

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import expm
 
-from controllers.parameters import Parameters
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, Transition, Update
 from learning.baselines import GreedyConfiguration

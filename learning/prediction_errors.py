@@ -8,10 +8,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.buffered import BufferedFunction
+from controllers.functions import BufferedFunction
 from controllers.model import discretise
-from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
 
 Vector = NDArray[np.float64]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.parameters import Parameters
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from learning.prediction_errors import KnownPenalty, SortedErrors
 from learning.step import certificate, clip_eigenvalues, prior_deviation

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from controllers import sdp
-from controllers.parameters import Parameters
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from learning.algorithm import LearnableController, Update
 from learning.configuration import Configuration
 from learning.errors import DefinitenessError, DivergenceError

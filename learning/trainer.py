@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Any, get_args, get_origin
 
-from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Parameters
 from cosim.evaluation.provenance import source_hashes
 from cosim.files import temporary_folder
 from cosim.lookup import GROUP as CONTROLLERS

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers import compile_functions
-from controllers.parameters import Parameters
+from controllers.theta import Parameters
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant

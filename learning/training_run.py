@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.economic import tune
 from controllers.factories import nmpc
-from controllers.parameters import Parameters
 from controllers.problem import Problem
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from cosim.plugins import OURS, depends_on
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, load_algorithm

@@ -126,7 +126,7 @@ def _version(wanted: bool) -> None:
     from importlib.metadata import version
 
     import fmus
-    from controllers.compilation import description
+    from controllers.functions import description
 
     print(f"cosim {version('rti-cosim')}")
     for name in ("evaporator", "evaporator_fmi3"):

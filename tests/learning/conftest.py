@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from tests.helpers.linear_quadratic import LinearQuadratic
 

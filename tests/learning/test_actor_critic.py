@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
+from controllers.theta import Parameters
 from learning import ActorCritic
 from learning.algorithm import Transition
 from learning.exploration import build_strategy

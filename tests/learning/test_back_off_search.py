@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
+from controllers.theta import Parameters
 from learning.back_off_search import BackOffSearch
 from learning.prediction_errors import OneStepModel
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from controllers.economic import tune
-from controllers.parameters import Parameters
+from controllers.optimum import Fouling
 from controllers.problem import Problem
-from controllers.quasi_static import Fouling
 from controllers.rti import RtiNmpc
+from controllers.theta import Parameters
 from cosim import FmuPlant, Scenario, simulate
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError

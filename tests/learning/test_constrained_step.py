@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from learning.configuration import Configuration
 from learning.errors import DivergenceError
 from learning.step import ConstrainedStep, Fit, rescaled

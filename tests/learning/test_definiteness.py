@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from learning.errors import DefinitenessError
 from learning.step import (
     CholeskyParametrisation,

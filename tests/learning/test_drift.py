@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from controllers.quasi_static import QuasiStaticPolicy
+from controllers.optimum import QuasiStaticPolicy
 from cosim import Scenario
 from learning.drift import Drift
 from learning.log import COLUMNS

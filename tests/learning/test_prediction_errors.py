@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from controllers.model import discretise
-from controllers.parameters import Parameters
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from cosim.penalty import Penalty
 from learning.prediction_errors import (
     KnownPenalty,

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from learning.step import prior_deviation
 from tests.helpers.other_units import factors
 

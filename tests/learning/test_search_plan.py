@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
+from controllers.theta import Parameters
 from learning.search_plan import (
     Block,
     Learn,

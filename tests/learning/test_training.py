@@ -4,10 +4,10 @@ import time
 import numpy as np
 import pytest
 
-from controllers.parameters import Parameters
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.rti.solution import RtiSolution
+from controllers.theta import Parameters
 from cosim import FmuPlant
 from learning.algorithm import Update, load_algorithm
 from learning.errors import CheckpointError, ConfigurationError

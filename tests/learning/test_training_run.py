@@ -3,9 +3,8 @@ import pytest
 
 from controllers.converged import ConvergedNmpc
 from controllers.economic import tune
-from controllers.parameters import Parameters
 from controllers.rti import RtiNmpc
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError

@@ -1,207 +1,215 @@
-"""kill -9 at random moments of training, evaluation, recording and results update.
+"""Signals at random moments of every long command: nothing is lost, nothing survives.
 
-    python -m tests.faults.kill --trials 60
+    python -m tests.faults.kill --trials 70 [--seed 0] [--only training]
 
-Every trial: start the command, kill its whole process group after a random share of the time that
-it takes, look at all files that are there (each must be absent, or whole and right), run it again
-(training with --resume where there is a checkpoint), and compare every byte with the run that
-nobody killed. Prints what happened as JSON; ends in an AssertionError if anything was lost or
-differs.
+Every trial: start the command in a folder of its own, and after a random share of the time that it
+takes kill its whole group, kill its first process alone, or send that SIGTERM or Ctrl-C, in turn.
+Every process that it had started must end, nobody may hold the folder, every file must be whole,
+and the command, run again, must end with the bytes of the run that nobody disturbed. Prints what
+happened as JSON; ends in an AssertionError with the first trial that did not hold.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import os
+import random
+import shutil
 import signal
-import subprocess
 import sys
+import tempfile
 import time
+import tomllib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from controllers import Parameters, Problem
-from cosim import Scenario
-from cosim.errors import RecordingError
-from cosim.evaluation.store import FILE
+from cosim.files import read_arrays
+from cosim.processes import HOLDER, LOCK, hold, release
 from cosim.recording import read_recording
-from learning.checkpoint import load as load_checkpoint
-from tests.helpers.campaigns import Trial, finish, main, start, trials
+from tests.helpers.command import run_cosim, start_cosim
+from tests.helpers.processes import alive, eventually
 
+ROOT = Path(__file__).parents[2]
+MARK = "COSIM_KILL"
 STUDY = """\
 schema = 1
 name = "runs"
 scenarios = ["paper"]
 training_seeds = { first = 0, count = 2 }
 evaluation = { seeds = 4, steps = 500 }
-curves = { points = 4, seeds = 2, steps = 100 }
-logs = ["q"]
 [[case]]
 controller = "tuned"
 [[case]]
 name = "q"
 algorithm = "q-learning"
 samples = 3000
-training = { checkpoint_every = 750 }
-[[trajectory]]
-name = "run"
-steps = 100
-figures = ["overlay"]
 """
-# So long that a small part of each command's time is its start, before it writes anything.
-TRAIN = "train --algorithm batch-q-learning --samples 6000 --log-every 100 --evaluate-every 1000"
-EVALUATE = "evaluate --seeds 8 --steps 2000 --jobs 2"
-RECORD = "simulate --steps 20000 --record"
+WAYS = ("kill the group", "kill the parent", "SIGTERM", "Ctrl-C")
+
+
+def _nothing(folder: Path) -> None:
+    pass
+
+
+def _study(folder: Path) -> None:
+    (folder / "study.toml").write_text(STUDY)
+
+
+def _recording(folder: Path) -> None:
+    done = run_cosim("simulate", "-n", 300, "--record", "--out", "recorded", folder=folder)
+    assert done.returncode == 0, done.stderr
 
 
 @dataclass(frozen=True)
 class Job:
-    """A command in a folder, its result files, and what must hold of files after a kill."""
+    """A command, the files whose bytes must repeat, what it needs before, how it goes on."""
 
     name: str
-    words: Callable[[Path], list[str]]
+    words: str
     results: tuple[str, ...]
-    inspect: Callable[[Path, Path], Counter[str]]
-    begin: Callable[[Path], None] = lambda folder: None
-
-
-def _train(folder: Path) -> list[str]:
-    words = [*TRAIN.split(), "--checkpoint-every", "100", "--out", "out"]
-    return [*words, "--resume"] if (folder / "out" / "checkpoint.npz").exists() else words
-
-
-def _inspect_training(folder: Path, _: Path) -> Counter[str]:
-    out, seen = folder / "out", Counter[str]()
-    if (out / "checkpoint.npz").exists():
-        load_checkpoint(out / "checkpoint.npz")
-        seen["checkpoints found"] += 1
-    if (out / "parameters.toml").exists():
-        Parameters.load(out / "parameters.toml", Problem.from_scenario(Scenario.load("paper")))
-        seen["θ files found"] += 1
-    if (out / "learning.csv").exists():
-        with (out / "learning.csv").open(newline="") as stream:
-            assert len({len(row) for row in csv.reader(stream)}) <= 1
-    return seen
-
-
-def _inspect_units(folder: Path, reference: Path) -> Counter[str]:
-    found, there = (_units(place / "out" / FILE) for place in (folder, reference))
-    assert found <= there
-    return Counter({"finished units found": len(found)})
-
-
-def _units(path: Path) -> set[str]:
-    """Key, seeds and indicators of the finished units in a file, the torn one apart."""
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    whole = [json.loads(line) for line in lines if line.endswith("\n")]
-    # As text: a settling time that does not exist is NaN.
-    return {json.dumps([unit[name] for name in ("key", "seeds", "indicators")]) for unit in whole}
-
-
-def _inspect_recording(folder: Path, reference: Path) -> Counter[str]:
-    out = folder / "out"
-    whole = read_recording(reference / "out" / "run.rrd")
-    if (out / "run.rrd").exists():
-        assert np.array_equal(read_recording(out / "run.rrd").samples, whole.samples)
-        return Counter({"whole recordings found": 1})
-    partial = next(out.glob(".run.*.partial.rrd"), None)
-    if partial is None or partial.stat().st_size == 0:
-        return Counter()
-    repaired = folder / "repaired.rrd"
-    rerun = str(Path(sys.executable).with_name("rerun"))
-    command = [rerun, "rrd", "optimize", str(partial), "-o", str(repaired)]
-    subprocess.run(command, capture_output=True, check=False)
-    try:
-        found = read_recording(repaired)
-    except RecordingError:
-        return Counter({"partial recordings without a block": 1})
-    rows = len(found.samples)
-    assert np.array_equal(found.samples, whole.samples[:rows])
-    for name, values in found.signals.items():
-        # The last block may have reached the disk for some signals only: the others have gaps.
-        there = ~np.isnan(values) & (not name.endswith("_time"))
-        assert np.array_equal(values[there], whole.signals[name][:rows][there]), name
-    return Counter({"partial recordings repaired": 1, "samples repaired": rows})
-
-
-def _stored(folder: Path) -> None:
-    (folder / "results").mkdir(exist_ok=True)
-    (folder / "results" / "runs.toml").write_text(STUDY)
-    (folder / "results" / "tolerances.toml").write_text("[tolerance]\n")
-
-
-def _inspect_results(folder: Path, reference: Path) -> Counter[str]:
-    seen = Counter[str]()
-    for path in (folder / "results").rglob("*"):
-        name = path.relative_to(folder)
-        if path.is_file() and ".work" not in name.parts and not path.name.startswith("."):
-            assert path.read_bytes() == (reference / name).read_bytes(), name
-            seen["result files found"] += 1
-    return seen
+    begin: Callable[[Path], None] = _nothing
+    again: str = ""
+    """Appended where a checkpoint is there."""
 
 
 JOBS = (
-    Job("training", _train, ("out/learning.csv", "out/parameters.toml"), _inspect_training),
+    Job(
+        "training",
+        "train -a batch-q-learning -n 6000 --log-every 100 --checkpoint-every 100 --out out",
+        ("out/learning.csv", "out/parameters.toml"),
+        again=" --resume",
+    ),
     Job(
         "evaluation",
-        lambda _: [*EVALUATE.split(), "--out", "out"],
+        "evaluate --seeds 8 --steps 2000 --jobs 2 --out out",
         ("out/evaluation.csv",),
-        _inspect_units,
     ),
+    Job("study", "study run study.toml --jobs 2 --out out", ("out/summary.csv",), _study),
     Job(
         "recording",
-        lambda _: [*RECORD.split(), "--out", "out"],
+        "simulate --steps 20000 --record --out out",
         ("out/trajectory.csv", "out/scenario.toml"),
-        _inspect_recording,
     ),
-    Job(
-        "results update",
-        lambda _: ["results", "update", "--results", "results"],
-        ("results/README.md", "results/runs/summary.csv", "results/runs/evaluation.csv"),
-        _inspect_results,
-        _stored,
-    ),
+    Job("view", "view recorded/run.rrd --png out.png", ("out.png",), _recording),
+    Job("export", "export tuned --out policy.fmu", ("policy.fmu",)),
 )
 
 
-def trial(one: Trial[Job]) -> Counter[str]:
-    """Kill a job once, look, finish it, compare; what was seen."""
-    job, folder, what = one.job, one.folder, f"{one.job.name} after a kill at {one.delay:.2f} s"
-    process = start(job.words(folder), folder, group=True)
-    time.sleep(one.delay)
+def words(job: Job, folder: Path) -> list[str]:
+    """The command, resumed where there is what it can resume."""
+    resumable = (folder / "out" / "checkpoint.npz").exists()
+    return (job.words + (job.again if resumable else "")).split()
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Keep all that a command leaves in the folder, and mark its processes."""
+    (folder / "tmp").mkdir(exist_ok=True)
+    own = {"TMPDIR": folder / "tmp", "COSIM_CACHE": folder / "cache", MARK: folder}
+    return {name: str(value) for name, value in own.items()} | {"PYTHONPATH": str(ROOT)}
+
+
+def family(folder: Path) -> list[str]:
+    """Numbers of the processes that the command in a folder has started and that still run."""
+    mark, found = f"{MARK}={folder}".encode(), []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark in (place / "environ").read_bytes().split(b"\0") and alive(place.name):
+                found.append(place.name)
+        except OSError:
+            continue
+    return found
+
+
+def inspect(folder: Path) -> int:
+    """How many files there are, hidden ones apart; each is whole, and nobody holds the folder."""
+    count = 0
+    for path in (folder / "out").rglob("*"):
+        if path.name.startswith(".") or not path.is_file():
+            continue
+        count += 1
+        if path.suffix == ".csv":
+            with path.open(newline="") as stream:
+                assert len({len(row) for row in csv.reader(stream)}) <= 1, path
+        elif path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix == ".toml":
+            tomllib.loads(path.read_text())
+        elif path.suffix == ".npz":
+            read_arrays(path)
+        elif path.suffix == ".rrd":
+            read_recording(path)
+    if (folder / "out").is_dir():
+        hold(folder / "out")
+        release()
+    return count
+
+
+def trial(job: Job, way: str, delay: float, folder: Path, reference: Path) -> Counter[str]:
+    """Disturb a job once, look, finish it, compare; what was seen."""
+    folder.mkdir()
+    job.begin(folder)
+    process = start_cosim(
+        *words(job, folder), folder=folder, env=environment(folder), start_new_session=True
+    )
+    time.sleep(delay)
     running = process.poll() is None
-    if running:
+    if running and way == "kill the group":
         os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
-    seen = Counter({"trials": 1, "killed": int(running)}) + job.inspect(folder, one.reference)
-    finish(start(job.words(folder), folder), what)
+    elif running and way == "Ctrl-C":
+        os.killpg(process.pid, signal.SIGINT)
+    elif running:
+        process.send_signal(signal.SIGKILL if way == "kill the parent" else signal.SIGTERM)
+    code = process.wait(60.0)
+    what = f"{job.name}, {way} after {delay:.2f} s"
+    assert eventually(lambda: not family(folder), 60.0), f"{what}: {family(folder)} still run"
+    said = process.stderr.read()
+    process.stderr.close()
+    assert "Traceback" not in said, f"{what}:\n{said}"
+    # A signal before Python has begun to handle it ends the process as the system does.
+    expected = {"SIGTERM": {143, -15}, "Ctrl-C": {130, -2}}.get(way, {-9})
+    assert code in ({0} | expected), f"{what}: exit code {code}\n{said}"
+    found = inspect(folder)
+    done = run_cosim(*words(job, folder), folder=folder, env=environment(folder))
+    assert done.returncode == 0, f"{what}, then again: {done.stderr}"
     for name in job.results:
-        same = (folder / name).read_bytes() == (one.reference / name).read_bytes()
-        assert same, f"{what}: {name} differs"
-    seen["equal to the byte afterwards"] += 1
+        assert (folder / name).read_bytes() == (reference / name).read_bytes(), f"{what}: {name}"
+    left = [path for path in folder.rglob("*") if path.name in {LOCK, HOLDER}]
+    assert not left, f"{what}, then again, left {left}"
+    return Counter({"trials": 1, "disturbed": int(running), "whole files found": found})
+
+
+def campaign(count: int, seed: int, names: tuple[str, ...] = ()) -> dict[str, Counter[str]]:
+    """Run trials in turn over the jobs and the ways; what was seen, by job."""
+    jobs = [job for job in JOBS if not names or job.name in names]
+    seen = {job.name: Counter[str]() for job in jobs}
+    draw, durations = random.Random(seed), dict[str, float]()
+    with tempfile.TemporaryDirectory(prefix="kill-") as top:
+        for number in range(count):
+            job, way = jobs[number % len(jobs)], WAYS[number // len(jobs) % len(WAYS)]
+            reference = Path(top) / job.name
+            if job.name not in durations:
+                reference.mkdir()
+                job.begin(reference)
+                began = time.monotonic()
+                done = run_cosim(*job.words.split(), folder=reference, env=environment(reference))
+                assert done.returncode == 0, done.stderr
+                durations[job.name] = time.monotonic() - began
+            delay = draw.uniform(0.05, 1.0) * durations[job.name]
+            folder = Path(top) / str(number)  # short: a socket's path has 107 bytes
+            seen[job.name] += trial(job, way, delay, folder, reference)
+            print(f"trial {number + 1}: {job.name}, {way} after {delay:.2f} s", file=sys.stderr)
+            shutil.rmtree(folder)
     return seen
 
 
-def campaign(
-    count: int, seed: int, names: tuple[str, ...] = (), seconds: float = float("inf")
-) -> dict[str, dict[str, int]]:
-    """Run trials in turn over the jobs, for a time; what was seen, by job."""
-    jobs = [job for job in JOBS if not names or job.name in names]
-    seen: dict[str, Counter[str]] = {job.name: Counter() for job in jobs}
-
-    def whole(job: Job, folder: Path) -> None:
-        finish(start(job.words(folder), folder), job.name)
-
-    for one in trials(jobs, count, seed, whole, seconds=seconds):
-        seen[one.job.name] += trial(one)
-        print(f"trial {one.number + 1}: {one.job.name}, kill at {one.delay:.2f} s", file=sys.stderr)
-    return {name: dict(counter) for name, counter in seen.items()}
-
-
 if __name__ == "__main__":
-    main(__doc__, JOBS, campaign, 60)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--trials", type=int, default=70)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", action="append", default=[], choices=[job.name for job in JOBS])
+    options = parser.parse_args()
+    print(json.dumps(campaign(options.trials, options.seed, tuple(options.only)), indent=1))

@@ -15,11 +15,10 @@ import pytest
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.factories import naive
 from controllers.qp.daqp_backend import DaqpBackend
-from cosim import FmuPlant, Scenario, evaluate, processes, simulate
-from cosim.errors import RecordingError
-from cosim.recording import read_recording
+from cosim import FmuPlant, Scenario, processes, simulate
 from tests.faults.kill import JOBS, campaign
 from tests.helpers.command import run_cosim
+from tests.helpers.drawing import skip_without_driver
 from tests.helpers.tank import build_tank, write_scenario
 from tests.helpers.training import make_run, train
 
@@ -52,10 +51,14 @@ def refused(result):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 @pytest.mark.parametrize("job", [job.name for job in JOBS])
-def test_a_kill_loses_nothing_that_was_written(job):
-    seen = campaign(1, seed=os.getpid(), names=(job,))
-    assert seen[job]["equal to the byte afterwards"] == 1
+def test_a_signal_loses_nothing_and_leaves_nothing(job):
+    try:
+        campaign(1, seed=os.getpid(), names=(job,))
+    except AssertionError as error:
+        skip_without_driver(str(error))
+        raise
 
 
 # Endurance -------------------------------------------------------------------------------------
@@ -69,17 +72,6 @@ def test_a_short_endurance_run_fails_nowhere_and_does_not_grow():
     assert seen["status"] == "finished"
     assert seen["failures"] == 0
     assert len(seen["J"]) == 10
-    assert seen["growth_mb"] < 5
-
-
-@pytest.mark.slow
-def test_many_units_of_evaluation_take_little_memory_and_one_file():
-    script = Path(__file__).with_name("endurance.py")
-    words = [sys.executable, str(script), "--units", "3000", "--jobs", "2"]
-    seen = json.loads(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
-    assert seen["status"] == "finished"
-    assert seen["files"] == 4, "units, table, timing, figure"
-    assert seen["megabytes_on_disk"] < 4
     assert seen["growth_mb"] < 5
 
 
@@ -247,17 +239,6 @@ def test_a_run_goes_on_through_solver_failures_and_counts_each(unreliable, tmp_p
         assert sum(row["status"] == "fallback" for row in csv.DictReader(stream)) == failures
 
 
-def flaky(scenario):
-    problem = Problem.from_scenario(scenario)
-    return RtiNmpc(problem, Parameters.naive(problem), backend=Unreliable)
-
-
-def test_an_evaluation_says_how_many_samples_failed(unreliable):
-    table = evaluate("paper", {"flaky": flaky}, 2, 600)
-    counted = sum(int(row["failures"]) for row in table.rows)
-    assert 0 < counted == unreliable.injected
-
-
 def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, monkeypatch):
     monkeypatch.setattr("controllers.rti.nmpc.make_backend", lambda name: unreliable())
     every = {"log_every": 1000, "evaluate_every": 2000, "checkpoint_every": 2000}
@@ -267,19 +248,3 @@ def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, mo
     # One-sample evaluations may fail too, and are not counted among the samples.
     assert unreliable.injected - 3 <= failures <= unreliable.injected
     assert failures > 5
-
-
-def test_a_recording_that_was_cut_says_how_to_repair_it(files, tmp_path):
-    path = tmp_path / "cut.rrd"
-    path.write_bytes(files["recording"].good[:-500])
-    try:
-        found = read_recording(path)
-    except RecordingError as error:
-        assert "rerun rrd optimize" in str(error)
-    else:
-        assert len(found.samples) <= 20
-
-
-def test_the_summary_of_a_run_says_how_many_failed(tmp_path):
-    result = command_line(tmp_path, "simulate", "--steps", "20", "--json", "--out", "out")
-    assert json.loads(result.stdout)["failures"] == 0

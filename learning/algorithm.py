@@ -7,7 +7,7 @@ protocol `Algorithm`, which says what else it has.
 from __future__ import annotations
 
 from importlib.metadata import entry_points
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,8 +192,12 @@ def load_algorithm(name: str) -> type[Algorithm]:
             f"{', '.join(sorted(known))}, or give module:Class"
         )
     found = load_plugin(target, f"algorithm '{name}'", AlgorithmLookupError)
-    needed = ("Configuration", "observe", "state", "restore")
+    needed = ("Configuration", "asks_for", "observe", "state", "restore")
     if missing := [part for part in needed if not hasattr(found, part)]:
         raise AlgorithmLookupError(f"algorithm '{name}' lacks {', '.join(missing)}")
+    if found.asks_for not in get_args(Privilege):
+        raise AlgorithmLookupError(
+            f"algorithm '{name}': asks_for must be operation or simulator, not {found.asks_for!r}"
+        )
     algorithm: type[Algorithm] = found
     return algorithm

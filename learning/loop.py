@@ -91,7 +91,7 @@ class TrainingLoop:
         algorithm_rng: np.random.Generator | None = None,
     ) -> None:
         scenario = plant.scenario
-        simulator = getattr(algorithm, "asks_for", "simulator") == "simulator"
+        simulator = algorithm.asks_for == "simulator"
         self._simulator = plant if simulator else None
         self._plant = plant if simulator else PlantInOperation(plant)
         self.controller, self.algorithm, self.rng = controller, algorithm, rng
@@ -313,7 +313,7 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
     rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
     loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
     first: int | None = getattr(rule, "first_episode", None)
-    if first is not None and getattr(rule, "asks_for", "simulator") != "simulator":
+    if first is not None and rule.asks_for != "simulator":
         raise PrivilegeError(
             f"{algorithm.__name__} asks for a plant in operation and states 'first_episode', which "
             "only a simulator has"

@@ -24,7 +24,7 @@ from cosim.protocols import functions_of
 from cosim.scenario import Scenario
 from cosim.statistics import shown
 from learning import checkpoint
-from learning.algorithm import Algorithm, LearnableController, load_algorithm
+from learning.algorithm import Algorithm, LearnableController, Privilege, load_algorithm
 from learning.checkpoint import Checkpoint
 from learning.configuration import Configuration
 from learning.drift import Drift
@@ -51,9 +51,9 @@ class Training:
     `parameters` are θ as the run hands it over, `rows` its log. `evaluation` is the greedy policy
     on held-out noise (`Judge.verdict`); `start` is θ where it started and `start_J` its greedy J,
     `baselines` that of `naive` and, where it is known, `optimal` on the same noise. `status` is
-    `finished` or `diverged: …`, which changes nothing of what θ is. `functions` says whether the
-    controller's were `interpreted` or `compiled`; `without_checkpoint` why there is none, if there
-    should be one.
+    `finished` or `diverged: …`, which changes nothing of what θ is; `asks_for` what the algorithm
+    asked of the plant. `functions` says whether the controller's were `interpreted` or `compiled`;
+    `without_checkpoint` why there is none, if there should be one.
     """
 
     run: TrainingRun
@@ -61,6 +61,7 @@ class Training:
     rows: list[LogRow]
     evaluation: dict[str, Any]
     status: str
+    asks_for: Privilege
     plant_samples: int
     start: Parameters
     start_J: float
@@ -108,8 +109,8 @@ class Training:
             {name: values / scale[name] for name, values in self.theta().items()},
             self.baselines,
             start=self.start_J,
-            title=f"{run.algorithm} on {run.scenario.name} from {Path(run.start).stem}, seed "
-            f"{run.seed}: {end}, J = {greedy}",
+            title=f"{run.algorithm} ({self.asks_for}) on {run.scenario.name} from "
+            f"{Path(run.start).stem}, seed {run.seed}: {end}, J = {greedy}",
         )
 
     def plot(self, path: str | Path) -> Path:
@@ -136,7 +137,7 @@ class Training:
         return {
             "version": version("rti-cosim"),
             "algorithm": run.algorithm,
-            "asks_for": getattr(load_algorithm(run.algorithm), "asks_for", "simulator"),
+            "asks_for": self.asks_for,
             "scenario": run.scenario.name,
             "scenario_hash": run.scenario.hash,
             "controller": run.controller,
@@ -241,6 +242,7 @@ def run_training(
             rows=session.rows,
             evaluation=judge.verdict(parameters.theta),
             status=status,
+            asks_for=session.loop.algorithm.asks_for,
             plant_samples=session.loop.counts.number,
             start=session.start,
             start_J=judge.start_J,

@@ -5,13 +5,16 @@ import pytest
 
 from controllers.errors import ControllerError
 from cosim import FmuPlant
-from learning import checkpoint
+from learning import QLearning, checkpoint
+from learning.checkpoint import Checkpoint
 from learning.errors import LearningError
-from learning.q_learning import QLearning
 from learning.training import _Session
 from tests.helpers.training import make_run, train
 
 RUN = make_run()
+ENTRIES = ("plant", "rows", "row_thetas", "theta")
+STATE = ("counts", "totals", "generator", "algorithm_generator", "columns")
+HARM = (lambda a: np.zeros(0), lambda a: a[:-1], lambda a: np.array(["text"]))
 
 
 @pytest.fixture(scope="module")
@@ -28,89 +31,20 @@ def resume(tmp_path_factory):
     with FmuPlant(RUN.scenario) as plant:
         session = _Session(RUN, QLearning, plant, folder)
 
-        def attempt(content):
-            checkpoint.save(folder / "checkpoint.npz", content)
+        def attempt(state, arrays):
+            checkpoint.save(folder / "checkpoint.npz", Checkpoint(session.identity, state, arrays))
             session.load()
 
         yield attempt
 
 
-ENTRIES = ("plant", "rows", "row_thetas", "theta")
-STATE = ("counts", "totals", "generator", "algorithm_generator", "columns")
-HARM = {
-    "none": lambda a: np.zeros(0),
-    "one row too many": lambda a: np.concatenate([a, a[:1]]),
-    "one row too few": lambda a: a[:-1],
-    "text": lambda a: np.array(["text"]),
-    "another order of dimensions": lambda a: np.asarray(a)[..., None],
-}
-WORDS = {
-    "nothing": None,
-    "a text": "text",
-    "a number": 1e400,
-    "a list": [1, [2]],
-    "a table": {"a": {}},
-    "an empty table": {},
-}
-
-
-def test_the_good_one_is_taken_up(resume, good):
-    resume(good)
-
-
-def refused(resume, content):
-    with pytest.raises((LearningError, ControllerError)) as caught:
-        resume(content)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("entry", ENTRIES)
-def test_a_missing_entry_is_refused(resume, good, entry):
-    arrays = {name: array for name, array in good.arrays.items() if name != entry}
-    refused(resume, checkpoint.Checkpoint(good.run, good.state, arrays))
-
-
-@pytest.mark.parametrize("entry", ENTRIES)
-@pytest.mark.parametrize("harm", HARM)
-def test_an_entry_of_another_form_is_refused(resume, good, entry, harm):
-    arrays = dict(good.arrays) | {entry: HARM[harm](good.arrays[entry])}
-    if entry == "plant" and harm == "another order of dimensions":
-        pytest.skip("bytes have no dimensions")
-    refused(resume, checkpoint.Checkpoint(good.run, good.state, arrays))
-
-
-@pytest.mark.parametrize("key", STATE)
-@pytest.mark.parametrize("word", WORDS)
-def test_a_state_of_another_form_is_refused(resume, good, key, word):
-    if key == "totals" and word == "an empty table":
-        pytest.skip("totals of no sample")
-    state = dict(good.state) | {key: WORDS[word]}
-    refused(resume, checkpoint.Checkpoint(good.run, state, good.arrays))
-
-
-@pytest.mark.parametrize("key", STATE)
-def test_a_missing_state_is_refused(resume, good, key):
-    state = {name: value for name, value in good.state.items() if name != key}
-    refused(resume, checkpoint.Checkpoint(good.run, state, good.arrays))
-
-
-@pytest.mark.parametrize("key", ["run", "state"])
-@pytest.mark.parametrize("word", WORDS)
-def test_an_account_of_another_form_is_refused(resume, good, key, word):
-    if key == "state" and isinstance(WORDS[word], dict):
-        pytest.skip("a state that lacks its parts: above")
-    content = {"run": good.run, "state": good.state} | {key: WORDS[word]}
-    refused(resume, checkpoint.Checkpoint(arrays=good.arrays, **content))
-
-
-ACCOUNTS = [b"", b"{", b"[]", b"null", b"\xff", b"1", b"[" * 9999, b'{"a":1}']
-
-
-@pytest.mark.parametrize("account", ACCOUNTS)
-def test_an_account_that_is_none_is_refused(good, tmp_path, account):
-    entries = dict(good.arrays) | {"about": np.frombuffer(account, dtype=np.uint8)}
-    entries["digest"] = np.frombuffer(checkpoint._digest(entries), dtype=np.uint8)
-    np.savez(tmp_path / "checkpoint.npz", allow_pickle=False, **entries)
-    with pytest.raises(LearningError) as caught:
-        checkpoint.load(tmp_path / "checkpoint.npz")
-    assert "\n" not in str(caught.value)
+def test_the_good_one_is_taken_up_and_others_are_refused_in_a_line(resume, good):
+    resume(good.state, good.arrays)
+    missing = [(good.state, {k: v for k, v in good.arrays.items() if k != e}) for e in ENTRIES]
+    missing += [({k: v for k, v in good.state.items() if k != key}, good.arrays) for key in STATE]
+    wrong = [(good.state, good.arrays | {e: h(good.arrays[e])}) for e in ENTRIES for h in HARM]
+    wrong += [(good.state | {key: word}, good.arrays) for key in STATE for word in (None, "text")]
+    for state, arrays in (*missing, *wrong):
+        with pytest.raises((LearningError, ControllerError)) as caught:
+            resume(state, arrays)
+        assert "\n" not in str(caught.value)

@@ -54,8 +54,8 @@ def model_description(version: FmiVersion, token: str, model: Model) -> str:
     ElementTree.SubElement(root, "DefaultExperiment", experiment)
     variables = ElementTree.SubElement(root, "ModelVariables")
     for variable in model.exported(version):
-        (_variable2 if version == 2 else _variable3)(variables, variable, model)
-    add_structure(root, version, model)
+        _variable(variables, version, variable, model)
+    _structure(root, version, model)
     return to_text(root)
 
 
@@ -195,53 +195,41 @@ def _real_attributes(variable: Variable) -> dict[str, str]:
     return attributes
 
 
-def _boolean(variable: Variable) -> dict[str, str]:
-    return {"start": "true" if variable.start else "false"}
-
-
 def _state_of(variable: Variable) -> str:
     return variable.name.removeprefix("der(").removesuffix(")")
 
 
-def _variable2(parent: ElementTree.Element, variable: Variable, model: Model) -> None:
-    scalar = ElementTree.SubElement(parent, "ScalarVariable", _common_attributes(variable, model))
+def _variable(
+    parent: ElementTree.Element, version: FmiVersion, variable: Variable, model: Model
+) -> None:
+    tag, attributes = _value(version, variable, model)
+    common = _common_attributes(variable, model)
+    if version == 2:
+        parent = ElementTree.SubElement(parent, "ScalarVariable", common)
+    else:
+        attributes = common | attributes
+    ElementTree.SubElement(parent, tag, attributes)
+
+
+def _value(version: FmiVersion, variable: Variable, model: Model) -> tuple[str, dict[str, str]]:
+    """The element of a variable's type and its attributes."""
     if variable.type is Type.BOOLEAN:
-        ElementTree.SubElement(scalar, "Boolean", _boolean(variable))
-    elif variable.type is Type.LAW:
-        ElementTree.SubElement(
-            scalar, "Enumeration", declaredType="Law", min="1", max="2", start="1"
+        return "Boolean", {"start": "true" if variable.start else "false"}
+    if variable.type is Type.LAW:
+        return "Enumeration", {"declaredType": "Law", "min": "1", "max": "2", "start": "1"}
+    if variable.type is Type.LAW_NUMBER:
+        return "Integer", {"min": "0", "max": "2", "start": "0"}
+    if variable.type in (Type.SEED, Type.SEED_HIGH):
+        if version == 3:
+            return "UInt64", {"min": "0", "max": str(2**64 - 1), "start": "0"}
+        return "Integer", {"min": _INT32[0], "max": _INT32[1], "start": "0"}
+    attributes = _real_attributes(variable)
+    if variable.kind is Kind.DERIVATIVE:
+        state = _state_of(variable)
+        attributes["derivative"] = str(
+            index(state, model) if version == 2 else model.value_reference(state)
         )
-    elif variable.type in (Type.SEED, Type.SEED_HIGH):
-        ElementTree.SubElement(scalar, "Integer", min=_INT32[0], max=_INT32[1], start="0")
-    elif variable.type is Type.LAW_NUMBER:
-        ElementTree.SubElement(scalar, "Integer", min="0", max="2", start="0")
-    else:
-        attributes = _real_attributes(variable)
-        if variable.kind is Kind.DERIVATIVE:
-            attributes["derivative"] = str(index(_state_of(variable), model))
-        ElementTree.SubElement(scalar, "Real", attributes)
-
-
-def _variable3(parent: ElementTree.Element, variable: Variable, model: Model) -> None:
-    attributes = _common_attributes(variable, model)
-    if variable.type is Type.BOOLEAN:
-        ElementTree.SubElement(parent, "Boolean", attributes | _boolean(variable))
-    elif variable.type is Type.LAW:
-        law = {"declaredType": "Law", "min": "1", "max": "2", "start": "1"}
-        ElementTree.SubElement(parent, "Enumeration", attributes | law)
-    elif variable.type is Type.SEED:
-        seed = {"min": "0", "max": str(2**64 - 1), "start": "0"}
-        ElementTree.SubElement(parent, "UInt64", attributes | seed)
-    else:
-        attributes |= _real_attributes(variable)
-        if variable.kind is Kind.DERIVATIVE:
-            attributes["derivative"] = str(model.value_reference(_state_of(variable)))
-        ElementTree.SubElement(parent, "Float64", attributes)
-
-
-def add_structure(root: ElementTree.Element, version: FmiVersion, model: Model) -> None:
-    """Append ModelStructure to the model description `root`."""
-    (_structure2 if version == 2 else _structure3)(root, model)
+    return "Real" if version == 2 else "Float64", attributes
 
 
 def index(name: str, model: Model) -> int:
@@ -250,54 +238,46 @@ def index(name: str, model: Model) -> int:
 
 
 _UNKNOWNS = (
-    ("Output", "Outputs", (Kind.STATE, Kind.OUTPUT), False),
-    ("ContinuousStateDerivative", "Derivatives", (Kind.DERIVATIVE,), False),
-    ("InitialUnknown", "InitialUnknowns", (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT), True),
+    ("Output", (Kind.STATE, Kind.OUTPUT), continuous_dependencies),
+    ("ContinuousStateDerivative", (Kind.DERIVATIVE,), continuous_dependencies),
+    ("InitialUnknown", (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT), initial_dependencies),
 )
+_GROUPS = {
+    "Output": "Outputs",
+    "ContinuousStateDerivative": "Derivatives",
+    "InitialUnknown": "InitialUnknowns",
+}
+"""FMI 2.0's elements around the unknowns."""
 
 
-def _dependencies(name: str, initial: bool, model: Model) -> tuple[str, ...]:
-    return (initial_dependencies if initial else continuous_dependencies)(name, model)
-
-
-def _kinds_text(name: str, dependencies: Iterable[str], model: Model) -> str:
-    """The states depend on themselves or on their start with constant factor 1."""
-    is_state = model.by_name[name].kind is Kind.STATE
-    return " ".join("constant" if is_state else "dependent" for _ in dependencies)
-
-
-def _structure2(root: ElementTree.Element, model: Model) -> None:
+def _structure(root: ElementTree.Element, version: FmiVersion, model: Model) -> None:
+    """Append ModelStructure: the unknowns and what they depend on."""
     structure = ElementTree.SubElement(root, "ModelStructure")
-    for _, tag, kinds, initial in _UNKNOWNS:
-        unknowns = model.names(*kinds)
-        if not unknowns:
+    shown = {v.name for v in model.exported(version)}
+    for tag, kinds, dependencies in _UNKNOWNS:
+        if not (unknowns := model.names(*kinds)):
             continue
-        group = ElementTree.SubElement(structure, tag)
+        parent = structure
+        if version == 2:
+            parent = ElementTree.SubElement(structure, _GROUPS[tag])
         for name in unknowns:
-            names = _dependencies(name, initial, model)
+            names = [n for n in dependencies(name, model) if n in shown]
+            # The states depend on themselves or on their start with constant factor 1.
+            kind = "constant" if model.by_name[name].kind is Kind.STATE else "dependent"
+            number = index if version == 2 else _reference
             ElementTree.SubElement(
-                group,
-                "Unknown",
-                index=str(index(name, model)),
-                dependencies=" ".join(str(index(n, model)) for n in names),
-                dependenciesKind=_kinds_text(name, names, model),
+                parent,
+                "Unknown" if version == 2 else tag,
+                {
+                    "index" if version == 2 else "valueReference": str(number(name, model)),
+                    "dependencies": " ".join(str(number(n, model)) for n in names),
+                    "dependenciesKind": " ".join([kind] * len(names)),
+                },
             )
 
 
-def _structure3(root: ElementTree.Element, model: Model) -> None:
-    structure = ElementTree.SubElement(root, "ModelStructure")
-    shown = {v.name for v in model.exported(3)}
-    for tag, _, kinds, initial in _UNKNOWNS:
-        for name in model.names(*kinds):
-            names = _dependencies(name, initial, model)
-            names = tuple(n for n in names if n in shown)
-            ElementTree.SubElement(
-                structure,
-                tag,
-                valueReference=str(model.value_reference(name)),
-                dependencies=" ".join(str(model.value_reference(n)) for n in names),
-                dependenciesKind=_kinds_text(name, names, model),
-            )
+def _reference(name: str, model: Model) -> int:
+    return model.value_reference(name)
 
 
 _TYPES = {

@@ -8,7 +8,6 @@ from cosim.figures import (
     Costs,
     evaluation_figure,
     overlay_figure,
-    parameters_figure,
     save,
     trajectory_figure,
 )
@@ -87,26 +86,6 @@ def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
         run = simulate(plant, Proportional(paper), 1, 0)
     assert save(trajectory_figure(run, paper), tmp_path / "a.png").stat().st_size > 10_000
     assert save(overlay_figure({"one": run}), tmp_path / "b.png").stat().st_size > 10_000
-
-
-def figures(rng):
-    increments = {"B_l": rng.random((51, 10)), "c_lambda": rng.random((51, 1))}
-    cost = {name: Costs(*rng.random((3, 9))) for name in ("naive", "$mine", "tuned")}
-    return {
-        "parameters": lambda: parameters_figure(
-            np.arange(51.0), increments | {"x_u": np.zeros((51, 2))}, rng.random(51)
-        ),
-        "evaluation": lambda: evaluation_figure(cost, title="$t"),
-    }
-
-
-@pytest.mark.parametrize("name", ["parameters", "evaluation"])
-def test_every_figure_repeats_its_bytes(name, tmp_path):
-    one, two = (
-        save(figures(np.random.default_rng(1))[name](), tmp_path / f"{i}.svg").read_bytes()
-        for i in range(2)
-    )
-    assert one == two
 
 
 def test_the_front_is_what_no_other_point_beats(rng):

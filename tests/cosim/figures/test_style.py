@@ -36,11 +36,6 @@ def test_another_format_is_refused(tmp_path):
         save(drawing(), tmp_path / "a.pdf")
 
 
-def test_an_unwritable_folder_is_named(tmp_path):
-    with pytest.raises(FigureError, match=r"cannot write .*no/a\.png"):
-        save(drawing(), tmp_path / "no" / "a.png")
-
-
 def test_names_become_mathematics_with_units():
     assert label("X2", "%") == "$X_{2}$ [%]"
     assert label("T200", "degC") == "$T_{200}$ [°C]"

@@ -35,11 +35,6 @@ def test_costs_are_shown_as_regret_where_the_optimum_is_known():
     assert {text.get_text() for text in axes.texts} == {"training", "greedy", "naive", "optimal"}
 
 
-def test_costs_are_shown_as_they_are_where_it_is_not():
-    axes = panels(training_figure(LOG, THETA, {"naive": 200.0}, title="t"))["J per sample"]
-    assert np.array_equal(axes.lines[0].get_ydata(), LOG["J"])
-
-
 def test_the_four_blocks_that_moved_most_are_named():
     axes = panels(training_figure(LOG, THETA, BASELINES, title="t"))["change of θ, by its scale"]
     assert [text.get_text() for text in axes.texts] == [
@@ -57,8 +52,3 @@ def test_what_was_not_measured_has_no_panel(tmp_path):
     figure = training_figure(log, still, {}, title="$t")
     assert list(panels(figure)) == ["J per sample"]
     assert save(figure, tmp_path / "a.png").stat().st_size > 5000
-
-
-def test_a_single_td_error_is_no_course():
-    log = LOG | {"td_error": np.array([9.0, np.nan, np.nan, np.nan])}
-    assert "TD error (r.m.s.)" not in panels(training_figure(log, THETA, BASELINES, title="t"))

@@ -72,7 +72,7 @@ def document(plan: Plan) -> dict[str, Any]:
             }
             for case in cases
         ],
-        "file": Path(definition.file).name if getattr(definition, "file", None) else None,
+        "file": Path(getattr(definition, "file", None) or "").name or None,
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.naive),
         "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},

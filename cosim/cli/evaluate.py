@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,6 +35,9 @@ def evaluate(
     seeds: Annotated[int, count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
     first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
     steps: StepsOption = 1000,
+    burn_in: Annotated[
+        int, count("--burn-in", least=0, text="Samples run before those that count.")
+    ] = 0,
     out: OutOption = Path("cosim-evaluation"),
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
@@ -47,38 +49,39 @@ def evaluate(
     and scenario.toml. Run again with the same --out to go on after an interruption.
     """
     with output(json) as out_:
+        from joblib import cpu_count
+
         from cosim.cli.compose import announce
         from cosim.evaluation import evaluate as run
-        from cosim.evaluation.parallel import cores
         from cosim.files import write_atomically
-        from cosim.kpis import comes_to_rest
-        from cosim.lookup import build_controller
         from cosim.scenario import Scenario
-        from learning.evaluation import stored_optimum
 
-        task = Scenario.load(scenario)
-        named = named_controllers(controllers)
-        options = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
+        task, named = Scenario.load(scenario), named_controllers(controllers)
+        options: dict[str, Any] = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
         options |= {"first-seed": first_seed} if first_seed else {}
+        options |= {"steps": steps} | ({"burn-in": burn_in} if burn_in else {})
+        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
         folder = open_folder(out).absolute()
         announce(task, out_)
-        yardstick = stored_optimum(task)
-        optimum = None if yardstick is None else partial(build_controller, yardstick)
-        extra = seeds if yardstick is not None and yardstick not in named else 0
-        units = len(named) * (seeds + comes_to_rest(task)) + extra
-        label = f"{', '.join(named)} on {task.name}"
-        with resumable(again), out_.progress(label, units) as progress:
+        total = (len(named) + ("optimal" not in named)) * seeds * (burn_in + steps)
+        with resumable(again), out_.progress(f"samples on {task.name}", total) as progress:
+
+            def report(samples: int, line: str) -> None:
+                progress(samples)
+                if line:
+                    out_.note(line)
+
             evaluation = run(
                 task,
-                {name: partial(build_controller, spec) for name, spec in named.items()},
+                named,
                 range(first_seed, first_seed + seeds),
                 steps,
-                optimum=optimum,
+                burn_in=burn_in,
                 folder=folder,
-                jobs=jobs or cores(),
+                jobs=jobs or cpu_count(),
                 scheduler=scheduler,
-                progress=progress,
-                command=_command(options | {"steps": steps}),
+                progress=report,
+                command=shlex.join(["cosim", "evaluate", *words]),
             )
         summary = evaluation.summary()
         evaluation.write(folder)
@@ -97,6 +100,8 @@ def named_controllers(text: str) -> dict[str, str]:
     for item in filter(None, (part.strip() for part in text.split(","))):
         name, equals, spec = item.partition("=")
         name, spec = (name.strip(), spec.strip()) if equals else (item, item)
+        if name.endswith(".toml"):
+            name = Path(name).stem
         if not name or not spec:
             raise EvaluationError(f"--controllers: '{item}' is not NAME=CONTROLLER")
         if name in named:
@@ -107,106 +112,65 @@ def named_controllers(text: str) -> dict[str, str]:
     return named
 
 
-def _command(options: dict[str, Any]) -> str:
-    """The command without what has no bearing on the table: --out, --jobs, --scheduler."""
-    words = ["cosim", "evaluate"]
-    for name, value in options.items():
-        words += [f"--{name}", str(value)]
-    return shlex.join(words)
-
-
 def show(summary: dict[str, Any], output: Output) -> None:
     """Print the table of controllers and the paired comparisons."""
     from cosim.statistics import shown
 
-    title = "{scenario}, {steps} samples × {count} seeds".format(
-        **summary, count=len(summary["seeds"])
-    )
-    controllers = summary["controllers"].items()
-    output.table(
-        title,
-        (
-            "controller",
-            "economic cost",
-            "violation",
-            "violating %",
-            "J",
-            "regret %",
-            "gap closed %",
-        ),
-        [
+    seeds, burn_in = len(summary["seeds"]), summary.get("burn_in", 0)
+    after = f" after {burn_in}" if burn_in else ""
+    settles = any(isfinite(row["settling_time"]) for row in summary["controllers"].values())
+    known = summary["optimum"] is not None
+    rows = []
+    for name, row in summary["controllers"].items():
+        timing, settled = summary["timing"][name], row["settling_time"]
+        rows.append(
             (
                 name,
-                shown(row["economic_cost"], digits=6),
-                f"{row['mean_violation']:.5f}",
-                f"{100 * row['violating_share']:.2f}",
                 shown(row["J"], digits=6),
-                percent(row["regret"]) if "regret" in row else "",
-                percent(row["gap_closed"], digits=4) if "gap_closed" in row else "",
+                *([_interval(row["regret"], 100.0)] if known else []),
+                shown(row["economic_cost"], digits=6),
+                f"{100 * row['violating_share']:.2f}",
+                *([f"{settled:.0f}" if isfinite(settled) else "–"] if settles else []),
+                str(row["failures"]),
+                f"{timing['prepare_median_us'] + timing['feedback_median_us']:.0f}",
             )
-            for name, row in controllers
-        ],
+        )
+    header = (
+        "controller",
+        "J",
+        *(["regret %"] if known else []),
+        "economic cost",
+        "violating %",
+        *(["settling s"] if settles else []),
+        "failures",
+        "step µs",
     )
-    if summary["optimum"] is not None:
+    title = f"{summary['scenario']}, {summary['steps']} samples{after} × {seeds} seeds"
+    output.table(title, header, rows)
+    if known:
         output.note(
-            f"regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "
+            "regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "
             f"{shown(summary['optimal_J'], digits=6)}"
         )
-    settling = {name: row["settling_time"] for name, row in controllers}
-    settles = any(map(isfinite, settling.values()))
-    output.table(
-        "behaviour",
-        (
-            "controller",
-            "input effort",
-            *(["settling time s"] if settles else []),
-            "failures",
-            "median step µs",
-        ),
-        [
-            (
-                name,
-                f"{row['input_effort']:.4f}",
-                *([_seconds(settling[name])] if settles else []),
-                str(row["failures"]),
-                f"{_step_time(summary['timing'][name]):.1f}",
-            )
-            for name, row in controllers
-        ],
-    )
-    if not summary["comparisons"]:
-        return
-    output.table(
-        "paired comparisons (95 % t interval over seeds)",
-        ("controller against reference", "ΔJ", "gain in J %"),
-        [
-            (
-                f"{row['controller']} − {row['reference']}",
-                interval(row["differences"]["J"]),
-                percent(row["gain_in_J"]),
-            )
-            for row in summary["comparisons"]
-        ],
-    )
+    if summary["comparisons"]:
+        output.table(
+            "paired comparisons (95 % t interval over seeds)",
+            ("controller against reference", "ΔJ", "gain in J %"),
+            [
+                (
+                    f"{row['controller']} − {row['reference']}",
+                    _interval(row["differences"]["J"]),
+                    _interval(row["gain_in_J"], 100.0),
+                )
+                for row in summary["comparisons"]
+            ],
+        )
 
 
-def _seconds(time: float) -> str:
-    return f"{time:.0f}" if isfinite(time) else "not settled"
-
-
-def _step_time(timing: dict[str, Any]) -> float:
-    return float(timing["prepare_median_us"] + timing["feedback_median_us"])
-
-
-def interval(estimate: dict[str, Any], scale: float = 1.0, digits: int = 3) -> str:
+def _interval(estimate: dict[str, Any], scale: float = 1.0) -> str:
     """An estimate of a summary with its t interval; nothing where it is undefined."""
     from cosim.statistics import shown
 
     if not isfinite(estimate["value"]):
         return ""
-    return shown(estimate["value"], estimate["t"], scale, digits)
-
-
-def percent(estimate: dict[str, Any], digits: int = 3) -> str:
-    """An estimate in per cent."""
-    return interval(estimate, 100.0, digits)
+    return shown(estimate["value"], estimate["t"], scale, 3)

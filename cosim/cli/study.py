@@ -12,7 +12,7 @@ from cosim.cli.output import Output, again, dump, open_folder, output, resumable
 
 if TYPE_CHECKING:
     from cosim.study.results import StudyResults
-    from cosim.study.runner import State
+    from cosim.study.run import State
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 
@@ -61,15 +61,17 @@ def execute(
     figures: bool = True,
 ) -> StudyResults:
     """Run a study with a progress bar; exits with code 1 where runs failed."""
+    from joblib import cpu_count
+
     from cosim.errors import FailedRunsError
-    from cosim.evaluation.parallel import cores
-    from cosim.study.engine import Study
+    from cosim.study.plan import Study, plan
+    from cosim.study.run import run_study
 
     study = Study.load(file)
     folder = open_folder(out)
     for scenario in study.scenarios.values():
         _announce(scenario, out_)
-    planned = study.plan()
+    planned = plan(study)
     label, total = f"{study.name}, thousands of samples", _thousands(planned.samples)
     with resumable(again), out_.progress(label, total) as bar:
 
@@ -81,9 +83,10 @@ def execute(
                 out_.note(f"{runs}  {line}")
 
         try:
-            return study.run(
+            return run_study(
+                study,
                 folder,
-                jobs=jobs or cores(),
+                jobs=jobs or cpu_count(),
                 scheduler=scheduler,
                 report=report,
                 planned=planned,
@@ -95,14 +98,14 @@ def execute(
     raise typer.Exit(1)
 
 
-@app.command()
-def plan(file: FileArgument, json: JsonOption = False) -> None:
+@app.command("plan")
+def show_plan(file: FileArgument, json: JsonOption = False) -> None:
     """Show what a study will do, and about how long: nothing is trained or written."""
     with output(json) as out_:
-        from cosim.study.engine import Study
         from cosim.study.estimate import estimate
+        from cosim.study.plan import Study, plan
 
-        planned = Study.load(file).plan()
+        planned = plan(Study.load(file))
         rows, seconds = estimate(planned)
         out_.table(
             f"{planned.definition.name}: {len(planned.runs)} runs, {planned.samples} plant samples",

@@ -15,8 +15,8 @@ from cosim.files import read_toml
 from cosim.study.document import Table
 from cosim.study.keyed import KeyedTable, read
 from cosim.study.pictures import LOGS, TRAJECTORIES
+from cosim.study.plan import EVALUATION
 from cosim.study.results import CURVES
-from cosim.study.store import EVALUATION
 from cosim.validation import describe
 
 TOLERANCES = "tolerances.toml"

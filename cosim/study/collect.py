@@ -12,8 +12,9 @@ import pandas as pd
 from cosim.errors import StudyError
 from cosim.files import read_json
 from cosim.study import online, theta
+from cosim.study.plan import EVALUATION, GREEDY
 from cosim.study.report import commit
-from cosim.study.store import EVALUATION, GREEDY, INDICATORS, LOG, RUN
+from cosim.study.store import INDICATORS, LOG, RUN
 from cosim.study.tables import CURVE, KEYS, STATE, read_table
 
 if TYPE_CHECKING:

@@ -5,7 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from cosim.errors import StudyError
 from cosim.files import read_toml
@@ -13,7 +20,15 @@ from cosim.validation import describe
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]
-Name = Annotated[str, Field(min_length=1, pattern=r"^[\w.+-]+$")]
+
+
+def _not_dots(name: str) -> str:
+    if not name.strip("."):
+        raise ValueError(f"'{name}' names a folder of its own; choose another name")
+    return name
+
+
+Name = Annotated[str, Field(min_length=1, pattern=r"^[\w.+-]+$"), AfterValidator(_not_dots)]
 Source = Annotated[str, Field(min_length=1)]
 PerScenario = Count | dict[str, Count]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""
@@ -47,6 +62,8 @@ class EvaluationTable(Table):
     """Number of noise seeds."""
     steps: PerScenario = 1000
     """Samples on each."""
+    burn_in: Annotated[int, Field(ge=0, le=100_000_000)] = 0
+    """Samples run before those that count: with 0 the run starts at the plant's initial state."""
 
 
 class CurvesTable(Table):
@@ -125,6 +142,9 @@ class CaseTable(Table):
     """Which panel of the figures shows it; the algorithm's name, if left out."""
     title: str = ""
     """A few words for readers."""
+    against: Source | None = None
+    """Name of the case that this one's paired difference is taken from; in a grid, that of the
+    same point where there is one."""
 
     @model_validator(mode="after")
     def _is_one_of_two(self) -> Self:

@@ -6,9 +6,11 @@ import time
 from dataclasses import dataclass, replace
 
 from cosim.errors import StudyError
-from cosim.study.plan import Plan, Run
-from cosim.study.protocols import Training
-from cosim.study.units import simulated
+from cosim.kpis import measure
+from cosim.lookup import build_controller
+from cosim.plant import FmuPlant
+from cosim.study.plan import Plan, Run, Training
+from learning.training import run_training
 
 TRIED, SIMULATED = (500, 1500), 200
 """Samples of two trainings, and of a closed loop, that are timed."""
@@ -38,7 +40,7 @@ def estimate(plan: Plan) -> tuple[list[Cost], float]:
         trained = 0 if first.training is None else first.training.samples
         if case not in rates:
             try:
-                rates[case] = _seconds_per_sample(plan, first)
+                rates[case] = _seconds_per_sample(first)
             except Exception as error:  # anything, from a user's algorithm
                 raise StudyError(f"case '{case}': {type(error).__name__}: {error}") from error
         simulation = "" if first.training is not None else case
@@ -46,8 +48,11 @@ def estimate(plan: Plan) -> tuple[list[Cost], float]:
             rates[simulation] = _seconds_per_step(plan, first)
         evaluated = first.samples - trained
         if first.training is not None:
-            greedy = first.training.evaluation_seeds * first.training.evaluation_steps
-            evaluated += greedy * (trained // first.training.evaluate_every + 1)
+            greedy = (
+                first.training.options["evaluation_seeds"]
+                * first.training.options["evaluation_steps"]
+            )
+            evaluated += greedy * (trained // first.training.options["evaluate_every"] + 1)
         seconds = len(runs) * (trained * rates[case] + evaluated * rates[simulation])
         costs.append(
             Cost(scenario, case, len(runs), len(runs) * trained, len(runs) * evaluated, seconds)
@@ -55,34 +60,30 @@ def estimate(plan: Plan) -> tuple[list[Cost], float]:
     return costs, sum(cost.seconds for cost in costs)
 
 
-def _seconds_per_sample(plan: Plan, run: Run) -> float:
+def _seconds_per_sample(run: Run) -> float:
     """From the difference of two short trainings, so that building and evaluating do not count."""
     if run.training is None:
         return 0.0
-    spent = {samples: _seconds(plan, run.training, samples) for samples in TRIED}
+    spent = {samples: _seconds(run.training, samples) for samples in TRIED}
     short, long = TRIED
     return max(spent[long] - spent[short], 0.0) / (long - short)
 
 
-def _seconds(plan: Plan, training: Training, samples: int) -> float:
-    short = replace(
-        training,
-        samples=samples,
-        log_every=samples,
-        evaluate_every=samples,
-        checkpoint_every=samples,
-        options={},
-    )
+def _seconds(training: Training, samples: int) -> float:
+    every = dict.fromkeys(("log_every", "evaluate_every", "checkpoint_every"), samples)
+    own = {name: training.options[name] for name in ("seed", "start", "controller")}
+    short = replace(training, samples=samples, options=own | every)
     begin = time.process_time()
-    plan.definition.trainer.advance(short, b"", 1e9)
+    run_training(short.prepare())
     return time.process_time() - begin
 
 
 def _seconds_per_step(plan: Plan, run: Run) -> float:
     scenario = plan.definition.scenarios[run.key.scenario]
-    controller = plan.definition.trainer.controller(run.case.controller or "naive", scenario)
+    controller = build_controller(run.case.controller or "naive", scenario)
     begin = time.process_time()
-    simulated(scenario, controller, SIMULATED, 0)
+    with FmuPlant(scenario) as plant:
+        measure(plant, controller, 0, SIMULATED)
     return (time.process_time() - begin) / SIMULATED
 
 

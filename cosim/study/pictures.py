@@ -17,12 +17,13 @@ from cosim.figures import overlay_figure, parameters_figure, save, trajectory_fi
 from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, plain
 from cosim.files import write_atomically
 from cosim.penalty import VIOLATING
+from cosim.plugins import build_controller
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.statistics import TD_WINDOW, td_error_mean
 from cosim.study.document import TrajectoryTable
-from cosim.study.plan import Plan, Run
-from cosim.study.store import LOG, PARAMETERS, safe
+from cosim.study.plan import Plan, Run, safe
+from cosim.study.store import LOG, PARAMETERS
 from cosim.study.tables import read_table
 from cosim.trajectory import Trajectory, read_csv
 
@@ -245,11 +246,11 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
 
 
 def _policy(plan: Plan, run: Run, out: Path) -> Policy:
-    trainer, scenario = plan.definition.trainer, plan.definition.scenarios[run.key.scenario]
+    scenario = plan.definition.scenarios[run.key.scenario]
     controller: Controller = (
-        trainer.controller(run.case.controller or "", scenario)
+        build_controller(run.case.controller or "", scenario)
         if run.training is None
-        else trainer.policy(run.training, (out / run.key.folder / PARAMETERS).read_text("utf-8"))
+        else run.training.controller((out / run.key.folder / PARAMETERS).read_text("utf-8"))
     )
 
     def act(s: Array) -> Array:

@@ -1,41 +1,181 @@
-"""What a study has to do: its runs, the facts that each depends on, and the order of work."""
+"""`Study`: what is compared with what. `plan`: its runs, and the facts that each depends on."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any, Self, get_args, get_origin
 
+from controllers.parameters import Parameters
+from controllers.problem import Problem
 from cosim.errors import StudyError
-from cosim.evaluation.provenance import code_hash, versions
+from cosim.files import temporary_folder
 from cosim.plant import FmuPlant
-from cosim.plugins import OURS
-from cosim.study.cases import Case
-from cosim.study.definition import HELD_OUT, Definition, Sizes
-from cosim.study.document import TrajectoryTable
-from cosim.study.protocols import Training
-from cosim.study.store import EVALUATION, GREEDY, Online, RunKey
+from cosim.plugins import OURS, code_hash, depends_on, import_from, versions
+from cosim.plugins import build_controller as build_named
+from cosim.protocols import Controller
+from cosim.scenario import Scenario, resolved
+from cosim.study.document import (
+    DEFAULT,
+    CaseTable,
+    PerScenario,
+    StudyTable,
+    TrajectoryTable,
+    read,
+    validate,
+)
 from cosim.validation import suggestion
+from learning.algorithm import load_algorithm
+from learning.errors import ConfigurationError
+from learning.evaluation import stored_optimum
+from learning.training_run import TrainingRun, build_controller, prepare
 
-BLOCK = 20_000
-"""Samples of an evaluation unit, about: a few seconds of work."""
+BASELINES, NAIVE = "baselines", "naive"
+EVALUATION, GREEDY = "evaluation.csv", "greedy.csv"
+RUNS = "runs"
+HELD_OUT = 1_000_000
+"""First of the held-out seeds of greedy evaluations during training."""
+ROW, CHECKPOINT = 500, 5000
+"""Most samples between two rows of a log, and about those between two checkpoints."""
+SEQUENCES = (list, tuple, set, frozenset)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One point of a grid: a controller, or an algorithm with one set of settings.
+
+    `scenarios` are names; `training_seeds` is empty for a controller. `group` is the panel of the
+    figures that shows it; `against` the case that its paired difference is taken from.
+    """
+
+    name: str
+    scenarios: tuple[str, ...]
+    group: str
+    controller: str | None = None
+    algorithm: str | None = None
+    samples: int = 0
+    start: str = ""
+    nmpc: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+    training_seeds: tuple[int, ...] = ()
+    against: str | None = None
+
+    @property
+    def target(self) -> str:
+        """The algorithm or the controller."""
+        return self.algorithm or self.controller or ""
+
+
+@dataclass(frozen=True)
+class Training:
+    """Arguments of `learning`'s `prepare`: equal ones give equal θ on any worker."""
+
+    algorithm: str
+    scenario: Scenario
+    samples: int
+    settings: Mapping[str, Any]
+    options: Mapping[str, Any]
+
+    def prepare(self) -> TrainingRun:
+        """The training run, checked; raises LearningError in one line."""
+        return prepare(
+            self.algorithm, self.scenario, self.samples, self.settings, dict(self.options)
+        )
+
+    def controller(self, parameters: str) -> Controller:
+        """The greedy controller of the θ that a TOML text holds."""
+        problem = Problem.from_scenario(self.scenario)
+        with temporary_folder("cosim-theta-") as folder:
+            path = folder / "parameters.toml"
+            path.write_text(parameters, "utf-8")
+            theta = Parameters.load(path, problem)
+        return build_controller(self.options["controller"], self.scenario, theta)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Noise of a scenario: `steps` samples on each of the `seeds` after `burn_in`; `curve_seeds`
+    held-out runs of `curve_steps` samples for a learning curve."""
+
+    seeds: tuple[int, ...]
+    steps: int
+    burn_in: int
+    curve_seeds: int
+    curve_steps: int
+
+
+@dataclass(frozen=True)
+class Online:
+    """Noise of the trainings that a controller runs beside, for the longest one's `steps`; its
+    cost is kept as means over `block` samples."""
+
+    seeds: tuple[int, ...]
+    steps: int
+    block: int
+
+
+def safe(name: str) -> str:
+    """A folder's name on any system."""
+    return re.sub(r"[^\w.+=()\[\]-]", "_", name)
+
+
+@dataclass(frozen=True)
+class RunKey:
+    """A run: scenario, case, and training seed (None for a controller).
+
+    Raises StudyError where a name is made of dots, or has a separator of folders.
+    """
+
+    scenario: str
+    case: str
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse names that lead out of the study's folder."""
+        for name in (self.scenario, self.case):
+            if not name.strip(". ") or "/" in name or "\\" in name:
+                raise StudyError(
+                    f"'{name}' cannot name a scenario, case or controller: it would name a folder "
+                    "elsewhere; give it another name"
+                )
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are, relative to the study's folder."""
+        parts = [safe(self.scenario), safe(self.case)]
+        return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
+
+    def __str__(self) -> str:
+        """As messages name it."""
+        seed = "" if self.seed is None else f", seed {self.seed}"
+        return f"{self.case} on {self.scenario}{seed}"
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run: a controller, or a training and the θ that comes of it."""
+    """One run: a controller, or a training and the θ that comes of it.
+
+    `controller` is what `cosim.lookup.build_controller` takes, or a factory(scenario); None for a
+    training. `greedy` says whether a controller runs on the noise of the learning curves, too;
+    `traces` are runs kept sample by sample.
+    """
 
     key: RunKey
     case: Case
+    scenario: Scenario
+    controller: Any
     training: Training | None
-    facts: dict[str, Any]
+    facts: Mapping[str, Any]
     sizes: Sizes
-    greedy: bool
-    """Whether a controller is run on the noise of the learning curves, too."""
+    greedy: bool = False
     traces: tuple[TrajectoryTable, ...] = ()
-    """Runs that are kept sample by sample."""
     online: Online | None = None
-    """The noise of the trainings that a controller runs beside."""
 
     @property
     def noise(self) -> dict[str, tuple[tuple[int, ...], int]]:
@@ -47,20 +187,257 @@ class Run:
             found[GREEDY] = (held_out, sizes.curve_steps)
         return found
 
+    def burn_in(self, file: str) -> int:
+        """Samples run before those that count; learning curves have none."""
+        return self.sizes.burn_in if file == EVALUATION else 0
+
     @property
     def samples(self) -> int:
-        """Plant samples of the run, validation apart."""
+        """Plant samples of the run; those of greedy evaluations while training apart."""
         trained = 0 if self.training is None else self.training.samples
-        evaluated = sum(len(seeds) * steps for seeds, steps in self.noise.values())
+        evaluated = sum(
+            len(seeds) * (self.burn_in(file) + steps) for file, (seeds, steps) in self.noise.items()
+        )
         beside = 0 if self.online is None else len(self.online.seeds) * self.online.steps
         return trained + evaluated + beside + sum(trace.steps for trace in self.traces)
+
+
+class Study:
+    """Cases × scenarios × training seeds, and the noise that they are compared on.
+
+    `load` reads a study file, `from_dict` takes the same document; `cosim.run_study` runs it.
+    `folder` is where its relative paths start and where its `module:Class` names are looked up,
+    too; `file` is its file as it was given. Raises StudyError, ScenarioError and what `learning`
+    raises of an algorithm.
+    """
+
+    def __init__(self, table: StudyTable, folder: Path, file: str | None = None) -> None:
+        self.table, self.file = table, file
+        self.folder = folder.resolve()
+        import_from(self.folder)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a study file; raises StudyError."""
+        return cls(read(path), Path(path).resolve().parent, str(path))
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any], folder: str | Path = ".") -> Self:
+        """Validate a document, structured like the TOML file; raises StudyError."""
+        return cls(validate(dict(document), "study"), Path(folder))
+
+    @property
+    def name(self) -> str:
+        """The study's name."""
+        return self.table.name
+
+    @cached_property
+    def scenarios(self) -> dict[str, Scenario]:
+        """Scenarios by name, in the study's order."""
+        own = {}
+        for document in self.table.scenario:
+            where = f"study '{self.name}', [[scenario]]"
+            scenario = Scenario.from_dict(resolved(document, where, self.folder), where)
+            own[scenario.name] = scenario
+        found: dict[str, Scenario] = {}
+        for source in self.table.scenarios:
+            path = self.folder / source if source.endswith(".toml") else source
+            scenario = own.get(source) or Scenario.load(path)
+            if scenario.name in found:
+                raise StudyError(
+                    f"two scenarios are called '{scenario.name}'; their files' name must differ"
+                )
+            found[scenario.name] = scenario
+        return found
+
+    @cached_property
+    def cases(self) -> list[Case]:
+        """Every case, grids written out."""
+        cases = [case for table in self.table.case for case in self._expanded(table)]
+        names = [case.name for case in cases]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise StudyError(f"two cases are called '{twice[0]}'; give each another name")
+        for scenario in self.scenarios:
+            sizes = self.sizes(scenario)
+            met = {seed for case in cases for seed in case.training_seeds}
+            held_out = range(HELD_OUT, HELD_OUT + sizes.curve_seeds)
+            for seeds, what in ((met, "a training seed"), (held_out, "a seed of the curves")):
+                if common := sorted(set(seeds) & set(sizes.seeds)):
+                    raise StudyError(
+                        f"evaluation: noise seed {common[0]} is {what} too; choose another "
+                        "first_seed"
+                    )
+        return cases
+
+    def _expanded(self, table: CaseTable) -> Iterator[Case]:
+        """The points of a case's grid."""
+        scenarios = tuple(self.scenarios if table.scenarios is None else table.scenarios)
+        if unknown := [name for name in scenarios if name not in self.scenarios]:
+            raise StudyError(
+                f"case '{table.name}': '{unknown[0]}' is none of the study's scenarios "
+                f"({', '.join(self.scenarios)})"
+            )
+        if table.algorithm is None:
+            given = table.controller or ""
+            sources = given if isinstance(given, list) else [given]
+            for source in sources:
+                own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
+                name = table.name or own
+                if table.name is not None and len(sources) > 1:
+                    name = f"{table.name}({own})"
+                yield Case(
+                    name,
+                    scenarios,
+                    table.group or BASELINES,
+                    controller=self._file(source),
+                    against=table.against,
+                )
+            return
+        axes: dict[str, list[Any]] = {}
+        for key in ("samples", "start", "nmpc"):
+            value = getattr(table, key)
+            axes[key] = value if isinstance(value, list) else [value]
+        for key, value in table.settings.items():
+            axes[key] = _axis(value, takes_list(table.algorithm, key))
+        if empty := [key for key, values in axes.items() if not values]:
+            raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
+        varied = [key for key, values in axes.items() if len(values) > 1]
+        for values in product(*axes.values()):
+            point = dict(zip(axes, values, strict=True))
+            label = " ".join(f"{key}={_text(point[key])}" for key in varied)
+            yield Case(
+                name=f"{table.name}({label})" if label else str(table.name),
+                scenarios=scenarios,
+                group=table.group or table.algorithm.rpartition(":")[2],
+                algorithm=table.algorithm,
+                samples=point.pop("samples"),
+                start=self._file(point.pop("start")),
+                nmpc=point.pop("nmpc"),
+                settings=point,
+                training=dict(table.training),
+                training_seeds=tuple((table.training_seeds or self.table.training_seeds).seeds),
+                against=table.against,
+            )
+
+    def _file(self, source: str) -> str:
+        """A file's path as seen from the study's folder; every other name as it is."""
+        is_file = source.endswith(".toml") and not Path(source).is_absolute()
+        return str(self.folder / source) if is_file else source
+
+    def counterpart(self, case: Case) -> str | None:
+        """Name of the case that a case's paired difference is taken from; raises StudyError.
+
+        In a grid it is the counterpart's point of the same label, where there is one.
+        """
+        if case.against is None:
+            return None
+        names = [other.name for other in [*self.references, *self.cases]]
+        label = case.name[case.name.index("(") :] if "(" in case.name else ""
+        for name in (case.against, f"{case.against}{label}"):
+            if name in names and name != case.name:
+                return name
+        raise StudyError(
+            f"case '{case.name}': there is no other case '{case.against}'"
+            f"{suggestion(case.against, names)}; there are {', '.join(names)}"
+        )
+
+    @cached_property
+    def optima(self) -> dict[str, str]:
+        """Names of the cases whose J is J*, by scenario; scenarios without one are not there."""
+        return {
+            name: self._named(optimum)
+            for name, scenario in self.scenarios.items()
+            if (optimum := stored_optimum(scenario)) is not None
+        }
+
+    @cached_property
+    def references(self) -> list[Case]:
+        """Controllers that relative figures need and that the study does not name: naive, J*."""
+        given = {case.controller for case in self.cases}
+        wanted: dict[str, list[str]] = {}
+        for name, scenario in self.scenarios.items():
+            if NAIVE not in given and scenario.controller.model is not None:
+                wanted.setdefault(NAIVE, []).append(name)
+            if name in self.optima and self.optima[name] not in given:
+                wanted.setdefault(self.optima[name], []).append(name)
+        return [
+            Case(name, tuple(scenarios), BASELINES, controller=name)
+            for name, scenarios in wanted.items()
+        ]
+
+    def _named(self, controller: str) -> str:
+        """A case's name for a controller: the study's, if it has one for it."""
+        return next((c.name for c in self.cases if c.controller == controller), controller)
+
+    @cached_property
+    def naive(self) -> str:
+        """Name of the case that the gap closed starts from."""
+        return self._named(NAIVE)
+
+    def relative(self, path: str) -> str:
+        """A parameters file's path as the study names it: results depend on no checkout's place."""
+        if not path.endswith(".toml") or self.folder not in Path(path).parents:
+            return path
+        return Path(path).relative_to(self.folder).as_posix()
+
+    def sizes(self, scenario: str) -> Sizes:
+        """Noise seeds and samples of a scenario."""
+        evaluation, curves = self.table.evaluation, self.table.curves
+        first = evaluation.first_seed
+        count = self._of(evaluation.seeds, scenario, "evaluation.seeds")
+        return Sizes(
+            tuple(range(first, first + count)),
+            self._of(evaluation.steps, scenario, "evaluation.steps"),
+            evaluation.burn_in,
+            self._of(curves.seeds, scenario, "curves.seeds"),
+            self._of(curves.steps, scenario, "curves.steps"),
+        )
+
+    def _of(self, value: PerScenario, scenario: str, field: str) -> int:
+        if isinstance(value, int):
+            return value
+        names = [*self.scenarios, DEFAULT]
+        if unknown := [name for name in value if name not in names]:
+            raise StudyError(
+                f"{field}: '{unknown[0]}' is no scenario of the study"
+                f"{suggestion(unknown[0], names)}; there are {', '.join(names)}"
+            )
+        number = value.get(scenario, value.get(DEFAULT))
+        if number is None:
+            raise StudyError(f"{field}: has no number for '{scenario}', and no '{DEFAULT}'")
+        return number
+
+    def training(self, case: Case, scenario: str, seed: int) -> Training:
+        """The training of a case on a scenario with one seed; raises ConfigurationError."""
+        assert case.algorithm is not None
+        sizes = self.sizes(scenario)
+        between = max(1, case.samples // self.table.curves.points)
+        rows = -(-between // ROW)
+        log_every = max(1, between // rows)
+        if (online := self.table.online) is not None:
+            log_every, rows = online.block, max(1, between // online.block)
+        own = {"seed": seed, "controller": case.nmpc, "start": case.start}
+        if twice := sorted(own.keys() & case.training):
+            raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
+        options = {
+            **own,
+            "log_every": log_every,
+            "evaluate_every": rows * log_every,
+            "checkpoint_every": log_every * max(1, round(CHECKPOINT / log_every)),
+            "evaluation_seeds": sizes.curve_seeds,
+            "evaluation_steps": sizes.curve_steps,
+            **case.training,
+        }
+        return Training(
+            case.algorithm, self.scenarios[scenario], case.samples, dict(case.settings), options
+        )
 
 
 @dataclass(frozen=True)
 class Plan:
     """The runs of a study, those first that the others are compared with, then seed by seed."""
 
-    definition: Definition
+    definition: Study
     runs: list[Run]
     provenance: dict[str, Any]
 
@@ -70,110 +447,125 @@ class Plan:
         return sum(run.samples for run in self.runs)
 
 
-def plan(definition: Definition) -> Plan:
-    """Everything that a study has to do, checked; raises what scenarios and trainer raise."""
-    code = code_hash(OURS)
+def plan(study: Study) -> Plan:
+    """All that a study has to do; every mistake in it is raised here, before the work."""
     plants = {}
-    for name, described in definition.scenarios.items():
+    for name, described in study.scenarios.items():
         with FmuPlant(described) as plant:
             plants[name] = {"scenario": described.hash, "fmu": plant.fmu_sha256}
-    sources = {
-        case.target: dict(definition.trainer.sources(case.target))
-        for case in [*definition.references, *definition.cases]
-    }
-    runs = []
-    for case, scenario, seed in _order(definition):
-        training = None if seed is None else definition.training(case, scenario, seed)
-        facts: dict[str, Any] = {
-            **plants[scenario],
-            "sources": sources[case.target],
-            "code": code,
-        }
+    depends: dict[tuple[str, str], dict[str, str]] = {}
+    runs, prepared = [], set()
+    for case, scenario, seed in _order(study):
+        training = None if seed is None else study.training(case, scenario, seed)
+        if (case.name, scenario) not in depends:
+            if ":" in (case.controller or ""):
+                build_named(case.target, study.scenarios[scenario])  # a mistake shows here
+            parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
+            depends[case.name, scenario] = depends_on(
+                study.scenarios[scenario], *parts, packages=OURS
+            )
+        facts: dict[str, Any] = {**depends[case.name, scenario], "fmu": plants[scenario]["fmu"]}
         if training is None:
-            facts["controller"] = definition.relative(case.controller or "")
+            facts["controller"] = study.relative(case.controller or "")
         else:
-            facts["training"] = asdict(training) | {
-                "scenario": scenario,
-                "start": definition.relative(training.start),
+            if (case.name, scenario) not in prepared:
+                prepared.add((case.name, scenario))
+                training.prepare()
+            facts["training"] = {
+                "algorithm": training.algorithm,
+                "samples": training.samples,
+                "settings": training.settings,
+                "options": {**training.options, "start": study.relative(case.start)},
             }
-            if case.start.endswith(".toml"):
-                facts["start"] = dict(definition.trainer.sources(case.start))
-        key = RunKey(scenario, case.name, seed)
-        curves = training is None and _learns(definition, scenario)
-        sizes, traces = definition.sizes(scenario), _traces(definition, case, scenario, seed)
-        online = None if training is not None else _online(definition, case, scenario)
-        runs.append(Run(key, case, training, facts, sizes, curves, traces, online))
-    _check(definition, runs)
-    provenance = {
+        beside = None if training is not None else _online(study, case, scenario)
+        runs.append(
+            Run(
+                RunKey(scenario, case.name, seed),
+                case,
+                study.scenarios[scenario],
+                case.controller,
+                training,
+                facts,
+                study.sizes(scenario),
+                training is None and any(case.algorithm for case in _on(study, scenario)),
+                _traces(study, case, scenario, seed),
+                beside,
+            )
+        )
+    _check_names(study)
+    check_folders(runs)
+    about = {
         "versions": versions(),
-        "code_hash": code,
+        "code_hash": code_hash(OURS),
         "scenarios": plants,
-        "study": definition.name,
+        "study": study.name,
     }
-    return Plan(definition, runs, provenance)
+    return Plan(study, runs, about)
+
+
+def _order(study: Study) -> Iterator[tuple[Case, str, int | None]]:
+    """Controllers first, then seed after seed: stopped early, every case has fewer seeds."""
+    cases = [*study.references, *study.cases]
+    for scenario in study.scenarios:
+        for case in cases:
+            if case.algorithm is None and scenario in case.scenarios:
+                yield case, scenario, None
+    trained = [case for case in cases if case.algorithm is not None]
+    for seed in sorted({seed for case in trained for seed in case.training_seeds}):
+        for scenario in study.scenarios:
+            for case in trained:
+                if seed in case.training_seeds and scenario in case.scenarios:
+                    yield case, scenario, seed
+
+
+def _on(study: Study, scenario: str) -> list[Case]:
+    return [case for case in study.cases if scenario in case.scenarios]
 
 
 def _traces(
-    definition: Definition, case: Case, scenario: str, seed: int | None
+    study: Study, case: Case, scenario: str, seed: int | None
 ) -> tuple[TrajectoryTable, ...]:
     """The trajectories that a run takes part in: of a training, that of the first seed."""
     if case.training_seeds and seed != case.training_seeds[0]:
         return ()
     return tuple(
         table
-        for table in definition.table.trajectory
+        for table in study.table.trajectory
         if case.name in (table.cases or [case.name]) and scenario in (table.scenarios or [scenario])
     )
 
 
-def _online(definition: Definition, controller: Case, scenario: str) -> Online | None:
+def _online(study: Study, controller: Case, scenario: str) -> Online | None:
     """The trainings that a controller of the study, or the optimum, runs beside."""
-    trained = [case for case in definition.cases if case.algorithm and scenario in case.scenarios]
-    wanted = controller in definition.cases or controller.name == definition.optima.get(scenario)
-    if definition.table.online is None or not trained or not wanted:
+    trained = [case for case in _on(study, scenario) if case.algorithm]
+    wanted = controller in study.cases or controller.name == study.optima.get(scenario)
+    if study.table.online is None or not trained or not wanted:
         return None
     seeds = sorted({seed for case in trained for seed in case.training_seeds})
-    steps = max(case.samples for case in trained)
-    return Online(tuple(seeds), steps, definition.table.online.block)
+    return Online(tuple(seeds), max(case.samples for case in trained), study.table.online.block)
 
 
-def _learns(definition: Definition, scenario: str) -> bool:
-    return any(case.algorithm and scenario in case.scenarios for case in definition.cases)
-
-
-def _order(definition: Definition) -> Iterator[tuple[Case, str, int | None]]:
-    """Controllers first, then seed after seed: stopped early, every case has fewer seeds."""
-    cases = [*definition.references, *definition.cases]
-    for scenario in definition.scenarios:
-        for case in cases:
-            if case.algorithm is None and scenario in case.scenarios:
-                yield case, scenario, None
-    trained = [case for case in cases if case.algorithm is not None]
-    for seed in sorted({seed for case in trained for seed in case.training_seeds}):
-        for scenario in definition.scenarios:
-            for case in trained:
-                if seed in case.training_seeds and scenario in case.scenarios:
-                    yield case, scenario, seed
-
-
-def _check(definition: Definition, runs: list[Run]) -> None:
-    """Find every mistake before the work: names of cases, algorithms, settings, folders."""
-    names = [case.name for case in [*definition.references, *definition.cases]]
-    trained = [case.name for case in definition.cases if case.algorithm is not None]
+def _check_names(study: Study) -> None:
+    """Raise StudyError where the study names a case that it does not have."""
+    names = [case.name for case in [*study.references, *study.cases]]
+    trained = [case.name for case in study.cases if case.algorithm is not None]
     asked = [
-        (f"trajectory '{t.name}'", c, names)
-        for t in definition.table.trajectory
-        for c in t.cases or []
+        (f"trajectory '{t.name}'", c, names) for t in study.table.trajectory for c in t.cases or []
     ]
-    asked += [("logs", case, trained) for case in definition.table.logs]
+    asked += [("logs", case, trained) for case in study.table.logs]
     for where, name, known in asked:
         if name not in known:
             raise StudyError(
                 f"{where}: there is no case '{name}'{suggestion(name, known)}; there are "
                 f"{', '.join(known)}"
             )
+    for case in study.cases:
+        study.counterpart(case)
+
+
+def check_folders(runs: list[Run]) -> None:
+    """Raise StudyError where two runs would have one folder, on a system that ignores case too."""
     folders: dict[str, RunKey] = {}
-    checked = set()
     for run in runs:
         folder = str(run.key.folder).lower()
         if folder in folders:
@@ -182,6 +574,28 @@ def _check(definition: Definition, runs: list[Run]) -> None:
                 "name"
             )
         folders[folder] = run.key
-        if run.training is not None and (run.key.case, run.key.scenario) not in checked:
-            checked.add((run.key.case, run.key.scenario))
-            definition.trainer.check(run.training)
+
+
+def takes_list(algorithm: str, setting: str) -> bool:
+    """Whether a hyperparameter is a list itself; raises AlgorithmLookupError."""
+    field = load_algorithm(algorithm).Configuration.model_fields.get(setting)
+    return field is not None and _is_sequence(field.annotation)
+
+
+def _is_sequence(annotation: Any) -> bool:
+    """Whether a type is a sequence, or may be one."""
+    if get_origin(annotation) in SEQUENCES or annotation in SEQUENCES:
+        return True
+    return any(_is_sequence(part) for part in get_args(annotation) if part is not Ellipsis)
+
+
+def _axis(value: Any, is_list: bool) -> list[Any]:
+    """Values of a setting: a list is a grid, but for a setting that is a list itself."""
+    if not isinstance(value, list):
+        return [value]
+    nested = bool(value) and all(isinstance(item, list) for item in value)
+    return value if nested or not is_list else [value]
+
+
+def _text(value: Any) -> str:
+    return Path(value).stem if isinstance(value, str) else json.dumps(value).replace(" ", "")

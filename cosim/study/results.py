@@ -27,8 +27,9 @@ from cosim.statistics import (
     two_way,
 )
 from cosim.study import collect, figures, online, paper, report, theta
+from cosim.study.plan import EVALUATION, safe
 from cosim.study.report import COLUMNS, SHORT
-from cosim.study.store import EVALUATION, INDICATORS, ONLINE, safe
+from cosim.study.store import INDICATORS, ONLINE
 from cosim.study.tables import CURVE, KEYS, STATE, WHERE, read_table, to_csv
 from cosim.text_tables import markdown_table
 from cosim.validation import suggestion

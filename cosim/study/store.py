@@ -1,16 +1,18 @@
-"""What a study has finished, on disk: a folder for each run, readable and found again.
+"""What a run has finished, on disk: a folder for each run, readable and found again.
 
     OUT/runs/SCENARIO/CASE/SEED/   run.json  checkpoint.npz | learning.csv parameters.toml
                                    evaluation.csv  greedy.csv  online.csv
+                                   trajectory-*.csv  timing.csv
 
-Only the process that runs the study writes, so workers need no shared disk.
+Tables are written by the process that runs the study alone; a worker writes no more than the
+checkpoint of the training that it runs, and its log and θ so far.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-import re
-import shutil
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +20,16 @@ from typing import Any
 
 from cosim.errors import StudyError
 from cosim.files import read_json, write_atomically
+from cosim.plugins import changed
 from cosim.study.document import TrajectoryTable
-from cosim.study.protocols import Progress
+from cosim.study.plan import EVALUATION, GREEDY, Online, Run
 from cosim.text_tables import cell, csv_pieces, csv_text, read_records
 
-RUNS = "runs"
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
-EVALUATION, GREEDY, FAILURE = "evaluation.csv", "greedy.csv", "failure.txt"
-ONLINE = "online.csv"
+FAILURE, ONLINE, TIMING = "failure.txt", "online.csv", "timing.csv"
+OURS = (CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, ONLINE, TIMING)
+TRACE = "trajectory-*.csv"
 INDICATORS = (
     "J",
     "economic_cost",
@@ -35,162 +38,187 @@ INDICATORS = (
     "input_effort",
     "failures",
 )
-Indicators = dict[int, dict[str, float]]
-"""Indicators of a controller by noise seed."""
+KEY = ("seed", "steps", "burn_in")
+PAUSE = 20
+"""Of the time that a table took to write, what passes at least until it is written again."""
+Figures = dict[str, float]
 
 
 @dataclass(frozen=True)
-class RunKey:
-    """A run of a study: scenario, case, and training seed (None for a controller)."""
+class Trained:
+    """A training at its end: `status` is `finished` or `diverged: …`, `log` learning.csv,
+    `parameters` θ as text, `plant_samples` all that the plant gave for it."""
 
-    scenario: str
-    case: str
-    seed: int | None
-
-    @property
-    def folder(self) -> Path:
-        """Where its files are, relative to the study's folder."""
-        parts = [safe(self.scenario), safe(self.case)]
-        return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
-
-    def __str__(self) -> str:
-        """As messages name it."""
-        seed = "" if self.seed is None else f", seed {self.seed}"
-        return f"{self.case} on {self.scenario}{seed}"
-
-
-@dataclass(frozen=True)
-class Online:
-    """Trainings that a controller runs beside: `seeds`, the longest one's `steps`, the `block`."""
-
-    seeds: tuple[int, ...]
-    steps: int
-    block: int
-
-
-def safe(name: str) -> str:
-    """A folder's name on any system."""
-    return re.sub(r"[^\w.+=()\[\]-]", "_", name)
+    samples: int
+    status: str
+    log: str
+    parameters: str
+    plant_samples: int
+    wall_seconds: float
 
 
 class RunStore:
-    """The files of one run; `facts` say all that its results depend on.
+    """The files of one run; `run.facts` say all that its results depend on.
 
-    What is there of other facts is dropped, never mixed in.
+    What is there of other facts, or is not as it was written, is deleted and named in `remarks`.
+    Only files that a run of a study writes are deleted, and only beside a run.json. Raises
+    StudyError where the folder holds other files than ours, or leads out of `out`.
     """
 
-    def __init__(self, out: Path, key: RunKey, facts: Mapping[str, Any]) -> None:
-        self.folder = out / key.folder
-        self._facts = json.loads(json.dumps(facts))
-        self._known: dict[tuple[str, int], Indicators] = {}
+    def __init__(self, out: Path, run: Run) -> None:
+        self.folder = out / run.key.folder
+        self.remarks: list[str] = []
+        """What was found changed or damaged, and is done anew."""
+        self._run = run
+        self._facts = json.loads(json.dumps(run.facts))
+        self._known: dict[str, dict[int, Figures]] = {}
+        self._unwritten: dict[str, float] = {}
+        self._next: dict[str, float] = {}
+        if not self.folder.resolve().is_relative_to(out.resolve()):
+            raise StudyError(f"'{self.folder}' leads out of '{out}'; choose another --out")
         (self.folder / FAILURE).unlink(missing_ok=True)
-        self._about = self._document()
+        self._about = self._found()
         if self._about.get("facts") != self._facts:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._about = {"facts": self._facts}
-            self._note(status="")
+            self._begin()
 
-    def _document(self) -> dict[str, Any]:
+    def _found(self) -> dict[str, Any]:
+        """run.json, where it and the files that it vouches for are whole; else {}."""
         path = self.folder / RUN
         if not path.is_file():
+            if any(p.name in OURS or p.match(TRACE) for p in self.folder.glob("*")):
+                raise StudyError(
+                    f"'{self.folder}' has no {RUN} and is no run of a study; move it away, or "
+                    "choose another --out"
+                )
             return {}
         try:
-            return read_json(path, f"'{path}'", StudyError)
-        except StudyError as error:
-            raise StudyError(f"{error}; delete its folder to run it again") from None
+            about = read_json(path, f"'{path}'", StudyError)
+            files = dict(about.get("files", {}))
+            dict(about["facts"])
+        except (StudyError, KeyError, TypeError, ValueError):
+            self.remarks.append(f"'{path}' is damaged; the run is done anew")
+            return {}
+        for name, digest in files.items():
+            if _digest(self.folder / name) == digest:
+                continue
+            self.remarks.append(f"'{self.folder / name}' is not as it was written; made anew")
+            if name in (LOG, PARAMETERS):
+                return {}
+            (self.folder / name).unlink(missing_ok=True)
+            about["files"] = {}
+        if (before := about["facts"]) != self._facts:
+            names = ", ".join(changed(before, self._facts))
+            self.remarks.append(f"{names} changed since these runs; they are done anew")
+        return about
 
-    def progress(self) -> Progress:
-        """Where the run's training stands."""
-        document = self._about
-        if status := document.get("status", ""):
-            return Progress(
-                int(document["samples"]),
-                status,
-                log=self._read(LOG),
-                parameters=self._read(PARAMETERS),
-                plant_samples=int(document["plant_samples"]),
-                wall_seconds=float(document["timing"]["wall_seconds"]),
-            )
-        path = self.folder / CHECKPOINT
-        if not path.is_file():
-            return Progress(0)
-        return Progress(
-            int(document.get("samples", 0)),
-            checkpoint=path.read_bytes(),
-            wall_seconds=float(document.get("timing", {}).get("wall_seconds", 0.0)),
-        )
+    def _begin(self) -> None:
+        """Delete what the run has left, file by file, and mark the folder as its own."""
+        for path in self.folder.glob("*"):
+            if path.name in OURS or path.match(TRACE):
+                path.unlink()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._about = {"facts": self._facts}
+        self.note(status="")
 
-    def advance(self, progress: Progress) -> None:
-        """Store how far a training has come; run.json last, so that what it says is there."""
-        if progress.ended:
-            self._write(LOG, progress.log)
-            self._write(PARAMETERS, progress.parameters)
-        else:
-            self._write(CHECKPOINT, progress.checkpoint)
-        self._note(
-            status=progress.status,
-            samples=progress.samples,
-            plant_samples=progress.plant_samples,
-            timing={
-                "wall_seconds": progress.wall_seconds,
-                "functions": self._with(progress.functions),
-            },
-        )
-        if progress.ended:
-            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+    def note(self, **values: Any) -> None:
+        """Write values to run.json."""
+        self._about = self._about | values
+        text = json.dumps(self._about, indent=1, sort_keys=True) + "\n"
+        write_atomically(self.folder / RUN, text)
 
     @property
-    def functions(self) -> list[str]:
-        """How the functions of the run's units were computed: `compiled`, `interpreted`, both."""
-        return list(self._about.get("timing", {}).get("functions", []))
+    def status(self) -> str:
+        """How the training ended; empty while it has not."""
+        return str(self._about.get("status", ""))
 
-    def used(self, functions: str | None) -> None:
-        """Note how a unit's functions were computed, None where that is not known."""
-        if functions is not None and functions not in self.functions:
-            timing = self._about.get("timing", {}) | {"functions": self._with(functions)}
-            self._note(timing=timing)
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """run.json: `facts`, and of a training `status`, `samples`, `plant_samples`, `timing`."""
+        return self._about
 
-    def _with(self, functions: str | None) -> list[str]:
-        return sorted({*self.functions, *([] if functions is None else [functions])})
+    @property
+    def log(self) -> str:
+        """The training's learning.csv, whose first row has θ at the start."""
+        return (self.folder / LOG).read_text("utf-8")
 
-    def _note(self, **changes: Any) -> None:
-        self._about = self._about | changes
-        self._write(RUN, json.dumps(self._about, indent=1, sort_keys=True) + "\n")
+    @property
+    def parameters(self) -> str:
+        """θ that the training ended with, as text."""
+        return (self.folder / PARAMETERS).read_text("utf-8")
 
-    def indicators(self, file: str, steps: int) -> Indicators:
-        """Indicators by noise seed that a file holds of runs of `steps` samples, read once."""
-        if (file, steps) not in self._known:
-            self._known[file, steps] = self._read_indicators(file, steps)
-        return self._known[file, steps]
+    def train(self, trained: Trained) -> None:
+        """Store a training at its end; run.json last, so that what it says is there."""
+        write_atomically(self.folder / LOG, trained.log)
+        write_atomically(self.folder / PARAMETERS, trained.parameters)
+        self.note(
+            status=trained.status,
+            samples=trained.samples,
+            plant_samples=trained.plant_samples,
+            timing={"wall_seconds": trained.wall_seconds},
+        )
+        (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
-    def _read_indicators(self, file: str, steps: int) -> Indicators:
-        path = self.folder / file
+    def indicators(self, file: str) -> dict[int, Figures]:
+        """Indicators by noise seed that a file holds of runs as long as the plan's, read once."""
+        if file not in self._known:
+            self._known[file] = self._read(file)
+        return self._known[file]
+
+    def _read(self, file: str) -> dict[int, Figures]:
+        path, wanted = self.folder / file, self._length(file)
         if not path.is_file():
             return {}
         try:
-            return {
-                int(row["seed"]): {name: float(row[name] or "nan") for name in INDICATORS}
-                for row in read_records(path, StudyError)
-                if int(row["steps"]) == steps
-            }
+            found = {}
+            for row in read_records(path, StudyError):
+                seed, steps, burn_in = (int(row.pop(name)) for name in KEY)
+                if (steps, burn_in) == wanted:
+                    found[seed] = {name: float(value or "nan") for name, value in row.items()}
+            return found
         except (StudyError, KeyError, ValueError):
-            raise StudyError(f"'{path}' is damaged; delete it to evaluate again") from None
+            self.remarks.append(f"'{path}' is damaged; made anew")
+            return {}
 
-    def missing(self, file: str, seeds: Sequence[int], steps: int) -> list[int]:
+    def _length(self, file: str) -> tuple[int, int]:
+        name = EVALUATION if file == TIMING else file
+        return self._run.noise[name][1], self._run.burn_in(name)
+
+    def missing(self, file: str) -> list[int]:
         """Noise seeds without indicators in a file."""
-        known = self.indicators(file, steps)
-        return [seed for seed in seeds if seed not in known]
+        known = self.indicators(file)
+        return [seed for seed in self._run.noise[file][0] if seed not in known]
 
-    def evaluate(self, file: str, steps: int, fresh: Indicators) -> None:
-        """Add indicators to a file."""
-        known = self.indicators(file, steps)
-        known.update(fresh)
+    def evaluate(
+        self, file: str, found: Mapping[int, Figures], clock: Mapping[int, Figures]
+    ) -> None:
+        """Add indicators to a file, and what the clock said to timing.csv."""
+        self.indicators(file).update(found)
+        changed = [file]
+        if file == EVALUATION:
+            self.indicators(TIMING).update(clock)
+            changed = [file, TIMING]
+        for name in changed:
+            self._unwritten.setdefault(name, 0.0)
+            if time.monotonic() >= self._next.get(name, 0.0):
+                self._write(name)
+
+    def flush(self) -> None:
+        """Write the tables that wait for it."""
+        for name in list(self._unwritten):
+            self._write(name)
+
+    def _write(self, file: str) -> None:
+        # The rows of many seeds are written again and again: the pause keeps that a small share.
+        begin, known = time.monotonic(), self._known[file]
+        names = list(next(iter(known.values()))) if file == TIMING else list(INDICATORS)
+        length = [str(value) for value in self._length(file)]
         rows = (
-            [str(seed), str(steps), *(cell(values[name]) for name in INDICATORS)]
-            for seed, values in sorted(known.items())
+            [str(seed), *length, *(cell(known[seed][name]) for name in names)]
+            for seed in sorted(known)
         )
-        write_atomically(self.folder / file, csv_pieces(("seed", "steps", *INDICATORS), rows))
+        write_atomically(self.folder / file, csv_pieces((*KEY, *names), rows))
+        self._next[file] = time.monotonic() + PAUSE * (time.monotonic() - begin)
+        del self._unwritten[file]
 
     def online(self, online: Online) -> dict[int, list[float]]:
         """Mean costs of blocks by training seed."""
@@ -203,49 +231,68 @@ class RunStore:
                 if (int(row["steps"]), int(row["block"])) == (online.steps, online.block):
                     found.setdefault(int(row["seed"]), []).append(float(row["J"]))
         except (StudyError, KeyError, ValueError):
-            raise StudyError(f"'{path}' is damaged; delete it to run again") from None
+            self.remarks.append(f"'{path}' is damaged; made anew")
+            return {}
         return found
 
-    def missing_online(self, online: Online | None) -> list[int]:
+    def missing_online(self) -> list[int]:
         """Seeds of trainings that the controller has not run beside yet."""
-        if online is None:
+        if self._run.online is None:
             return []
-        known = self.online(online)
-        return [seed for seed in online.seeds if seed not in known]
+        known = self.online(self._run.online)
+        return [seed for seed in self._run.online.seeds if seed not in known]
 
-    def accompany(self, online: Online, seed: int, costs: Sequence[float]) -> None:
+    def accompany(self, seed: int, costs: Sequence[float]) -> None:
         """Add the mean costs of a run's blocks."""
+        online = self._run.online
+        assert online is not None
         known = self.online(online) | {seed: list(costs)}
         rows = (
             [str(one), str(online.steps), str(online.block), cell(cost)]
             for one, costs in sorted(known.items())
             for cost in costs
         )
-        self._write(ONLINE, csv_text(("seed", "steps", "block", "J"), rows))
+        write_atomically(self.folder / ONLINE, csv_text(("seed", "steps", "block", "J"), rows))
 
-    def _trace(self, trace: TrajectoryTable) -> Path:
+    def trajectory(self, trace: TrajectoryTable) -> Path:
+        """File of a trajectory, which may not be there yet."""
         return self.folder / f"trajectory-{trace.name}-{trace.seed}-{trace.steps}.csv"
-
-    def trajectory(self, trace: TrajectoryTable) -> Path | None:
-        """File of a trajectory, None if there is none yet."""
-        path = self._trace(trace)
-        return path if path.is_file() else None
 
     def trace(self, trace: TrajectoryTable, trajectory: str) -> None:
         """Store a trajectory."""
-        write_atomically(self._trace(trace), trajectory)
+        write_atomically(self.trajectory(trace), trajectory)
 
     def fail(self, trace: str) -> None:
         """Keep the traceback of what failed."""
-        self._write(FAILURE, trace)
+        write_atomically(self.folder / FAILURE, trace)
 
-    def _read(self, name: str) -> str:
-        try:
-            return (self.folder / name).read_text("utf-8")
-        except (OSError, UnicodeDecodeError):
-            raise StudyError(
-                f"'{self.folder / name}' is damaged; delete the folder to run it again"
-            ) from None
+    @property
+    def finished(self) -> bool:
+        """Whether all that the plan asks of the run is there."""
+        return (
+            (self._run.training is None or bool(self.status))
+            and not any(self.missing(file) for file in self._run.noise)
+            and not self.missing_online()
+            and all(self.trajectory(trace).is_file() for trace in self._run.traces)
+        )
 
-    def _write(self, name: str, content: str | bytes) -> None:
-        write_atomically(self.folder / name, content)
+    def seal(self) -> None:
+        """Note the hashes of a finished run's files, so that a torn or edited one is noticed."""
+        self.flush()
+        paths = [path for path in self.folder.glob("*") if path.name in OURS or path.match(TRACE)]
+        files = {path.name: _digest(path) for path in sorted(paths) if path.name != TIMING}
+        if self._about.get("files") != files:
+            self.note(files=files)
+
+    def unseal(self) -> None:
+        """Forget the hashes before more is written."""
+        if self._about.get("files"):
+            self.note(files={})
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, empty where it is not there."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""

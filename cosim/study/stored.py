@@ -12,9 +12,9 @@ from cosim.study.check import TOLERANCES
 from cosim.study.document import StudyTable
 from cosim.study.document import read as read_study
 from cosim.study.keyed import rounded_csv
+from cosim.study.plan import RUNS
 from cosim.study.report import TABLES
 from cosim.study.results import ABOUT, TIMING, StudyResults
-from cosim.study.store import RUNS
 from cosim.validation import suggestion
 
 WORK = ".work"

@@ -11,14 +11,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from controllers.problem import Problem
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
 from cosim.study.store import LOG
 from cosim.study.tables import read_table
 from cosim.validation import suggestion
+from learning.training_run import starting_parameters
 
 if TYPE_CHECKING:
-    from cosim.study.plan import Plan, Run
+    from cosim.study.plan import Plan, Run, Training
 
 Array = NDArray[np.float64]
 Table = tuple[str, Sequence[str], list[list[str]]]
@@ -37,8 +39,17 @@ def scales(plan: Plan) -> dict[str, float]:
     found: dict[str, float] = {}
     for run in plan.runs:
         if run.training is not None:
-            found |= plan.definition.trainer.scales(run.training)
+            found |= _scales(run.training)
     return found
+
+
+def _scales(training: Training) -> dict[str, float]:
+    """Learning scale of each entry of a training's θ, by its column of the log."""
+    run = training.prepare()
+    problem = Problem.from_scenario(run.scenario)
+    blocks = starting_parameters(problem, run.configuration, run.start).blocks
+    names = (f"{PREFIX}{label}" for label in blocks.labels)
+    return dict(zip(names, blocks.scale.tolist(), strict=True))
 
 
 def collected(runs: Sequence[Run], out: Path) -> pd.DataFrame:

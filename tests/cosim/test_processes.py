@@ -24,11 +24,15 @@ SLOW = pytest.mark.slow
 
 WORKERS = (
     "import os, time\n"
-    "from cosim.evaluation.parallel import run_all\n"
-    "def work(path):\n"
-    "    open(path + str(os.getpid()), 'w').close()\n"
-    "    time.sleep(600)\n"
-    "run_all(work, {{str(k): {folder!r} + '/' for k in range(4)}}.items(), print, jobs=2)\n"
+    "from cosim import evaluate\n"
+    "class Sleeping:\n"
+    "    def __init__(self, scenario): pass\n"
+    "    def reset(self):\n"
+    "        open({folder!r} + '/' + str(os.getpid()), 'w').close()\n"
+    "        time.sleep(600)\n"
+    "    def prepare(self): pass\n"
+    "    def feedback(self, s, a=None): pass\n"
+    "evaluate('paper', {{str(k): Sleeping for k in range(4)}}, 1, 5, jobs=2)\n"
 )
 
 

@@ -8,10 +8,9 @@ import pytest
 import fmus
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, evaluate, simulate
-from cosim.errors import EvaluationError, PlantError, StudyError
-from cosim.evaluation.provenance import code_hash
-from cosim.plugins import OURS
-from cosim.study.units import Place
+from cosim.errors import EvaluationError, PlantError
+from cosim.plugins import OURS, code_hash
+from cosim.study.run import Place
 from tests.helpers.loop import Proportional
 
 
@@ -92,9 +91,9 @@ def test_an_evaluation_ends_in_a_line_and_goes_on_with_the_fmu_of_before(scenari
 @pytest.mark.parametrize("how", HOW)
 def test_a_unit_of_a_study_ends_in_a_line(scenario, how):
     with FmuPlant(scenario) as plant:
-        known = {scenario.hash: plant.fmu_sha256}
-    place = Place(None, (), code_hash(OURS), known)
+        known = plant.fmu_sha256
+    place = Place((), code_hash(OURS), known)
     place.enter(scenario)
     replacing(scenario, how)
-    with pytest.raises((StudyError, PlantError), match=r"plant\.fmu"):
+    with pytest.raises((EvaluationError, PlantError), match=r"plant\.fmu"):
         place.enter(scenario)

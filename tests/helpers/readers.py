@@ -12,9 +12,7 @@ from controllers import Parameters, Problem
 from controllers.errors import ParameterError
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import EvaluationError, PlantError, RecordingError, ScenarioError, TrajectoryError
-from cosim.evaluation.store import FILE, Store
-from cosim.evaluation.unit import UnitResult
+from cosim.errors import PlantError, RecordingError, ScenarioError, TrajectoryError
 from cosim.plant.archive import unpack
 from cosim.recording import RerunRecorder, read_recording
 from cosim.trajectory import read_csv
@@ -76,13 +74,6 @@ def _seal(checkpoint: Checkpoint) -> str:
     return digest.hexdigest()
 
 
-def _units(path: Path) -> list[tuple[str, UnitResult]]:
-    """Finished units, where none is torn: of a torn one the store thinks that it never was."""
-    if not path.read_bytes().endswith(b"\n"):
-        raise EvaluationError("the last unit is torn")
-    return list(Store(path.parent).load({"unit"}))
-
-
 def readers(folder: Path) -> dict[str, Reader]:
     """Every reader with a good file of its own, made in `folder`."""
     scenario = Scenario.load("paper")
@@ -92,8 +83,6 @@ def readers(folder: Path) -> dict[str, Reader]:
     (folder / "scenario.toml").write_text(scenario.to_toml())
     (folder / "plant.fmu").write_bytes(shipped().read_bytes())
     Parameters.naive(problem).save(folder / "theta.toml")
-    unit = UnitResult((7, 8), {"J": [6400.0, 6401.5]}, {"median_us": [60.0, 61.0]}, ("compiled",))
-    Store(folder).save("unit", unit)
     kinds: list[tuple[str, str, Any, type[Exception], Any]] = [
         ("scenario", "scenario.toml", Scenario.load, ScenarioError, None),
         ("theta", "theta.toml", lambda p: Parameters.load(p, problem), ParameterError,
@@ -102,7 +91,6 @@ def readers(folder: Path) -> dict[str, Reader]:
         ("trajectory", "trajectory.csv", lambda p: read_csv(p, scenario), TrajectoryError, None),
         ("recording", "run.rrd", read_recording, RecordingError, None),
         ("fmu", "plant.fmu", unpack, PlantError, None),
-        ("unit", FILE, _units, EvaluationError, repr),
     ]  # fmt: skip
     return {
         name: Reader(name, file, (folder / file).read_bytes(), read(folder / file), read, *rest)

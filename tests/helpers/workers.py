@@ -11,30 +11,8 @@ from tests.helpers.loop import Proportional
 LEDGER = "COSIM_TEST_LEDGER"
 
 
-def square(number):
-    return number * number
-
-
-def refuse_three(number):
-    if number == 3:
-        raise ValueError("three")
-    return number
-
-
 def die(_):
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def die_once(task):
-    """Square a number; the first process to come here is killed."""
-    number, marker = task
-    try:
-        Path(marker).touch(exist_ok=False)
-    except FileExistsError:
-        return number * number
-    # The others' results must be in before the pool breaks, or nothing is there to be lost.
-    time.sleep(0.3)
-    return die(number)
 
 
 class Noting(Proportional):
@@ -73,3 +51,12 @@ class Mortal(Noting):
 
 def mortal(scenario):
     return Mortal(scenario)
+
+
+class Dying(Proportional):
+    def reset(self):
+        die(None)
+
+
+def always_dying(scenario):
+    return Dying(scenario)

@@ -6,26 +6,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import StudyError
+from cosim.study import run as engine
 from cosim.study.results import StudyResults
-from tests.helpers.loop import Proportional
-from tests.helpers.toy_trainer import ToyTrainer, study
+from tests.helpers.toy_study import GROW, run_toy
 
 ONLINE = {"block": 500, "period": 1000, "signals": ["td_error"]}
 
 
-def online(**changes):
+def online(folder, jobs=1, **changes):
     case = [
-        {"name": "grow", "algorithm": "grow", "samples": 1000},
-        {"controller": ["naive", "best"]},
+        {"name": "grow", "algorithm": GROW, "samples": 1000},
+        {"controller": ["naive", "optimal"]},
     ]
-    return study(online=ONLINE | changes, case=case, logs=["grow"])
+    return run_toy(folder, jobs=jobs, online=ONLINE | changes, case=case, logs=["grow"])
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    return online().run(tmp_path_factory.mktemp("online"))
+    return online(tmp_path_factory.mktemp("online"))
 
 
 def rows(results, case):
@@ -36,29 +37,34 @@ def rows(results, case):
 def test_a_controller_runs_on_the_noise_of_every_training(results):
     scenario = Scenario.load("paper")
     with FmuPlant(scenario) as plant:
-        run = simulate(plant, Proportional(scenario), 1000, seed=1)
+        run = simulate(plant, naive(scenario), 1000, seed=1)
     cost = (run.signals["stage_cost"].values + run.signals["penalty"].values).reshape(2, 500)
-    found = [row for row in rows(results, "best") if row["training_seed"] == "1"]
+    found = [row for row in rows(results, "naive") if row["training_seed"] == "1"]
     assert [int(row["samples"]) for row in found] == [500, 1000]
     np.testing.assert_array_equal([float(row["J"]) for row in found], cost.mean(axis=1))
 
 
 def test_a_training_counts_with_its_own_samples(results):
-    costs = [float(row["J"]) for row in rows(results, "grow")]
-    assert costs == [7000 - 0.5 - 0, 7000 - 1.0 - 0, 7000 - 0.5 - 1, 7000 - 1.0 - 1]
+    logs = [results.folder / "runs" / "paper" / "grow" / seed / "learning.csv" for seed in "01"]
+    own = [
+        row["J"] for log in logs for row in csv.DictReader(log.read_text().splitlines()) if row["J"]
+    ]
+    assert [row["J"] for row in rows(results, "grow")] == own
 
 
 def test_the_table_pairs_each_run_with_the_optimum_on_its_noise(results):
     ((title, header, lines),) = results.further()
     assert "paper" in title
     own = np.array([float(row["J"]) for row in rows(results, "grow")]).reshape(2, 2).mean(axis=1)
-    best = np.array([float(row["J"]) for row in rows(results, "best")]).reshape(2, 2).mean(axis=1)
+    best = (
+        np.array([float(row["J"]) for row in rows(results, "optimal")]).reshape(2, 2).mean(axis=1)
+    )
     line = dict(zip(header, next(line for line in lines if line[0] == "grow"), strict=True))
     expected = 100 * (own - best).mean() / best.mean()
     assert float(line["regret %, mean [95 %]"].split()[0]) == pytest.approx(expected, rel=5e-3)
     assert float(line["worst"]) == pytest.approx(100 * (own / best - 1).max(), rel=5e-3)
     assert line["period 1"] == line["regret %, mean [95 %]"].split()[0]
-    assert "0" in next(line for line in lines if line[0] == "best")
+    assert "0" in next(line for line in lines if line[0] == "optimal")
 
 
 def test_the_report_has_table_and_figure_and_needs_no_runs(results, tmp_path):
@@ -76,31 +82,31 @@ def test_a_signal_that_no_log_has_is_named(results, tmp_path):
 
 @pytest.mark.slow
 def test_two_workers_give_the_bytes_of_one(results, tmp_path):
-    again = online().run(tmp_path, jobs=2)
+    again = online(tmp_path, jobs=2)
     content = [(folder / "online.csv").read_bytes() for folder in (results.folder, again.folder)]
     assert content[0] == content[1]
 
 
 def test_a_run_that_goes_on_does_nothing_twice(results, monkeypatch):
-    monkeypatch.setattr(ToyTrainer, "controller", lambda *_: pytest.fail("was done"))
-    again = online().run(results.folder)
-    assert rows(again, "best")
+    monkeypatch.setattr(engine, "perform", lambda *_: pytest.fail("was done"))
+    again = online(results.folder)
+    assert rows(again, "optimal")
 
 
 def test_a_study_without_it_has_no_such_table(tmp_path):
-    plain = study().run(tmp_path)
+    plain = run_toy(tmp_path)
     assert plain.further() == []
     assert not (tmp_path / "online.csv").exists()
 
 
-def test_a_period_is_made_of_whole_blocks():
+def test_a_period_is_made_of_whole_blocks(tmp_path):
     with pytest.raises(StudyError, match="period: must be a multiple of block = 500"):
-        online(period=750)
+        online(tmp_path, period=750)
 
 
 def test_of_the_references_only_the_optimum_runs_beside(tmp_path):
-    case = [{"name": "grow", "algorithm": "grow", "samples": 500}]
-    found = study(online=ONLINE, case=case).run(tmp_path)
-    assert rows(found, "best")
+    case = [{"name": "grow", "algorithm": GROW, "samples": 500}]
+    found = run_toy(tmp_path, online=ONLINE, case=case)
+    assert rows(found, "optimal")
     assert not rows(found, "naive")
     assert len(found.of("naive", "paper"))

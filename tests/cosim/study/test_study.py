@@ -1,15 +1,18 @@
-"""The engine with a trainer that learns nothing: what is stored, resumed, repeated and counted."""
+"""The engine: what is stored, resumed, repeated, counted, refused."""
 
-import numpy as np
-import pandas as pd
+import json
+import shutil
+from pathlib import Path
+
 import pytest
 
-from cosim import FmuPlant, simulate
-from cosim.errors import FailedRunsError, StudyError
+from cosim import FmuPlant, Study, run_study, simulate
+from cosim.errors import CosimError, FailedRunsError, StudyError
+from cosim.study.plan import RunKey, plan
 from cosim.study.results import StudyResults
-from tests.helpers.loop import Proportional
-from tests.helpers.toy_trainer import study
+from tests.helpers.toy_study import case, document, run_toy
 
+ROOT = Path(__file__).parents[3]
 TABLES = ("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "study.json")
 
 
@@ -17,167 +20,285 @@ def contents(folder):
     return {name: (folder / name).read_bytes() for name in TABLES}
 
 
+def stamps(folder, pattern):
+    return {path: path.stat().st_mtime_ns for path in sorted(folder.glob(pattern))}
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    return study().run(folder)
+    run_toy(folder)
+    return folder
 
 
 def test_every_case_scenario_and_seed_is_run_and_evaluated(whole):
-    keys = whole.runs[["case", "training_seed"]].itertuples(index=False)
-    runs = [(case, None if pd.isna(seed) else seed) for case, seed in keys]
-    assert set(runs) == {
-        ("naive", None),
-        ("best", None),
-        *((f"grow(rate={rate})", seed) for rate in (1.0, 2.0) for seed in (0, 1)),
-    }
-    assert set(whole.evaluation.seed) == {100_000, 100_001, 100_002}
-    assert len(whole.evaluation) == 3 * len(runs)
-    assert np.isfinite(whole.evaluation.J).all()
-    trained = whole.curves[(whole.curves.case == "grow(rate=1.0)")]
-    assert trained[trained.training_seed == 0].samples.tolist() == [500, 1000, 1200]
-    assert whole.of("grow(rate=1.0)", "paper").plant_samples.tolist() == [1207, 1207]
+    found = {path.parent.relative_to(whole / "runs").as_posix() for path in whole.rglob("run.json")}
+    grown = {f"paper/grow(rate={rate})/{seed}" for rate in (1.0, 2.0) for seed in (0, 1)}
+    assert found == {"paper/naive", "paper/optimal"} | grown
+    assert not list(whole.rglob("checkpoint.npz"))
 
 
-def test_results_read_back_are_those_that_were_returned(whole):
-    again = StudyResults.load(whole.folder)
-    assert again.about == whole.about
-    for name in ("state", "evaluation", "curves"):
-        pd.testing.assert_frame_equal(
-            getattr(again, name), getattr(whole, name), check_dtype=False, check_exact=True
-        )
+def test_a_run_s_indicators_are_those_of_its_own_closed_loop(whole):
+    from cosim.lookup import build_controller
 
-
-def test_regret_is_paired_with_the_optimum_on_the_same_noise(whole):
-    best, grown = (whole.indicator(case, "paper") for case in ("best", "grow(rate=2.0)"))
-    expected = np.mean(grown[1] - best[0]) / np.mean(best)
-    assert whole.regret("grow(rate=2.0)", "paper", [1]).value == pytest.approx(expected, rel=1e-12)
-    assert whole.regret("best", "paper").value == 0.0
-    assert whole.gap_closed("best", "paper").value == pytest.approx(1.0)
+    folder = whole / "runs" / "paper" / "grow(rate=2.0)" / "1"
+    row = (folder / "evaluation.csv").read_text().splitlines()[2].split(",")
+    with FmuPlant("paper") as plant:
+        theta = build_controller(str(folder / "parameters.toml"), plant.scenario)
+        alone = simulate(plant, theta, 30, 100_001).summary()
+    assert (row[0], float(row[3])) == ("100001", alone["J"])
 
 
 def test_two_workers_give_the_bytes_of_one(whole, tmp_path):
-    study().run(tmp_path, jobs=2)
-    assert contents(tmp_path) == contents(whole.folder)
+    run_toy(tmp_path, jobs=2)
+    assert contents(tmp_path) == contents(whole)
 
 
-def test_a_study_that_was_interrupted_goes_on_from_its_checkpoints(tmp_path):
-    def interrupted(name):
-        case = {
-            "name": "c",
-            "algorithm": "interrupt",
-            "samples": 1600,
-            "settings": {"marker": str(tmp_path / name)},
-        }
-        return study(case=[case])
+def test_a_training_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path):
+    def interrupted(out):
+        toy = case(
+            "c",
+            "Interrupt",
+            1600,
+            settings={"marker": str(tmp_path / "marker")},
+            training={"checkpoint_every": 400},
+        )
+        run_toy(out, case=[toy], training_seeds={"count": 1})
 
-    out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        interrupted("marker").run(out)
-    assert list(out.glob("runs/*/*/*/checkpoint.npz"))
-    interrupted("marker").run(out)
-    undisturbed = tmp_path / "undisturbed"
-    interrupted("marker").run(undisturbed)
-    assert contents(out) == contents(undisturbed)
-    assert not list(out.glob("runs/*/*/*/checkpoint.npz"))
+        interrupted(tmp_path / "out")
+    assert list((tmp_path / "out").glob("runs/*/*/*/checkpoint.npz"))
+    interrupted(tmp_path / "out")
+    interrupted(tmp_path / "undisturbed")
+    assert contents(tmp_path / "out") == contents(tmp_path / "undisturbed")
 
 
-def test_what_is_finished_is_not_done_again_and_more_seeds_are_added(tmp_path):
-    study().run(tmp_path)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("runs/**/parameters.toml")}
-    assert len(before) == 4
-    results = study(training_seeds={"first": 0, "count": 3}, evaluation={"seeds": 4, "steps": 30})
-    results = results.run(tmp_path)
-    assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert len(results.runs) == 2 + 2 * 3
-    assert results.indicator("grow(rate=1.0)", "paper").shape == (3, 4)
+def test_what_is_finished_is_not_done_again_and_more_seeds_are_added(whole, tmp_path):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    before = stamps(tmp_path, "runs/**/parameters.toml")
+    more = {"training_seeds": {"first": 0, "count": 3}, "evaluation": {"seeds": 4, "steps": 30}}
+    run_toy(tmp_path, **more)
+    after = stamps(tmp_path, "runs/**/parameters.toml")
+    assert len(after) == len(before) + 2
+    assert before.items() <= after.items()
+    for path in tmp_path.glob("runs/**/evaluation.csv"):
+        assert len(path.read_text().splitlines()) == 1 + 4
 
 
-def test_a_changed_setting_is_trained_anew(tmp_path):
+def test_a_changed_setting_is_named_and_trained_anew(tmp_path):
+    lines = []
+
     def one(rate):
-        return study(case=[{"name": "g", "algorithm": "grow", "samples": 600, "settings": rate}])
+        run_toy(
+            tmp_path,
+            case=[case("g", settings={"rate": rate})],
+            report=lambda _, line: lines.append(line),
+        )
+        return (tmp_path / "runs/paper/g/0/parameters.toml").read_text()
 
-    first = one({"rate": 1.0}).run(tmp_path).of("g", "paper").J.iloc[0]
-    second = one({"rate": 30.0}).run(tmp_path).of("g", "paper").J.iloc[0]
-    assert first != second
+    first = one(1.0)
+    lines.clear()
+    assert one(3.0) != first
+    assert "training changed since these runs; they are done anew" in lines
 
 
-def test_a_diverged_run_counts_with_its_own_cost(tmp_path):
-    case = {"name": "d", "algorithm": "diverge", "samples": 2000}
-    results = study(case=[case]).run(tmp_path)
-    run = results.of("d", "paper").iloc[1]
-    assert (run.status, run.samples) == ("diverged: as told", 1000)
+def test_burn_in_is_run_and_not_counted(tmp_path):
+    evaluation = {"seeds": 1, "steps": 20, "burn_in": 10}
+    run_toy(tmp_path, case=[{"controller": "naive"}], evaluation=evaluation)
+    row = (tmp_path / "runs/paper/naive/evaluation.csv").read_text().splitlines()[1].split(",")
     with FmuPlant("paper") as plant:
-        own = simulate(plant, Proportional(plant.scenario, gain=1.0 + 1), 30, 100_001)
-    assert results.indicator("d", "paper")[1, 1] == own.summary()["J"]
+        from controllers.factories import naive
+
+        run = simulate(plant, naive(plant.scenario), 30, 100_000)
+    cost = (run["stage_cost"] + run["penalty"])[10:].mean()
+    assert row[:4] == ["100000", "20", "10", repr(float(cost))]
 
 
 def test_a_failing_case_is_told_at_once_and_the_others_are_done(tmp_path):
-    cases = [
-        {"name": "broken", "algorithm": "break", "samples": 600},
-        {"name": "grow", "algorithm": "grow", "samples": 600},
-    ]
     lines = []
-    with pytest.raises(FailedRunsError, match="broken on paper, seed 0: ZeroDivisionError: broken"):
-        study(case=cases).run(tmp_path, report=lambda _, line: lines.append(line))
+    with pytest.raises(FailedRunsError, match="ZeroDivisionError"):
+        run_toy(
+            tmp_path,
+            case=[case("broken", "Break"), case("grow")],
+            report=lambda _, line: lines.append(line),
+        )
     assert any(line.startswith("failed: broken on paper, seed 0") for line in lines)
-    results = StudyResults.load(tmp_path)
-    assert len(results.of("grow", "paper")) == 2
-    assert results.of("broken", "paper").empty
+    assert len(list(tmp_path.glob("runs/paper/grow/*/evaluation.csv"))) == 2
     trace = next(tmp_path.glob("runs/paper/broken/0/failure.txt")).read_text()
-    assert "toy_trainer.py" in trace
+    assert "toy_study.py" in trace
 
 
-def test_sizes_may_differ_by_scenario(tmp_path):
-    evaluation = {"seeds": {"default": 2, "nominal": 1}, "steps": {"paper": 10, "nominal": 15}}
-    results = study(
-        scenarios=["paper", "nominal"], evaluation=evaluation, case=[{"controller": "naive"}]
-    ).run(tmp_path)
-    own = results.evaluation[results.evaluation.case == "naive"].groupby("scenario")
-    sizes = {name: (len(rows), rows.steps.iloc[0]) for name, rows in own}
-    assert sizes == {"paper": (2, 10), "nominal": (1, 15)}
-
-
-def test_a_scenario_may_be_written_in_the_study(tmp_path):
-    own = [{"extends": "paper", "name": "cheap", "penalty": {"linear": [1e3, 1e3]}}]
-    results = study(scenarios=["paper", "cheap"], scenario=own, case=[{"controller": "naive"}])
-    assert results.scenarios["cheap"].penalty.linear == (1e3, 1e3)
-    assert list(results.run(tmp_path).runs.scenario) == ["paper"] * 2 + ["cheap"] * 2
+def test_sizes_may_differ_by_scenario_and_a_scenario_be_written_in_the_study(tmp_path):
+    run_toy(
+        tmp_path,
+        scenarios=["paper", "cheap"],
+        scenario=[{"extends": "paper", "name": "cheap", "penalty": {"linear": [1e3, 1e3]}}],
+        evaluation={"seeds": {"default": 2, "cheap": 1}, "steps": {"paper": 10, "cheap": 15}},
+        case=[{"controller": "naive"}],
+    )
+    sizes = {
+        path.parts[-3]: [line.split(",")[1] for line in path.read_text().splitlines()[1:]]
+        for path in tmp_path.glob("runs/*/naive/evaluation.csv")
+    }
+    assert sizes == {"paper": ["10", "10"], "cheap": ["15"]}
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"case": [{"name": "a"}]}, "case 'a': needs either algorithm or controller"),
-        ({"case": [{"algorithm": "grow"}]}, "needs a name"),
-        ({"case": [{"controller": "naive", "samples": 5}]}, "samples is for an algorithm"),
-        ({"cases": []}, r"cases: unknown field \(did you mean 'case'\?\)"),
-        ({"schema": 2}, "schema"),
-        ({"case": [{"controller": "naive"}] * 2}, "two cases are called 'naive'"),
-        ({"scenarios": ["papr"]}, "did you mean 'paper'"),
-        ({"evaluation": {"first_seed": 1}}, "noise seed 1 is a training seed too"),
-        ({"evaluation": {"first_seed": 1_000_000}}, "a seed of the curves too"),
-        ({"evaluation": {"steps": {"nominal": 3}}}, "'nominal' is no scenario of the study"),
-        ({"evaluation": {"steps": {}}}, "has no number for 'paper'"),
-        (
-            {"case": [{"name": "a", "algorithm": "grow", "scenarios": ["nominal"]}]},
-            "'nominal' is none of the study's scenarios",
-        ),
-        ({"case": [{"name": "a", "algorithm": "grov"}]}, "unknown algorithm 'grov'"),
-        ({"case": [{"name": "a", "algorithm": "grow", "samples": []}]}, "samples is empty"),
+        {"case": [{"name": "a"}]},
+        {"case": [{"algorithm": "q-learning"}]},
+        {"case": [{"controller": "naive", "samples": 5}]},
+        {"cases": []},
+        {"schema": 2},
+        {"case": [{"controller": "naive"}] * 2},
+        {"case": [{"name": "..", "controller": "naive"}]},
+        {"case": [{"controller": "naive", "against": "tuned"}]},
+        {"scenarios": ["papr"]},
+        {"evaluation": {"first_seed": 1}},
+        {"evaluation": {"first_seed": 1_000_000}},
+        {"evaluation": {"steps": {"nominal": 3}}},
+        {"evaluation": {"steps": {}}},
+        {"case": [case("a", scenarios=["nominal"])]},
+        {"case": [{"name": "a", "algorithm": "q-lerning"}]},
+        {"case": [case("a", samples=[])]},
+        {"case": [case("a", settings={"rat": 1.0})]},
+        {"case": [case("a", training={"seed": 1})]},
+        {"logs": ["nobody"]},
     ],
 )
-def test_a_mistake_is_named_before_any_work(changes, message, tmp_path):
-    from cosim.errors import CosimError
+def test_a_mistake_is_refused_before_any_work(changes, tmp_path):
+    # A search's settings are learning's own errors.
+    from learning.errors import LearningError
 
-    with pytest.raises(CosimError, match=message):
-        study(**changes).run(tmp_path)
-    assert not list(tmp_path.glob("runs/**/run.json"))
+    with pytest.raises((CosimError, LearningError)):
+        run_toy(tmp_path, **changes)
+    assert not list(tmp_path.rglob("run.json"))
 
 
-def test_a_damaged_file_is_named(tmp_path):
-    study().run(tmp_path)
-    damaged = next(tmp_path.glob("runs/paper/naive/evaluation.csv"))
-    damaged.write_text("seed,steps\n1,x\n")
-    with pytest.raises(StudyError, match=r"evaluation\.csv' is damaged; delete it"):
-        study().run(tmp_path)
+# What is found in the folder --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["learning.csv", "parameters.toml", "evaluation.csv"])
+@pytest.mark.parametrize("damage", ["torn", "edited", "gone"])
+def test_a_finished_run_s_damaged_file_is_named_and_made_again(whole, tmp_path, name, damage):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "runs" / "paper" / "grow(rate=1.0)" / "0" / name
+    content = path.read_bytes()
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(content[: len(content) // 2] + (b"1\n" if damage == "edited" else b""))
+    lines = []
+    run_toy(tmp_path, report=lambda _, line: lines.append(line))
+    assert any(str(path) in line for line in lines)
+    assert path.read_bytes() == content
+    assert contents(tmp_path) == contents(whole)
+
+
+def test_a_torn_run_json_is_named_and_the_run_made_again(whole, tmp_path):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "runs" / "paper" / "naive" / "run.json"
+    path.write_text("{")
+    lines = []
+    run_toy(tmp_path, report=lambda _, line: lines.append(line))
+    assert any(str(path) in line for line in lines)
+    assert contents(tmp_path) == contents(whole)
+
+
+def test_nothing_is_deleted_but_files_of_runs(tmp_path):
+    precious = tmp_path / "runs" / "paper" / "naive" / "precious.txt"
+    precious.parent.mkdir(parents=True)
+    precious.write_text("mine")
+    run_toy(tmp_path, case=[{"controller": "naive"}])
+    about = json.loads((precious.parent / "run.json").read_text())
+    about["facts"]["rti-cosim"] = "other"
+    (precious.parent / "run.json").write_text(json.dumps(about))
+    run_toy(tmp_path, case=[{"controller": "naive"}])
+    assert precious.read_text() == "mine"
+
+
+def test_a_folder_of_somebody_else_is_refused(tmp_path):
+    other = tmp_path / "runs" / "paper" / "naive" / "evaluation.csv"
+    other.parent.mkdir(parents=True)
+    other.write_text("mine")
+    with pytest.raises(StudyError):
+        run_toy(tmp_path, case=[{"controller": "naive"}])
+    assert other.read_text() == "mine"
+
+
+def test_a_run_s_folder_does_not_lead_elsewhere(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out" / "runs").mkdir(parents=True)
+    (tmp_path / "out" / "runs" / "paper").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StudyError):
+        run_toy(tmp_path / "out", case=[{"controller": "naive"}])
+
+
+@pytest.mark.parametrize("name", [".", "..", "...", "a/b", "a\\b", ""])
+def test_a_name_that_leads_elsewhere_is_refused(name):
+    for names in ((name, "case"), ("scenario", name)):
+        with pytest.raises(StudyError):
+            RunKey(*names)
+
+
+# The plan ---------------------------------------------------------------------------------------
+
+
+def cases(**table):
+    given = {"name": "c", "algorithm": case("")["algorithm"]} | table
+    return Study.from_dict(document(case=[given]), "/study").cases
+
+
+def test_lists_are_a_grid_and_name_what_varies():
+    found = cases(settings={"rate": [1, 2], "marker": "x"}, start=["naive", "tuned"])
+    assert [one.name for one in found] == [
+        "c(start=naive rate=1)",
+        "c(start=naive rate=2)",
+        "c(start=tuned rate=1)",
+        "c(start=tuned rate=2)",
+    ]
+    assert found[3].settings == {"rate": 2, "marker": "x"}
+
+
+def test_a_setting_that_is_a_list_itself_takes_a_list_of_lists_as_a_grid():
+    assert [one.settings["weights"] for one in cases(settings={"weights": [1, 2]})] == [[1, 2]]
+    found = cases(settings={"weights": [[1, 2], [3]]})
+    assert [one.settings["weights"] for one in found] == [[1, 2], [3]]
+
+
+def test_files_are_seen_from_the_study():
+    assert cases(start="mine.toml")[0].start == str(Path("/study/mine.toml"))
+    found = cases(name=None, algorithm=None, controller=["theta/mine.toml", "module:make"])
+    assert [(one.name, one.training_seeds) for one in found] == [("mine", ()), ("module.make", ())]
+    assert found[0].controller == str(Path("/study/theta/mine.toml"))
+
+
+def test_a_counterpart_is_that_of_the_same_point_of_the_grid():
+    search = case("search", start=["naive", "tuned"])
+    with_rule = case("rule", start=["naive", "tuned"], against="search")
+    study = Study.from_dict(document(case=[search, with_rule]))
+    found = {one.name: study.counterpart(one) for one in study.cases}
+    assert found["rule(start=tuned)"] == "search(start=tuned)"
+    assert found["search(start=tuned)"] is None
+
+
+def moved(folder, start="clean"):
+    """Facts of the runs of a study in a folder that holds its start."""
+    folder.mkdir()
+    shutil.copy(ROOT / "results" / "starts" / f"{start}.toml", folder / "start.toml")
+    runs = [{"controller": "start.toml"}, case("q", start="start.toml")]
+    found = plan(Study.from_dict(document(case=runs), folder))
+    return {run.key: run.facts for run in found.runs}
+
+
+def test_a_study_that_moved_keeps_its_runs_and_another_theta_at_the_start_is_another_run(tmp_path):
+    here = moved(tmp_path / "here")
+    assert here == moved(tmp_path / "there")
+    changed = moved(tmp_path / "other", "fouled")
+    assert {key.case for key in here if here[key] != changed[key]} == {"start", "q"}
+
+
+def test_results_of_a_folder_are_those_that_were_returned(whole):
+    again = run_study(document(), whole)
+    assert StudyResults.load(whole).about == again.about

@@ -6,43 +6,45 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cosim import Study
+from controllers.parameters import Parameters
+from controllers.problem import Problem
 from cosim.errors import StudyError
+from cosim.study import run as engine
 from cosim.study.results import StudyResults
-from tests.helpers.toy_trainer import ToyTrainer, document
+from cosim.study.store import Trained
+from tests.helpers.toy_study import GROW, run_toy
 
 ROWS = {0: 0.0, 200: 3.0, 500: 6.0, 700: 7.0, 800: 9.0, 1000: 10.0}
 """How far θ has come, by samples."""
 
 
-class Wanderer(ToyTrainer):
+def wander(training, folder):
     """g goes from 0 to 10, faster with `rate`, and further with the seed; h moves from 1 to 2."""
-
-    def advance(self, training, checkpoint, seconds):
-        found = super().advance(training, checkpoint, seconds)
-        if not found.ended:
-            return found
-        factor = training.settings["rate"] * (1 + training.seed)
-        log = "samples,J,greedy_J,td_error,theta g,theta h[0]\n"
-        for samples, way in ROWS.items():
-            log += f"{samples},1,{6900 if samples else ''},1,{factor * way},{1 + way / 10}\n"
-        return replace(found, log=log)
-
-    def scales(self, training):
-        return {"theta g": 2.0, "theta h[0]": 1.0}
+    factor = training.settings["rate"] * (1 + training.options["seed"])
+    log = "samples,J,greedy_J,td_error,theta g,theta h[0]\n"
+    for samples, way in ROWS.items():
+        log += f"{samples},1,{6900 if samples else ''},1,{factor * way},{1 + way / 10}\n"
+    theta = Parameters.naive(Problem.from_scenario(training.scenario))
+    theta["x_l"][:] += factor / 10
+    theta.save(folder / "theta.toml")
+    text = (folder / "theta.toml").read_text("utf-8")
+    return Trained(1000, "finished", log, text, 1000, 0.1)
 
 
-def wandering(**theta):
+def wandering(folder, **theta):
     case = [
-        {"name": "go", "algorithm": "grow", "samples": 1000, "settings": {"rate": [1.0, 3.0]}},
-        {"controller": ["naive", "best"]},
+        {"name": "go", "algorithm": GROW, "samples": 1000, "settings": {"rate": [1.0, 3.0]}},
+        {"controller": ["naive", "optimal"]},
     ]
-    return Study.from_dict(document(case=case, theta=theta), ".", trainer=Wanderer())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine, "_train", wander)
+        patch.setattr("cosim.study.theta._scales", lambda _: {"theta g": 2.0, "theta h[0]": 1.0})
+        return run_toy(folder, case=case, theta=theta)
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    return wandering(without=["h"], blocks=["h"]).run(tmp_path_factory.mktemp("theta"))
+    return wandering(tmp_path_factory.mktemp("theta"), without=["h"], blocks=["h"])
 
 
 def lines_of(results, number):
@@ -89,7 +91,7 @@ def test_the_report_has_both_tables_and_needs_no_runs(results, tmp_path):
 
 
 def test_a_block_that_no_log_has_is_named(tmp_path):
-    found = wandering(without=["hh"]).run(tmp_path)
+    found = wandering(tmp_path, without=["hh"])
     with pytest.raises(StudyError, match=r"no log has a block 'hh'.*'h'.*there are g, h"):
         found.further()
 

@@ -1,0 +1,396 @@
+"""`evaluate`: controllers × seeds on common random numbers, a study of controllers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import EvaluationError, StudyError
+from cosim.files import temporary_folder, write_atomically
+from cosim.kpis import comes_to_rest, displaced, settling_time
+from cosim.plant import FmuPlant
+from cosim.plugins import (
+    OURS,
+    build_controller,
+    code_hash,
+    depends_on,
+    parameters_hash,
+    versions,
+)
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.simulation import simulate
+from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
+from cosim.study.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, check_folders
+from cosim.study.run import Runner
+from cosim.study.store import TIMING
+from cosim.text_tables import cell, csv_pieces
+from learning.evaluation import stored_optimum
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+OPTIMAL = "optimal"
+Factory = Callable[[Scenario], Controller]
+
+MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
+COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
+INDICATORS = (*MEANS, "failures")
+DRAWN = ("J", "economic_cost", "mean_violation")
+PROVENANCE = (
+    "version",
+    "versions",
+    "code_hash",
+    "scenario_hash",
+    "fmu_sha256",
+    "parameters_hash",
+    "command",
+)
+COLUMNS = (
+    "controller",
+    "scenario",
+    "seed",
+    "steps",
+    "economic_cost",
+    "mean_violation",
+    "violating_share",
+    "J",
+    "regret",
+    "gap_closed",
+    "gain_in_J",
+    "input_effort",
+    "settling_time",
+    "failures",
+    *PROVENANCE,
+)
+
+
+def evaluate(
+    scenario: Scenario | str | Path,
+    controllers: Mapping[str, Factory | str] | Sequence[str],
+    seeds: int | Sequence[int],
+    steps: int,
+    *,
+    burn_in: int = 0,
+    folder: str | Path | None = None,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: Callable[[int, str], None] | None = None,
+    command: str = "cosim.evaluate",
+) -> Evaluation:
+    """Run every controller on every seed and return the table; the bytes depend on no worker.
+
+    A seed means the same disturbances to all controllers (common random numbers), so differences
+    are to be taken seed by seed. Where the scenario's optimum is stored it runs too, for J*,
+    without rows of its own unless it is named.
+
+    Raises EvaluationError on a malformed request or failed workers, and whatever building or
+    running a controller raises.
+
+    Parameters
+    ----------
+    controllers : by name a factory(scenario) -> Controller, importable where the workers run, or
+        what `cosim.lookup.build_controller` takes; or only such texts, a file by its stem. The
+        one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
+    seeds : the seeds, or their number S for 0 … S−1.
+    steps : samples per run that count.
+    burn_in : samples run before them; 0 starts at the scenario's initial state.
+    folder : where finished runs are kept and found again; None keeps none.
+    jobs : worker processes; 1 works in this process.
+    scheduler : address of a Dask scheduler, used in place of `jobs`.
+    progress : called with the samples done, and with a line on what is done anew.
+    command : the text of the column `command`.
+    """
+    scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+    numbers = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
+    named = _named(controllers)
+    _check(named, numbers, steps, burn_in)
+    wanted = list(named)
+    if OPTIMAL not in named and (optimum := stored_optimum(scenario)) is not None:
+        named[OPTIMAL] = optimum
+    with FmuPlant(scenario) as plant:
+        fmu = plant.fmu_sha256
+    facts = {
+        "scenario": scenario.name,
+        "steps": steps,
+        "version": versions().partition("rti-cosim ")[2].partition(";")[0],
+        "versions": versions(),
+        "code_hash": code_hash(OURS),
+        "scenario_hash": scenario.hash,
+        "fmu_sha256": fmu,
+        "command": command,
+    } | ({"burn_in": burn_in} if burn_in else {})
+    sizes = Sizes(numbers, steps, burn_in, 0, 0)
+    runs, settling, parameters = [], {}, {}
+    for name, item in named.items():
+        controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
+        parameters[name] = parameters_hash(controller)
+        depends = depends_on(scenario, item, type(controller), packages=OURS) | {
+            "fmu": fmu,
+            "controller": item if isinstance(item, str) else _qualified(item),
+            "parameters": parameters[name],
+        }
+        try:
+            key = RunKey(scenario.name, name)
+        except StudyError as error:
+            raise EvaluationError(str(error)) from None
+        case = Case(name, (scenario.name,), "")
+        runs.append(Run(key, case, scenario, item, None, depends, sizes))
+        if name in wanted:
+            settling[name] = _settling(scenario, controller, steps)
+    check_folders(runs)
+
+    tell = progress or (lambda samples, line: None)
+
+    with temporary_folder("cosim-evaluation-") as own:
+        runner = Runner(runs, Path(folder or own), (Path.cwd(),), lambda s, _: tell(s.samples, ""))
+        for line in runner.remarks:
+            tell(0, line)
+        runner.go(jobs, scheduler)
+        for failure in runner.failures.values():
+            raise failure.error or EvaluationError(failure.message)
+        columns, timing = {}, {}
+        for name, store in zip(named, runner.stores.values(), strict=True):
+            columns[name] = _columns(store.indicators(EVALUATION), numbers)
+            timing[name] = _columns(store.indicators(TIMING), numbers)
+    return Evaluation(wanted, numbers, columns, timing, settling, parameters, facts)
+
+
+def _qualified(factory: Factory) -> str:
+    """A factory's name, as far as it has one."""
+    inner = getattr(factory, "func", factory)
+    arguments = f"{getattr(factory, 'args', '')}{getattr(factory, 'keywords', '')}"
+    return f"{inner.__module__}:{getattr(inner, '__qualname__', type(inner).__name__)}{arguments}"
+
+
+def _columns(figures: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> dict[str, Array]:
+    """Figures by name over the seeds, (S,) each; NaN where a seed has none."""
+    names = list(next(iter(figures.values()), {}))
+    nothing = dict.fromkeys(names, float("nan"))
+    rows = [figures.get(seed, nothing) for seed in seeds]
+    return {name: np.array([row[name] for row in rows]) for name in names}
+
+
+def _settling(scenario: Scenario, controller: Controller, steps: int) -> float:
+    """Settling time in s without disturbances, NaN where the scenario has permanent ones."""
+    start = displaced(scenario) if comes_to_rest(scenario) else None
+    if start is None:
+        return float("nan")
+    with FmuPlant(start) as plant:
+        return settling_time(simulate(plant, controller, steps, 0, residuals=False))
+
+
+def _named(controllers: Mapping[str, Factory | str] | Sequence[str]) -> dict[str, Factory | str]:
+    """Controllers by name; raises EvaluationError where two have one name."""
+    if isinstance(controllers, Mapping):
+        return dict(controllers)
+    named = {Path(text).stem if text.endswith(".toml") else text: text for text in controllers}
+    if isinstance(controllers, str) or len(named) < len(controllers):
+        raise EvaluationError(
+            "controllers must be a list of different names, or a mapping that gives each one"
+        )
+    return dict(named)
+
+
+def _check(
+    controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps: int, burn_in: int
+) -> None:
+    if not controllers:
+        raise EvaluationError("no controller to evaluate")
+    own = controllers.get(OPTIMAL, OPTIMAL)
+    if isinstance(own, str) and own != OPTIMAL:
+        raise EvaluationError(f"'{OPTIMAL}' names the controller that gives J*, not '{own}'")
+    if not seeds:
+        raise EvaluationError("no seed to evaluate on; give at least one")
+    if len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise EvaluationError("seeds must be distinct and not negative")
+    if max(seeds) >= 1 << 64:
+        raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
+    if steps < 1 or burn_in < 0:
+        raise EvaluationError(f"steps must be at least 1, not {steps}; burn-in at least 0")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Indicators of controllers × seeds on common random numbers.
+
+    `columns` and `timing` hold, by controller, what was measured over the seeds by name, (S,)
+    each; `settling` the settling time in s, NaN where permanent disturbances let nothing settle;
+    `parameters` each controller's hash; `facts` are the columns that do not vary.
+    """
+
+    controllers: Sequence[str]
+    seeds: Sequence[int]
+    columns: Mapping[str, Mapping[str, Array]]
+    timing: Mapping[str, Mapping[str, Array]]
+    settling: Mapping[str, float]
+    parameters: Mapping[str, str]
+    facts: Mapping[str, Any]
+
+    @property
+    def optimum(self) -> str | None:
+        """Name of the controller that gives J*, a row of its own or not; None if unknown."""
+        return OPTIMAL if OPTIMAL in self.columns else None
+
+    @property
+    def naive(self) -> str | None:
+        """Name of the controller that the gap is measured from, None if it is not there."""
+        return NAIVE if NAIVE in self.controllers else None
+
+    @property
+    def reference(self) -> str:
+        """Name of the controller that gains are measured against."""
+        return self.naive or self.controllers[0]
+
+    @property
+    def optimal(self) -> Array:
+        """J of the optimum over the seeds, (S,), NaN where it is not known."""
+        if self.optimum is None:
+            return np.full(len(self.seeds), np.nan)
+        return self.column(self.optimum, "J")
+
+    def column(self, controller: str, name: str) -> Array:
+        """An indicator of a controller over the seeds, (S,)."""
+        return self.columns[controller][name]
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows, by controller as given, then by seed; NaN where an indicator is undefined."""
+        return list(self._rows())
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        nothing = np.full(len(self.seeds), np.nan)
+        naive = nothing if self.naive is None else self.column(self.naive, "J")
+        for controller in self.controllers:
+            constant = {
+                "controller": controller,
+                "settling_time": self.settling[controller],
+                "parameters_hash": self.parameters[controller],
+                **self.facts,
+            }
+            columns, cost = self.columns[controller], self.column(controller, "J")
+            figures = {name: columns[name] for name in INDICATORS} | {
+                "regret": regrets(cost, self.optimal),
+                "gap_closed": gaps_closed(cost, naive, self.optimal),
+                "gain_in_J": gains(cost, self.column(self.reference, "J")),
+            }
+            for row, seed in enumerate(self.seeds):
+                values = {name: float(column[row]) for name, column in figures.items()}
+                values["failures"] = int(values["failures"])
+                yield {**constant, "seed": seed, **values}
+
+    def to_csv(self) -> str:
+        """The table as CSV; floats read back to the same bits, undefined ones are empty."""
+        return "".join(self._csv())
+
+    def _csv(self) -> Iterator[str]:
+        return csv_pieces(COLUMNS, ([cell(row[name]) for name in COLUMNS] for row in self._rows()))
+
+    def _timing_csv(self) -> Iterator[str]:
+        names = list(self.timing[self.controllers[0]])
+        return csv_pieces(
+            ["controller", "seed", *names],
+            (
+                [controller, str(seed), *(f"{self.timing[controller][n][row]:.6g}" for n in names)]
+                for controller in self.controllers
+                for row, seed in enumerate(self.seeds)
+            ),
+        )
+
+    def to_pandas(self) -> Any:
+        """The rows as a pandas data frame."""
+        import pandas as pd  # noqa: PLC0415 - half a second
+
+        return pd.DataFrame(self.rows, columns=list(COLUMNS))
+
+    def figure(self) -> Figure:
+        """Regret (J where J* is not known) with its intervals; economic cost against violation."""
+        from cosim.figures.evaluation import Costs, evaluation_figure  # noqa: PLC0415 - matplotlib
+
+        return evaluation_figure(
+            {name: Costs(*(self.column(name, key) for key in DRAWN)) for name in self.controllers},
+            title=f"{self.facts['scenario']}, {self.facts['steps']} samples × {len(self.seeds)} "
+            "seeds, the same disturbances for all",
+            optimal=None if self.optimum is None else self.optimal,
+        )
+
+    def plot(self, path: str | Path) -> Path:
+        """Draw `figure` to a PNG or SVG file; raises FigureError where it cannot be written."""
+        from cosim.figures.style import save  # noqa: PLC0415 - matplotlib
+
+        return save(self.figure(), path)
+
+    def write(self, folder: Path) -> None:
+        """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""
+        write_atomically(folder / EVALUATION, self._csv())
+        self.plot(folder / "evaluation.png")
+        write_atomically(folder / TIMING, self._timing_csv())
+
+    def summary(self) -> dict[str, Any]:
+        """The evaluation as a JSON document: controllers, comparisons, provenance, timing.
+
+        `controllers`: per controller the means over all seeds and samples, `failures` in total,
+        `settling_time` [s], `intervals` of each mean, where J* is known the `regret`
+        (J − J*)/|J*|, and where the naive controller is there too `gap_closed` =
+        (J_naive − J)/(J_naive − J*). `comparisons`: for each pair, the paired difference
+        controller − reference of each mean, and `gain_in_J`, (J_ref − J)/|J_ref|. Every interval
+        is of 95 %, paired over seeds, once by Student's t and once by BCa bootstrap. `optimal_J`
+        is J* on the same seeds.
+        """
+        names = list(self.controllers)
+        return {
+            **self.facts,
+            "seeds": list(self.seeds),
+            "reference": self.reference,
+            "optimum": self.optimum,
+            "optimal_J": None if self.optimum is None else float(np.mean(self.optimal)),
+            "controllers": {name: self._controller(name) for name in names},
+            "comparisons": [
+                self._comparison(name, reference)
+                for i, name in enumerate(names)
+                for reference in names[:i]
+            ],
+            "timing": {
+                name: {key: float(np.median(values)) for key, values in self.timing[name].items()}
+                for name in names
+            },
+        }
+
+    def _controller(self, name: str) -> dict[str, Any]:
+        estimates = {key: mean(self.column(name, key)) for key in MEANS}
+        document: dict[str, Any] = {key: estimate.value for key, estimate in estimates.items()}
+        document |= {
+            "failures": int(np.sum(self.column(name, "failures"))),
+            "settling_time": self.settling[name],
+            "parameters_hash": self.parameters[name],
+            "intervals": {
+                key: {"t": estimate.t, "bootstrap": estimate.bootstrap}
+                for key, estimate in estimates.items()
+            },
+        }
+        if self.optimum is None:
+            return document
+        cost = self.column(name, "J")
+        document["regret"] = regret(cost, self.optimal).to_dict()
+        if self.naive is not None:
+            naive = self.column(self.naive, "J")
+            document["gap_closed"] = gap_closed(cost, naive, self.optimal).to_dict()
+        return document
+
+    def _comparison(self, name: str, reference: str) -> dict[str, Any]:
+        return {
+            "controller": name,
+            "reference": reference,
+            "differences": {
+                key: mean(self.column(name, key) - self.column(reference, key)).to_dict()
+                for key in COMPARED
+            },
+            "gain_in_J": gain(self.column(name, "J"), self.column(reference, "J")).to_dict(),
+        }

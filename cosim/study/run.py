@@ -1,0 +1,439 @@
+"""Runs a plan: work items on this machine's cores or a Dask cluster, stored as they end."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import joblib
+from joblib.externals.loky import get_reusable_executor
+
+from controllers import compile_functions
+from cosim.errors import EvaluationError, FailedRunsError
+from cosim.files import temporary_folder
+from cosim.kpis import measure
+from cosim.plant import FmuPlant
+from cosim.plant.archive import unpack
+from cosim.plugins import OURS, build_controller, code_hash, import_from
+from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.simulation import simulate
+from cosim.study.document import TrajectoryTable
+from cosim.study.plan import EVALUATION, Plan, Run, Study, Training, plan
+from cosim.study.results import StudyResults
+from cosim.study.store import CHECKPOINT, INDICATORS, Figures, RunStore, Trained
+from learning.log import COLUMNS, LogRow, to_csv
+from learning.training import run_training
+
+BLOCK = 20_000
+"""Samples of an item of evaluation, about: a few seconds of work."""
+ROUNDS = 3
+"""Times that workers may die without having finished one item."""
+ANSWER_SECONDS, WORKER_SECONDS = 10.0, 300.0
+"""Within which a Dask scheduler answers, and for which it may be without a worker."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """What every item needs: folders of foreign modules, and the hashes of our code and the FMU
+    that the work was given out with."""
+
+    folders: tuple[str, ...]
+    code: str
+    fmu: str
+
+    def enter(self, scenario: Scenario) -> None:
+        """Let foreign modules be imported; raises EvaluationError on other code or another FMU."""
+        for folder in self.folders:
+            import_from(Path(folder))
+        if (here := code_hash(OURS)) != self.code:
+            raise EvaluationError(
+                f"a worker runs other code ({here}) than the work was given out with "
+                f"({self.code}); install the same version of rti-cosim everywhere"
+            )
+        if (found := unpack(scenario.plant.fmu)).sha256 != self.fmu:
+            raise EvaluationError(
+                f"FMU '{found.path}' was replaced, or is another one on this worker (SHA-256 "
+                f"{found.sha256[:16]}…, not {self.fmu[:16]}…); what is finished is stored: put "
+                "the FMU back, or begin anew with it"
+            )
+
+
+@dataclass(frozen=True)
+class Item:
+    """Work that one process does in one go, the same wherever that is.
+
+    A `training` to its end, its checkpoint in `folder` where the workers share this disk. Else a
+    controller for `steps` samples on each of the `seeds` after `burn_in`: its indicators for
+    `file`; the run itself, where a `trace` is asked for; means over `block` samples, where that is
+    not 0. `samples` are those of all the controller's items. The controller is a text for
+    `build_controller`, a factory(scenario), or the `training`'s with θ = `parameters`.
+    """
+
+    run: str
+    place: Place
+    scenario: Scenario
+    training: Training | None = None
+    folder: Path | None = None
+    parameters: str = ""
+    controller: Any = None
+    file: str = ""
+    seeds: tuple[int, ...] = ()
+    steps: int = 0
+    burn_in: int = 0
+    trace: TrajectoryTable | None = None
+    block: int = 0
+    samples: int = 0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An item that raised: its message, the traceback, and the error where it can be sent."""
+
+    message: str
+    trace: str
+    error: BaseException | None
+
+
+Measured = dict[int, tuple[Figures, Figures]]
+Outcome = Trained | Measured | str | list[float] | Failure
+
+
+def perform(item: Item) -> tuple[Item, Outcome]:
+    """Do an item; whatever it raises becomes a Failure, `sys.exit` in a plug-in too."""
+    try:
+        item.place.enter(item.scenario)
+        if item.training is not None and not item.parameters:
+            return item, _train(item.training, item.folder)
+        return item, _simulate(item)
+    except (KeyboardInterrupt, Terminated):
+        raise
+    except BaseException as error:
+        text = " ".join(f"{error}".split()) or type(error).__name__
+        sent: BaseException | None = error
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            sent = None
+        message = f"{type(error).__name__}: {text}"
+        return item, Failure(message, traceback.format_exc(), sent)
+
+
+def _train(training: Training, folder: Path | None) -> Trained:
+    run, begin = training.prepare(), perf_counter()
+    with temporary_folder("cosim-training-") as own:
+        out = folder or own
+        result = run_training(run, out, resume=(out / CHECKPOINT).is_file())
+        result.parameters.save(own / "theta.toml")
+        theta = (own / "theta.toml").read_text("utf-8")
+    rows = result.rows
+    # The log of a study starts with θ at the start, from which its increments are counted.
+    start = dict.fromkeys(rows[0] if rows else COLUMNS, float("nan")) | {"samples": 0.0}
+    return Trained(
+        int(rows[-1]["samples"]) if rows else 0,
+        result.status,
+        to_csv([LogRow(start, result.start), *rows]),
+        theta,
+        result.plant_samples,
+        perf_counter() - begin,
+    )
+
+
+def _simulate(item: Item) -> Measured | str | list[float]:
+    controller = _controller(item)
+    compile_functions(controller, item.samples)
+    with FmuPlant(item.scenario) as plant:
+        if item.trace is not None:
+            return simulate(plant, controller, item.steps, item.seeds[0]).to_csv()
+        if item.block:
+            run = simulate(plant, controller, item.steps, item.seeds[0], residuals=False)
+            cost = run["stage_cost"] + run["penalty"]
+            firsts = range(0, item.steps, item.block)
+            return [float(cost[first : first + item.block].mean()) for first in firsts]
+        found = {}
+        for seed in item.seeds:
+            figures, clock = measure(plant, controller, seed, item.steps, item.burn_in)
+            found[seed] = ({name: figures[name] for name in INDICATORS}, clock)
+        return found
+
+
+def _controller(item: Item) -> Controller:
+    if item.training is not None:
+        return item.training.controller(item.parameters)
+    if isinstance(item.controller, str):
+        return build_controller(item.controller, item.scenario)
+    controller: Controller = item.controller(item.scenario)
+    return controller
+
+
+@dataclass(frozen=True)
+class State:
+    """How far a study is: plant samples done, runs done and in all, and how many failed."""
+
+    samples: int
+    runs: int
+    all_runs: int
+    failed: int
+
+
+Report = Callable[[State, str], None]
+"""Gets the state and a line for what just happened; the line is empty for mere progress."""
+
+
+def silent(state: State, line: str) -> None:
+    """Report nothing."""
+
+
+class Runner:
+    """Does the runs of a plan; `out` holds what was finished before (`RunStore`)."""
+
+    def __init__(self, runs: list[Run], out: Path, folders: tuple[Path, ...], report: Report):
+        self._runs = {str(run.key): run for run in runs}
+        self._report, self._folders = report, tuple(map(str, dict.fromkeys(folders)))
+        self.stores = {name: RunStore(out, run) for name, run in self._runs.items()}
+        self.failures: dict[str, Failure] = {}
+        """The first failure of each run that failed."""
+        self._done = dict.fromkeys(self._runs, 0)
+        self._finished: set[str] = set()
+        self.remarks = list(dict.fromkeys(x for s in self.stores.values() for x in s.remarks))
+        """What was found changed or damaged, and is done anew."""
+
+    def go(self, jobs: int, scheduler: str | None) -> None:
+        """Do all that is not done: trainings and controllers first, then the learnt policies.
+
+        Raises EvaluationError where no worker can work. Every run that can be done is done.
+        """
+        if jobs < 1:
+            raise EvaluationError(f"jobs must be at least 1, not {jobs}")
+        fruitless = 0
+        while True:
+            items = self._missing(shared_disk=scheduler is None)
+            before = len(self._finished)
+            if not items:
+                return
+            done = 0
+            try:
+                with _workers(jobs, scheduler) as parallel:
+                    with out_of_reach_of_ctrl_c():
+                        outcomes = parallel(joblib.delayed(perform)(item) for item in items)
+                    for item, outcome in outcomes:
+                        self._take(item, outcome)
+                        done += 1
+            except BrokenProcessPool as error:
+                fruitless = 0 if done or len(self._finished) > before else fruitless + 1
+                if fruitless == ROUNDS:
+                    raise EvaluationError(
+                        f"the workers died {ROUNDS} times without finishing one of the work "
+                        f"items left ({error}); run with --jobs 1 to see why"
+                    ) from None
+            finally:
+                for store in self.stores.values():
+                    store.flush()
+
+    def _missing(self, shared_disk: bool) -> list[Item]:
+        """Items that can be done now; the evaluation of a training's θ waits for its end."""
+        items: list[Item] = []
+        for name, run in self._runs.items():
+            if name in self.failures or name in self._finished:
+                continue
+            items += self._items(name, run, shared_disk)
+            self._finish(name, run)
+        self._tell("")
+        return items
+
+    def _items(self, name: str, run: Run, shared_disk: bool) -> Iterator[Item]:
+        store = self.stores[name]
+        place = Place(self._folders, run.facts["rti-cosim"], run.facts["fmu"])
+        trained = 0 if run.training is None else run.training.samples
+        samples = run.samples - trained
+        base = Item(name, place, run.scenario, controller=run.controller, samples=samples)
+        self._done[name] = 0
+        if run.training is not None:
+            base = replace(base, training=run.training)
+            if not store.status:
+                store.unseal()
+                yield replace(base, folder=store.folder.absolute() if shared_disk else None)
+                return
+            base = replace(base, parameters=store.parameters)
+            self._done[name] = trained
+        for file, (seeds, steps) in run.noise.items():
+            missing, burn_in = store.missing(file), run.burn_in(file)
+            self._done[name] += (len(seeds) - len(missing)) * (burn_in + steps)
+            size = max(1, BLOCK // (burn_in + steps))
+            for first in range(0, len(missing), size):
+                block = tuple(missing[first : first + size])
+                yield replace(base, file=file, seeds=block, steps=steps, burn_in=burn_in)
+        for trace in run.traces:
+            if store.trajectory(trace).is_file():
+                self._done[name] += trace.steps
+            else:
+                yield replace(base, trace=trace, seeds=(trace.seed,), steps=trace.steps)
+        if (online := run.online) is not None:
+            beside = store.missing_online()
+            self._done[name] += online.steps * (len(online.seeds) - len(beside))
+            for seed in beside:
+                yield replace(base, seeds=(seed,), steps=online.steps, block=online.block)
+
+    def _take(self, item: Item, outcome: Outcome) -> None:
+        """Store what an item gave and say so."""
+        name, store = item.run, self.stores[item.run]
+        if isinstance(outcome, Failure):
+            if name not in self.failures:
+                self.failures[name] = outcome
+                store.fail(outcome.trace)
+                self._tell(f"failed: {name}: {outcome.message}")
+            return
+        store.unseal()
+        self._done[name] += len(item.seeds) * (item.burn_in + item.steps)
+        if isinstance(outcome, Trained):
+            store.train(outcome)
+            self._done[name] = outcome.samples
+            self._tell("" if outcome.status == "finished" else f"{name}: {outcome.status}")
+            return
+        if isinstance(outcome, str):
+            assert item.trace is not None
+            store.trace(item.trace, outcome)
+        elif isinstance(outcome, list):
+            store.accompany(item.seeds[0], outcome)
+        else:
+            store.evaluate(
+                item.file,
+                {seed: figures for seed, (figures, _) in outcome.items()},
+                {seed: clock for seed, (_, clock) in outcome.items()},
+            )
+        self._tell(self._finish(name, self._runs[name]))
+
+    def _finish(self, name: str, run: Run) -> str:
+        """Seal a run that has all that the plan asks for; a line on it."""
+        store = self.stores[name]
+        if not store.finished:
+            return ""
+        store.seal()
+        self._finished.add(name)
+        found = store.indicators(EVALUATION)
+        cost = sum(found[seed]["J"] for seed in run.sizes.seeds) / len(run.sizes.seeds)
+        status = store.status.partition(":")[0]
+        return f"{name}: J {cost:.6g}{f', {status}' if status else ''}"
+
+    def _tell(self, line: str) -> None:
+        done, failed = len(self._finished), len(self.failures)
+        self._report(State(sum(self._done.values()), done, len(self._runs), failed), line)
+
+
+@contextmanager
+def _workers(jobs: int, scheduler: str | None) -> Iterator[joblib.Parallel]:
+    """Where items are done, in no certain order: this process, `jobs` processes, or a cluster."""
+    options = {"return_as": "generator_unordered", "batch_size": 1}
+    if scheduler is not None:
+        with _cluster(scheduler) as client, joblib.parallel_config("dask", client=client):
+            yield joblib.Parallel(n_jobs=-1, **options)
+    elif jobs == 1:
+        yield joblib.Parallel(n_jobs=1, backend="sequential", **options)
+    else:
+        config = {"initializer": _begin, "initargs": (os.getpid(),), "inner_max_num_threads": 1}
+        try:
+            with joblib.parallel_config("loky", **config):
+                yield joblib.Parallel(n_jobs=jobs, max_nbytes=None, **options)
+        finally:
+            # Kept workers would know an edited module or variable as it was.
+            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+
+
+def _begin(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and end with it."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    follow_parent(parent)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Any]:
+    """A Dask client; all that goes wrong with the cluster is an EvaluationError of one line."""
+    try:
+        dask: Any = import_module("distributed")
+    except ImportError:
+        raise EvaluationError(
+            "a Dask scheduler needs the extra 'cluster': pip install 'rti-cosim[cluster]'"
+        ) from None
+
+    def gone(error: BaseException) -> EvaluationError:
+        return EvaluationError(
+            f"the Dask cluster at '{address}' does not answer, has no worker, or lost them again "
+            f"and again ({' '.join(str(error).split())[:200]}); what is finished is stored: the "
+            "same command goes on"
+        )
+
+    try:
+        client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
+    except Exception as error:
+        raise gone(error) from None
+    try:
+        client.wait_for_workers(1, timeout=WORKER_SECONDS)
+        yield client
+    except ModuleNotFoundError as error:
+        raise EvaluationError(
+            f"a worker of the cluster cannot import '{error.name}'; install the same version of "
+            "rti-cosim, and what the items need, on scheduler and workers"
+        ) from None
+    except (dask.KilledWorker, CancelledError, OSError, TimeoutError) as error:
+        raise gone(error) from None
+    finally:
+        with suppress(Exception):
+            client.close(timeout=ANSWER_SECONDS)
+
+
+def run_study(
+    source: Study | str | Path | Mapping[str, Any],
+    out: str | Path,
+    *,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    report: Report = silent,
+    planned: Plan | None = None,
+    figures: bool = True,
+) -> StudyResults:
+    """Train and evaluate all of a study that `out` does not hold yet, and write its tables there.
+
+    Raises StudyError and what scenarios and algorithms raise before any work is done;
+    FailedRunsError after all other runs are done and written.
+
+    Parameters
+    ----------
+    source : a study, its file, or the same document as a mapping.
+    jobs : worker processes; 1 works in this process. No byte of a table depends on it.
+    scheduler : address of a Dask scheduler, used in place of `jobs`.
+    report : gets the state after every work item, and a line for each run that ends or fails.
+    planned : what `plan` returned, if it is known.
+    figures : whether the study's trajectories and logs are drawn.
+    """
+    if isinstance(source, Mapping):
+        source = Study.from_dict(source)
+    study = source if isinstance(source, Study) else Study.load(source)
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    planned = planned or plan(study)
+    runner = Runner(planned.runs, folder, (study.folder, Path.cwd()), report)
+    for line in runner.remarks:
+        report(State(0, 0, len(planned.runs), 0), line)
+    runner.go(jobs, scheduler)
+    results = StudyResults.collect(planned, folder)
+    results.write(planned, figures=figures)
+    if runner.failures:
+        name, failure = next(iter(runner.failures.items()))
+        more = len(runner.failures) - 1
+        others = f" ({more} more run{'s' if more > 1 else ''} failed)" if more else ""
+        raise FailedRunsError(f"{name}: {failure.message}{others}; run again to try anew")
+    return results

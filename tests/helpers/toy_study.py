@@ -1,0 +1,82 @@
+"""Studies that take a second: an algorithm that only moves a bound, and short runs."""
+
+from pathlib import Path
+from typing import ClassVar
+
+from pydantic import Field
+
+from cosim import run_study
+from learning.configuration import Configuration
+
+HERE = "tests.helpers.toy_study"
+GROW = f"{HERE}:Grow"
+
+
+class ToyConfiguration(Configuration):
+    rate: float = Field(1.0, description="what x_l moves in 1000 samples")
+    marker: str = Field("", description="file that says that the run was interrupted")
+    weights: list[float] = Field([], description="a setting that is a list itself")
+
+
+class Grow:
+    """Moves the lower bounds of θ evenly; explores nothing."""
+
+    Configuration: ClassVar = ToyConfiguration
+    asks_for: ClassVar = "operation"
+    needs_action_value = needs_points = explores = False
+
+    def __init__(self, controller, scenario, configuration, samples, strategy, rng):
+        self._controller, self._configuration = controller, configuration
+
+    def observe(self, transition):
+        if (transition.number + 1) % 100 == 0:
+            theta = self._controller.theta.copy()
+            where = self._controller.parameters.blocks.slices["x_l"]
+            theta[where] += self._configuration.rate / 10
+            self._controller.theta = theta
+
+    def state(self):
+        return {}
+
+    def restore(self, state):
+        pass
+
+
+class Break(Grow):
+    def observe(self, transition):
+        raise ZeroDivisionError("broken in the middle")
+
+
+class Interrupt(Grow):
+    """Is interrupted by the user once, behind its first checkpoint."""
+
+    def observe(self, transition):
+        super().observe(transition)
+        marker = Path(self._configuration.marker)
+        if transition.number == 700 and not marker.exists():
+            marker.touch()
+            raise KeyboardInterrupt
+
+
+def case(name, kind="Grow", samples=600, **more):
+    return {"name": name, "algorithm": f"{HERE}:{kind}", "samples": samples} | more
+
+
+def document(**changes):
+    return {
+        "schema": 1,
+        "name": "toy",
+        "scenarios": ["paper"],
+        "training_seeds": {"first": 0, "count": 2},
+        "evaluation": {"seeds": 3, "steps": 30},
+        "curves": {"points": 4, "seeds": 2, "steps": 20},
+        "case": [
+            case("grow", settings={"rate": [1.0, 2.0]}),
+            {"controller": ["naive", "optimal"]},
+        ],
+    } | changes
+
+
+def run_toy(out, *, jobs=1, report=lambda state, line: None, **changes):
+    """Run the document with some changes."""
+    return run_study(document(**changes), out, jobs=jobs, report=report)

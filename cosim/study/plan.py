@@ -11,8 +11,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Self, get_args, get_origin
 
-from controllers.parameters import Parameters
 from controllers.problem import Problem
+from controllers.theta import Parameters
 from cosim.errors import StudyError
 from cosim.files import temporary_folder
 from cosim.plant import FmuPlant

@@ -16,8 +16,16 @@ from tests.helpers.processes import eventually
 AGAIN = "; what is finished is kept: the same command goes on from there"
 COMMANDS = {
     "simulate": ("simulate -n 5000000", "", ".cosim.lock"),
-    "evaluate": ("evaluate --seeds 9999 -n 1000 --jobs 1", AGAIN, ".units.jsonl"),
-    "evaluate --jobs": ("evaluate --seeds 9999 -n 1000 --jobs 2", AGAIN, ".units.jsonl"),
+    "evaluate": (
+        "evaluate --seeds 9999 -n 1000 --jobs 1",
+        AGAIN,
+        "runs/paper/naive/evaluation.csv",
+    ),
+    "evaluate --jobs": (
+        "evaluate --seeds 9999 -n 1000 --jobs 2",
+        AGAIN,
+        "runs/paper/naive/evaluation.csv",
+    ),
     "study": ("study run study.toml --jobs 2", AGAIN, "runs/**/*.csv"),
     "train": (
         "train -a q-learning -n 9999999 --checkpoint-every 1000 --log-every 100",

@@ -1,12 +1,17 @@
+"""Batch Q-learning, and what its replay solves again."""
+
 import numpy as np
+import pytest
 
 from controllers.errors import QpError
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
-from learning import BatchQLearning
+from learning import BatchQLearning, QLearning
+from learning.batch_q_learning import ReplayBuffer
 from learning.exploration import build_strategy
 from learning.loop import TrainingLoop, begin
-from learning.training_run import TrainingRun
+from learning.q_learning import AverageCost
+from learning.training_run import TrainingRun, starting_parameters
 
 
 class Bench:
@@ -76,3 +81,146 @@ def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenar
         assert np.flatnonzero(updates).tolist() == [59, 79, 99, 119]
         offsets[measured] = learner.controller.parameters["c_f"]
     assert np.abs(offsets[False]).max() < 0.1 * np.abs(offsets[True]).max()
+
+
+@pytest.fixture(scope="module")
+def collected(scenario, problem):
+    """Samples of a run at one θ, with their points, and the controller."""
+    configuration = QLearning.Configuration(
+        line_search=True, rule="fit", exploration_probability=0.4
+    )
+    controller = RtiNmpc(problem, starting_parameters(problem, configuration))
+    strategy = build_strategy(configuration, scenario, 100)
+    algorithm = QLearning(
+        controller, scenario, configuration, 100, strategy, np.random.default_rng(0)
+    )
+    with FmuPlant(scenario) as plant:
+        interaction = TrainingLoop(plant, controller, algorithm, strategy, np.random.default_rng(0))
+        interaction.start(plant.reset(5))
+        samples = [interaction.next()[0] for _ in range(60)]
+    return controller, samples
+
+
+def average_cost(scenario):
+    return AverageCost(scenario.discount, 0, 1.0, 0.0)
+
+
+def filled(controller, samples, capacity=100):
+    """A buffer that these samples were put into."""
+    buffer = ReplayBuffer(controller, capacity)
+    for sample in samples:
+        buffer.add(sample)
+    return buffer
+
+
+def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collected):
+    controller, samples = collected
+    buffer = filled(controller, samples)
+    replayed = buffer.replay(average_cost(scenario))
+    q = [sample.action_value.value for sample in samples]
+    target = [sample.cost + scenario.discount * sample.next_policy.value for sample in samples]
+    assert replayed.rows.tolist() == list(range(60))
+    assert replayed.action_value == pytest.approx(q, rel=1e-9)
+    assert replayed.target == pytest.approx(target, rel=1e-9)
+    assert replayed.gradient == pytest.approx(
+        np.array([s.action_value.value_gradient for s in samples]), rel=1e-6, abs=1e-6
+    )
+    assert any(sample.explored for sample in samples)
+    assert replayed.failures == 0
+
+
+def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, collected):
+    controller, samples = collected
+    whole, gaps = filled(controller, samples), filled(controller, samples[::3])
+    expected = whole.replay(average_cost(scenario))
+    found = gaps.replay(average_cost(scenario))
+    assert found.td_error == pytest.approx(expected.td_error[::3], rel=1e-9, abs=1e-6)
+
+
+def test_replay_sees_the_present_theta(scenario, collected):
+    controller, samples = collected
+    buffer = filled(controller, samples)
+    before = buffer.replay(average_cost(scenario))
+    theta = controller.theta.copy()
+    h = 1e-3
+    position = controller.parameters.blocks.slices["b_l"].start
+    moved = theta.copy()
+    moved[position] += h
+    try:
+        controller.theta = moved
+        after = buffer.replay(average_cost(scenario))
+    finally:
+        controller.theta = theta
+    slope = (after.action_value - before.action_value) / h
+    assert slope == pytest.approx(before.gradient[:, position], rel=1e-3, abs=1e-3)
+
+
+class Counting:
+    """A controller that counts its feedbacks."""
+
+    def __init__(self, controller, *, memoryless=True):
+        self._controller, self.memoryless, self.feedbacks = controller, memoryless, 0
+
+    @property
+    def theta(self):
+        return self._controller.theta
+
+    @theta.setter
+    def theta(self, theta):
+        self._controller.theta = theta
+
+    def prepare_at(self, point):
+        self._controller.prepare_at(point)
+
+    def feedback(self, *arguments):
+        self.feedbacks += 1
+        return self._controller.feedback(*arguments)
+
+
+def replayed(controller, samples, cost):
+    """A replay that remembers nothing."""
+    buffer = filled(Counting(controller, memoryless=False), samples)
+    return buffer.replay(cost)
+
+
+def assert_same(first, second):
+    for name in ("rows", "action_value", "target", "gradient", "failures"):
+        assert np.array_equal(getattr(first, name), getattr(second, name)), name
+
+
+def test_what_the_loop_solved_is_not_solved_again(scenario, collected):
+    controller, samples = collected
+    counting = Counting(controller)
+    buffer = filled(counting, samples)
+    found = buffer.replay(average_cost(scenario))
+    assert counting.feedbacks == sum(sample.explored for sample in samples)
+    assert_same(found, replayed(controller, samples, average_cost(scenario)))
+
+
+def test_another_theta_and_a_new_batch_know_nothing_of_the_one_before(scenario, collected):
+    controller, samples = collected
+    start = controller.theta
+    buffer = filled(controller, samples)
+    first = buffer.replay(average_cost(scenario))
+    try:
+        controller.theta = start + 1e-3
+        assert not np.array_equal(buffer.replay(average_cost(scenario)).gradient, first.gradient)
+    finally:
+        controller.theta = start
+    assert_same(buffer.replay(average_cost(scenario)), first)
+    buffer.clear()
+    for sample in samples[30:]:
+        buffer.add(sample)
+    found = buffer.replay(average_cost(scenario))
+    assert_same(found, replayed(controller, samples[30:], average_cost(scenario)))
+
+
+def test_a_restored_buffer_remembers_what_was_solved(scenario, collected):
+    controller, samples = collected
+    buffer = filled(controller, samples)
+    first = buffer.replay(average_cost(scenario))
+    counting = Counting(controller)
+    other = ReplayBuffer(counting, 100)
+    other.restore(buffer.state())
+    assert_same(other.replay(average_cost(scenario)), first)
+    assert counting.feedbacks == 0

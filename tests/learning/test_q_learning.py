@@ -1,3 +1,5 @@
+"""Online Q-learning: the printed rule in closed form, the Kalman recursion, the mean cost."""
+
 import numpy as np
 import pytest
 
@@ -6,8 +8,8 @@ from cosim import FmuPlant
 from learning import QLearning
 from learning.exploration import build_strategy
 from learning.loop import TrainingLoop
-from learning.q_learning import AS_PRINTED
-from learning.step import line_search
+from learning.q_learning import AS_PRINTED, AverageCost, KalmanRegression
+from learning.step import Fit, line_search
 from learning.training_run import starting_parameters
 
 
@@ -75,23 +77,6 @@ def test_a_line_searched_step_never_raises_the_sampled_td_error(plant, problem, 
     assert min(lengths) < 1.0 == max(lengths), "some steps are shortened, some are not"
 
 
-def test_without_line_search_some_steps_do_raise_it(plant, problem):
-    bench = Bench(plant, problem, **{**AS_PRINTED, "step_size": 10.0})
-    raised = 0
-    for _ in range(60):
-        point = bench.controller.linearisation_point
-        sample, _ = bench.interaction.next()
-        if sample is None:
-            continue
-        sample = sample._replace(point=point)
-        target = sample.cost + plant.scenario.discount * sample.next_policy.value
-        before = target - sample.action_value.value
-        bench.algorithm.observe(sample)
-        raised += abs(bench.td_error(sample, target)[0]) > abs(before)
-        bench.interaction.renew()
-    assert raised > 0
-
-
 def test_state_and_restore_carry_all_memory(plant, problem):
     bench, other = (Bench(plant, problem, prior_samples=20, step_every=30) for _ in range(2))
     samples = [bench.interaction.next()[0] for _ in range(50)]
@@ -103,3 +88,66 @@ def test_state_and_restore_carry_all_memory(plant, problem):
         first, second = bench.algorithm.observe(sample), other.algorithm.observe(sample)
     assert first == second
     assert np.array_equal(bench.controller.theta, other.controller.theta)
+
+
+def regression(size, variance, **changes):
+    settings = {"clip": np.inf, "memory": np.inf, **changes}
+    return KalmanRegression(size, variance, **settings)
+
+
+@pytest.fixture
+def data(rng):
+    gradient = rng.normal(size=(60, 4))
+    return gradient, gradient @ np.array([1.0, -2.0, 0.5, 0.0]) + 0.3 * rng.normal(size=60)
+
+
+def test_the_recursion_is_the_batch_ridge_regression(data):
+    gradient, errors = data
+    kalman = regression(4, 0.7)
+    for row, error in zip(gradient, errors, strict=True):
+        kalman.update(error, row)
+    information = np.eye(4) + gradient.T @ gradient / 0.7
+    assert kalman.mean == pytest.approx(np.linalg.solve(information, gradient.T @ errors / 0.7))
+    assert kalman.covariance == pytest.approx(np.linalg.inv(information))
+    fit = kalman.fit()
+    assert fit.metric() == pytest.approx(information)
+    assert fit.metric() @ fit.minimiser == pytest.approx(fit.gradient)
+
+
+def test_an_outlier_moves_no_further_than_the_clip():
+    far, clipped = regression(1, 4.0), regression(1, 4.0, clip=3.0)
+    far.update(6.0, np.ones(1))
+    clipped.update(1e9, np.ones(1))
+    assert clipped.mean == pytest.approx(far.mean)
+
+
+def test_drift_lets_a_parameter_be_followed(rng):
+    still, following = regression(1, 0.1), regression(1, 0.1, drift=1e-3)
+    for k in range(4000):
+        truth = 1.0 if k < 2000 else -1.0
+        for kalman in (still, following):
+            kalman.update(truth + 0.1 * rng.normal(), np.ones(1))
+    assert following.mean[0] == pytest.approx(-1.0, abs=0.1)
+    assert abs(still.mean[0]) < 0.2
+
+
+def fit():
+    metric = np.array([[2.0, 0.5], [0.5, 1.0]])
+    minimiser = np.array([0.3, -0.4])
+    return Fit(metric @ minimiser, minimiser, lambda: metric)
+
+
+def test_discounted_target_and_untouched_fit():
+    average_cost = AverageCost(0.9, 1, 10.0, 6000.0)
+    assert average_cost.target(5.0, 100.0) == 95.0
+    same = fit()
+    assert average_cost.take(same) is same
+
+
+def test_mean_cost_takes_the_step_of_c_lambda():
+    average_cost = AverageCost(1.0, 1, 10.0, 6000.0)
+    assert average_cost.target(6001.0, 100.0) == 101.0
+    rest = average_cost.take(fit())
+    assert average_cost.mean_cost == pytest.approx(6000.0 - 4.0)
+    assert rest.minimiser.tolist() == [0.3, 0.0]
+    assert rest.gradient == pytest.approx(rest.metric() @ rest.minimiser)

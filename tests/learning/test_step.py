@@ -1,0 +1,322 @@
+"""Steps of θ: fits against their programmes, definiteness, constraints, and the prior."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from qpsolvers import solve_qp
+
+from controllers.theta import Parameters
+from controllers.theta import ThetaBlocks
+from learning.configuration import Configuration
+from learning.step import (
+    CholeskyParametrisation,
+    ConstrainedStep,
+    Fit,
+    LinearMatrixInequality,
+    certificate,
+    clip_eigenvalues,
+    line_search,
+    matrix_of,
+    policy_gradient_fit,
+    prior_deviation,
+    td_fit,
+    td_step,
+)
+from tests.helpers.carrier import Carrier
+from tests.helpers.other_units import factors
+
+SIZE = 6
+
+
+def programme(fit):
+    """Minimiser of dᵀMd − 2bᵀd by a QP solver that knows nothing of closed forms."""
+    return solve_qp(2 * fit.metric(), -2 * fit.gradient, solver="daqp")
+
+
+def check(fit):
+    assert fit.minimiser == pytest.approx(programme(fit), rel=1e-6, abs=1e-9)
+
+
+@given(seed=st.integers(0, 10**6), step_size=st.floats(1e-4, 10.0), td_error=st.floats(-1e3, 1e3))
+def test_td_fit_equals_its_quadratic_programme(seed, step_size, td_error):
+    gradient = np.random.default_rng(seed).normal(size=SIZE)
+    check(td_fit(td_error, gradient, step_size))
+
+
+def test_td_fit_is_the_papers_fitting_problem(rng):
+    gradient, td_error, step_size = rng.normal(size=SIZE), 3.7, 0.4
+    fit = td_fit(td_error, gradient, step_size)
+
+    def cost(d):
+        return (td_error - gradient @ d) ** 2 + d @ d / step_size
+
+    best = cost(fit.minimiser)
+    for _ in range(50):
+        assert cost(fit.minimiser + 1e-3 * rng.normal(size=SIZE)) > best
+
+
+def test_td_fit_is_normalised_and_the_td_step_is_not(rng):
+    gradient = rng.normal(size=SIZE)
+    norm = gradient @ gradient
+    assert td_fit(2.0, gradient, 1e6).minimiser == pytest.approx(2.0 * gradient / norm, rel=1e-5)
+    assert td_step(2.0, gradient, 0.3).minimiser == pytest.approx(0.6 * gradient)
+    check(td_step(2.0, gradient, 0.3))
+
+
+@pytest.mark.parametrize("natural", [False, True])
+def test_policy_gradient_fit_descends_and_equals_its_programme(rng, natural):
+    root = rng.normal(size=(SIZE, SIZE))
+    metric = root @ root.T + np.eye(SIZE) if natural else None
+    gradient = rng.normal(size=SIZE)
+    fit = policy_gradient_fit(gradient, 0.7, metric)
+    check(fit)
+    assert fit.minimiser @ gradient < 0
+
+
+@pytest.mark.parametrize(
+    ("error", "step"),
+    [
+        (lambda t: 1.0 - t, 1.0),
+        (lambda t: 1.0 - 3.0 * t, 0.5),
+        (lambda t: 1.0 + t, 0.0),
+        (lambda t: 1.0 if t == 0 else float("nan"), 0.0),
+    ],
+)
+def test_line_search_takes_the_largest_step_that_does_not_raise_the_error(error, step):
+    assert line_search(error) == step
+
+
+SMALLEST = 1e-2
+KINDS = (LinearMatrixInequality, CholeskyParametrisation)
+
+
+@pytest.fixture(scope="module")
+def blocks(problem):
+    return ThetaBlocks.of(problem)
+
+
+def fit_towards(target, metric):
+    return Fit(metric @ target, target, lambda: metric)
+
+
+def random_fit(blocks, rng, size=5.0):
+    root = rng.normal(size=(blocks.size, blocks.size))
+    return fit_towards(size * rng.normal(size=blocks.size), root @ root.T + np.eye(blocks.size))
+
+
+def projected_gradient(blocks, theta, fit, rounds=2000):
+    """The constrained fit by Frobenius projections: slow, and nothing in common with Clarabel."""
+    weight = 1.0 / blocks.scale
+    for name in ("B_l", "B_Vf"):
+        size = blocks.block(name).dimension
+        rows, columns = np.triu_indices(size)
+        weight[blocks.slices[name]] = np.where(rows == columns, 1.0, np.sqrt(2.0))
+    # In y = weight · scale · d a block's norm is Frobenius's, so clipping is the projection.
+    unit = weight * blocks.scale
+    metric = fit.metric() / np.outer(unit, unit)
+    gradient = fit.gradient / unit
+    y = np.zeros(blocks.size)
+    z, momentum = y.copy(), 1.0
+    length = 1.0 / np.linalg.eigvalsh(metric)[-1]
+    for _ in range(rounds):
+        moved = theta + (z - length * (metric @ z - gradient)) / weight
+        new = (clip_eigenvalues(blocks, moved, SMALLEST) - theta) * weight
+        following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
+        z, y, momentum = new + (momentum - 1) / following * (new - y), new, following
+    return theta + y / weight
+
+
+def objective(blocks, theta, new, fit):
+    d = (new - theta) / blocks.scale
+    return d @ fit.metric() @ d - 2 * fit.gradient @ d
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_step_is_definite_and_certified(blocks, parameters, rng, kind):
+    enforce = kind(blocks, SMALLEST)
+    theta = parameters.theta
+    corrected = 0
+    for _ in range(30):
+        new, vouched = enforce(theta, random_fit(blocks, rng))
+        assert vouched.smallest >= SMALLEST * (1 - 1e-9)
+        assert vouched.smallest == pytest.approx(certificate(blocks, new).smallest)
+        assert not vouched.refused
+        corrected += vouched.corrected
+    assert corrected > 20
+
+
+def test_a_free_step_that_is_definite_is_taken_as_it_is(blocks, parameters, rng):
+    fit = random_fit(blocks, rng, size=1e-3)
+    new, vouched = LinearMatrixInequality(blocks, SMALLEST)(parameters.theta, fit)
+    assert np.array_equal(new, parameters.theta + blocks.scale * fit.minimiser)
+    assert not vouched.corrected
+
+
+def test_cholesky_takes_a_small_step_to_first_order(blocks, parameters, rng):
+    enforce = CholeskyParametrisation(blocks, SMALLEST)
+    errors = []
+    for size in (1e-2, 1e-3):
+        fit = random_fit(blocks, np.random.default_rng(1), size)
+        new, _ = enforce(parameters.theta, fit)
+        free = parameters.theta + blocks.scale * fit.minimiser
+        errors.append(np.abs(new - free).max())
+    # Second order: a tenth of the step leaves a hundredth of the error (and the tiny floor).
+    assert errors[1] < 0.012 * errors[0] + 1e-8
+
+
+def test_cholesky_does_not_follow_a_step_far_beyond_the_present_hessian(blocks, parameters, rng):
+    enforce = CholeskyParametrisation(blocks, SMALLEST)
+    fit = random_fit(blocks, rng, size=1e4)
+    new, vouched = enforce(parameters.theta, fit)
+    assert vouched.smallest >= SMALLEST
+    for name in ("B_l", "B_Vf"):
+        before, after = (matrix_of(blocks, theta, name) for theta in (parameters.theta, new))
+        # ‖Φ(X)‖ ≤ √(n/2) for ‖X‖₂ = 1
+        most = (1 + np.sqrt(len(before) / 2)) ** 2
+        assert np.linalg.norm(after, 2) <= 1.01 * most * np.linalg.norm(before, 2)
+
+
+def test_lmi_step_equals_a_generic_conic_solution(blocks, parameters, rng):
+    theta = parameters.theta
+    for _ in range(3):
+        root = rng.normal(size=(blocks.size, blocks.size)) / np.sqrt(blocks.size)
+        metric = root @ root.T + 0.3 * np.eye(blocks.size)
+        fit = fit_towards(2.0 * rng.normal(size=blocks.size), metric)
+        new, vouched = LinearMatrixInequality(blocks, SMALLEST)(theta, fit)
+        assert vouched.corrected
+        reference = projected_gradient(blocks, theta, fit)
+        assert objective(blocks, theta, new, fit) == pytest.approx(
+            objective(blocks, theta, reference, fit), rel=1e-6
+        )
+        assert (new - reference) / blocks.scale == pytest.approx(0.0, abs=1e-4)
+
+
+def test_projection_is_the_nearest_definite_matrix(blocks, parameters):
+    matrix = np.diag([1.0, -1.0, 2.0, 0.5])
+    theta = parameters.replace({"B_l": matrix}).theta
+    clipped = matrix_of(blocks, clip_eigenvalues(blocks, theta, SMALLEST), "B_l")
+    assert clipped == pytest.approx(np.diag([1.0, SMALLEST, 2.0, 0.5]))
+
+
+@pytest.fixture
+def controller(problem):
+    return Carrier(Parameters.naive(problem, ThetaBlocks.of(problem, slack_weights=True)))
+
+
+def towards(blocks, **values):
+    d = np.zeros(blocks.size)
+    for name, entries in values.items():
+        d[blocks.slices[name]] = entries
+    return Fit(d, d, lambda: np.eye(d.size))
+
+
+def test_take_moves_theta_by_the_scaled_step(controller):
+    step = ConstrainedStep(controller, Configuration())
+    before = controller.theta.copy()
+    update = step.take(towards(step.blocks, c_lambda=2.0, x_l=[0.5, 0.0]), td_error=3.0)
+    assert (
+        controller.parameters["c_lambda"]
+        == before[controller.parameters.blocks.slices["c_lambda"]] + 2e3
+    )
+    assert controller.parameters["x_l"].tolist() == [25.5, 40.0]
+    assert update.td_error == 3.0 and update.step == pytest.approx(np.hypot(2.0, 0.5))
+    assert not update.corrected and update.smallest_eigenvalue == pytest.approx(1.0)
+
+
+def test_slack_weights_stay_above_what_exactness_asks_for(controller):
+    step = ConstrainedStep(controller, Configuration())
+    step.take(towards(step.blocks, w_sigma=-1e6, W_sigma=-1e6), 0.0)
+    assert controller.parameters["w_sigma"].tolist() == [61.0, 61.0]
+    assert controller.parameters["W_sigma"].tolist() == [1.0, 1.0]
+
+
+def test_bounds_that_would_cross_refuse_the_step(controller):
+    step = ConstrainedStep(controller, Configuration())
+    before = controller.theta.copy()
+    update = step.take(towards(step.blocks, x_l=[200.0, 0.0], b_l=1.0), 0.0)
+    assert update.refused and update.step == 0.0
+    assert np.array_equal(controller.theta, before)
+
+
+def test_a_trust_region_holds_after_the_lmi(controller, rng):
+    """The corrected step stays within the cap, and B ⪰ εI with it."""
+    step = ConstrainedStep(controller, Configuration())
+    size, least = step.scale.size, Configuration().smallest_eigenvalue
+    corrected = 0
+    for _ in range(40):
+        # Ill conditioned, as information is: what the free step leaves out is cheap to move.
+        factor = rng.normal(size=(size, size)) * np.geomspace(1.0, 1e-4, size)
+        metric = factor @ factor.T + 1e-8 * np.eye(size)
+        minimiser = rng.normal(size=size) * 3.0
+        fit = Fit(metric @ minimiser, minimiser, lambda metric=metric: metric)
+        before = controller.theta.copy()
+        new, vouched = step.proposal(fit.within(3.0, np.linalg.norm))
+        assert np.linalg.norm((new - before) / step.scale) <= 3.0 * (1 + 1e-9)
+        assert vouched.smallest >= least * (1 - 1e-9)
+        corrected += vouched.corrected
+        controller.theta = new
+    assert corrected > 20, "the test must meet corrected steps"
+
+
+def test_a_flat_start_is_not_lifted(problem):
+    flat = Carrier(Parameters.naive(problem).replace({"B_l": np.diag([1.0, 1.0, 1e-4, 1.0])}))
+    step = ConstrainedStep(flat, Configuration())
+    update = step.take(towards(step.blocks, x_l=[0.1, 0.0]), 0.0)
+    assert not update.corrected
+    assert flat.parameters["B_l"][2, 2] == 1e-4
+
+
+def test_a_projection_keeps_what_is_admissible_and_mends_the_rest(controller):
+    step = ConstrainedStep(controller, Configuration())
+    theta = controller.theta.copy()
+    theta[step.blocks.slices["x_l"]] = [26.0, 41.0]
+    assert not step.move(theta).corrected
+    assert np.array_equal(controller.theta, theta)
+    theta[step.blocks.slices["B_Vf"]] = [-1.0, 0.0, 2.0]
+    assert step.move(theta).corrected
+    assert controller.parameters["B_Vf"] == pytest.approx(np.diag([1e-3, 2.0]), abs=1e-5)
+
+
+def parameters(problem, rng):
+    blocks = ThetaBlocks.of(problem, slack_weights=True)
+    root = rng.normal(size=(4, 4))
+    naive = Parameters.naive(problem, blocks, value_offset=6e5)
+    return naive.replace(
+        {
+            "B_l": (root @ root.T + (root @ root.T).T) / 2,
+            "B_Vf": np.diag(rng.uniform(1.0, 2.0, 2)),
+            "b_l": rng.normal(size=4),
+            "b_lambda": rng.normal(size=2),
+        }
+    )
+
+
+def test_other_units_of_states_inputs_and_cost_give_the_same_prior(problem, rng):
+    start = parameters(problem, rng)
+    state, action, cost = np.array([10.0, 0.1]), np.array([1e-3, 7.0]), 50.0
+    factor = factors(start.blocks, state, action, cost)
+    moved, erred, explored = np.array([1.5, 2.0]), np.array([1.0, 0.1]), np.array([10.0, 10.0])
+    width = prior_deviation(start, moved, erred, explored, 6e5, 0.3)
+    other = prior_deviation(
+        start.with_theta(factor * start.theta),
+        state * moved,
+        state * erred,
+        action * explored,
+        cost * 6e5,
+        0.3,
+    )
+    assert other == pytest.approx(factor * width)
+
+
+def test_the_naive_start_of_the_evaporator_has_the_widths_that_were_found_by_hand(problem):
+    blocks = ThetaBlocks.of(problem)
+    start = Parameters.naive(problem, blocks, value_offset=621_038.0)
+    explored = np.array([10.0, 10.0])
+    width = start.with_theta(
+        prior_deviation(start, np.array([1.6, 1.4]), np.array([1.0, 0.1]), explored, 621_038.0, 0.3)
+    )
+    assert width["B_l"] == pytest.approx(np.full((4, 4), 0.3))
+    assert width["b_l"] == pytest.approx(np.full(4, 3.0))
+    assert width["x_l"][0] == pytest.approx(2.0)
+    assert width["c_lambda"] == pytest.approx(1e5, rel=0.01)

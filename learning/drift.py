@@ -5,11 +5,9 @@ from __future__ import annotations
 from controllers.optimum import DAY, Fouling, QuasiStaticPolicy
 from cosim.scenario import Scenario
 
-COLUMNS = ("UA2", "reference_J")
-
 
 class Drift:
-    """Heat transfer UA2 and quasi-static reference at a time, of a condenser that fouls.
+    """The parameter that fouls and the quasi-static reference at a time.
 
     `of` gives none for another plant, whose log has no such columns.
     """
@@ -24,10 +22,10 @@ class Drift:
         return None if fouling is None else cls(fouling, QuasiStaticPolicy.stored(scenario))
 
     def row(self, time: float) -> dict[str, float]:
-        """UA2 in kW/K and J* at it, by column, at a time in s; J* is NaN where it is not stored."""
+        """The parameter and J* at it, by column, at a time in s; J* is NaN where it is not stored."""
         days = time / DAY
         present = float(self._fouling.heat_transfer(days))
         reference = (
             float("nan") if self._reference is None else float(self._reference.gain_at(present))
         )
-        return dict(zip(COLUMNS, (present, reference), strict=True))
+        return {self._fouling.parameter: present, "reference_J": reference}

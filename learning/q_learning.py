@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from pydantic import Field
 from controllers.errors import QpError
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, Transition, Update
+from learning.checkpoint import arrays_of, group, prefixed, take_up
 from learning.configuration import (
     Configuration,
     Count,
@@ -236,12 +237,14 @@ class KalmanFilter:
 
     def _filter(self, variance: float) -> KalmanRegression:
         settings = self._configuration
+        size = self._step.scale.size
         return KalmanRegression(
-            self._step.scale.size,
+            np.zeros(size),
+            np.eye(size),
             variance,
-            clip=settings.innovation_clip,
-            memory=settings.variance_memory,
-            drift=settings.parameter_drift,
+            settings.innovation_clip,
+            settings.variance_memory,
+            settings.parameter_drift,
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -253,7 +256,7 @@ class KalmanFilter:
             "sums": np.array([self._count, self._squares, self._average_cost.mean_cost]),
         }
         if self._regression is not None:
-            state |= self._regression.state()
+            state |= prefixed("filter ", arrays_of(self._regression))
         return {name: np.array(values) for name, values in state.items()}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
@@ -263,11 +266,12 @@ class KalmanFilter:
         self._adopt(state["scale"])
         count, self._squares, self._average_cost.mean_cost = (float(v) for v in state["sums"])
         self._count = int(count)
-        if "covariance" in state:
-            self._regression = self._filter(float(state["variance"]))
-            self._regression.restore(state)
+        if kept := group(state, "filter "):
+            self._regression = self._filter(1.0)
+            take_up(self._regression, kept)
 
 
+@dataclass
 class KalmanRegression:
     """d ~ N(0, I) in scaled coordinates; each δ measures ∇Qᵀd with variance r.
 
@@ -278,27 +282,26 @@ class KalmanRegression:
     `memory` samples. `drift` is added to P's diagonal at each sample.
     """
 
-    def __init__(
-        self, size: int, variance: float, *, clip: float, memory: float, drift: float = 0.0
-    ) -> None:
-        self._clip, self._memory, self._drift = clip, memory, drift
-        self.covariance: Matrix = np.eye(size)
-        self.mean: Vector = np.zeros(size)
-        self.variance = variance
+    mean: Vector
+    covariance: Matrix
+    variance: float
+    clip: float
+    memory: float
+    drift: float = 0.0
 
     def update(self, td_error: float, gradient: Vector) -> float:
         """Take δ and ∇Q (n,), scaled; returns the innovation δ − ∇Qᵀd."""
         spread = self.covariance @ gradient
         scale = self.variance + float(gradient @ spread)
         innovation = td_error - float(gradient @ self.mean)
-        limit = self._clip * self.variance**0.5
+        limit = self.clip * self.variance**0.5
         gain = spread / scale
         self.mean += gain * min(max(innovation, -limit), limit)
         self.covariance -= gain[:, None] * spread
-        if self._drift:
-            self.covariance[np.diag_indices_from(self.covariance)] += self._drift
+        if self.drift:
+            self.covariance[np.diag_indices_from(self.covariance)] += self.drift
         square = min(innovation * innovation, OUTLIER * self.variance)
-        self.variance += (square - self.variance) / self._memory
+        self.variance += (square - self.variance) / self.memory
         return innovation
 
     def fit(self) -> Fit:
@@ -310,19 +313,6 @@ class KalmanRegression:
     def taken(self) -> None:
         """The step has gone into θ: d starts from zero again, P stays."""
         self.mean[:] = 0.0
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Mean, covariance and variance."""
-        return {
-            "mean": self.mean.copy(),
-            "covariance": self.covariance.copy(),
-            "variance": np.array(self.variance),
-        }
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self.mean, self.covariance = state["mean"].copy(), state["covariance"].copy()
-        self.variance = float(state["variance"])
 
 
 class SampleSteps:

@@ -92,7 +92,7 @@ def test_state_and_restore_carry_all_memory(plant, problem):
 
 def regression(size, variance, **changes):
     settings = {"clip": np.inf, "memory": np.inf, **changes}
-    return KalmanRegression(size, variance, **settings)
+    return KalmanRegression(np.zeros(size), np.eye(size), variance, **settings)
 
 
 @pytest.fixture

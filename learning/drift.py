@@ -22,7 +22,7 @@ class Drift:
         return None if fouling is None else cls(fouling, QuasiStaticPolicy.stored(scenario))
 
     def row(self, time: float) -> dict[str, float]:
-        """The parameter and J* at it, by column, at a time in s; J* is NaN where it is not stored."""
+        """The parameter and J* at it, by column, at a time in s; J* is NaN where none is stored."""
         days = time / DAY
         present = float(self._fouling.heat_transfer(days))
         reference = (

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from qpsolvers import solve_qp
 
-from controllers.theta import Parameters
-from controllers.theta import ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks
 from learning.configuration import Configuration
 from learning.step import (
     CholeskyParametrisation,

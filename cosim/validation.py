@@ -74,8 +74,11 @@ def _dotted(path: list[Any]) -> str:
 def _fields(model: type[BaseModel], path: list[Any]) -> list[str]:
     """Names that the table at `path` allows."""
     for part in path:
+        if isinstance(part, int):  # an entry of a list of tables
+            continue
         annotation = model.model_fields[str(part)].annotation
-        candidates = (annotation, *get_args(annotation))
+        inner = get_args(annotation)
+        candidates = (annotation, *inner, *(deeper for each in inner for deeper in get_args(each)))
         model = next(
             option
             for option in candidates

@@ -17,6 +17,12 @@ MAY = {
 """What a package may import of the others; no file imports itself in a circle."""
 HIDDEN = {"controllers": ("cosim.plant", "fmus"), "fmus": ("cosim.plant",)}
 """A controller does not see the plant."""
+GROUND = (
+    "comparison", "environment", "errors", "files", "kpis", "penalty", "plugins", "processes",
+    "protocols", "scenario", "signals", "simulation", "statistics", "text_tables", "trajectory",
+    "validation",
+)  # fmt: skip
+"""Modules of cosim that all packages may import; they import none of controllers and learning."""
 ONLY = {"rerun": ("cosim.recording",), "fmpy": ("cosim.plant", "fmus", "cosim.cli.fmu")}
 """Third-party packages that only these modules import."""
 
@@ -50,6 +56,14 @@ def test_a_package_imports_only_those_it_may():
         others = {other.partition(".")[0] for other in found} & set(PACKAGES)
         assert others - {package} <= MAY[package], name
         assert not [other for other in found if other.startswith(HIDDEN.get(package, ()))], name
+
+
+def test_the_ground_knows_nobody_who_stands_on_it():
+    known = modules()
+    for name in GROUND:
+        found = imported(known[f"cosim.{name}"], known)
+        above = ("controllers", "learning", "fmus", "cosim.study", "cosim.evaluation", "cosim.cli")
+        assert not [other for other in found if other.startswith(above)], name
 
 
 @pytest.mark.parametrize("library", ONLY)

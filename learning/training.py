@@ -223,8 +223,9 @@ def run_training(
     clock = time.perf_counter()
     best = build_controller(optimum, run.scenario) if optimum else None
     folder = None if out is None else Path(out)
-    for name in (LOG, PARAMETERS, CHECKPOINT):
-        if folder is not None:
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (LOG, PARAMETERS, CHECKPOINT):
             check_target(folder / name)
     with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
         session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)

@@ -80,13 +80,16 @@ def train(
     says why.
     """
     with output(json) as out_:
+        from cosim.files import write_atomically
         from cosim.scenario import Scenario
         from learning.algorithm import load_algorithm
         from learning.training_run import prepare
 
         found = load_algorithm(algorithm)
         if explain:
-            _explain(algorithm, found.Configuration.documentation(), out_)
+            rows = found.Configuration.documentation()
+            out_.table(f"hyperparameters of {algorithm}", ("name", "default", "meaning"), rows)
+            out_.json({name: {"default": given, "meaning": text} for name, given, text in rows})
             return
         settings = found.Configuration.from_assignments(assignments or [])
         samples = options.pop("samples")
@@ -100,7 +103,8 @@ def train(
             "wall_seconds": training.wall_seconds,
             "functions": training.functions,
         }
-        _write(folder, training, summary)
+        training.save(folder)
+        write_atomically(folder / "summary.json", dump(summary))
         if record:
             record_training(folder / "training.rrd", training)
         if overwrite and not record:
@@ -213,13 +217,6 @@ def _remark(progress: Progressing) -> Callable[[int, LogRow], None]:
     return update
 
 
-def _write(folder: Path, training: Training, summary: dict[str, Any]) -> None:
-    from cosim.files import write_atomically
-
-    training.save(folder)
-    write_atomically(folder / "summary.json", dump(summary))
-
-
 def record_training(path: Path, training: Training) -> None:
     """Write a Rerun recording of a training."""
     from cosim import recording
@@ -245,7 +242,9 @@ def record_training(path: Path, training: Training) -> None:
 def _show(summary: dict[str, Any], output: Output) -> None:
     from cosim.statistics import shown
 
-    title = "{algorithm} on {scenario}, {samples} samples, seed {seed}: {status}".format(**summary)
+    title = (
+        "{algorithm} ({asks_for}) on {scenario}, {samples} samples, seed {seed}: {status}"
+    ).format(**summary)
     regret, gap = summary["regret"], summary["gap_closed"]
     rows = [
         ("greedy J on held-out noise", shown(summary["J"], digits=6)),
@@ -259,10 +258,3 @@ def _show(summary: dict[str, Any], output: Output) -> None:
         rows.append(("regret %", shown(regret, summary["regret_interval"], 100, 3)))
         rows.append(("gap closed %", shown(gap, None, 100, 4)))
     output.table(title, ("per sample", "value"), rows)
-
-
-def _explain(algorithm: str, documentation: list[tuple[str, str, str]], output: Output) -> None:
-    output.table(f"hyperparameters of {algorithm}", ("name", "default", "meaning"), documentation)
-    output.json(
-        {name: {"default": default, "meaning": text} for name, default, text in documentation}
-    )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +81,19 @@ class Row:
         """Grid points a state, quadrature nodes and those of the penalty a disturbance."""
         accuracy = self.optimum.accuracy
         return self.optimum.grid.shape, accuracy.nodes, accuracy.penalty_nodes
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row as JSON has it."""
+        found = self.optimum
+        return {
+            "name": self.name,
+            "J": found.gain,
+            "lower": found.lower,
+            "upper": found.upper,
+            "states": found.grid.shape,
+            "accuracy": asdict(found.accuracy),
+            "change": self.change,
+        }
 
     @property
     def stable(self) -> bool:

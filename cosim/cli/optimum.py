@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -72,18 +72,11 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: Output) 
     name = policy.fouling.parameter
     rows = [(f"{value:.4f}", f"{gain:.4f}") for value, gain in policy.gains]
     rows.append(("mean over a cycle", f"{policy.gain:.4f}"))
-    out_.table(
-        f"quasi-static reference of {task.name}: a reference, not a bound", (name, "J*"), rows
-    )
-    out_.json(
-        {
-            "scenario": task.name,
-            "kind": "reference",
-            "objection": f"quasi-static: J* along {name}(t), no bound",
-            "J": policy.gain,
-            "table": [{name: value, "J": gain} for value, gain in policy.gains],
-        }
-    )
+    title = f"quasi-static reference of {task.name}: a reference, not a bound"
+    out_.table(title, (name, "J*"), rows)
+    document = {"scenario": task.name, "kind": "reference", "J": policy.gain}
+    document["objection"] = f"quasi-static: J* along {name}(t), no bound"
+    out_.json(document | {"table": [{name: p, "J": gain} for p, gain in policy.gains]})
 
 
 def _solve(
@@ -116,7 +109,7 @@ def _solve(
     certificate = found.certificate
     objection = certificate.objection() if certificate else "no certificate; make one with --refine"
     kind = "reference" if objection else "optimum"
-    cells = [
+    shown = [
         (
             row.name,
             *(f"{value:.4f}" for value in (row.optimum.gain, row.optimum.lower, row.optimum.upper)),
@@ -126,7 +119,7 @@ def _solve(
         for row in rows
     ]
     header = ("", "J", "J* ≥", "J* ≤", "states", "nodes", "penalty nodes", "change")
-    out_.table(f"{kind} of {task.name}", header, cells)
+    out_.table(f"{kind} of {task.name}", header, shown)
     if certificate is not None:
         shown = [(f.name, *(f"{x:.2f}" for x in f[1:])) for f in certificate.figures]
         out_.table("certificate", ("", "J", "from", "to"), shown)
@@ -143,18 +136,7 @@ def _solve(
         "file": str(path),
         "stable": objection is None and all(row.stable for row in rows[-2:]),
         "certificate": certificate.to_list() if certificate else None,
-        "rows": [
-            {
-                "name": row.name,
-                "J": row.optimum.gain,
-                "lower": row.optimum.lower,
-                "upper": row.optimum.upper,
-                "states": row.optimum.grid.shape,
-                "accuracy": asdict(row.optimum.accuracy),
-                "change": row.change,
-            }
-            for row in rows
-        ],
+        "rows": [row.to_dict() for row in rows],
     }
 
 
@@ -162,28 +144,24 @@ def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) 
     """J of a parameters file: the policy's simulated J and the difference, paired on `SEEDS`."""
     import numpy as np
 
-    from controllers import factories
+    from controllers import OptimalPolicy, factories
     from controllers.dynamic_programming.policy_iteration import SEARCH, Figure
-    from controllers.optimum import OptimalPolicy
     from cosim.plant import FmuPlant
     from cosim.simulation import simulate
     from cosim.statistics import mean
 
-    def costs(controller: Any, fmu: FmuPlant) -> Any:
-        runs = (simulate(fmu, controller, STEPS, seed, residuals=False) for seed in SEEDS)
-        return np.array([run.summary()["J"] for run in runs])
-
-    assert found.certificate is not None
+    with FmuPlant(scenario) as fmu:
+        J = [
+            [simulate(fmu, each, STEPS, seed, residuals=False).summary()["J"] for seed in SEEDS]
+            for each in (factories.from_file(scenario, theta), OptimalPolicy(plant, found))
+        ]
+    difference = mean(np.array(J[0]) - np.array(J[1]))
+    assert found.certificate is not None and difference.t is not None
     base = found.certificate["simulation"]
     assert base is not None
-    with FmuPlant(scenario) as fmu:
-        searched = costs(factories.from_file(scenario, theta), fmu)
-        difference = mean(searched - costs(OptimalPolicy(plant, found), fmu))
-    assert difference.t is not None
     value = base.value + difference.value
-    spread = 0.5 * (difference.t[1] - difference.t[0])
-    half_width = float(np.hypot(spread, 0.5 * (base.upper - base.lower)))
-    return Figure(SEARCH, value, value - half_width, value + half_width)
+    half_width = 0.5 * np.hypot(difference.t[1] - difference.t[0], base.upper - base.lower)
+    return Figure(SEARCH, value, value - float(half_width), value + float(half_width))
 
 
 @contextmanager

@@ -83,18 +83,14 @@ def declared_variables(fmu: Path) -> str:
             if version2 or variable.type in _FMI3_SCALARS:
                 _read(instance, variable, version2)
         instance.freeInstance()
-        token = _accepts_another_token(folder, description)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    return f"{len(description.modelVariables)} read" + (f"; {token}" if token else "")
-
-
-def _face(description: ModelDescription) -> str:
-    return "CoSimulation" if description.coSimulation is not None else "ModelExchange"
+    return f"{len(description.modelVariables)} read"
 
 
 def _initialised(folder: str, description: ModelDescription) -> Any:
-    instance = fmpy.instantiate_fmu(folder, description, _face(description))
+    face = "CoSimulation" if description.coSimulation is not None else "ModelExchange"
+    instance = fmpy.instantiate_fmu(folder, description, face)
     if description.fmiVersion.startswith("2"):
         instance.setupExperiment(startTime=0.0)
     instance.enterInitializationMode()
@@ -109,18 +105,6 @@ def _read(instance: Any, variable: ModelVariable, version2: bool) -> None:
             getattr(instance, f"get{type_}")([variable.valueReference])
     except Exception as error:
         raise CheckError(f"{variable.name} is declared a {variable.type}, but {error}") from error
-
-
-def _accepts_another_token(folder: str, description: ModelDescription) -> str:
-    """A remark where the FMU does not compare the GUID or instantiation token with its own."""
-    description.guid = "{00000000-0000-0000-0000-000000000000}"
-    try:
-        fmpy.instantiate_fmu(
-            folder, description, _face(description), logger=lambda *_: None
-        ).freeInstance()
-    except Exception:
-        return ""
-    return "it accepts any GUID"
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ def evaluate(
     Parameters
     ----------
     controllers : by name a factory(scenario) -> Controller, importable where the workers run, or
-        what `cosim.lookup.build_controller` takes; or only such texts, a file by its stem. The
+        what `cosim.plugins.build_controller` takes; or only such texts, a file by its stem. The
         one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
     seeds : the seeds, or their number S for 0 … S−1.
     steps : samples per run that count.

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 from cosim.errors import StudyError
 from cosim.kpis import measure
-from cosim.lookup import build_controller
 from cosim.plant import FmuPlant
+from cosim.plugins import build_controller
 from cosim.study.plan import Plan, Run, Training
 from learning.training import run_training
 

@@ -161,7 +161,7 @@ class RunKey:
 class Run:
     """One run: a controller, or a training and the θ that comes of it.
 
-    `controller` is what `cosim.lookup.build_controller` takes, or a factory(scenario); None for a
+    `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
     training. `greedy` says whether a controller runs on the noise of the learning curves, too;
     `traces` are runs kept sample by sample.
     """

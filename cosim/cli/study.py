@@ -106,21 +106,13 @@ def show_plan(file: FileArgument, json: JsonOption = False) -> None:
         from cosim.study.plan import Study, plan
 
         planned = plan(Study.load(file))
-        rows, seconds = estimate(planned)
+        rows = estimate(planned)
+        seconds = float(rows.seconds.sum())
+        rows["minutes"] = [f"{value / 60:.1f}" for value in rows.pop("seconds")]
         out_.table(
             f"{planned.definition.name}: {len(planned.runs)} runs, {planned.samples} plant samples",
             ("scenario", "case", "runs", "training samples", "evaluation samples", "CPU minutes"),
-            [
-                (
-                    row.scenario,
-                    row.case,
-                    str(row.runs),
-                    str(row.training_samples),
-                    str(row.evaluation_samples),
-                    f"{row.seconds / 60:.1f}",
-                )
-                for row in rows
-            ],
+            rows.astype(str).to_numpy().tolist(),
         )
         out_.note(f"about {seconds / 3600:.2f} h of one core, as fast as this one is now")
         out_.json(

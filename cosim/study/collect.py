@@ -69,11 +69,11 @@ def document(plan: Plan) -> dict[str, Any]:
                 "nmpc": case.nmpc,
                 "settings": dict(case.settings),
                 "scenarios": list(case.scenarios),
-                "against": getattr(case, "against", None),
+                "against": case.against,
             }
             for case in cases
         ],
-        "file": Path(getattr(definition, "file", None) or "").name or None,
+        "file": Path(definition.file).name if definition.file else None,
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.naive),
         "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},
@@ -110,12 +110,11 @@ def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.Data
     noise = {}
     for file, (seeds, steps) in run.noise.items():
         path = folder / file
-        rows = (
-            read_table(path, (), {"seed": int, "steps": int})
-            if path.is_file()
-            else pd.DataFrame(columns=["seed", "steps"])
-        )
-        rows = rows[rows.steps == steps].drop_duplicates("seed").set_index("seed")
+        if not path.is_file():
+            return None
+        rows = read_table(path, (), {"seed": int, "steps": int, "burn_in": int})
+        rows = rows[(rows.steps == steps) & (rows.burn_in == run.burn_in(file))]
+        rows = rows.drop_duplicates("seed").set_index("seed")
         if not set(seeds) <= set(rows.index):
             return None
         noise[file] = rows.loc[list(seeds)].reset_index()

@@ -46,11 +46,11 @@ class BackOffSearch:
     Each has a line search of three rounds. That of the bound which binds most often at κ = 0 has
     the first round, which shows what others there are, and, with those in place, the last two.
 
-    A round runs a few κ, on a simulator all on the same noise. What is fitted to the samples near a κ is how the loop
-    moves with it: mean stage cost and the mean of the other states linearly, the bounded state
-    with its bound. The known penalty is then that of the very states that were seen, moved so.
-    Every sample near it thus serves each κ; to compare costs alone would take many times the
-    samples, since one violation in a thousand decides.
+    A round runs a few κ, on a simulator all on the same noise. What is fitted to the samples near a
+    κ is how the loop moves with it: mean stage cost and the mean of the other states linearly, the
+    bounded state with its bound. The known penalty is then that of the very states that were seen,
+    moved so. Every sample near it thus serves each κ; to compare costs alone would take many times
+    the samples, since one violation in a thousand decides.
 
     No true bound is loosened: x_l stays at or above the scenario's, x_u at or below. Of back-offs
     whose estimates differ by less than `PLATEAU` the smallest is taken. Where the estimate falls

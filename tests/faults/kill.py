@@ -94,7 +94,7 @@ JOBS = (
         "simulate --steps 20000 --record --out out",
         ("out/trajectory.csv", "out/scenario.toml"),
     ),
-    Job("view", "view recorded/run.rrd --png out.png", ("out.png",), _recording),
+    Job("view", "view recorded/run.rrd --png out.png", (), _recording),
     Job("export", "export tuned --out policy.fmu", ("policy.fmu",)),
 )
 

@@ -69,7 +69,7 @@ def document(plan: Plan) -> dict[str, Any]:
                 "nmpc": case.nmpc,
                 "settings": dict(case.settings),
                 "scenarios": list(case.scenarios),
-                "against": case.against,
+                "against": definition.counterpart(case),
             }
             for case in cases
         ],

@@ -155,7 +155,7 @@ def evaluate(
             tell(0, line)
         runner.go(jobs, scheduler)
         for failure in runner.failures.values():
-            raise failure.error or EvaluationError(failure.message)
+            raise failure.error()
         columns, timing = {}, {}
         for name, store in zip(named, runner.stores.values(), strict=True):
             columns[name] = _columns(store.indicators(EVALUATION), numbers)

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -31,6 +27,7 @@ from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
+from cosim.study.cluster import on_cluster
 from cosim.study.document import TrajectoryTable
 from cosim.study.plan import EVALUATION, Plan, Run, Study, Training, plan
 from cosim.study.results import StudyResults
@@ -42,8 +39,6 @@ BLOCK = 20_000
 """Samples of an item of evaluation, about: a few seconds of work."""
 ROUNDS = 3
 """Times that workers may die without having finished one item."""
-ANSWER_SECONDS, WORKER_SECONDS = 10.0, 300.0
-"""Within which a Dask scheduler answers, and for which it may be without a worker."""
 
 
 @dataclass(frozen=True)
@@ -101,11 +96,17 @@ class Item:
 
 @dataclass(frozen=True)
 class Failure:
-    """An item that raised: its message, the traceback, and the error where it can be sent."""
+    """An item that raised: its message, the traceback, and the error's class where it is ours."""
 
     message: str
     trace: str
-    error: BaseException | None
+    kind: type[Exception] | None = None
+
+    def error(self) -> Exception:
+        """The error once more; an EvaluationError for that of a plug-in."""
+        if self.kind is not None and self.kind.__init__ is Exception.__init__:
+            return self.kind(self.message.partition(": ")[2])
+        return EvaluationError(self.message)
 
 
 Measured = dict[int, tuple[Figures, Figures]]
@@ -123,13 +124,11 @@ def perform(item: Item) -> tuple[Item, Outcome]:
         raise
     except BaseException as error:
         text = " ".join(f"{error}".split()) or type(error).__name__
-        sent: BaseException | None = error
-        try:
-            pickle.loads(pickle.dumps(error))
-        except Exception:
-            sent = None
         message = f"{type(error).__name__}: {text}"
-        return item, Failure(message, traceback.format_exc(), sent)
+        kind = type(error) if isinstance(error, Exception) else None
+        if kind is not None and kind.__module__.partition(".")[0] not in OURS:
+            kind = None
+        return item, Failure(message, traceback.format_exc(), kind)
 
 
 def _train(training: Training, folder: Path | None) -> Trained:
@@ -226,12 +225,9 @@ class Runner:
                 return
             done = 0
             try:
-                with _workers(jobs, scheduler) as parallel:
-                    with out_of_reach_of_ctrl_c():
-                        outcomes = parallel(joblib.delayed(perform)(item) for item in items)
-                    for item, outcome in outcomes:
-                        self._take(item, outcome)
-                        done += 1
+                for item, outcome in _outcomes(items, jobs, scheduler):
+                    self._take(item, outcome)
+                    done += 1
             except BrokenProcessPool as error:
                 fruitless = 0 if done or len(self._finished) > before else fruitless + 1
                 if fruitless == ROUNDS:
@@ -333,23 +329,26 @@ class Runner:
         self._report(State(sum(self._done.values()), done, len(self._runs), failed), line)
 
 
-@contextmanager
-def _workers(jobs: int, scheduler: str | None) -> Iterator[joblib.Parallel]:
-    """Where items are done, in no certain order: this process, `jobs` processes, or a cluster."""
-    options = {"return_as": "generator_unordered", "batch_size": 1}
+def _outcomes(
+    items: list[Item], jobs: int, scheduler: str | None
+) -> Iterator[tuple[Item, Outcome]]:
+    """Do items in this process, in `jobs` processes or on a cluster, in no certain order."""
     if scheduler is not None:
-        with _cluster(scheduler) as client, joblib.parallel_config("dask", client=client):
-            yield joblib.Parallel(n_jobs=-1, **options)
-    elif jobs == 1:
-        yield joblib.Parallel(n_jobs=1, backend="sequential", **options)
-    else:
-        config = {"initializer": _begin, "initargs": (os.getpid(),), "inner_max_num_threads": 1}
-        try:
-            with joblib.parallel_config("loky", **config):
-                yield joblib.Parallel(n_jobs=jobs, max_nbytes=None, **options)
-        finally:
-            # Kept workers would know an edited module or variable as it was.
-            get_reusable_executor().shutdown(wait=True, kill_workers=True)
+        yield from on_cluster(scheduler, perform, items)
+        return
+    tasks = (joblib.delayed(perform)(item) for item in items)
+    options = {"return_as": "generator_unordered", "batch_size": 1}
+    if jobs == 1:
+        yield from joblib.Parallel(n_jobs=1, backend="sequential", **options)(tasks)
+        return
+    config = {"initializer": _begin, "initargs": (os.getpid(),), "inner_max_num_threads": 1}
+    try:
+        with joblib.parallel_config("loky", **config), out_of_reach_of_ctrl_c():
+            outcomes = joblib.Parallel(n_jobs=jobs, max_nbytes=None, **options)(tasks)
+        yield from outcomes
+    finally:
+        # Kept workers would know an edited module or variable as it was.
+        get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
 def _begin(parent: int) -> None:
@@ -357,42 +356,6 @@ def _begin(parent: int) -> None:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     follow_parent(parent)
-
-
-@contextmanager
-def _cluster(address: str) -> Iterator[Any]:
-    """A Dask client; all that goes wrong with the cluster is an EvaluationError of one line."""
-    try:
-        dask: Any = import_module("distributed")
-    except ImportError:
-        raise EvaluationError(
-            "a Dask scheduler needs the extra 'cluster': pip install 'rti-cosim[cluster]'"
-        ) from None
-
-    def gone(error: BaseException) -> EvaluationError:
-        return EvaluationError(
-            f"the Dask cluster at '{address}' does not answer, has no worker, or lost them again "
-            f"and again ({' '.join(str(error).split())[:200]}); what is finished is stored: the "
-            "same command goes on"
-        )
-
-    try:
-        client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
-    except Exception as error:
-        raise gone(error) from None
-    try:
-        client.wait_for_workers(1, timeout=WORKER_SECONDS)
-        yield client
-    except ModuleNotFoundError as error:
-        raise EvaluationError(
-            f"a worker of the cluster cannot import '{error.name}'; install the same version of "
-            "rti-cosim, and what the items need, on scheduler and workers"
-        ) from None
-    except (dask.KilledWorker, CancelledError, OSError, TimeoutError) as error:
-        raise gone(error) from None
-    finally:
-        with suppress(Exception):
-            client.close(timeout=ANSWER_SECONDS)
 
 
 def run_study(

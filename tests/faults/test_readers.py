@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from learning import checkpoint
 from learning.errors import CheckpointError
 
-NAMES = ("scenario", "theta", "checkpoint", "trajectory", "recording", "fmu", "unit")
+NAMES = ("scenario", "theta", "checkpoint", "trajectory", "recording", "fmu")
 # A recording and an FMU cost much more to read than a page of text.
 EXAMPLES = {"recording": 6, "fmu": 8}
 LENIENT = {
@@ -97,7 +97,7 @@ def test_a_file_of_another_kind_is_refused(files, tmp_path, name, content):
     assert files[name].refuses(target)
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "unit"])
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kind", ["missing", "folder"])
 def test_what_is_no_file_is_refused(files, tmp_path, name, kind):
     target = tmp_path / files[name].file
@@ -106,7 +106,7 @@ def test_what_is_no_file_is_refused(files, tmp_path, name, kind):
     assert files[name].refuses(target)
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "unit"])
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.skipif(os.geteuid() == 0 and not hasattr(os, "setresuid"), reason="needs users")
 def test_a_file_that_may_not_be_read_is_refused(files, tmp_path, name):
     """Read it as another user, since root may read everything."""

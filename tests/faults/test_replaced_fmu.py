@@ -10,6 +10,7 @@ from controllers.factories import naive
 from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.errors import EvaluationError, PlantError
 from cosim.plugins import OURS, code_hash
+from cosim.study import run
 from cosim.study.run import Place
 from tests.helpers.loop import Proportional
 
@@ -63,7 +64,10 @@ def test_a_plant_keeps_to_what_it_was_made_from(scenario, how):
 
 
 @pytest.mark.parametrize("how", HOW)
-def test_an_evaluation_ends_in_a_line_and_goes_on_with_the_fmu_of_before(scenario, tmp_path, how):
+def test_an_evaluation_ends_in_a_line_and_goes_on_with_the_fmu_of_before(
+    scenario, tmp_path, how, monkeypatch
+):
+    monkeypatch.setattr(run, "BLOCK", 20)  # an item a seed
     runs = []
 
     def counting(described):

@@ -66,15 +66,6 @@ def hold(scenario):
     return Hold(scenario.reference_action)
 """
 UNDER_WAY = "runs/*/*/*/checkpoint.npz"
-# Checkpoints are handed over after every piece, not only after some seconds.
-COMMAND = """\
-import sys
-import cosim.study.runner
-cosim.study.runner.SLICE = 0.0
-from cosim.cli import main
-sys.argv = ["cosim", *sys.argv[1:]]
-main()
-"""
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +84,7 @@ def start(folder, out, *options):
     arguments = ["study", "run", "../study.toml", "--out", str(out), "--json", *options]
     # A session of its own, so that its workers can be killed with it.
     return subprocess.Popen(
-        [sys.executable, "-c", COMMAND, *arguments],
+        [sys.executable, "-m", "cosim", *arguments],
         cwd=folder / "elsewhere",
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -30,7 +30,7 @@ curves = { points = 2, seeds = 2, steps = 40 }
 name = "mine"
 algorithm = "my_algorithm:CappedTd"
 samples = 600
-settings = { cap = [0.02, 0.05] }
+settings = { radius = [0.02, 0.05] }
 training = { checkpoint_every = 300 }
 
 [[case]]

@@ -49,7 +49,7 @@ def evaluate(
     and scenario.toml. Run again with the same --out to go on after an interruption.
     """
     with output(json) as out_:
-        from joblib import cpu_count
+        from loky import cpu_count
 
         from cosim.cli.compose import announce
         from cosim.evaluation import evaluate as run

@@ -61,7 +61,7 @@ def execute(
     figures: bool = True,
 ) -> StudyResults:
     """Run a study with a progress bar; exits with code 1 where runs failed."""
-    from joblib import cpu_count
+    from loky import cpu_count
 
     from cosim.errors import FailedRunsError
     from cosim.study.plan import Study, plan

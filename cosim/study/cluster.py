@@ -27,8 +27,8 @@ def on_cluster(
 ) -> Iterator[Outcome]:
     """Do `work` on items on the workers of a scheduler; outcomes in the order in which they end.
 
-    joblib's Dask back end waits for ever where a scheduler dies; here each silence ends in
-    EvaluationError, of one line. What the work itself raises goes through.
+    A scheduler that dies or is silent ends in EvaluationError, of one line. What the work itself
+    raises goes through.
     """
     with _client(address) as (dask, client), _translated(dask, address):
         ended: SimpleQueue[Any] = SimpleQueue()

@@ -6,15 +6,15 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import joblib
-from joblib.externals.loky import get_reusable_executor
+import loky
 
 from controllers import compile_functions
 from cosim.errors import EvaluationError, FailedRunsError
@@ -225,9 +225,10 @@ class Runner:
                 return
             done = 0
             try:
-                for item, outcome in _outcomes(items, jobs, scheduler):
-                    self._take(item, outcome)
-                    done += 1
+                with closing(_outcomes(items, jobs, scheduler)) as outcomes:
+                    for item, outcome in outcomes:
+                        self._take(item, outcome)
+                        done += 1
             except BrokenProcessPool as error:
                 fruitless = 0 if done or len(self._finished) > before else fruitless + 1
                 if fruitless == ROUNDS:
@@ -331,24 +332,25 @@ class Runner:
 
 def _outcomes(
     items: list[Item], jobs: int, scheduler: str | None
-) -> Iterator[tuple[Item, Outcome]]:
+) -> Generator[tuple[Item, Outcome], None, None]:
     """Do items in this process, in `jobs` processes or on a cluster, in no certain order."""
     if scheduler is not None:
         yield from on_cluster(scheduler, perform, items)
         return
-    tasks = (joblib.delayed(perform)(item) for item in items)
-    options = {"return_as": "generator_unordered", "batch_size": 1}
     if jobs == 1:
-        yield from joblib.Parallel(n_jobs=1, backend="sequential", **options)(tasks)
+        yield from map(perform, items)
         return
-    config = {"initializer": _begin, "initargs": (os.getpid(),), "inner_max_num_threads": 1}
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    workers = loky.ProcessPoolExecutor(
+        min(jobs, len(items)), initializer=_begin, initargs=(os.getpid(),), env=one_thread
+    )
     try:
-        with joblib.parallel_config("loky", **config), out_of_reach_of_ctrl_c():
-            outcomes = joblib.Parallel(n_jobs=jobs, max_nbytes=None, **options)(tasks)
-        yield from outcomes
+        with out_of_reach_of_ctrl_c():
+            ended = [workers.submit(perform, item) for item in items]
+        for future in loky.as_completed(ended):
+            yield future.result()
     finally:
-        # Kept workers would know an edited module or variable as it was.
-        get_reusable_executor().shutdown(wait=True, kill_workers=True)
+        workers.shutdown(wait=True, kill_workers=True)
 
 
 def _begin(parent: int) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted(p for name in ("fmus", "cosim", "controllers", "learning")
                  for p in (ROOT / name).rglob("*.py"))  # fmt: skip
-FORBIDDEN = {"pickle", "cPickle", "dill", "shelve", "marshal", "cloudpickle"}
+FORBIDDEN = {"pickle", "cPickle", "dill", "shelve", "marshal", "joblib", "cloudpickle"}
 
 
 def imports(tree):
@@ -27,11 +27,6 @@ def findings(path):
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("np.load", "numpy.load"):
             if "allow_pickle" not in {keyword.arg for keyword in node.keywords}:
                 yield ast.unparse(node)
-        elif isinstance(node, ast.Attribute) and ast.unparse(node) in (
-            "joblib.load",
-            "joblib.dump",
-        ):
-            yield ast.unparse(node)
         elif isinstance(node, ast.Constant) and node.value == "0.0.0.0":
             yield "0.0.0.0"
 
@@ -43,7 +38,5 @@ def test_no_module_unpickles_or_listens_to_the_world():
 
 def test_the_check_sees_what_it_looks_for(tmp_path):
     path = tmp_path / "bad.py"
-    path.write_text(
-        "import pickle\nnp.load(f)\ny = g(allow_pickle=True)\nhost = '0.0.0.0'\njoblib.load(f)\n"
-    )
-    assert len(list(findings(path))) == 5
+    path.write_text("import pickle\nx = np.load(f)\ny = g(allow_pickle=True)\nhost = '0.0.0.0'\n")
+    assert len(list(findings(path))) == 4

@@ -97,7 +97,7 @@ def test_the_last_digits_of_the_start_choose_nothing(name, problem, tmp_path):
 def test_tuned_with_back_off_is_within_a_thousandth_of_the_optimum(scenario, seed):
     from controllers.factories import optimal
 
-    run = make_run("backoff", scenario, samples=8000, seed=seed)
+    run = make_run("backoff-simulator", scenario, samples=8000, seed=seed)
     run = dataclasses.replace(run, log_every=500, evaluate_every=8000, checkpoint_every=8000)
     theta = train(run).parameters
     problem = Problem.from_scenario(run.scenario)

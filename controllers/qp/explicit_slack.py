@@ -30,7 +30,16 @@ ATTEMPTS: dict[str, list[dict[str, Any]]] = {
         {"eps_abs": 1e-9, "eps_rel": 0.0},
         {"eps_abs": 1e-9, "eps_rel": 0.0, "primal_infeasibility_solving": True},
     ],
-    "piqp": [{"eps_abs": 1e-10, "eps_rel": 1e-12}],
+    # Without the gap piqp stops at multipliers that do not fit the rows' slack.
+    "piqp": [
+        {
+            "eps_abs": 1e-10,
+            "eps_rel": 1e-12,
+            "check_duality_gap": True,
+            "eps_duality_gap_abs": 1e-9,
+            "eps_duality_gap_rel": 0.0,
+        }
+    ],
     "clarabel": [{"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}],
     "daqp": [{"primal_tol": 1e-10, "dual_tol": 1e-12}],
 }

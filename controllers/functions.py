@@ -188,34 +188,57 @@ def bind_compiled(functions: Sequence[BufferedFunction], samples: int = LONG) ->
     number. Without a compiler, and where it fails, the interpreter stays; the results are the same
     to the bit. Raises ControllerError on another word in COSIM_COMPILE.
     """
-    chosen, compiler = switch(), find_compiler()
-    if chosen == "never" or compiler is None or (samples < LOOK and chosen != "now"):
+    if samples < LOOK and switch() != "now":
         return INTERPRETED
-    source = c_source([function.function for function in functions])
-    content = "\0".join((source, identity(compiler), *FLAGS))
-    path = cache_folder("compiled") / f"{hashlib.sha256(content.encode()).hexdigest()[:32]}.lib"
+    source = {"functions.c": c_source([function.function for function in functions])}
+    path = library(source, ["functions.c"], make=samples >= LONG or switch() == "now")
     try:
-        if not path.is_file():
-            if samples < LONG and chosen != "now":
-                return INTERPRETED
-            _compile(compiler, source, path)
-        os.utime(path)
-        libraries = [ca.external(each.function.name(), str(path)) for each in functions]
-    except (OSError, RuntimeError, subprocess.SubprocessError, filelock.Timeout):
+        libraries = [ca.external(each.function.name(), str(path)) for each in functions if path]
+    except RuntimeError:
         return INTERPRETED
-    for function, library in zip(functions, libraries, strict=True):
-        function.bind(library)
+    if path is None:
+        return INTERPRETED
+    for function, compiled in zip(functions, libraries, strict=True):
+        function.bind(compiled)
     return COMPILED
 
 
-def _compile(compiler: str, source: str, path: Path) -> None:
-    """Make a library; it appears whole, and of several processes one makes it."""
+def library(
+    sources: Mapping[str, str | bytes], entry: Sequence[str], *, make: bool = True
+) -> Path | None:
+    """Shared library of C files in the user's cache, made where it is missing and `make` says so.
+
+    `sources` are the files by name, `entry` the names of those that the compiler is given; the
+    others are included by them. It is the same file for the same content, compiler and flags, it
+    appears whole, and of several processes one makes it. None without a compiler, where it fails,
+    and where COSIM_COMPILE says `never`; ControllerError on a word that it does not know.
+    """
+    compiler = find_compiler()
+    if switch() == "never" or compiler is None:
+        return None
+    files = {name: s.encode() if isinstance(s, str) else s for name, s in sources.items()}
+    content = hashlib.sha256("\0".join((identity(compiler), *FLAGS, *entry)).encode())
+    for name in sorted(files):
+        content.update(f"\0{name}\0{len(files[name])}\0".encode() + files[name])
+    try:
+        path = cache_folder("compiled") / f"{content.hexdigest()[:32]}.lib"
+        if not path.is_file():
+            if not make:
+                return None
+            _compile([compiler, *FLAGS, "-o", "library", *entry, "-lm"], files, path)
+        os.utime(path)
+    except (OSError, subprocess.SubprocessError, filelock.Timeout):
+        return None
+    return path
+
+
+def _compile(command: Sequence[str], files: Mapping[str, bytes], path: Path) -> None:
     with filelock.FileLock(path.with_suffix(".lock"), timeout=PATIENCE):
         if path.is_file():
             return
         with temporary_folder(".partial-", path.parent) as folder:
-            (folder / "functions.c").write_text(source, encoding="utf-8")
-            command = [compiler, *FLAGS, "-o", "library", "functions.c", "-lm"]
+            for name, content in files.items():
+                (folder / name).write_bytes(content)
             if run_child(command, timeout=PATIENCE, folder=folder, log=subprocess.DEVNULL):
                 raise OSError("the compiler failed")
             (folder / "library").replace(path)

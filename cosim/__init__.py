@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from cosim.plant import FmuPlant as FmuPlant
     from cosim.scenario import Scenario as Scenario
     from cosim.simulation import simulate as simulate
-    from cosim.study.plan import Study as Study
-    from cosim.study.results import StudyResults as StudyResults
-    from cosim.study.run import run_study as run_study
+    from cosim.studies.plan import Study as Study
+    from cosim.studies.results import StudyResults as StudyResults
+    from cosim.studies.run import study as study
     from cosim.trajectory import Trajectory as Trajectory
     from learning.training import Training as Training
     from learning.training import train as train
@@ -26,12 +26,12 @@ _HOMES = {
     "Evaluation": "cosim.evaluation",
     "FmuPlant": "cosim.plant",
     "Scenario": "cosim.scenario",
-    "Study": "cosim.study.plan",
-    "StudyResults": "cosim.study.results",
+    "Study": "cosim.studies.plan",
+    "StudyResults": "cosim.studies.results",
     "Training": "learning.training",
     "Trajectory": "cosim.trajectory",
     "evaluate": "cosim.evaluation",
-    "run_study": "cosim.study.run",
+    "study": "cosim.studies.run",
     "simulate": "cosim.simulation",
     "train": "learning.training",
 }
@@ -44,8 +44,8 @@ __all__ = [
     "Training",
     "Trajectory",
     "evaluate",
-    "run_study",
     "simulate",
+    "study",
     "train",
 ]
 

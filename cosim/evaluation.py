@@ -27,9 +27,9 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
-from cosim.study.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, check_folders
-from cosim.study.run import Runner
-from cosim.study.store import TIMING
+from cosim.studies.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, check_folders
+from cosim.studies.run import Runner
+from cosim.studies.store import TIMING
 from cosim.text_tables import cell, csv_pieces
 from learning.evaluation import stored_optimum
 

@@ -39,11 +39,11 @@ def reproduce(
     tables of `cosim study run`. Run again with the same --out to go on after an interruption.
     """
     with output(json) as out_:
-        from cosim.study.stored import stored_results
+        from cosim.studies.stored import stored_results
 
         name = "reproduce" if budget is BudgetName.quick else "reproduce-full"
         execute(stored_results() / f"{name}.toml", out, out_, jobs=jobs)
-        from cosim.study.results import StudyResults
+        from cosim.studies.results import StudyResults
 
         results = StudyResults.load(out)
         summary = write_summary(results)

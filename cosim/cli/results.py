@@ -49,9 +49,9 @@ def check(
     """
     with output(json) as out_:
         from cosim.files import temporary_folder
-        from cosim.study.check import differences, load_tolerances
-        from cosim.study.results import StudyResults
-        from cosim.study.stored import chosen, stored_results, stored_studies
+        from cosim.studies.check import differences, load_tolerances
+        from cosim.studies.results import StudyResults
+        from cosim.studies.stored import chosen, stored_results, stored_studies
 
         folder = folder or (Path("results") if Path("results").is_dir() else stored_results())
         tolerances, studies = load_tolerances(folder), stored_studies(folder)
@@ -85,7 +85,7 @@ def update(
     What long studies have finished is kept in the folder's `.work`; run again to go on.
     """
     with output(json) as out_:
-        from cosim.study.stored import (
+        from cosim.studies.stored import (
             WORK,
             chosen,
             report,

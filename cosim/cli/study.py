@@ -11,8 +11,8 @@ from cosim.cli.options import JobsOption, JsonOption, OutOption, SchedulerOption
 from cosim.cli.output import Output, again, dump, open_folder, output, resumable
 
 if TYPE_CHECKING:
-    from cosim.study.results import StudyResults
-    from cosim.study.run import State
+    from cosim.studies.results import StudyResults
+    from cosim.studies.run import State
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 
@@ -64,15 +64,15 @@ def execute(
     from loky import cpu_count
 
     from cosim.errors import FailedRunsError
-    from cosim.study.plan import Study, plan
-    from cosim.study.run import run_study
+    from cosim.studies.plan import Study, plan
+    from cosim.studies.run import study
 
-    study = Study.load(file)
+    definition = Study.load(file)
     folder = open_folder(out)
-    for scenario in study.scenarios.values():
+    for scenario in definition.scenarios.values():
         _announce(scenario, out_)
-    planned = plan(study)
-    label, total = f"{study.name}, thousands of samples", _thousands(planned.samples)
+    planned = plan(definition)
+    label, total = f"{definition.name}, thousands of samples", _thousands(planned.samples)
     with resumable(again), out_.progress(label, total) as bar:
 
         def report(state: State, line: str) -> None:
@@ -83,8 +83,8 @@ def execute(
                 out_.note(f"{runs}  {line}")
 
         try:
-            return run_study(
-                study,
+            return study(
+                definition,
                 folder,
                 jobs=jobs or cpu_count(),
                 scheduler=scheduler,
@@ -102,8 +102,8 @@ def execute(
 def show_plan(file: FileArgument, json: JsonOption = False) -> None:
     """Show what a study will do, and about how long: nothing is trained or written."""
     with output(json) as out_:
-        from cosim.study.estimate import estimate
-        from cosim.study.plan import Study, plan
+        from cosim.studies.estimate import estimate
+        from cosim.studies.plan import Study, plan
 
         planned = plan(Study.load(file))
         rows = estimate(planned)
@@ -135,7 +135,7 @@ def report(
     A study that is not finished, or a stored one, is reported with what it has.
     """
     with output(json) as out_:
-        from cosim.study.results import StudyResults
+        from cosim.studies.results import StudyResults
 
         results = StudyResults.load(folder)
         page = results.report()
@@ -157,8 +157,8 @@ def _thousands(samples: int) -> int:
 def write_summary(results: StudyResults) -> dict[str, Any]:
     """Write summary.json and return what it says; `timing` is what timing.csv says of each run."""
     from cosim.files import write_atomically
-    from cosim.study.results import TIMING
-    from cosim.study.tables import read_table
+    from cosim.studies.results import TIMING
+    from cosim.studies.tables import read_table
 
     document = {
         **results.about,
@@ -175,7 +175,7 @@ def write_summary(results: StudyResults) -> dict[str, Any]:
 
 def show(results: StudyResults, out_: Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
-    from cosim.study.report import COLUMNS, SHORT
+    from cosim.studies.report import COLUMNS, SHORT
 
     chosen = COLUMNS if columns == "all" else columns.split(",") if columns else SHORT
     for scenario in results.scenarios:

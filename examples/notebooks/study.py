@@ -1,7 +1,7 @@
 """A small study: two rules, two seeds, one scenario. Open it as a notebook."""
 
 # %% What is compared with what; the same as a file is docs/how-to/study.md
-from cosim import run_study
+from cosim import study
 
 SAMPLES = 5000
 document = {
@@ -17,7 +17,7 @@ document = {
         {"name": "batch", "algorithm": "batch-q-learning", "samples": SAMPLES},
     ],
 }
-results = run_study(document, "notebook-study")
+results = study(document, "notebook-study")
 
 # %% The table, least regret first
 print(results.table("fouled"))

@@ -10,8 +10,8 @@ from controllers.factories import naive
 from cosim import FmuPlant, Scenario, evaluate, simulate
 from cosim.errors import EvaluationError, PlantError
 from cosim.plugins import OURS, code_hash
-from cosim.study import run
-from cosim.study.run import Place
+from cosim.studies import run
+from cosim.studies.run import Place
 from tests.helpers.loop import Proportional
 
 

@@ -28,12 +28,12 @@ COVERED = {
     "cosim view demo/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim view run/run.rrd": "opens a window; tests/cosim/recording/test_viewer.py draws it",
     "cosim optimum --scenario paper": "minutes; tests/cosim/cli/test_optimum.py",
-    "cosim reproduce --budget quick": "minutes; tests/cosim/study/test_stored.py",
+    "cosim reproduce --budget quick": "minutes; tests/cosim/studies/test_stored.py",
     "cosim study run study.toml --out study": "a synopsis; docs/how-to/study.md",
     "cosim study report study": "a synopsis; docs/how-to/study.md",
     "cosim compare run other-run": "a synopsis; tests/cosim/cli/test_compare.py",
     "cosim fmu info|check|build": "a synopsis; tests/cosim/cli/test_fmu.py",
-    "cosim results check|update": "a synopsis; tests/cosim/study/test_stored.py",
+    "cosim results check|update": "a synopsis; tests/cosim/studies/test_stored.py",
 }
 # Typed with a smaller budget than the page's, which is meant for a reader with time.
 SMALLER = {

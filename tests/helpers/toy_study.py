@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from cosim import run_study
+from cosim import study
 from learning.configuration import Configuration
 
 HERE = "tests.helpers.toy_study"
@@ -79,4 +79,4 @@ def document(**changes):
 
 def run_toy(out, *, jobs=1, report=lambda state, line: None, **changes):
     """Run the document with some changes."""
-    return run_study(document(**changes), out, jobs=jobs, report=report)
+    return study(document(**changes), out, jobs=jobs, report=report)

@@ -62,7 +62,14 @@ def test_the_ground_knows_nobody_who_stands_on_it():
     known = modules()
     for name in GROUND:
         found = imported(known[f"cosim.{name}"], known)
-        above = ("controllers", "learning", "fmus", "cosim.study", "cosim.evaluation", "cosim.cli")
+        above = (
+            "controllers",
+            "learning",
+            "fmus",
+            "cosim.cli",
+            "cosim.evaluation",
+            "cosim.studies",
+        )
         assert not [other for other in found if other.startswith(above)], name
 
 

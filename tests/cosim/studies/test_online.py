@@ -9,8 +9,8 @@ import pytest
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import StudyError
-from cosim.study import run as engine
-from cosim.study.results import StudyResults
+from cosim.studies import run as engine
+from cosim.studies.results import StudyResults
 from tests.helpers.toy_study import GROW, run_toy
 
 ONLINE = {"block": 500, "period": 1000, "signals": ["td_error"]}

@@ -20,7 +20,7 @@ from cosim.plugins import OURS, code_hash, depends_on, import_from, versions
 from cosim.plugins import build_controller as build_named
 from cosim.protocols import Controller
 from cosim.scenario import Scenario, resolved
-from cosim.study.document import (
+from cosim.studies.document import (
     DEFAULT,
     CaseTable,
     PerScenario,
@@ -205,7 +205,7 @@ class Run:
 class Study:
     """Cases × scenarios × training seeds, and the noise that they are compared on.
 
-    `load` reads a study file, `from_dict` takes the same document; `cosim.run_study` runs it.
+    `load` reads a study file, `from_dict` takes the same document; `cosim.study` runs it.
     `folder` is where its relative paths start and where its `module:Class` names are looked up,
     too; `file` is its file as it was given. Raises StudyError, ScenarioError and what `learning`
     raises of an algorithm.

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from controllers.problem import Problem
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
-from cosim.study.store import LOG
-from cosim.study.tables import read_table
+from cosim.studies.store import LOG
+from cosim.studies.tables import read_table
 from cosim.validation import suggestion
 from learning.training_run import starting_parameters
 
 if TYPE_CHECKING:
-    from cosim.study.plan import Plan, Run, Training
+    from cosim.studies.plan import Plan, Run, Training
 
 Array = NDArray[np.float64]
 Table = tuple[str, Sequence[str], list[list[str]]]

@@ -11,7 +11,7 @@ from cosim.errors import StudyError
 from cosim.kpis import measure
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
-from cosim.study.plan import Plan, Run, Training
+from cosim.studies.plan import Plan, Run, Training
 from learning.training import run_training
 
 SHORT, LONG, SIMULATED = 500, 1500, 200

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.study.results import StudyResults
-from cosim.study.tables import KEYS, to_csv
+from cosim.studies.results import StudyResults
+from cosim.studies.tables import KEYS, to_csv
 from cosim.text_tables import markdown_table
 from tests.helpers.toy_study import GROW, run_toy
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from cosim import FmuPlant, Study, run_study, simulate
+from cosim import FmuPlant, Study, simulate, study
 from cosim.errors import CosimError, FailedRunsError, StudyError
-from cosim.study.plan import RunKey, plan
-from cosim.study.results import StudyResults
+from cosim.studies.plan import RunKey, plan
+from cosim.studies.results import StudyResults
 from tests.helpers.toy_study import case, document, run_toy
 
 ROOT = Path(__file__).parents[3]
@@ -300,5 +300,5 @@ def test_a_study_that_moved_keeps_its_runs_and_another_theta_at_the_start_is_ano
 
 
 def test_results_of_a_folder_are_those_that_were_returned(whole):
-    again = run_study(document(), whole)
+    again = study(document(), whole)
     assert StudyResults.load(whole).about == again.about

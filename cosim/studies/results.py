@@ -26,16 +26,16 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.study import collect, figures, online, paper, report, theta
-from cosim.study.plan import EVALUATION, safe
-from cosim.study.report import COLUMNS, SHORT
-from cosim.study.store import INDICATORS, ONLINE
-from cosim.study.tables import CURVE, KEYS, STATE, WHERE, read_table, to_csv
+from cosim.studies import collect, figures, online, paper, report, theta
+from cosim.studies.plan import EVALUATION, safe
+from cosim.studies.report import COLUMNS, SHORT
+from cosim.studies.store import INDICATORS, ONLINE
+from cosim.studies.tables import CURVE, KEYS, STATE, WHERE, read_table, to_csv
 from cosim.text_tables import markdown_table
 from cosim.validation import suggestion
 
 if TYPE_CHECKING:
-    from cosim.study.plan import Plan
+    from cosim.studies.plan import Plan
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ class StudyResults:
 
         `figures` draws the kept trajectories and logs, too.
         """
-        from cosim.study import pictures  # noqa: PLC0415 - needs controllers
+        from cosim.studies import pictures  # noqa: PLC0415 - needs controllers
 
         out = self.folder
         pictures.keep(plan, out)

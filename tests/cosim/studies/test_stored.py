@@ -9,12 +9,12 @@ from typer.testing import CliRunner
 from cosim.cli.main import app
 from cosim.comparison import load_run
 from cosim.errors import ResultsError
-from cosim.study.check import compared_tables
-from cosim.study.document import read
-from cosim.study.keyed import rounded_csv
-from cosim.study.results import StudyResults
-from cosim.study.stored import stored_studies
-from cosim.study.tables import read_table
+from cosim.studies.check import compared_tables
+from cosim.studies.document import read
+from cosim.studies.keyed import rounded_csv
+from cosim.studies.results import StudyResults
+from cosim.studies.stored import stored_studies
+from cosim.studies.tables import read_table
 
 STORED = Path(__file__).parents[3] / "results"
 MINIMAL = """\
@@ -222,7 +222,7 @@ samples = 400
 
 def test_the_reproduction_is_a_study_with_the_paper_s_table_and_figure(tmp_path, monkeypatch):
     (tmp_path / "reproduce.toml").write_text(PAPER)
-    monkeypatch.setattr("cosim.study.stored.stored_results", lambda: tmp_path)
+    monkeypatch.setattr("cosim.studies.stored.stored_results", lambda: tmp_path)
     out = tmp_path / "out"
     result = CliRunner().invoke(app, ["reproduce", "--out", str(out), "--jobs", "1"])
     assert result.exit_code == 0, result.output + repr(result.exception)

@@ -21,10 +21,10 @@ from cosim.plugins import build_controller
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.statistics import TD_WINDOW, td_error_mean
-from cosim.study.document import TrajectoryTable
-from cosim.study.plan import Plan, Run, safe
-from cosim.study.store import LOG, PARAMETERS
-from cosim.study.tables import read_table
+from cosim.studies.document import TrajectoryTable
+from cosim.studies.plan import Plan, Run, safe
+from cosim.studies.store import LOG, PARAMETERS
+from cosim.studies.tables import read_table
 from cosim.trajectory import Trajectory, read_csv
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ import pytest
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.errors import StudyError
-from cosim.study import run as engine
-from cosim.study.results import StudyResults
-from cosim.study.store import Trained
+from cosim.studies import run as engine
+from cosim.studies.results import StudyResults
+from cosim.studies.store import Trained
 from tests.helpers.toy_study import GROW, run_toy
 
 ROWS = {0: 0.0, 200: 3.0, 500: 6.0, 700: 7.0, 800: 9.0, 1000: 10.0}
@@ -38,7 +38,7 @@ def wandering(folder, **theta):
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine, "_train", wander)
-        patch.setattr("cosim.study.theta._scales", lambda _: {"theta g": 2.0, "theta h[0]": 1.0})
+        patch.setattr("cosim.studies.theta._scales", lambda _: {"theta g": 2.0, "theta h[0]": 1.0})
         return run_toy(folder, case=case, theta=theta)
 
 

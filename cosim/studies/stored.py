@@ -8,13 +8,13 @@ from pathlib import Path
 
 from cosim.errors import ResultsError
 from cosim.files import write_atomically
-from cosim.study.check import TOLERANCES
-from cosim.study.document import StudyTable
-from cosim.study.document import read as read_study
-from cosim.study.keyed import rounded_csv
-from cosim.study.plan import RUNS
-from cosim.study.report import TABLES
-from cosim.study.results import ABOUT, TIMING, StudyResults
+from cosim.studies.check import TOLERANCES
+from cosim.studies.document import StudyTable
+from cosim.studies.document import read as read_study
+from cosim.studies.keyed import rounded_csv
+from cosim.studies.plan import RUNS
+from cosim.studies.report import TABLES
+from cosim.studies.results import ABOUT, TIMING, StudyResults
 from cosim.validation import suggestion
 
 WORK = ".work"

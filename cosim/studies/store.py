@@ -21,8 +21,8 @@ from typing import Any
 from cosim.errors import StudyError
 from cosim.files import read_json, write_atomically
 from cosim.plugins import changed
-from cosim.study.document import TrajectoryTable
-from cosim.study.plan import EVALUATION, GREEDY, Online, Run
+from cosim.studies.document import TrajectoryTable
+from cosim.studies.plan import EVALUATION, GREEDY, Online, Run
 from cosim.text_tables import cell, csv_pieces, csv_text, read_records
 
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"

@@ -12,11 +12,11 @@ from pydantic import Field, ValidationError
 from cosim.comparison import RunSignals, compare
 from cosim.errors import ResultsError
 from cosim.files import read_toml
-from cosim.study.document import Table
-from cosim.study.keyed import KeyedTable, read
-from cosim.study.pictures import LOGS, TRAJECTORIES
-from cosim.study.plan import EVALUATION
-from cosim.study.results import CURVES
+from cosim.studies.document import Table
+from cosim.studies.keyed import KeyedTable, read
+from cosim.studies.pictures import LOGS, TRAJECTORIES
+from cosim.studies.plan import EVALUATION
+from cosim.studies.results import CURVES
 from cosim.validation import describe
 
 TOLERANCES = "tolerances.toml"

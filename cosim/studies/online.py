@@ -25,12 +25,12 @@ from cosim.figures.style import (
     regret_axis,
 )
 from cosim.statistics import regret, regret_terms, regrets, shown
-from cosim.study.store import ONLINE
-from cosim.study.tables import read_table
+from cosim.studies.store import ONLINE
+from cosim.studies.tables import read_table
 from cosim.validation import suggestion
 
 if TYPE_CHECKING:
-    from cosim.study.plan import Run
+    from cosim.studies.plan import Run
 
 Array = NDArray[np.float64]
 Course = tuple[Array, Array, Array]

@@ -11,14 +11,14 @@ import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.files import read_json
-from cosim.study import online, theta
-from cosim.study.plan import EVALUATION, GREEDY
-from cosim.study.report import commit
-from cosim.study.store import INDICATORS, LOG, RUN
-from cosim.study.tables import CURVE, KEYS, STATE, read_table
+from cosim.studies import online, theta
+from cosim.studies.plan import EVALUATION, GREEDY
+from cosim.studies.report import commit
+from cosim.studies.store import INDICATORS, LOG, RUN
+from cosim.studies.tables import CURVE, KEYS, STATE, read_table
 
 if TYPE_CHECKING:
-    from cosim.study.plan import Plan, Run
+    from cosim.studies.plan import Plan, Run
 
 SCHEMA = 1
 EVALUATED = "evaluated"

@@ -27,11 +27,11 @@ from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
-from cosim.study.cluster import on_cluster
-from cosim.study.document import TrajectoryTable
-from cosim.study.plan import EVALUATION, Plan, Run, Study, Training, plan
-from cosim.study.results import StudyResults
-from cosim.study.store import CHECKPOINT, INDICATORS, Figures, RunStore, Trained
+from cosim.studies.cluster import on_cluster
+from cosim.studies.document import TrajectoryTable
+from cosim.studies.plan import EVALUATION, Plan, Run, Study, Training, plan
+from cosim.studies.results import StudyResults
+from cosim.studies.store import CHECKPOINT, INDICATORS, Figures, RunStore, Trained
 from learning.log import COLUMNS, LogRow, to_csv
 from learning.training import run_training
 
@@ -360,7 +360,7 @@ def _begin(parent: int) -> None:
     follow_parent(parent)
 
 
-def run_study(
+def study(
     source: Study | str | Path | Mapping[str, Any],
     out: str | Path,
     *,
@@ -386,11 +386,11 @@ def run_study(
     """
     if isinstance(source, Mapping):
         source = Study.from_dict(source)
-    study = source if isinstance(source, Study) else Study.load(source)
+    definition = source if isinstance(source, Study) else Study.load(source)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    planned = planned or plan(study)
-    runner = Runner(planned.runs, folder, (study.folder, Path.cwd()), report)
+    planned = planned or plan(definition)
+    runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
     for line in runner.remarks:
         report(State(0, 0, len(planned.runs), 0), line)
     runner.go(jobs, scheduler)

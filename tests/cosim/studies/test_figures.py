@@ -6,8 +6,8 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures import palette
-from cosim.study.figures import Dots, learning_curve, profile_figure, regret_figure
-from cosim.study.pictures import density_figure, increments, phase_figure
+from cosim.studies.figures import Dots, learning_curve, profile_figure, regret_figure
+from cosim.studies.pictures import density_figure, increments, phase_figure
 from tests.helpers.loop import Proportional
 
 

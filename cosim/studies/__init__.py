@@ -1,0 +1,1 @@
+"""Studies: cases × scenarios × training seeds, from a TOML file to a report."""

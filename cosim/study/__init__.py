@@ -1,1 +1,0 @@
-"""Experiments: one engine for cases × scenarios × training seeds, from a TOML file to a report."""

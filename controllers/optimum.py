@@ -10,7 +10,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from math import isfinite
+from math import isfinite, modf
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +33,7 @@ from controllers.dynamic_programming.policy_iteration import (
     solve,
 )
 from controllers.errors import ModelError, OptimumError, QpError
+from controllers.model import Model
 from controllers.problem import load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
 from cosim.scenario import Scenario
@@ -326,7 +327,7 @@ class OptimalPolicy:
         return row, clamped
 
 
-# a plant that fouls --------------------------------------------------------------------------
+# a plant that changes -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -363,8 +364,7 @@ class Fouling:
         if not model.uncertain:
             raise OptimumError(f"model '{model.name}' names no uncertain parameter that could foul")
         name = model.uncertain[0]
-        nominal = model.nominal_parameters[model.parameter_indices((name,))[0]]
-        return cls(name, float(given.get(name, nominal)), rate, floor, period)
+        return cls(name, _parameter(scenario, model, name), rate, floor, period)
 
     def heat_transfer(self, days: ArrayLike) -> Vector:
         """The fouled parameter at a number of days since the start, clean at 0."""
@@ -378,28 +378,89 @@ class Fouling:
         values: list[float] = np.linspace(fouled, self.clean, NODES).round(6).tolist()
         return values
 
-    def held(self, value: float) -> dict[str, float | None]:
-        """Plant parameters of a condenser that stays as it is at a value of p."""
-        return {self.parameter: value, **dict.fromkeys(FOULING)}
+    @property
+    def plants(self) -> list[Mapping[str, float | None]]:
+        """Plant parameters of a condenser that stays as it is at each node."""
+        return [{self.parameter: value, **dict.fromkeys(FOULING)} for value in self.nodes]
+
+    def present(self, time: float) -> dict[str, float]:
+        """The parameter by name at a time in s."""
+        return {self.parameter: float(self.heat_transfer(time / DAY))}
+
+    def position(self, time: ArrayLike) -> Vector:
+        """Where among the nodes the parameter is at times in s: 1.5 is midway between 1 and 2."""
+        values = self.heat_transfer(np.asarray(time) / DAY)
+        return np.asarray(np.interp(values, self.nodes, np.arange(NODES)), dtype=np.float64)
+
+    def quadrature(self) -> tuple[Vector, Vector]:
+        """Times in s and weights of a mean over one cycle."""
+        x, weights = np.polynomial.legendre.leggauss(40)
+        return 0.5 * self.period * DAY * (x + 1.0), weights / 2.0
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Parameters that jump: those of `plants[i]` hold from `starts[i]` in s on."""
+
+    starts: tuple[float, ...]
+    plants: tuple[Mapping[str, float], ...]
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Jumps | None:
+        """What jumps in a scenario's plant, None where nothing does."""
+        changes = scenario.plant.changes
+        if not changes:
+            return None
+        model = load_model(scenario.plant.model or scenario.controller.model)
+        names = dict.fromkeys(name for change in changes for name in change.parameters)
+        plants = [{name: _parameter(scenario, model, name) for name in names}]
+        for change in changes:
+            plants.append(plants[-1] | change.parameters)
+        return cls((0.0, *(change.time for change in changes)), tuple(plants))
+
+    def present(self, time: float) -> dict[str, float]:
+        """The parameters that jump, by name, at a time in s."""
+        return dict(self.plants[int(self.position(time))])
+
+    def position(self, time: ArrayLike) -> Vector:
+        """Which of the plants is there at times in s."""
+        return np.asarray(np.searchsorted(self.starts, time, side="right") - 1, dtype=np.float64)
+
+    def quadrature(self) -> tuple[Vector, Vector]:
+        """Times in s and weights of a mean from the start to the last change."""
+        return np.array(self.starts[:-1]), np.diff(self.starts) / self.starts[-1]
+
+
+def change_of(scenario: Scenario) -> Fouling | Jumps | None:
+    """How a scenario's plant changes, None where it stays as it is."""
+    fouling, jumps = Fouling.of(scenario), Jumps.of(scenario)
+    if fouling and jumps:
+        raise OptimumError("a condenser that fouls and plant.changes have no common reference")
+    return fouling or jumps
+
+
+def _parameter(scenario: Scenario, model: Model, name: str) -> float:
+    """A plant parameter as the scenario sets it, else as the plant's model has it."""
+    nominal = model.nominal_parameters[model.parameter_indices((name,))[0]]
+    return float(scenario.plant.parameters.get(name, nominal))
 
 
 class QuasiStaticPolicy:
-    """π*(s; p(t)): linear in p between the optimal policies of fixed values of the fouled p.
+    """π*(s) of the plant as it is at the time; between the nodes of a law, linear in them.
 
-    It knows the law of fouling and the clock, which starts at a clean condenser with each `reset`
-    and goes on by one sample with each `prepare`. A reference, not a bound: it looks at no
-    change to come, and for a condenser that fouled infinitely slowly it would be the optimum.
+    It knows the law of the change and the clock, which starts with each `reset` and goes on by one
+    sample with each `prepare`. A reference, not a bound: it looks at no change to come, and for
+    a plant that changed infinitely slowly, or seldom, it would be the optimum.
     """
 
     name = "optimal"
 
     def __init__(
-        self, fouling: Fouling, policies: Sequence[OptimalPolicy], sampling_time: float
+        self, law: Fouling | Jumps, policies: Sequence[OptimalPolicy], sampling_time: float
     ) -> None:
-        self.fouling = fouling
+        self.law = law
         self.policies = tuple(policies)
-        self._nodes = fouling.nodes
-        self._days_per_sample = sampling_time / DAY
+        self._h = sampling_time
         self._sample = -1
 
     @classmethod
@@ -409,46 +470,46 @@ class QuasiStaticPolicy:
         *,
         progress: Callable[[Progress], None] | None = None,
     ) -> QuasiStaticPolicy:
-        """The policy of a scenario that fouls; solves what is not stored. Raises OptimumError."""
-        fouling = _fouling(scenario)
+        """The policy of a scenario that changes; solves what is not stored. Raises OptimumError."""
+        law = _law(scenario)
         policies = [
-            OptimalPolicy.from_scenario(scenario, overrides=fouling.held(value), progress=progress)
-            for value in fouling.nodes
+            OptimalPolicy.from_scenario(scenario, overrides=plant, progress=progress)
+            for plant in law.plants
         ]
-        return cls(fouling, policies, scenario.sampling_time)
+        return cls(law, policies, scenario.sampling_time)
 
     @classmethod
     def stored(cls, scenario: Scenario) -> QuasiStaticPolicy | None:
-        """The policy of a scenario that fouls where all of its optima are stored, else None."""
-        fouling = _fouling(scenario)
+        """The policy of a scenario that changes where all of its optima are stored, else None."""
+        law = _law(scenario)
         policies = []
-        for value in fouling.nodes:
-            policy = OptimalPolicy.stored(scenario, overrides=fouling.held(value))
+        for plant in law.plants:
+            policy = OptimalPolicy.stored(scenario, overrides=plant)
             if policy is None:
                 return None
             policies.append(policy)
-        return cls(fouling, policies, scenario.sampling_time)
+        return cls(law, policies, scenario.sampling_time)
 
     @property
-    def gains(self) -> list[tuple[float, float]]:
-        """(p, J* at that p), by increasing p."""
-        return list(zip(self._nodes, (policy.gain for policy in self.policies), strict=True))
+    def gains(self) -> list[tuple[Mapping[str, float | None], float]]:
+        """(plant parameters, J* of that plant), in the order of the law's plants."""
+        gains = (policy.gain for policy in self.policies)
+        return list(zip(self.law.plants, gains, strict=True))
 
     @property
     def gain(self) -> float:
-        """Mean of J*(p(t)) over one cycle, J* between the nodes by monotone cubics."""
-        x, weights = np.polynomial.legendre.leggauss(40)
-        values = self.fouling.heat_transfer(0.5 * self.fouling.period * (x + 1.0))
-        return float(self.gain_at(values) @ weights / 2.0)
+        """Mean of J* over one cycle of fouling, or from the start to the last jump."""
+        times, weights = self.law.quadrature()
+        return float(self.gain_at(times) @ weights)
 
-    def gain_at(self, heat_transfer: ArrayLike) -> Vector:
-        """J* of a condenser that stays at values of p, of any shape."""
-        curve = PchipInterpolator(self._nodes, [policy.gain for policy in self.policies])
-        found: Vector = curve(np.clip(heat_transfer, self._nodes[0], self._nodes[-1]))
+    def gain_at(self, time: ArrayLike) -> Vector:
+        """J* of the plant as it is at times in s, between the nodes by monotone cubics."""
+        gains = [policy.gain for policy in self.policies]
+        found: Vector = PchipInterpolator(np.arange(len(gains)), gains)(self.law.position(time))
         return found
 
     def reset(self) -> None:
-        """Start the clock at a clean condenser."""
+        """Start the clock."""
         self._sample = -1
 
     def prepare(self) -> None:
@@ -456,12 +517,12 @@ class QuasiStaticPolicy:
         self._sample += 1
 
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> OptimalSolution:
-        """Action and value at s (n,) for the present heat transfer; raises QpError as each does."""
-        present = float(self.fouling.heat_transfer(max(self._sample, 0) * self._days_per_sample))
-        upper = min(max(bisect_right(self._nodes, present), 1), len(self._nodes) - 1)
-        low, high = self._nodes[upper - 1], self._nodes[upper]
-        share = min(max((present - low) / (high - low), 0.0), 1.0)
-        first, second = (self.policies[i].feedback(s, a) for i in (upper - 1, upper))
+        """Action and value at s (n,) for the plant as it is; raises QpError as each does."""
+        share, lower = modf(self.law.position(max(self._sample, 0) * self._h))
+        first = self.policies[int(lower)].feedback(s, a)
+        if share == 0.0:
+            return first
+        second = self.policies[int(lower) + 1].feedback(s, a)
         return OptimalSolution(
             (1.0 - share) * first.action + share * second.action,
             (1.0 - share) * first.value + share * second.value,
@@ -469,11 +530,11 @@ class QuasiStaticPolicy:
         )
 
 
-def _fouling(scenario: Scenario) -> Fouling:
-    fouling = Fouling.of(scenario)
-    if fouling is None:
-        raise OptimumError("the scenario's condenser does not foul: its optimum is OptimalPolicy's")
-    return fouling
+def _law(scenario: Scenario) -> Fouling | Jumps:
+    law = change_of(scenario)
+    if law is None:
+        raise OptimumError("the scenario's plant does not change: its optimum is OptimalPolicy's")
+    return law
 
 
 @dataclass(frozen=True)
@@ -493,17 +554,17 @@ class Yardstick:
 def optimal(
     scenario: Scenario, progress: Callable[[Progress], None] | None = None
 ) -> OptimalPolicy | QuasiStaticPolicy:
-    """The optimal policy of a scenario, or the quasi-static one of a condenser that fouls."""
-    if Fouling.of(scenario) is None:
+    """The optimal policy of a scenario, or the quasi-static one of a plant that changes."""
+    if change_of(scenario) is None:
         return OptimalPolicy.from_scenario(scenario, progress=progress)
     return QuasiStaticPolicy.from_scenario(scenario, progress=progress)
 
 
 def yardstick(scenario: Scenario) -> Yardstick | None:
     """What is stored for a scenario, None where nothing is; solves nothing."""
-    if Fouling.of(scenario) is not None:
+    if (law := change_of(scenario)) is not None:
         found = QuasiStaticPolicy.stored(scenario)
-        note = f"quasi-static: J* along {found.fouling.parameter}(t), no bound" if found else ""
+        note = f"quasi-static: J* along {', '.join(law.present(0.0))}(t), no bound"
         return None if found is None else Yardstick(found.gain, "reference", found, note)
     policy = OptimalPolicy.stored(scenario)
     if policy is None:

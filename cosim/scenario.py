@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping
 from functools import cached_property
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -61,6 +62,15 @@ class MappingTable(Table):
     """One parameter per disturbance for its half width or standard deviation."""
 
 
+class ChangeTable(Table):
+    """A change of the plant in operation, which controllers and rules are not told of."""
+
+    time: Positive
+    """Time since the reset in s; it takes effect at the first sample at or after it."""
+    parameters: Annotated[dict[str, Number], Field(min_length=1)]
+    """Tunable parameters of the FMU and their values from then on."""
+
+
 class PlantTable(Table):
     """The FMU and the map from its variables to states, actions, disturbances and stage cost.
 
@@ -81,6 +91,8 @@ class PlantTable(Table):
     """State at k = 0, (n,)."""
     parameters: dict[str, float | bool] = {}
     """Further start values, by variable, that each reset writes."""
+    changes: Annotated[tuple[ChangeTable, ...], Field(strict=False)] | None = None
+    """Tables `[[plant.changes]]`: what changes in mid run, times increasing."""
     model: Annotated[str, Field(pattern=r"^[\w.]+:\w+$")] | None = None
     """Model of the plant for its optimum, `module:factory`, where the controller's is another."""
     mapping: MappingTable = MappingTable()
@@ -226,6 +238,9 @@ class Scenario(Table):
             upper = getattr(self.bounds, f"{kind}_upper")
             if not all(low < high for low, high in zip(lower, upper, strict=True)):
                 raise _misfit(f"bounds.{kind}_lower", f"must be below {kind}_upper in every entry")
+        times = [change.time for change in plant.changes or ()]
+        if any(first >= second for first, second in pairwise(times)):
+            raise _misfit("plant.changes", "must have increasing times")
         names = (*plant.states, *plant.actions, *plant.disturbances)
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise _misfit("plant", f"names '{twice}' twice among states, actions and disturbances")
@@ -260,6 +275,18 @@ class Scenario(Table):
         Tables are merged, everything else is replaced; the result is validated as a whole.
         """
         return self._validated(merged(self.to_dict(), changes), f"scenario '{self.name}'")
+
+    def at(self, time: float) -> Scenario:
+        """The scenario of the plant as it is at a time in s, with no further change to come.
+
+        Only `plant.changes` count; a condenser that fouls goes on fouling.
+        """
+        document = self.to_dict()
+        plant = document["plant"]
+        for change in plant.pop("changes", ()):
+            if change["time"] <= time:
+                plant["parameters"] |= change["parameters"]
+        return Scenario.from_dict(document)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document that this scenario was validated from, every default written out."""

@@ -51,14 +51,14 @@ def optimum(
     The policy is stored and serves as controller `optimal`. It is called J* where solution,
     refinement and long simulation agree within 0.05 % and no policy search is below; else
     it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
-    A plant that fouls has the quasi-static reference: J* along its heat transfer.
+    A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is.
     """
-    from controllers.optimum import Fouling, QuasiStaticPolicy
+    from controllers.optimum import QuasiStaticPolicy, change_of
     from cosim.cli.compose import load_scenario
 
     with output(json) as out_:
         task = load_scenario(scenario)
-        if Fouling.of(task) is not None:
+        if change_of(task) is not None:
             with _progress(out_) as show:
                 _show_quasi_static(QuasiStaticPolicy.from_scenario(task, progress=show), task, out_)
             return
@@ -69,14 +69,15 @@ def optimum(
 
 
 def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: Output) -> None:
-    name = policy.fouling.parameter
-    rows = [(f"{value:.4f}", f"{gain:.4f}") for value, gain in policy.gains]
-    rows.append(("mean over a cycle", f"{policy.gain:.4f}"))
+    names = list(policy.law.present(0.0))
+    table = [{name: plant[name] for name in names} | {"J": gain} for plant, gain in policy.gains]
+    rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
+    rows.append(("mean", *[""] * (len(names) - 1), f"{policy.gain:.4f}"))
     title = f"quasi-static reference of {task.name}: a reference, not a bound"
-    out_.table(title, (name, "J*"), rows)
+    out_.table(title, (*names, "J*"), rows)
     document = {"scenario": task.name, "kind": "reference", "J": policy.gain}
-    document["objection"] = f"quasi-static: J* along {name}(t), no bound"
-    out_.json(document | {"table": [{name: p, "J": gain} for p, gain in policy.gains]})
+    document["objection"] = f"quasi-static: J* along {', '.join(names)}(t), no bound"
+    out_.json(document | {"table": table})
 
 
 def _solve(

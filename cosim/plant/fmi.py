@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -209,6 +209,17 @@ class Instance:
         """Replace the start value of a variable, by type and reference, for the next reset."""
         buffer, index = self._slots[type_, reference]
         buffer[index] = value
+
+    def writer(self, references: Sequence[int], values: Sequence[float]) -> Callable[[], None]:
+        """A function that writes values to real variables between two steps."""
+        buffer, _, arguments = self._exchange(references)
+        buffer[:] = values
+
+        def write() -> None:
+            if (status := self._set_values(*arguments)) not in ACCEPTED:
+                self.fail(f"Set{self.real}", status)
+
+        return write
 
     def _write_starts(self) -> None:
         for name, function, arguments in self._starts:

@@ -135,6 +135,7 @@ class FmuPlant:
         self._started = False
         self._penalty_now = 0.0
         self._fmi = interface(archive, wiring, self._h)
+        self._changes = {k: self._fmi.writer(*change) for k, change in wirer.changes().items()}
         self._advance = self._fmi.advance
         self._inputs = self._fmi.inputs
         self._outputs = self._fmi.outputs
@@ -189,6 +190,8 @@ class FmuPlant:
         self._inputs[:] = values
         penalty, k = self._penalty_now, self._k
         self._k = _NOT_STARTED
+        if k in self._changes:
+            self._changes[k]()
         self._advance(k * self._h)
         states, cost = self._states[:], self._outputs[0]
         if not isfinite(cost + sum(states)):

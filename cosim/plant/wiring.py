@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Iterator, Sequence
+from math import ceil
 from typing import Any, NamedTuple
 
 from cosim.errors import PlantError
@@ -104,6 +105,23 @@ class Wirer:
             states=[self._real(name, "plant.states") for name in plant.states],
             starts=self._starts(),
         )
+
+    def changes(self) -> dict[int, tuple[list[int], list[float]]]:
+        """By the number of a sample the value references to write at its start, and the values."""
+        scenario = self._scenario
+        found: dict[int, tuple[list[int], list[float]]] = {}
+        for change in scenario.plant.changes or ():
+            references, values = found.setdefault(
+                ceil(change.time / scenario.sampling_time), ([], [])
+            )
+            for name, value in change.parameters.items():
+                reference = self._real(name, "plant.changes")
+                variable = self._variables[name]
+                if variable.variability != "tunable" and variable.causality != "input":
+                    raise self._misfit(name, "plant.changes", "is not tunable")
+                references.append(reference)
+                values.append(value)
+        return found
 
     def seeds(self) -> list[SeedWord]:
         """The variables that take the seed, low word first."""

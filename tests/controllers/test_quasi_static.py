@@ -1,4 +1,4 @@
-"""The quasi-static reference of a plant that fouls, and the yardstick of any."""
+"""The quasi-static reference of a plant that fouls or jumps, and the yardstick of any."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from controllers import optimum as store
 from controllers.dynamic_programming.policy_iteration import Settings
 from controllers.errors import OptimumError
-from controllers.optimum import Fouling, OptimalPolicy, QuasiStaticPolicy, yardstick
+from controllers.optimum import Fouling, OptimalPolicy, QuasiStaticPolicy, change_of, yardstick
 from cosim import FmuPlant, Scenario
 
 
@@ -49,11 +49,11 @@ def test_a_condenser_that_does_not_foul_has_no_law():
 
 
 def test_the_reference_is_the_mean_of_the_optima_along_the_cycle(policy):
-    nodes, gains = np.array(policy.gains).T
+    nodes, gains = np.array([(plant["UA2"], gain) for plant, gain in policy.gains]).T
     assert nodes[-1] == 6.84
     assert (np.diff(gains) < 0).all()
     days = (np.arange(20_000) + 0.5) * 6.0 / 20_000
-    linear = np.interp(policy.fouling.heat_transfer(days), nodes, gains).mean()
+    linear = np.interp(policy.law.heat_transfer(days), nodes, gains).mean()
     assert policy.gain == pytest.approx(linear, rel=1e-3)
     assert gains[-1] < policy.gain < gains[0]
 
@@ -89,6 +89,34 @@ def test_the_yardstick_of_the_drifting_plant_is_a_reference(drifting, policy):
     assert found.kind == "reference"
     assert "no bound" in found.note
     assert found.value == policy.gain
+
+
+def test_a_plant_that_jumps_has_the_optimum_of_the_plant_as_it_is():
+    jump = Scenario.load("jump")
+    policy, before, after = (
+        yardstick(jump).controller,
+        yardstick(Scenario.load("paper")),
+        yardstick(Scenario.load("fouled")),
+    )
+    first, second = (change.time for change in jump.plant.changes)
+    times = [0.0, first - 60.0, first, second - 60.0, second, 1e9]
+    expected = [before.value] * 2 + [after.value] * 2 + [before.value] * 2
+    assert policy.gain_at(times).tolist() == expected
+    share = first / second
+    assert policy.gain == pytest.approx(share * before.value + (1 - share) * after.value)
+    s = [28.0, 60.0]
+    policy.reset()
+    for _ in range(int(first / 60.0)):
+        policy.prepare()
+    np.testing.assert_array_equal(policy.feedback(s).action, before.controller.policy(s))
+    policy.prepare()
+    np.testing.assert_array_equal(policy.feedback(s).action, after.controller.policy(s))
+
+
+def test_a_plant_cannot_foul_and_jump():
+    changes = [{"time": 60.0, "parameters": {"UA2": 5.2}}]
+    with pytest.raises(OptimumError, match="no common reference"):
+        change_of(Scenario.load("drifting").replace({"plant": {"changes": changes}}))
 
 
 def test_what_is_not_stored_has_no_yardstick(tmp_path, monkeypatch):

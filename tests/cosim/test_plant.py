@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim import FmuPlant
+from cosim import FmuPlant, Scenario
 from cosim.errors import PlantError
 from cosim.simulation import spawn_seeds
 
@@ -290,3 +290,41 @@ def test_a_scenario_that_does_not_fit_the_fmu_is_refused_by_name(paper, change, 
         FmuPlant(paper.replace({"plant": change}))
     for word in words:
         assert word in str(error.value)
+
+
+def _changed(name, value, time=120.0):
+    changes = [{"time": time, "parameters": {name: value}}]
+    return Scenario.load("paper").replace({"plant": {"changes": changes}})
+
+
+def _run(scenario, steps, fmu):
+    with FmuPlant(scenario, fmu) as plant:
+        plant.reset(5)
+        return np.array([plant.step(scenario.reference_action).s for _ in range(steps)])
+
+
+@pytest.mark.parametrize("fmu", ["evaporator", "evaporator_fmi3"])
+def test_a_change_takes_effect_at_its_sample_and_ends_with_the_reset(fmu):
+    scenario = _changed("UA2", 5.2)
+    before, seen = (_run(each, 3, fmu) for each in (Scenario.load("paper"), scenario))
+    np.testing.assert_array_equal(seen[:2], before[:2])
+    assert seen[2, 1] > before[2, 1]
+    with FmuPlant(scenario, fmu) as plant:
+        plant.reset(5)
+        for _ in range(2):
+            plant.step(scenario.reference_action)
+        saved = plant.snapshot()
+        steps = [plant.step(scenario.reference_action).s for _ in range(2)]
+        plant.restore(saved)
+        np.testing.assert_array_equal(plant.step(scenario.reference_action).s, steps[0])
+        plant.reset(5)
+        np.testing.assert_array_equal(plant.step(scenario.reference_action).s, before[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("UA3", "no variable 'UA3'"), ("X2_start", "is not tunable; plant.changes")],
+)
+def test_a_change_of_what_cannot_be_changed_is_refused(name, message):
+    with pytest.raises(PlantError, match=message):
+        FmuPlant(_changed(name, 1.0))

@@ -10,7 +10,15 @@ from cosim.scenario import Scenario, presets
 
 
 def test_presets_are_those_that_the_design_names():
-    assert presets() == ["drifting", "fast-sampling", "fouled", "mismatched", "nominal", "paper"]
+    assert presets() == [
+        "drifting",
+        "fast-sampling",
+        "fouled",
+        "jump",
+        "mismatched",
+        "nominal",
+        "paper",
+    ]
 
 
 def test_paper_holds_the_numbers_of_the_paper(paper):
@@ -54,7 +62,23 @@ def test_other_presets_differ_from_paper_in_what_their_name_says(paper):
         "fouled": {"plant"},
         "mismatched": {"plant", "disturbance"},
         "drifting": {"plant"},
+        "jump": {"plant"},
     }
+
+
+def test_the_plant_as_it_is_at_a_time_is_a_scenario_of_its_own(paper):
+    jump, fouled = Scenario.load("jump"), Scenario.load("fouled")
+    first, second = (change.time for change in jump.plant.changes)
+    assert jump.at(first - 1.0).hash == paper.hash
+    assert jump.at(first).hash == jump.at(second - 1.0).hash == fouled.hash
+    assert jump.at(second).plant.parameters == {"UA2": 6.84}
+    assert fouled.at(1e9) == fouled
+
+
+def test_changes_come_one_after_another(paper):
+    change = {"time": 60.0, "parameters": {"UA2": 5.2}}
+    with pytest.raises(ScenarioError, match="increasing times"):
+        paper.replace({"plant": {"changes": [change, change]}})
 
 
 @pytest.mark.parametrize("name", ["fouled", "mismatched"])

@@ -28,6 +28,13 @@ def test_a_plant_that_stays_as_it_is_has_none():
     assert Drift.of(Scenario.load("fouled")) is None
 
 
+def test_the_log_of_a_plant_that_jumps_shows_the_parameter_as_it_is():
+    jump = Scenario.load("jump")
+    drift, time = Drift.of(jump), jump.plant.changes[0].time
+    assert [drift.row(t)["UA2"] for t in (0.0, time, 1e9)] == [6.84, 5.2, 6.84]
+    assert drift.row(time)["reference_J"] > drift.row(0.0)["reference_J"]
+
+
 @pytest.mark.parametrize(("name", "more"), [("paper", []), ("drifting", ["UA2", "reference_J"])])
 def test_the_log_shows_it_at_the_end_of_each_row(name, more):
     every = {"log_every": 30, "evaluate_every": 60, "checkpoint_every": 60}

@@ -16,7 +16,7 @@ import fmus
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-PRESETS = {"paper", "nominal", "fast-sampling", "fouled", "mismatched", "drifting"}
+PRESETS = {"paper", "nominal", "fast-sampling", "fouled", "mismatched", "drifting", "jump"}
 
 
 # Other people's tools may warn; what is installed may not.

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.problem import Problem
 from controllers.rti import LinearisationPoint
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
@@ -26,7 +25,7 @@ from learning.algorithm import (
 from learning.checkpoint import generator_state, group, prefixed, restore_generator
 from learning.errors import PrivilegeError
 from learning.exploration import Strategy, build_strategy
-from learning.training_run import TrainingRun, build_controller, starting_parameters
+from learning.training_run import TrainingRun, build_controller
 
 Vector = NDArray[np.float64]
 CHECKED_EVERY = 10
@@ -304,9 +303,7 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
 
     All random numbers come from the run's seed.
     """
-    problem = Problem.from_scenario(run.scenario)
-    start = starting_parameters(problem, run.configuration, run.start)
-    controller = build_controller(run.controller, run.scenario, start)
+    controller = build_controller(run.controller, run.scenario, run.starting_parameters())
     strategy = build_strategy(run.configuration, run.scenario, run.samples)
     plant_seed, rng = spawn_seeds(run.seed)
     own = run.algorithm_rng()

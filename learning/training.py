@@ -186,7 +186,7 @@ def train(
     scenario : a scenario, a preset's name or a TOML file.
     samples : plant samples; None is what the algorithm says, else 50 000.
     seed : seed of noise and exploration.
-    start : where θ starts: naive, tuned or a parameters file.
+    start : where θ starts: naive, tuned, commissioned or a parameters file.
     settings : hyperparameters by name; the algorithm's Configuration documents them.
     out : folder that the run's checkpoints are kept in; None keeps none. `Training.save` writes
         the rest.

@@ -18,6 +18,7 @@ from controllers.theta import Parameters, ThetaBlocks
 from cosim.plugins import OURS, depends_on
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, load_algorithm
+from learning.commissioning import back_off
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 
@@ -65,7 +66,8 @@ class TrainingRun:
         default=1.5, metadata=_about("Times the start's J at which a run has diverged.")
     )
     start: str = field(
-        default="naive", metadata=_about("Where θ starts: naive, tuned or a parameters file.")
+        default="naive",
+        metadata=_about("Where θ starts: naive, tuned, commissioned or a parameters file."),
     )
     rest_after: int | None = field(
         default=None,
@@ -96,6 +98,13 @@ class TrainingRun:
             values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
         values["source"] = depends_on(self.scenario, self.algorithm, packages=OURS)
         return values
+
+    def starting_parameters(self) -> Parameters:
+        """θ where the run starts; the errors are those of `starting_parameters` below."""
+        problem = Problem.from_scenario(self.scenario)
+        if self.start != "commissioned":
+            return starting_parameters(problem, self.configuration, self.start)
+        return back_off(starting_parameters(problem, self.configuration, "tuned"), self.scenario)
 
     def algorithm_rng(self) -> np.random.Generator:
         """The algorithm's own generator, apart from those of noise and exploration."""

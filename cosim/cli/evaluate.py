@@ -27,8 +27,8 @@ def evaluate(
         typer.Option(
             "--controllers",
             "-c",
-            help="Comma-separated: naive, tuned, converged, optimal, a parameters file or "
-            "module:factory; NAME=… gives one another name.",
+            help="Comma-separated: naive, tuned, commissioned, converged, optimal, a parameters "
+            "file or module:factory; NAME=… gives one another name.",
         ),
     ] = "naive",
     scenario: ScenarioOption = "paper",

@@ -25,7 +25,8 @@ def simulate(
         typer.Option(
             "--controller",
             "-c",
-            help="naive, tuned, converged, optimal, a parameters file, or module:factory.",
+            help="naive, tuned, commissioned, converged, optimal, a parameters file, or "
+            "module:factory.",
         ),
     ] = "naive",
     steps: StepsOption = 1000,

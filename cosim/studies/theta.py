@@ -11,13 +11,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from controllers.problem import Problem
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
 from cosim.studies.store import LOG
 from cosim.studies.tables import read_table
 from cosim.validation import suggestion
-from learning.training_run import starting_parameters
 
 if TYPE_CHECKING:
     from cosim.studies.plan import Plan, Run, Training
@@ -46,8 +44,7 @@ def scales(plan: Plan) -> dict[str, float]:
 def _scales(training: Training) -> dict[str, float]:
     """Learning scale of each entry of a training's θ, by its column of the log."""
     run = training.prepare()
-    problem = Problem.from_scenario(run.scenario)
-    blocks = starting_parameters(problem, run.configuration, run.start).blocks
+    blocks = run.starting_parameters().blocks
     names = (f"{PREFIX}{label}" for label in blocks.labels)
     return dict(zip(names, blocks.scale.tolist(), strict=True))
 

@@ -1,0 +1,39 @@
+import numpy as np
+import pytest
+
+from controllers.economic import tune
+from cosim.plugins import build_controller
+from learning import commissioning
+from learning.training_run import prepare
+
+
+def test_the_first_days_theta_is_tuned_and_backed_off_where_the_model_binds(scenario, problem):
+    found, tuned = build_controller("commissioned", scenario).parameters, tune(problem).parameters
+    assert 26.0 < found["x_l"][0] < 30.0
+    assert found["x_u"].tolist() == scenario.state_upper.tolist()
+    for name in ("B_l", "b_l", "B_Vf", "b_Vf", "c_f"):
+        assert np.array_equal(found[name], tuned[name])
+
+
+def test_the_plant_says_nothing_of_it(scenario):
+    other = scenario.replace(
+        {"plant": {"parameters": {"UA2": 5.2}}, "disturbance": {"law": "normal"}}
+    )
+    one, two = (build_controller("commissioned", s).parameters for s in (scenario, other))
+    assert np.array_equal(one.theta, two.theta)
+
+
+def test_a_training_starts_with_it(scenario, monkeypatch):
+    monkeypatch.setattr(commissioning, "SAMPLES", 1000)
+    monkeypatch.setattr(commissioning, "_found", {})
+    run = prepare("q-learning", scenario, 1000, None, {"seed": 0, "start": "commissioned"})
+    start = run.starting_parameters()
+    assert start["x_l"][0] > 25.0 and "w_sigma" in start.blocks
+    assert np.array_equal(start.theta, run.starting_parameters().theta)
+
+
+def test_without_noise_nothing_is_backed_off(scenario, monkeypatch):
+    monkeypatch.setattr(commissioning, "GUESS", 0.0)
+    monkeypatch.setattr(commissioning, "_found", {})
+    found = build_controller("commissioned", scenario).parameters
+    assert found["x_l"].tolist() == pytest.approx([25.0, 40.0])

@@ -61,7 +61,6 @@ def _written(path, data):
 
 
 REFUSED = {
-    "empty": (lambda p: _written(p, b""), ["corrupt or not an FMU"]),
     "text": (lambda p: _written(p, b"not a zip"), ["corrupt or not an FMU"]),
     "truncated": (_truncated, ["corrupt or not an FMU", "build it again"]),
     "flipped bits": (_flipped, ["corrupt or not an FMU"]),
@@ -83,7 +82,6 @@ REFUSED = {
         lambda p: _zip(p, [("../evil", "x")]),
         ["'../evil'", "leads outside"],
     ),
-    "parent inside": (lambda p: _zip(p, [("a/../../evil", "x")]), ["leads outside"]),
     "absolute": (lambda p: _zip(p, [("/etc/evil", "x")]), ["leads outside"]),
     "backslash": (lambda p: _zip(p, [("..\\evil", "x")]), ["leads outside"]),
     "drive": (lambda p: _zip(p, [("C:evil", "x")]), ["leads outside"]),
@@ -113,15 +111,6 @@ def test_an_archive_of_absurd_size_is_refused_before_it_is_unpacked(tmp_path, mo
     monkeypatch.setattr(archive, "MAX_ENTRIES", 0)
     with pytest.raises(PlantError, match="more than 0 entries"):
         unpack(path)
-
-
-def test_missing_files_and_unknown_names_are_told_apart(tmp_path):
-    with pytest.raises(PlantError, match=r"unknown FMU 'evaporater'.*evaporator, evaporator_fmi3"):
-        unpack("evaporater")
-    with pytest.raises(PlantError, match="does not exist"):
-        unpack(tmp_path / "none.fmu")
-    with pytest.raises(PlantError, match="not a file"):
-        unpack(tmp_path)
 
 
 def test_an_fmu_without_a_binary_for_this_platform_says_what_it_has(tmp_path, paper):

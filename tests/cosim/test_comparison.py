@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from cosim import FmuPlant, simulate
 from cosim.cli.output import dump
 from cosim.comparison import RunSignals, as_document, compare, load_run
-from cosim.errors import ComparisonError, RecordingError, TrajectoryError
+from cosim.errors import ComparisonError, TrajectoryError
 from cosim.recording import RerunRecorder
 from cosim.trajectory import Signal
 from tests.helpers.loop import Proportional
@@ -31,12 +31,6 @@ def test_equal_runs_are_equal():
     assert result.differences[0].maximum == 0.0
 
 
-def test_one_bit_counts_without_a_tolerance():
-    result = compare(run(P2=[1.0, 2.0]), run(P2=[1.0, np.nextafter(2.0, 3.0)]))
-    assert not result.equal
-    assert result.first == 1
-
-
 @given(st.lists(st.tuples(values, values), min_size=1, max_size=30), st.floats(0.0, 10.0))
 def test_first_and_largest_difference_against_a_plain_loop(pairs, tolerance):
     a, b = zip(*pairs, strict=True)
@@ -54,13 +48,6 @@ def test_first_and_largest_difference_against_a_plain_loop(pairs, tolerance):
     assert found.first == (beyond[0] if beyond else None)
 
 
-def test_the_sign_of_zero_is_a_bit_and_no_distance():
-    a, b = run(P2=[1.0, 0.0]), run(P2=[1.0, -0.0])
-    assert compare(a, b).first == 1
-    assert compare(a, b, {"P2": 0.0}).equal
-    assert "0.0 against -0.0" in compare(a, b).lines()[0]
-
-
 def test_units_and_the_order_of_columns_count():
     a, b = run(P2=[1.0], X2=[1.0]), run(X2=[1.0], P2=[1.0])
     assert compare(a, b).order == 0
@@ -70,16 +57,6 @@ def test_units_and_the_order_of_columns_count():
     result = compare(run(P2=[1.0]), bar)
     assert result.units == {"P2": ("kPa", "bar")}
     assert not result.equal
-
-
-def test_the_message_has_signal_step_both_values_and_units():
-    a = run(time=[0.0, 60.0, 120.0], P2=[49.0, 50.0, 51.0], T=[1.0, 1.0, 1.0])
-    b = run(time=[0.0, 60.0, 120.0], P2=[49.0, 50.5, 51.25], T=[1.0, 1.0, 2.0])
-    text = compare(a, b, {"P2": 0.1}).lines()
-    assert text == [
-        "first difference at sample 1 (time 60 s): P2 differs by up to 0.5 kPa "
-        "(sample 1: 50.0 against 50.5), tolerance 0.1 kPa"
-    ]
 
 
 def test_a_tolerance_is_in_the_signals_unit_and_holds_for_it_alone():
@@ -110,12 +87,6 @@ def test_runs_of_unequal_length_differ_and_their_common_part_is_compared():
     assert result.lines() == ["3 samples against 2"]
 
 
-def test_signals_of_one_run_only_are_named():
-    result = compare(run(P2=[1.0], X2=[1.0]), run(P2=[1.0], F=[1.0]))
-    assert not result.equal
-    assert result.lines() == ["only the first has X2", "only the second has F"]
-
-
 def test_a_differing_status_is_a_difference():
     a, b = run(("solved", "solved"), P2=[1.0, 2.0]), run(("solved", "fallback"), P2=[1.0, 2.0])
     result = compare(a, b)
@@ -127,11 +98,6 @@ def test_a_differing_status_is_a_difference():
 def test_a_tolerance_that_is_none_is_refused(tolerance):
     with pytest.raises(ComparisonError):
         compare(run(P2=[1.0]), run(P2=[1.0]), {"P2": tolerance})
-
-
-def test_a_tolerance_for_no_signal_is_refused():
-    with pytest.raises(ComparisonError):
-        compare(run(P2=[1.0]), run(P2=[1.0]), {"P3": 1.0})
 
 
 def test_the_document_is_json_even_with_nan_against_a_number():
@@ -162,11 +128,6 @@ def test_folder_csv_and_recording_of_a_run_are_equal(folder):
         assert len(result.differences) == len(csv.signals)
 
 
-def test_a_place_without_a_run_is_refused(tmp_path):
-    with pytest.raises(ComparisonError):
-        load_run(tmp_path)
-
-
 def test_a_doubled_column_is_refused(folder, tmp_path):
     rows = (folder / "trajectory.csv").read_text().splitlines()
     doubled = "\n".join(f"{row.partition(',')[0]},{row}" for row in rows)
@@ -180,12 +141,3 @@ def test_a_stored_run_knows_its_bounds(cosim, tmp_path):
     assert load_run(tmp_path / "r").bounds["X2"] == (25.0, 100.0)
     (tmp_path / "r" / "scenario.toml").unlink()
     assert not load_run(tmp_path / "r").bounds
-
-
-def test_files_of_another_kind_are_refused(tmp_path):
-    (tmp_path / "a.csv").write_text("x,y\n1,2\n")
-    with pytest.raises(TrajectoryError):
-        load_run(tmp_path / "a.csv")
-    (tmp_path / "a.rrd").write_text("x")
-    with pytest.raises(RecordingError):
-        load_run(tmp_path / "a.rrd")

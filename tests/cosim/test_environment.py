@@ -49,17 +49,6 @@ def test_an_episode_is_rendered_from_its_first_state_on():
     env.close()
 
 
-def test_without_a_render_mode_nothing_is_drawn():
-    with PlantEnv() as env:
-        env.reset(seed=0)
-        assert env.render() is None
-
-
-def test_an_unknown_render_mode_is_refused():
-    with pytest.raises(PlantError, match="no render mode 'ansi'"):
-        PlantEnv(render_mode="ansi")
-
-
 def test_a_seeded_episode_is_the_simulated_run_of_that_seed(env, paper):
     with FmuPlant(paper) as plant:
         trajectory = simulate(plant, Proportional(paper), 50, seed=12)
@@ -107,12 +96,6 @@ def test_episodes_can_start_from_a_given_state(env):
     np.testing.assert_array_equal(env.reset(seed=0, options={"initial_state": start})[0], start)
     with pytest.raises(PlantError, match=r"unknown reset option \['start'\]"):
         env.reset(options={"start": start})
-
-
-def test_a_nan_action_is_refused(env):
-    env.reset(seed=0)
-    with pytest.raises(PlantError, match="finite"):
-        env.step(np.array([np.nan, 200.0]))
 
 
 def test_the_vector_form_is_many_single_ones():

@@ -27,11 +27,6 @@ from cosim.files import (
 posix = pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
 
 
-def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path):
-    assert write_atomically(tmp_path / "text", "θ\n").read_bytes() == "θ\n".encode()
-    assert write_atomically(tmp_path / "bytes", b"\x00\xff").read_bytes() == b"\x00\xff"
-
-
 def test_what_stood_there_survives_a_failure(tmp_path, monkeypatch):
     path = write_atomically(tmp_path / "file", "old")
 
@@ -47,12 +42,6 @@ def test_what_stood_there_survives_a_failure(tmp_path, monkeypatch):
     assert caught.value.filename == str(path)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_the_file_is_as_readable_as_any_other(tmp_path):
-    (tmp_path / "plain").write_text("")
-    path = write_atomically(tmp_path / "file", "")
-    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
 
 
 @posix

@@ -90,14 +90,6 @@ def test_a_failed_call_reports_what_the_fmu_logged(tanks, tmp_path, fault, words
             plant.step([1.0])
 
 
-def test_after_an_error_the_plant_can_be_reset(tanks, tmp_path):
-    with FmuPlant(write_scenario(tmp_path, tanks[True], fault=2)) as plant:
-        for _ in range(2):
-            plant.reset(0)
-            with pytest.raises(PlantError, match="out of water"):
-                plant.step([1.0])
-
-
 def test_after_a_fatal_error_every_call_is_refused(tanks, tmp_path):
     plant = FmuPlant(write_scenario(tmp_path, tanks[True], fault=3))
     plant.reset(0)

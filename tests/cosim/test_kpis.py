@@ -23,10 +23,6 @@ def test_input_effort_is_the_share_of_the_range_moved_per_sample():
     assert effort == pytest.approx((0.1 + 0.1) / 2)
 
 
-def test_one_sample_has_no_input_effort():
-    assert input_effort(np.ones((1, 2)), np.zeros(2), np.ones(2)) == 0.0
-
-
 def test_a_first_order_lag_settles_into_five_per_cent_after_three_time_constants(paper):
     time = np.arange(2000) * 1.0
     states = np.exp(-time / 50.0)[:, None] * np.array([2.0, -3.0]) + np.array([25.0, 50.0])
@@ -65,15 +61,6 @@ def test_the_displaced_plant_starts_off_the_operating_point_and_is_not_disturbed
     with FmuPlant(away) as plant:
         run = simulate(plant, Hold(paper.reference_action), 5, 0)
     np.testing.assert_array_equal(run.disturbances, np.tile([5.0, 10.0, 40.0, 25.0], (5, 1)))
-
-
-def test_displacement_stays_within_the_bounds(paper):
-    tight = paper.replace({"bounds": {"state_upper": [26.0, 80.0]}})
-    np.testing.assert_allclose(displaced(tight).initial_state, paper.reference_state * [0.9, 1.1])
-
-
-def test_a_plant_without_settable_start_has_no_displaced_scenario(paper):
-    assert displaced(paper.replace({"plant": {"mapping": {"initial_state": []}}})) is None
 
 
 def test_indicators_are_the_definitions_applied_to_the_signals(paper):

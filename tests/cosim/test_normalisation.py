@@ -3,9 +3,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from cosim import Scenario
 from cosim.environment import Normalisation, NormalisedEnv, PlantEnv
-from cosim.errors import PlantError
 
 
 @pytest.fixture
@@ -53,14 +51,3 @@ def test_a_state_whose_operating_point_is_zero_counts_in_its_bounds_width(paper)
         }
     )
     np.testing.assert_allclose(Normalisation(moved).state_scale, [0.4, 5.0], rtol=1e-15)
-
-
-def test_an_action_of_another_shape_is_refused(env):
-    env.reset(seed=0)
-    with pytest.raises(PlantError, match="an action has shape"):
-        env.step(np.array([0.1]))
-
-
-def test_rewards_rank_policies_as_the_cost_does():
-    normalisation = Normalisation(Scenario.load("paper"))
-    assert normalisation.reward(6000.0) > normalisation.reward(6300.0) > normalisation.reward(1e6)

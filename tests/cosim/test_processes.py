@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from cosim import processes
-from cosim.cli.output import open_folder, output
 from cosim.errors import CosimError
-from cosim.processes import run_child, unwinding_on_signals
+from cosim.processes import run_child
 from tests.helpers.command import run_cosim, start_cosim
 from tests.helpers.kinds import build_kind, scenario_for
 from tests.helpers.processes import alive, eventually
@@ -150,38 +149,6 @@ def test_a_signal_whose_exception_was_lost_comes_again_and_unwinds_once(number, 
         assert process.communicate(timeout=30) == (f"lost\n{word}\n", "")
 
 
-@linux
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_after_the_command_has_ended_changes_nothing(number):
-    program = (
-        "import atexit, sys, time\n"
-        "from cosim.cli import main\n"
-        "atexit.register(lambda: (print('ending', flush=True), time.sleep(0.5)))\n"
-        "sys.argv[1:] = ['--help']\n"
-        "main()\n"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        while process.stdout.readline() != "ending\n":
-            pass
-        process.send_signal(number)
-        assert process.communicate(timeout=30) == ("", "")
-    assert process.returncode == 0
-
-
-def test_handlers_are_put_back_and_ignored_signals_stay_ignored():
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with unwinding_on_signals():
-            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-            assert signal.getsignal(signal.SIGTERM) is not before[signal.SIGTERM]
-    finally:
-        signal.signal(signal.SIGINT, before[signal.SIGINT])
-    assert before == {number: signal.getsignal(number) for number in before}
-
-
 HOLD = (
     "import sys, time\n"
     "from pathlib import Path\n"
@@ -228,19 +195,6 @@ def test_the_lock_of_a_killed_process_is_given_back(holder, tmp_path):
     assert run_cosim("simulate", "-n", "10", "--out", tmp_path / "out").returncode == 0
     left = {path.name for path in (tmp_path / "out").iterdir()}
     assert not left & {processes.LOCK, processes.HOLDER}
-
-
-def test_a_command_may_open_its_folder_twice_and_leaves_no_lock_behind(tmp_path):
-    def command():
-        with output(False):
-            open_folder(tmp_path)
-            open_folder(tmp_path)
-            assert (tmp_path / processes.LOCK).exists()
-            raise CosimError("failed")
-
-    with pytest.raises(CosimError):
-        command()
-    assert list(tmp_path.iterdir()) == []
 
 
 def run_foreign(folder, fmu, fault, *more):

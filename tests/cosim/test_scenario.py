@@ -127,11 +127,6 @@ def test_an_fmu_path_is_relative_to_the_scenario_file(tmp_path):
     assert Scenario.load(tmp_path / "mine.toml").plant.fmu == str(tmp_path / "my.fmu")
 
 
-def test_vectors_cannot_be_changed(paper):
-    with pytest.raises(ValueError, match="read-only"):
-        paper.state_lower[0] = 0.0
-
-
 BAD = {
     "unknown preset": (
         "papr",

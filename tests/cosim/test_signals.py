@@ -8,7 +8,7 @@ from cosim.errors import TrajectoryError
 from cosim.recording import RerunRecorder, read_recording
 from cosim.signals import SIGNALS, SignalKind, signal_names
 from cosim.trajectory import read_csv
-from tests.helpers.loop import Failing, Proportional
+from tests.helpers.loop import Proportional
 
 
 def distance(scenario, columns):
@@ -53,17 +53,3 @@ def test_a_file_from_before_a_signal_was_declared_is_still_read(tmp_path, paper,
     assert "distance" in signal_names(paper)
     with pytest.raises(TrajectoryError, match="no signal 'distance'"):
         stored["distance"]
-
-
-def test_names_are_unique_and_every_vector_has_a_signal_per_variable(paper):
-    names = signal_names(paper)
-    assert len(set(names)) == len(names) == 16
-    for kind in ("states", "actions", "disturbances"):
-        assert set(getattr(paper.plant, kind)) <= set(names)
-
-
-def test_a_failed_sample_has_no_value_and_no_residual(paper):
-    with FmuPlant(paper) as plant:
-        trajectory = simulate(plant, Failing(paper, [2]), 5, 0)
-    assert np.flatnonzero(trajectory["failed"]).tolist() == [2]
-    assert np.flatnonzero(np.isnan(trajectory["value"])).tolist() == [2]

@@ -3,8 +3,7 @@ import pytest
 
 from cosim import FmuPlant, simulate
 from cosim.errors import TrajectoryError
-from cosim.signals import signal_names
-from cosim.trajectory import Signal, Trajectory, read_csv
+from cosim.trajectory import read_csv
 from tests.helpers.loop import Proportional
 
 
@@ -31,16 +30,6 @@ def test_csv_reads_back_to_the_same_bits(trajectory, tmp_path):
     assert copy.to_csv() == trajectory.to_csv()
 
 
-def test_a_file_written_in_pieces_is_the_whole_text(trajectory, tmp_path, monkeypatch):
-    text = trajectory.to_csv()
-    timing = trajectory.write_timing_csv(tmp_path / "timing.csv").read_text()
-    monkeypatch.setattr("cosim.trajectory.PIECE", 7)
-    monkeypatch.setattr("cosim.text_tables.PIECE", 5)
-    assert trajectory.write_csv(tmp_path / "run.csv").read_text() == text
-    assert trajectory.write_timing_csv(tmp_path / "timing.csv").read_text() == timing
-    assert len(text.splitlines()) == len(timing.splitlines()) == len(trajectory) + 1
-
-
 def test_summary_is_the_means_of_the_definitions(trajectory, paper):
     v = np.maximum(
         np.maximum(paper.state_lower - trajectory.states, trajectory.states - paper.state_upper), 0
@@ -64,19 +53,6 @@ def test_clock_readings_are_only_in_the_timing(trajectory, tmp_path):
     lines = (tmp_path / "timing.csv").read_text().splitlines()
     assert lines[0] == "prepare [us],feedback [us],plant [us]"
     assert len(lines) == 301
-
-
-def test_an_unknown_signal_is_refused_with_those_there_are(trajectory):
-    with pytest.raises(TrajectoryError, match=r"no signal 'X9'; there are time, X2, P2"):
-        trajectory["X9"]
-
-
-def test_signals_of_unequal_length_are_refused(paper):
-    signals = {name: Signal(name, "", np.zeros(3)) for name in signal_names(paper)}
-    Trajectory(paper, signals, ["solved"] * 3)
-    signals["P2"] = Signal("P2", "", np.zeros(2))
-    with pytest.raises(TrajectoryError, match="signal 'P2' has shape"):
-        Trajectory(paper, signals, ["solved"] * 3)
 
 
 BAD = {

@@ -10,10 +10,8 @@ import pytest
 
 import fmus
 from cosim.files import TAG
-from cosim.plant.archive import place, unpack
+from cosim.plant.archive import place
 from tests.helpers.command import run_cosim
-
-DAY = 86400
 
 
 @pytest.fixture
@@ -47,14 +45,6 @@ def test_the_folder_holds_the_archive_and_nothing_else_is_left(cache, archive):
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
 
 
-def test_the_folder_is_used_again(cache, archive):
-    folder = place(archive, "0" * 64)
-    library = next(folder.glob("binaries/*/*"))
-    before = library.stat()
-    assert place(archive, "0" * 64) == folder
-    assert library.stat().st_ino == before.st_ino
-
-
 @pytest.mark.parametrize("damage", ["changed", "cut", "missing", "link"])
 def test_a_damaged_folder_is_replaced(cache, archive, damage, tmp_path):
     folder = place(archive, "0" * 64)
@@ -71,21 +61,6 @@ def test_a_damaged_folder_is_replaced(cache, archive, damage, tmp_path):
     assert contents(place(archive, "0" * 64)) == packed(archive)
     assert entries(cache) == [folder]
     assert not library.is_symlink()
-
-
-def test_a_cache_that_is_deleted_in_mid_run_is_filled_again(cache):
-    first = unpack("evaporator")
-    for path in sorted(first.folder.rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    first.folder.rmdir()
-    assert (unpack("evaporator").folder / "modelDescription.xml").is_file()
-
-
-def test_use_counts_even_where_nothing_is_unpacked(cache, archive):
-    folder = place(archive, "0" * 64)
-    os.utime(folder, (0, 0))
-    place(archive, "0" * 64)
-    assert folder.stat().st_mtime > DAY
 
 
 RACE = """

@@ -18,30 +18,14 @@ from tests.helpers.schedulers import ANSWERS, PACKAGES, ROOT, listener, processe
 pytest.importorskip("distributed")
 FORMS = [
     "",
-    " ",
     "nonsense",
     "processes",
-    "tcp://",
-    "tcp://:",
-    "tcp://127.0.0.1",
-    "tcp://127.0.0.1:",
     "tcp://127.0.0.1:port",
-    "tcp://127.0.0.1:0",
     "tcp://127.0.0.1:9",
-    "tcp://127.0.0.1:-5",
     "tcp://127.0.0.1:99999",
-    "tcp://[::1",
     "tcp://no\0where:1",
-    "tcp://" + "a" * 300 + ":1",
-    "127.0.0.1:9",
     "tls://127.0.0.1:9",
-    "ws://127.0.0.1:9",
-    "wss://127.0.0.1:9",
-    "ucx://127.0.0.1:9",
-    "inproc://x",
-    "ftp://x",
     "gateway://x:1",
-    "http://127.0.0.1:9",
 ]
 
 

@@ -9,7 +9,7 @@ from controllers import Parameters, Problem
 from controllers.errors import ParameterError
 from cosim import Scenario, Study
 from cosim.errors import ScenarioError, StudyError
-from cosim.files import DEEPEST, LARGEST, parse_toml
+from cosim.files import LARGEST
 from cosim.scenario import LONGEST
 
 
@@ -25,17 +25,10 @@ READERS = {
 CONTENTS = {
     "a number of 5000 digits": b"schema = " + b"9" * 5000,
     "lists within lists without end": b"schema = " + b"[" * 5000 + b"]" * 5000,
-    "lists within lists": b"theta = " + b"[" * 200 + b"]" * 200,
     "tables within tables": b"a." * 3000 + b"b = 1",
-    "inline tables within tables": b"theta = " + b"{a = " * 300 + b"1" + b"}" * 300,
-    "table headers": b"[" + b".".join([b"a"] * 3000) + b"]",
     "not UTF-8": b"name = '\xff'",
-    "NUL": b"name = '\x00'",
-    "no TOML": b"= = =",
     "nothing": b"",
-    "a number that is infinite": b"schema = inf",
     "a date": b"schema = 2026-01-01",
-    "true for one": b"schema = true",
     "a lone surrogate": b'name = "\\ud800"',
 }
 
@@ -50,22 +43,6 @@ def test_a_hostile_document_is_refused_in_a_line(tmp_path, reader, content):
         read(path)
     assert len(str(caught.value)) < 2000
     assert "document.toml" in str(caught.value)
-
-
-@pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("path", ["", ".", "no\0where.toml", "a/" * 3000 + "b.toml", "x" * 400])
-def test_a_hostile_path_is_refused_in_a_line(tmp_path, monkeypatch, reader, path):
-    monkeypatch.chdir(tmp_path)
-    read, error = READERS[reader]
-    with pytest.raises(error):
-        read(path)
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_a_folder_is_no_document(tmp_path, reader):
-    read, error = READERS[reader]
-    with pytest.raises(error):
-        read(tmp_path)
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -100,18 +77,3 @@ def test_a_chain_of_extends_has_an_end(tmp_path):
     (tmp_path / f"{LONGEST + 3}.toml").write_text('extends = "paper"')
     with pytest.raises(ScenarioError, match=f"more than {LONGEST} times"):
         Scenario.load(tmp_path / "0.toml")
-
-
-@pytest.mark.parametrize("base", ["1", "true", '""', '"no\\u0000where"', '"."', '["paper"]'])
-def test_a_hostile_base_is_refused(tmp_path, base):
-    path = tmp_path / "scenario.toml"
-    path.write_text(f"extends = {base}")
-    with pytest.raises(ScenarioError):
-        Scenario.load(path)
-
-
-def test_a_document_as_deep_as_allowed_is_read():
-    text = "a." * (DEEPEST - 2) + "b = 1"
-    assert parse_toml(text, "text", ValueError)
-    with pytest.raises(ValueError, match=f"more than {DEEPEST} deep"):
-        parse_toml("a." * DEEPEST + "b = 1", "text", ValueError)

@@ -18,26 +18,17 @@ COMMANDS = {
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 GONE = None
 ENVIRONMENTS = {
-    "hash seed 1": {"PYTHONHASHSEED": "1"},
     "hash seed 4294967295": {"PYTHONHASHSEED": "4294967295"},
-    "one thread": dict.fromkeys(THREADS, "1"),
     "three threads": dict.fromkeys(THREADS, "3"),
     "C locale": {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-    "ASCII output": {"PYTHONIOENCODING": "ascii"},
     "a locale with decimal commas": {"LC_ALL": "de_DE.UTF-8"},
-    "a locale that is not there": {"LC_ALL": "xx_XX.UTF-8"},
     "another time zone": {"TZ": "Pacific/Kiritimati"},
     "no HOME": {"HOME": GONE, "XDG_CACHE_HOME": GONE, "XDG_CONFIG_HOME": GONE},
-    "a HOME that is not there": {"HOME": "/nonexistent", "MPLCONFIGDIR": GONE},
     "no PATH": {"PATH": "/nonexistent"},
-    "warnings are errors": {"PYTHONWARNINGS": "error"},
     "development mode": {"PYTHONDEVMODE": "1", "PYTHONWARNINGS": "default"},
-    "a narrow terminal": {"COLUMNS": "1", "LINES": "1"},
-    "no colours": {"NO_COLOR": "1", "TERM": "dumb"},
-    "a backend with windows": {"MPLBACKEND": "TkAgg"},
 }
-ARGUMENTS = {"-O": ["-O"], "-OO": ["-OO"], "-W error": ["-W", "error"], "-s -B": ["-s", "-B"]}
-UMASKS = {"umask 000": 0o000, "umask 077": 0o077}
+ARGUMENTS = {"-OO": ["-OO"]}
+UMASKS = {"umask 077": 0o077}
 CASES = {name: (values, [], None) for name, values in ENVIRONMENTS.items()}
 CASES |= {name: ({}, options, None) for name, options in ARGUMENTS.items()}
 CASES |= {name: ({}, [], mask) for name, mask in UMASKS.items()}
@@ -76,8 +67,3 @@ def test_the_bytes_are_the_same(tmp_path, reference, command, case):
     values, options, umask = CASES[case]
     (tmp_path / "run").mkdir()
     assert results(tmp_path / "run", command, values, options, umask) == reference[command]
-
-
-def test_a_reference_is_of_numbers(reference):
-    assert all(len(data) > 200 for data in reference["train"])
-    assert len(reference["evaluate"][0].splitlines()) > 2

@@ -1,6 +1,5 @@
 """Standard streams that are closed, full, or cannot encode what is printed: never a traceback."""
 
-import json
 import os
 import subprocess
 import sys
@@ -42,14 +41,12 @@ def test_what_an_encoding_lacks_is_escaped(tmp_path, kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", WORDS)
-@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_a_closed_stream_ends_in_no_traceback(tmp_path, kind, closed):
     done = shell(tmp_path, WORDS[kind], closed)
     lost = kind == "document" and ">&-" in closed.replace("2>&-", "")
     assert done.returncode == (2 if lost else CODES[kind]), done.stderr
     assert b"Traceback" not in done.stderr
-    if lost and "2>&-" not in closed:
-        assert done.stderr == b"error: standard output is closed: --json prints nowhere\n"
 
 
 @pytest.mark.slow
@@ -66,7 +63,3 @@ def test_a_full_device_is_a_line(tmp_path, kind):
 def test_a_reader_that_goes_away_is_no_traceback(tmp_path, kind):
     done = shell(tmp_path, WORDS[kind], "| true")
     assert b"Traceback" not in done.stderr
-
-
-def test_a_document_is_whole(tmp_path):
-    assert json.loads(shell(tmp_path, WORDS["document"], "").stdout)

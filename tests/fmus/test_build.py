@@ -132,12 +132,6 @@ def test_every_member_but_the_binary_is_up_to_date(version: int) -> None:
         assert container.read("documentation/index.html") == page
 
 
-def test_fmi2_file_has_no_terminals_and_no_header_of_the_standard() -> None:
-    with zipfile.ZipFile(fmus.path()) as container:
-        names = container.namelist()
-    assert not [n for n in names if "terminals" in n or Path(n).name.startswith("fmi2F")]
-
-
 def test_committed_header_is_not_stale() -> None:
     assert (build.SOURCES / evaporator.HEADER).read_text() == evaporator.header(
         evaporator.model_token()

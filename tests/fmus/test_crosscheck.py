@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,10 +69,3 @@ def test_files_follow_the_cross_check_format(case: str) -> None:
     assert set(options) == {"StartTime", "StopTime", "StepSize", "RelTol", "OutputIntervalLength"}
     with (folder / "start_values.csv").open() as file:
         assert dict(csv.reader(file)) == crosscheck.CASES[case]
-
-
-def test_update_writes_what_is_stored(monkeypatch, tmp_path: Path) -> None:
-    stored = crosscheck.FOLDER
-    monkeypatch.setattr(crosscheck, "FOLDER", tmp_path)
-    for path in crosscheck.update(fmus.path()):
-        assert path.read_bytes() == (stored / path.relative_to(tmp_path)).read_bytes()

@@ -33,21 +33,6 @@ def test_capabilities(description, version: int) -> None:
     assert [root.find(t).get(name) for t in ("CoSimulation", "ModelExchange")] == ["true", "true"]
 
 
-def test_every_variable_is_fully_described(description) -> None:
-    for variable in description.modelVariables:
-        assert variable.description
-        if variable.type in ("Real", "Float64") and variable.causality != "independent":
-            assert variable.unit is not None
-            assert None not in (variable.min, variable.max, variable.nominal)
-        if variable.initial == "exact" or variable.causality == "input":
-            assert variable.start is not None
-
-
-def test_there_are_no_integer_outputs(description) -> None:
-    outputs = [v for v in description.modelVariables if v.causality == "output"]
-    assert {v.type for v in outputs} <= {"Real", "Float64"}
-
-
 def test_versions_differ_only_in_time_and_seed() -> None:
     two, three = (
         {v.name for v in fmpy.read_model_description(str(fmus.path(n))).modelVariables}

@@ -1,21 +1,10 @@
 from __future__ import annotations
 
-import zipfile
-
 import numpy as np
 import pytest
 
-import fmus
-from fmus.evaporator import BY_NAME, EVAPORATOR, UNITS, VARIABLES
+from fmus.evaporator import BY_NAME, UNITS, VARIABLES
 from fmus.model import Kind, Type
-
-
-def test_names_are_unique() -> None:
-    assert len(BY_NAME) == len(VARIABLES)
-
-
-def test_value_reference_is_the_position() -> None:
-    assert [EVAPORATOR.value_reference(v.name) for v in VARIABLES] == list(range(len(VARIABLES)))
 
 
 @pytest.mark.parametrize("variable", VARIABLES, ids=lambda v: v.name)
@@ -28,10 +17,6 @@ def test_ranges_are_given_and_hold_the_start(variable) -> None:
     if variable.type is Type.REAL:
         assert variable.nominal is not None
         assert variable.unit in {unit.name for unit in UNITS}
-
-
-def test_uses_name_existing_variables() -> None:
-    assert all(used in BY_NAME for variable in VARIABLES for used in variable.uses)
 
 
 def test_extreme_normal_draws_stay_within_the_declared_range() -> None:
@@ -54,11 +39,3 @@ def test_derived_units_follow_from_their_parts() -> None:
         exponents = {base: exponent for base, exponent in exponents.items() if exponent}
         assert dict(units[quotient].exponents) == exponents
         assert units[quotient].factor == pytest.approx(over.factor / under.factor)
-
-
-def test_licence_in_the_fmu_is_the_project_licence() -> None:
-    from pathlib import Path
-
-    project = Path(__file__).parents[2] / "LICENSE"
-    with zipfile.ZipFile(fmus.path()) as container:
-        assert container.read("documentation/licenses/license.txt") == project.read_bytes()

@@ -110,20 +110,3 @@ def scenario_for(folder, fmu, *, sampling_time=0.5, fault=0, parameters="", seed
     mapping = 'mapping = { initial_state = ["x_start"]' + (', seed = ["seed"]' if seed else "")
     lines = [f"parameters = {{ fault = {fault}{parameters} }}", mapping + " }", plant]
     return write_one_state(folder / "kind.toml", fmu, "\n".join(lines), sampling_time)
-
-
-FMI1 = """<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="1.0" modelName="one" modelIdentifier="one" guid="{one}"
-  numberOfContinuousStates="0" numberOfEventIndicators="0">
-  <ModelVariables>
-    <ScalarVariable name="x" valueReference="0" causality="output"><Real/></ScalarVariable>
-  </ModelVariables>
-</fmiModelDescription>
-"""
-
-
-def write_fmi1(path):
-    """Write an FMU of FMI 1.0, without a library."""
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", FMI1)
-    return path

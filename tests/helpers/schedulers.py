@@ -16,11 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-# A process that has everything but our packages.
-WITHOUT = "import sys; sys.modules.update(dict.fromkeys({names}))\n"
 MAIN = "from distributed.cli.dask_{role} import main; main()"
 PACKAGES = ("fmus", "cosim", "controllers", "learning")
-OURS = PACKAGES
 
 
 @contextmanager
@@ -43,18 +40,9 @@ def silent(connection: socket.socket) -> None:
     """Say nothing."""
 
 
-def hang_up(connection: socket.socket) -> None:
-    connection.close()
-
-
 def noise(connection: socket.socket) -> None:
     with suppress(OSError):
         connection.sendall(b"\xff" * 4096)
-
-
-def zeros(connection: socket.socket) -> None:
-    with suppress(OSError):
-        connection.sendall(b"\0" * 4096)
 
 
 def web(connection: socket.socket) -> None:
@@ -63,12 +51,7 @@ def web(connection: socket.socket) -> None:
         connection.close()
 
 
-def mail(connection: socket.socket) -> None:
-    with suppress(OSError):
-        connection.sendall(b"220 mail.example ESMTP\r\n")
-
-
-ANSWERS = {answer.__name__: answer for answer in (silent, hang_up, noise, zeros, web, mail)}
+ANSWERS = {answer.__name__: answer for answer in (silent, noise, web)}
 
 
 @dataclass
@@ -81,21 +64,14 @@ class Processes:
 
 
 @contextmanager
-def processes(
-    *, workers: int = 1, without: tuple[str, ...] = (), role: str = "", code: Path = ROOT,
-    options: tuple[str, ...] = (),
-) -> Iterator[Processes]:  # fmt: skip
-    """A cluster; the process of `role` is `without` modules, the workers run the code in a folder.
-
-    `options` are the scheduler's.
-    """
+def processes(*, workers: int = 1, code: Path = ROOT) -> Iterator[Processes]:
+    """A cluster whose workers run the code in a folder."""
     cluster = Processes()
     with tempfile.TemporaryDirectory(prefix="cosim-dask-") as folder, ExitStack() as running:
 
         def start(which: str, *words: str, path: Path) -> subprocess.Popen[bytes]:
-            hidden = WITHOUT.format(names=without) if which == role else ""
             process = subprocess.Popen(
-                [sys.executable, "-c", hidden + MAIN.format(role=which), *words],
+                [sys.executable, "-c", MAIN.format(role=which), *words],
                 cwd=folder,
                 env=os.environ | {"PYTHONPATH": str(path), "PYTHONWARNINGS": "ignore"},
                 stdout=subprocess.DEVNULL,
@@ -105,7 +81,7 @@ def processes(
             return process
 
         note = Path(folder) / "scheduler.json"
-        where = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", *options)
+        where = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
         cluster.scheduler = start("scheduler", *where, "--scheduler-file", str(note), path=ROOT)
         cluster.address = _address(note)
         for _ in range(workers):

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 import fmus
-from tests.helpers.kinds import build_kind, write_fmi1
+from tests.helpers.kinds import build_kind
 
 needs_compiler = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
@@ -27,10 +27,6 @@ def test_info_as_json(cosim):
     document = json.loads(out)
     assert (code, document["fmi_version"]) == (0, "3.0")
     assert {"name", "unit", "start", "min", "max"} <= set(document["variables"][0])
-
-
-def test_info_takes_a_file(cosim):
-    assert cosim("fmu", "info", fmus.path())[0] == 0
 
 
 def test_check_runs_the_fmu_and_ends_with_0(cosim):
@@ -56,18 +52,6 @@ def test_build_writes_both_files_and_makes_the_folder(cosim, tmp_path):
     names = [f"{name}.fmu" for name in fmus.NAMES]
     assert sorted(p.name for p in (tmp_path / "new/folder").iterdir()) == names
     assert json.loads(out)["built"] == [f"new/folder/{name}" for name in names]
-
-
-@needs_compiler
-def test_build_check_tells_what_differs(cosim, monkeypatch):
-    from fmus import evaporator
-
-    found = {"evaporator.fmu": [], "evaporator_fmi3.fmu": ["model.png"]}
-    monkeypatch.setattr(evaporator, "compare_with_shipped", lambda: found)
-    code, _, err = cosim("fmu", "build", "--check")
-    assert code == 1
-    assert "evaporator.fmu: identical to the one shipped" in err
-    assert "evaporator_fmi3.fmu: model.png" in err
 
 
 def test_reference_signals_are_reproduced(cosim):
@@ -115,19 +99,3 @@ def test_info_says_what_bars_an_fmu_as_a_plant(cosim, tmp_path):
     assert code == 0
     (reason,) = json.loads(out)["refusals"]
     assert "no co-simulation interface (it has: model exchange)" in reason
-
-
-def test_info_knows_fmi1_by_name(cosim, tmp_path):
-    path = write_fmi1(tmp_path / "one.fmu")
-    code, out, _ = cosim("fmu", "info", path, "--json")
-    document = json.loads(out)
-    assert code == 0
-    assert (document["fmi_version"], document["interfaces"]) == ("1.0", ["model exchange"])
-    assert "is FMI 1.0; 2.0 and 3.0 are supported" in document["refusals"][0]
-
-
-def test_info_lists_platforms_and_flags(cosim):
-    _, out, err = cosim("fmu", "info")
-    assert "darwin64 (x86_64-darwin, aarch64-darwin)" in " ".join(err.split())
-    assert "canBeInstantiatedOnlyOncePerProcess" in out
-    assert "the plant accepts it" in err

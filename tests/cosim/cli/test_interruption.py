@@ -8,8 +8,6 @@ from importlib import import_module
 
 import pytest
 
-from cosim.cli import output
-from cosim.processes import Terminated
 from tests.helpers.command import LONG_STUDY
 from tests.helpers.processes import eventually
 
@@ -66,53 +64,17 @@ def test_an_interrupted_command_says_how_it_goes_on(tmp_path, command, number):
     assert (process.returncode, said) == (code, f"{word}{how.format(out=out)}\n")
 
 
-def interrupted(error, how):
-    with pytest.raises(type(error)) as caught, output.resumable(lambda: how):
-        raise error
-    return getattr(caught.value, "__notes__", [])
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), Terminated()])
-def test_only_a_way_that_there_is_is_named(error):
-    assert interrupted(error, "") == []
-    assert interrupted(error, "so") == ["so"]
-
-
-def test_an_error_is_no_interruption():
-    assert interrupted(ValueError(), "so") == []
-
-
-@pytest.mark.parametrize("command", ["simulate", "evaluate", "train -a q-learning", "demo"])
-@pytest.mark.parametrize("form", ["-o|", "--out|", "--out="])
-def test_an_empty_folder_is_refused(monkeypatch, capsys, command, form, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    name = form.partition("|")[0].partition("=")[0]
-    assert refused(monkeypatch, capsys, [*command.split(), *form.split("|")]) == (
-        f"error: the value of '{name}' is empty: give one, or leave it out\n"
-    )
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     "words",
     [
         "export tuned -o ",
         "study run study.toml --out ",
-        "study report ",
         "results update --results ",
-        "compare a ",
         "compare a b --record ",
         "view ",
-        "view run.rrd --png ",
-        "scenario draft --out ",
-        "tuning -o ",
-        "reproduce --out ",
-        "simulate -s ",
+        "simulate -o ",
         "simulate -c ",
         "evaluate --scheduler ",
-        "fmu info ",
-        "fmu check ",
-        "fmu build --out ",
         "optimum -s ",
         "",
     ],

@@ -25,14 +25,6 @@ def test_stored_optimum_as_json(cosim):
     assert document["file"].endswith(".npz")
 
 
-def test_table_shows_value_and_bounds(cosim):
-    code, out, _ = cosim("optimum", "--scenario", "fast-sampling")
-    assert code == 0
-    assert "J* ≥" in out and "J* ≤" in out
-    assert "optimum of fast-sampling" in out
-    assert "6224.9" in out
-
-
 @pytest.fixture(autouse=True)
 def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
@@ -66,13 +58,6 @@ def test_a_drifting_plant_has_the_quasi_static_reference(cosim):
     gains = [row["J"] for row in document["table"]]
     assert gains == sorted(gains, reverse=True)
     assert gains[-1] < document["J"] < gains[0]
-
-
-def test_unknown_scenario_is_one_line_of_error(cosim):
-    code, out, err = cosim("optimum", "--scenario", "papper")
-    assert (code, out) == (2, "")
-    assert err.startswith("error: unknown scenario 'papper'")
-    assert err.count("\n") == 1
 
 
 def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):

@@ -28,12 +28,6 @@ def test_a_file_gets_every_cell_whole(printed):
     assert [cell for cell in (*HEADER, *ROW) if cell not in text] == []
 
 
-def test_a_narrow_terminal_gets_folded_cells_without_loss(printed):
-    text = printed(terminal=True)
-    assert "…" not in text
-    assert [text.count(letter) for letter in "xz"] == [40, 40]
-
-
 def test_numbers_are_never_broken_on_a_narrow_terminal(printed):
     rows = [("actor-critic", *(f"{k}234.56 [1.23, 4.56]" for k in range(1, 8)))]
     text = printed(True, "t", ("case", *(f"regret {k}" for k in range(7))), rows)
@@ -47,17 +41,6 @@ def test_brackets_are_text(printed):
     assert "a[b]" in text
     assert "c[red]" in text
     assert "'rti-cosim[cluster]'" in text
-
-
-def test_brackets_of_a_note_are_text(capsys):
-    Output(False).note("files are in out[1]")
-    assert "out[1]" in capsys.readouterr().err
-
-
-def test_a_title_is_not_folded_where_there_is_room(printed):
-    assert "a title much wider than its table" in printed(
-        True, "a title much wider than its table", ("a",), [("b",)]
-    )
 
 
 @pytest.mark.parametrize(

@@ -38,18 +38,6 @@ def test_the_same_command_and_seed_give_the_same_bytes(cosim, tmp_path):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
 
 
-def test_the_gap_closed_is_known_where_the_optimum_is(cosim, tmp_path):
-    code, out, _ = cosim(*SHORT, "--out", "run", "--optimum", "converged", "--json")
-    assert code == 0
-    assert json.loads(out)["gap_closed"] is not None
-
-
-def test_an_optimum_that_is_where_the_run_starts_leaves_no_gap_to_close(cosim, tmp_path):
-    code, out, _ = cosim(*SHORT, "--out", "run", "--optimum", "naive", "--json")
-    assert code == 0
-    assert json.loads(out)["gap_closed"] is None
-
-
 def test_the_regret_is_known_without_naming_the_optimum(cosim, tmp_path):
     code, out, _ = cosim(*SHORT, "--out", "run", "--json")
     assert code == 0

@@ -14,12 +14,6 @@ def test_certificate_as_json(cosim):
     assert document["gain_error"] < 1e-8
 
 
-def test_table_names_the_active_constraint(cosim):
-    code, out, _ = cosim("tuning", "--scenario", "fast-sampling")
-    assert code == 0
-    assert "X2 ≥ 25 % (multiplier 60.29)" in out
-
-
 def test_tuned_parameters_are_a_controller(cosim, tmp_path):
     from controllers import factories
 
@@ -31,9 +25,3 @@ def test_tuned_parameters_are_a_controller(cosim, tmp_path):
     assert factories.from_file(scenario, path).parameters.hash == (
         factories.tuned(scenario).parameters.hash
     )
-
-
-def test_unwritable_file_is_one_line_of_error(cosim, tmp_path):
-    code, _, err = cosim("tuning", "--out", tmp_path / "missing" / "tuned.toml")
-    assert code == 2
-    assert err.splitlines()[-1].startswith("error: ")

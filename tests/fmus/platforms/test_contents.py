@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import struct
 import subprocess
 import zipfile
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import fmus
-from fmus.build import PLATFORMS, universal_binary
+from fmus.build import PLATFORMS
 from fmus.evaporator import EVAPORATOR
 from tests.helpers import mach_o
 
@@ -44,14 +43,6 @@ def test_there_is_a_library_for_each_platform(binaries, version: int) -> None:
     assert set(binaries) == expected
 
 
-def test_fmi2_names_x86_by_its_own_and_arm_by_the_tuples_of_fmi3() -> None:
-    assert [platform.folder("2.0") for platform in PLATFORMS] == [
-        "linux64", "aarch64-linux", "win64", "darwin64", "aarch64-darwin",
-    ]  # fmt: skip
-    assert all(re.fullmatch(r"(x86_64|aarch64)-(linux|windows|darwin)", p.folder("3.0"))
-               for p in PLATFORMS)  # fmt: skip
-
-
 def test_macos_libraries_export_the_functions_of_the_standard_and_need_the_system_alone(
     binaries, functions, version: int
 ) -> None:
@@ -71,15 +62,6 @@ def test_macos_libraries_export_the_functions_of_the_standard_and_need_the_syste
     if version == 2:
         on_x86 = [("darwin64", "x86_64"), ("darwin64", "aarch64")]
     assert found == [("aarch64-darwin", "aarch64"), *on_x86]
-
-
-def test_universal_binary_starts_each_slice_on_a_page(binaries) -> None:
-    libraries = [data for name, data in binaries.items() if name.endswith(".dylib")]
-    thin = [mach_o.slices(library)[0] for library in libraries]
-    joined = universal_binary(thin)
-    assert mach_o.slices(joined) == thin
-    offsets = [struct.unpack_from(">I", joined, 16 + 20 * i)[0] for i in range(2)]
-    assert all(offset % 16384 == 0 for offset in offsets)
 
 
 def test_windows_library_exports_the_functions_and_needs_what_windows_10_has(

@@ -12,7 +12,6 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from fmus import BuildError, evaporator
-from fmus.build import COMPILER_FLAGS
 from fmus.sampled import SampledSystem, build_sampled, sampled_sources
 
 
@@ -38,16 +37,6 @@ def test_a_rebuild_repeats_its_bytes(
     assert again.read_bytes() == built[1].read_bytes()
 
 
-def test_another_core_has_another_token(adder: SampledSystem, tmp_path: Path) -> None:
-    core = adder.sources["core.h"].replace(b"gain[0] * u[0]", b"gain[0] + u[0]")
-    paths = [
-        build_sampled(system, tmp_path / f"{k}.fmu")
-        for k, system in enumerate([adder, replace(adder, sources={"core.h": core})])
-    ]
-    tokens = {fmpy.read_model_description(str(path)).guid for path in paths}
-    assert len(tokens) == 2
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -58,11 +47,6 @@ def test_another_core_has_another_token(adder: SampledSystem, tmp_path: Path) ->
 def test_a_wrong_table_is_refused(adder: SampledSystem, change: dict, message: str) -> None:
     with pytest.raises(BuildError, match=message):
         replace(adder, **change)
-
-
-def test_one_name_for_two_variables_is_refused(adder: SampledSystem) -> None:
-    with pytest.raises(BuildError, match="two variables of adder are called 'u'"):
-        replace(adder, outputs=adder.inputs)
 
 
 FULL_NAME = "#define fmi2FullName(name) name"
@@ -102,7 +86,3 @@ def test_sources_of_two_models_link_into_one_program(
     program = tmp_path / "both"
     subprocess.run(["cc", tmp_path / "main.c", *objects, "-o", program, "-lm"], check=True)
     assert subprocess.run([program], check=False).returncode == 0
-
-
-def test_no_products_are_contracted() -> None:
-    assert "-ffp-contract=off" in COMPILER_FLAGS

@@ -62,17 +62,6 @@ def test_range_of_the_model_description_is_enforced(refused, plant, name: str) -
         assert refused(plant, lambda v=value: plant.set(**{name: v}))[0] == DISCARD
 
 
-@pytest.mark.parametrize("reference", [len(VARIABLES), 10_000, 2**32 - 1])
-def test_unknown_value_reference_is_an_error(refused, plant, reference: int) -> None:
-    plant.initialise()
-    suffix = "Real" if plant.version == 2 else "Float64"
-    status, text = refused(plant, lambda: getattr(plant.fmu, f"get{suffix}")([reference]))
-    assert status == ERROR
-    assert f"unknown value reference {reference}" in text
-    status, text = refused(plant, lambda: getattr(plant.fmu, f"set{suffix}")([reference], [1.0]))
-    assert status == ERROR
-
-
 @pytest.mark.parametrize("kind", [Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT])
 def test_calculated_variable_cannot_be_set(refused, plant, kind: Kind) -> None:
     plant.initialise()

@@ -40,11 +40,3 @@ def test_adjoint_is_the_transposed_jacobian(open_fmu, switches, initialising: bo
     jacobian = np.array(columns).T
     for row, unit in zip(jacobian, np.eye(len(UNKNOWNS)), strict=True):
         np.testing.assert_allclose(adjoint(instance, unit), row, rtol=1e-12, atol=1e-12)
-
-
-def test_inner_products_agree(open_fmu) -> None:
-    instance = open_fmu(3).initialise(seed=2)
-    rng = np.random.default_rng(0)
-    forward, reverse = rng.normal(size=len(KNOWNS)), rng.normal(size=len(UNKNOWNS))
-    left = reverse @ np.array(instance.directional(UNKNOWNS, KNOWNS, list(forward)))
-    assert forward @ adjoint(instance, reverse) == pytest.approx(left, rel=1e-12)

@@ -71,11 +71,6 @@ def test_start_parameters_in_initialisation_mode(plant) -> None:
         np.testing.assert_allclose(column, numeric, rtol=1e-7, atol=1e-7)
 
 
-def test_start_parameters_do_not_act_afterwards(plant) -> None:
-    plant.initialise()
-    assert not np.any(jacobian(plant, UNKNOWNS, ["X2_start", "P2_start"]))
-
-
 def test_seed_of_several_knowns_is_the_sum_of_columns(plant) -> None:
     plant.initialise(seed=2, override=True)
     seed = np.linspace(-1.0, 2.0, len(KNOWNS))
@@ -83,7 +78,3 @@ def test_seed_of_several_knowns_is_the_sum_of_columns(plant) -> None:
     np.testing.assert_allclose(
         together, jacobian(plant, UNKNOWNS, KNOWNS) @ seed, rtol=1e-12, atol=1e-9
     )
-
-
-def test_every_unknown_is_covered() -> None:
-    assert {BY_NAME[name].kind for name in UNKNOWNS} == {Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT}

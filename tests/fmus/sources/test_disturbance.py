@@ -70,13 +70,6 @@ def test_override_of_the_recorded_disturbances_repeats_the_trajectory(open_fmu, 
         assert recorded.get("X2", "P2") == replayed.get("X2", "P2")
 
 
-def test_tunable_range_acts_at_once_and_keeps_the_draw(plant) -> None:
-    plant.initialise(seed=5)
-    before = plant.get("X1")[0]
-    plant.set(X1_range=0.5)
-    assert plant.get("X1")[0] == pytest.approx(5.0 + 0.5 * (before - 5.0), rel=1e-15)
-
-
 def test_draws_are_held_and_right_continuous(plant) -> None:
     plant.initialise(seed=6)
     first = plant.get("X1")
@@ -84,20 +77,6 @@ def test_draws_are_held_and_right_continuous(plant) -> None:
     assert plant.get("X1") == first
     plant.step(59.0, 1.0)
     assert plant.get("X1") != first
-
-
-def test_sampling_time_sets_the_grid(plant) -> None:
-    values = draws_at_six_seconds(plant)
-    assert len({row[0] for row in values}) == 3
-
-
-def draws_at_six_seconds(plant) -> list[list[float]]:
-    plant.initialise(seed=6, sampling_time=6.0)
-    rows = []
-    for k in range(9):
-        rows.append(plant.get("X1"))
-        plant.step(2.0 * k, 2.0)
-    return rows
 
 
 def test_the_laws_number_is_the_law_where_it_is_given(open_fmu) -> None:

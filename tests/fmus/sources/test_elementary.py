@@ -85,8 +85,3 @@ def test_cosine_and_sine_of_turns_are_within_1e_16_and_two_ulp(library: ctypes.C
             angle = 2 * PI * Decimal(x)
             assert ulps(library.own_cos(x), series(angle, 0)) < 2.0, x
             assert ulps(library.own_sin(x), series(angle, 1)) < 2.0, x
-
-
-def test_whole_quarter_turns_are_exact(library: ctypes.CDLL) -> None:
-    assert [library.own_cos(0.25 * k) for k in range(4)] == [1.0, 0.0, -1.0, 0.0]
-    assert [library.own_sin(0.25 * k) for k in range(4)] == [0.0, 1.0, 0.0, -1.0]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ctypes import byref, c_double, c_int, c_size_t, c_uint32, c_void_p
 
-import pytest
-from fmpy.fmi1 import FMICallException
 from fmpy.fmi2 import fmi2EventInfo
 
 DISCARD, ERROR = 2, 3
@@ -71,23 +69,9 @@ def test_each_function_is_allowed_in_its_states_alone(complaint, state: tuple[st
     assert complaints == []
 
 
-def test_initialisation_needs_an_experiment(open_fmu) -> None:
-    instance = open_fmu(2)
-    with pytest.raises(FMICallException):
-        instance.fmu.enterInitializationMode()
-    assert "call fmi2SetupExperiment first" in instance.messages[-1][2]
-
-
 def test_last_successful_time(open_fmu) -> None:
     instance = open_fmu(2).initialise()
     instance.step(0.0, 90.0)
     time = c_double()
     instance.fmu.dll.fmi2GetRealStatus(instance.handle, 2, byref(time))
     assert time.value == 90.0
-
-
-def test_time_is_no_variable(open_fmu) -> None:
-    instance = open_fmu(2).initialise()
-    with pytest.raises(FMICallException):
-        instance.get("time")
-    assert "unknown value reference 0" in instance.messages[-1][2]

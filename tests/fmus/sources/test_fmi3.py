@@ -103,35 +103,6 @@ def test_what_is_not_offered_is_refused_with_a_message(open_fmu, function, argum
     assert call(None, *arguments) == ERROR
 
 
-@pytest.mark.parametrize("option", ["eventModeUsed", "requiredIntermediateVariables"])
-def test_event_mode_and_intermediate_update_are_refused(open_fmu, option: str) -> None:
-    instance = open_fmu(3)
-    handle = instance.fmu.component
-    value = True if option == "eventModeUsed" else [1]
-    with pytest.raises(Exception, match="Failed to instantiate"):
-        instance.fmu.instantiate(logMessage=instance._log3, **{option: value})
-    instance.fmu.component = handle
-    assert "not offered" in instance.messages[-1][2]
-
-
-def test_scheduled_execution_is_refused_with_a_message(open_fmu) -> None:
-    instance = open_fmu(3)
-    call = instance.fmu.dll.fmi3InstantiateScheduledExecution
-    call.restype = c_void_p
-    callbacks = instance.fmu.logMessage, *(kind() for kind in call.argtypes[-3:])
-    assert call(b"a", b"b", b"", off, off, None, *callbacks) is None
-    assert "scheduled execution is not offered" in instance.messages[-1][2]
-
-
-def test_last_successful_time_of_a_refused_step(open_fmu) -> None:
-    instance = open_fmu(3).initialise(stop=60.0)
-    time = c_double()
-    flags = [byref(c_bool()) for _ in range(3)]
-    arguments = (c_double(0), c_double(61), on, *flags, byref(time))
-    assert instance.fmu.dll.fmi3DoStep(instance.handle, *arguments) == ERROR
-    assert time.value == 0.0
-
-
 def test_time_is_a_variable(open_fmu) -> None:
     instance = open_fmu(3).initialise(start=30.0)
     instance.step(30.0, 60.0)

@@ -105,17 +105,6 @@ def test_model_exchange_changes_it_at_time_events_alone(open_fmu, version: int) 
     assert model.get("UA2_present") == plant.get("UA2_present")
 
 
-def test_before_time_zero_the_cycle_goes_on(plant) -> None:
-    plant.initialise(start=-0.5 * DAY, **ON)
-    share = plant.get("UA2_present")[0] / 6.84
-    assert share == pytest.approx(0.7 + 0.3 * np.exp(-0.3 * 5.5), rel=1e-14)
-
-
-def test_period_zero_is_never_cleaned(plant) -> None:
-    plant.initialise(start=100 * DAY, **(ON | {"cleaning_period": 0.0}))
-    assert plant.get("UA2_present")[0] == pytest.approx(0.7 * 6.84, rel=1e-12)
-
-
 def test_parameters_act_at_once(plant) -> None:
     plant.initialise(start=3 * DAY, stochastic=False)
     before = plant.get("der(P2)")[0]

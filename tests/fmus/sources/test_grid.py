@@ -60,15 +60,6 @@ def test_grid_starts_at_time_zero_whatever_the_start_time(open_fmu, version: int
     assert from_zero.get("X1") == from_thirty.get("X1")
 
 
-def test_tiny_steps_are_not_lost(plant) -> None:
-    plant.initialise(stochastic=False, X2_start=30.0)
-    before = plant.get("X2")[0]
-    rate = plant.get("der(X2)")[0]
-    for k in range(1000):
-        plant.step(k * 1e-6, 1e-6)
-    assert plant.get("X2")[0] - before == pytest.approx(1e-3 * rate, rel=1e-5)
-
-
 def test_sampling_time_that_no_second_divides(open_fmu, version: int) -> None:
     sampling_time = 100.0 / 7.0
     whole = run(open_fmu(version), [0.0, 700.0], sampling_time=sampling_time)

@@ -44,11 +44,6 @@ def test_step_of_too_many_integration_steps_is_discarded_at_once(refused, plant)
     plant.step(0.0, 86400.0)
 
 
-def test_same_seed_same_bits_in_both_versions(open_fmu) -> None:
-    runs = [open_fmu(version).initialise(seed=11).run(200) for version in (2, 3, 2)]
-    assert runs[0] == runs[1] == runs[2]
-
-
 def test_instances_do_not_touch_each_other(open_fmu, version: int) -> None:
     alone = open_fmu(version).initialise(seed=1).run(10)
     first, second = open_fmu(version).initialise(seed=1), open_fmu(version).initialise(seed=2)
@@ -79,10 +74,3 @@ def test_parameters_that_make_the_integration_diverge_are_an_error(refused, plan
     assert status == ERROR
     assert "left the finite numbers" in text
     assert plant.run(0) == before
-
-
-def test_start_parameters_act_until_initialisation_ends(plant) -> None:
-    plant.enter_initialisation()
-    assert plant.get("X2") == [25.0]
-    plant.set(X2_start=30.0)
-    assert plant.get("X2") == [30.0]

@@ -34,25 +34,6 @@ def test_state_moves_to_another_instance_with_all_its_parameters(open_fmu, versi
     source.free(state)
 
 
-def test_snapshot_restores_the_mode_too(plant) -> None:
-    before = plant.save()
-    plant.initialise()
-    plant.restore(before)
-    plant.initialise(seed=3)
-    plant.free(before)
-
-
-def test_a_handle_is_used_again(plant) -> None:
-    plant.initialise()
-    state = plant.save()
-    address = state.value
-    name = "fmi2GetFMUstate" if plant.version == 2 else "fmi3GetFMUState"
-    getattr(plant.fmu, name)(plant.fmu.component, state)
-    assert state.value == address
-    plant.free(state)
-    assert state.value is None
-
-
 def test_serialised_state_continues_bit_identically_in_another_process(
     open_fmu, version, folders, tmp_path
 ) -> None:
@@ -92,54 +73,6 @@ def test_flipped_bit_in_a_serialised_state_is_an_error(refused, plant, position:
         assert "corrupt" in text or "not a state of this FMU" in text
         data[offset] ^= 0x10
     plant.free(plant.deserialise(bytes(data)))
-
-
-@pytest.mark.parametrize("size", [0, 1, 100])
-def test_serialised_state_of_another_length_is_an_error(refused, plant, size: int) -> None:
-    plant.initialise()
-    assert "bytes" in refused(plant, lambda: plant.deserialise(b"\x00" * size))[1]
-
-
-def test_implausible_state_with_a_right_checksum_is_an_error(refused, plant) -> None:
-    """A forged state must not bring in what the setters refuse."""
-    plant.initialise(P100=321.0)
-    state = plant.save()
-    data = bytearray(plant.serialise(state))
-    plant.free(state)
-    import struct
-
-    at = data.index(struct.pack("<d", 321.0))
-    for value in (float("nan"), 1e9):
-        data[at : at + 8] = struct.pack("<d", value)
-        data[-8:] = struct.pack("<Q", fnv1a(data[:-8]))
-        assert "corrupt" in refused(plant, lambda: plant.deserialise(bytes(data)))[1]
-    data[at : at + 8] = struct.pack("<d", 123.0)
-    data[-8:] = struct.pack("<Q", fnv1a(data[:-8]))
-    plant.restore(handle := plant.deserialise(bytes(data)))
-    assert plant.get("P100") == [123.0]
-    plant.free(handle)
-
-
-def fnv1a(data: bytes) -> int:
-    value = 14695981039346656037
-    for byte in data:
-        value = (value ^ byte) * 1099511628211 % 2**64
-    return value
-
-
-@pytest.mark.slow
-def test_a_million_snapshots_leave_memory_flat(plant) -> None:
-    import psutil
-
-    plant.initialise()
-    process = psutil.Process()
-    plant.free(plant.save())
-    before = process.memory_info().rss
-    for _ in range(1_000_000):
-        state = plant.save()
-        plant.restore(state)
-        plant.free(state)
-    assert process.memory_info().rss - before < 2**20
 
 
 def test_state_of_one_fmi_version_continues_in_the_other(open_fmu) -> None:

@@ -1,4 +1,4 @@
-"""Write docs/reference/platforms.md: python -m tests.helpers.platform_page [FILE].
+"""Write docs/reference/platforms.md: python -m benchmarks.platforms [FILE].
 
 Runs every binary that can be run here and every importer that is installed; takes some minutes.
 """
@@ -25,7 +25,7 @@ from tests.helpers.platforms import (
     verdict,
 )
 
-PAGE = Path(__file__).parents[2] / "docs" / "reference" / "platforms.md"
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "platforms.md"
 NATURE = {"x86_64-linux": "natively", "aarch64-linux": "qemu-user", "x86_64-windows": "wine64"}
 
 
@@ -54,7 +54,7 @@ def main(target: Path) -> None:
 HEAD = f"""\
 # Platforms and importers
 
-Written by `python -m tests.helpers.platform_page`, which runs all that can be run on a Linux
+Written by `python -m benchmarks.platforms`, which runs all that can be run on a Linux
 machine on x86-64 with Debian's qemu-user, libc6-arm64-cross and wine64, and PyPI's ziglang. A small
 C program steps the library of each platform {STEPS} times and hashes the bits of every state,
 derivative and output after each step; the verdict compares the hashes with those of Linux on

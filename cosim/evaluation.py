@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cosim.errors import EvaluationError, StudyError
 from cosim.files import temporary_folder, write_atomically
-from cosim.kpis import comes_to_rest, displaced, settling_time
+from cosim.kpis import comes_to_rest, displaced
 from cosim.plant import FmuPlant
 from cosim.plugins import (
     OURS,
@@ -25,7 +25,6 @@ from cosim.plugins import (
 )
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
-from cosim.simulation import simulate
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, check_folders
 from cosim.studies.run import Runner
@@ -128,7 +127,8 @@ def evaluate(
         "command": command,
     } | ({"burn_in": burn_in} if burn_in else {})
     sizes = Sizes(numbers, steps, burn_in, 0, 0)
-    runs, settling, parameters = [], {}, {}
+    settles = comes_to_rest(scenario) and displaced(scenario) is not None
+    runs, parameters = [], {}
     for name, item in named.items():
         controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
         parameters[name] = parameters_hash(controller)
@@ -142,9 +142,8 @@ def evaluate(
         except StudyError as error:
             raise EvaluationError(str(error)) from None
         case = Case(name, (scenario.name,), "")
-        runs.append(Run(key, case, scenario, item, None, depends, sizes))
-        if name in wanted:
-            settling[name] = _settling(scenario, controller, steps)
+        settle = settles and name in wanted
+        runs.append(Run(key, case, scenario, item, None, depends, sizes, settle=settle))
     check_folders(runs)
 
     tell = progress or (lambda samples, line: None)
@@ -156,10 +155,11 @@ def evaluate(
         runner.go(jobs, scheduler)
         for failure in runner.failures.values():
             raise failure.error()
-        columns, timing = {}, {}
+        columns, timing, settling = {}, {}, {}
         for name, store in zip(named, runner.stores.values(), strict=True):
             columns[name] = _columns(store.indicators(EVALUATION), numbers)
             timing[name] = _columns(store.indicators(TIMING), numbers)
+            settling[name] = store.settling
     return Evaluation(wanted, numbers, columns, timing, settling, parameters, facts)
 
 
@@ -176,15 +176,6 @@ def _columns(figures: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -
     nothing = dict.fromkeys(names, float("nan"))
     rows = [figures.get(seed, nothing) for seed in seeds]
     return {name: np.array([row[name] for row in rows]) for name in names}
-
-
-def _settling(scenario: Scenario, controller: Controller, steps: int) -> float:
-    """Settling time in s without disturbances, NaN where the scenario has permanent ones."""
-    start = displaced(scenario) if comes_to_rest(scenario) else None
-    if start is None:
-        return float("nan")
-    with FmuPlant(start) as plant:
-        return settling_time(simulate(plant, controller, steps, 0, residuals=False))
 
 
 def _named(controllers: Mapping[str, Factory | str] | Sequence[str]) -> dict[str, Factory | str]:

@@ -163,7 +163,7 @@ class Run:
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
     training. `greedy` says whether a controller runs on the noise of the learning curves, too;
-    `traces` are runs kept sample by sample.
+    `settle` whether its settling time is wanted; `traces` are runs kept sample by sample.
     """
 
     key: RunKey
@@ -176,6 +176,7 @@ class Run:
     greedy: bool = False
     traces: tuple[TrajectoryTable, ...] = ()
     online: Online | None = None
+    settle: bool = False
 
     @property
     def noise(self) -> dict[str, tuple[tuple[int, ...], int]]:

@@ -19,7 +19,7 @@ import loky
 from controllers import compile_functions
 from cosim.errors import EvaluationError, FailedRunsError
 from cosim.files import temporary_folder
-from cosim.kpis import measure
+from cosim.kpis import displaced, measure, settling_time
 from cosim.plant import FmuPlant
 from cosim.plant.archive import unpack
 from cosim.plugins import OURS, build_controller, code_hash, import_from
@@ -74,8 +74,9 @@ class Item:
     A `training` to its end, its checkpoint in `folder` where the workers share this disk. Else a
     controller for `steps` samples on each of the `seeds` after `burn_in`: its indicators for
     `file`; the run itself, where a `trace` is asked for; means over `block` samples, where that is
-    not 0. `samples` are those of all the controller's items. The controller is a text for
-    `build_controller`, a factory(scenario), or the `training`'s with θ = `parameters`.
+    not 0; the time in which it comes to rest, where it shall `settle`. `samples` are those of all
+    the controller's items. The controller is a text for `build_controller`, a factory(scenario),
+    or the `training`'s with θ = `parameters`.
     """
 
     run: str
@@ -91,6 +92,7 @@ class Item:
     burn_in: int = 0
     trace: TrajectoryTable | None = None
     block: int = 0
+    settle: bool = False
     samples: int = 0
 
 
@@ -110,7 +112,7 @@ class Failure:
 
 
 Measured = dict[int, tuple[Figures, Figures]]
-Outcome = Trained | Measured | str | list[float] | Failure
+Outcome = Trained | Measured | str | list[float] | float | Failure
 
 
 def perform(item: Item) -> tuple[Item, Outcome]:
@@ -151,10 +153,14 @@ def _train(training: Training, folder: Path | None) -> Trained:
     )
 
 
-def _simulate(item: Item) -> Measured | str | list[float]:
+def _simulate(item: Item) -> Measured | str | list[float] | float:
     controller = _controller(item)
     compile_functions(controller, item.samples)
-    with FmuPlant(item.scenario) as plant:
+    scenario = displaced(item.scenario) if item.settle else item.scenario
+    assert scenario is not None
+    with FmuPlant(scenario) as plant:
+        if item.settle:
+            return settling_time(simulate(plant, controller, item.steps, 0, residuals=False))
         if item.trace is not None:
             return simulate(plant, controller, item.steps, item.seeds[0]).to_csv()
         if item.block:
@@ -278,6 +284,8 @@ class Runner:
                 self._done[name] += trace.steps
             else:
                 yield replace(base, trace=trace, seeds=(trace.seed,), steps=trace.steps)
+        if store.unsettled:
+            yield replace(base, settle=True, steps=run.sizes.steps)
         if (online := run.online) is not None:
             beside = store.missing_online()
             self._done[name] += online.steps * (len(online.seeds) - len(beside))
@@ -303,6 +311,8 @@ class Runner:
         if isinstance(outcome, str):
             assert item.trace is not None
             store.trace(item.trace, outcome)
+        elif isinstance(outcome, float):
+            store.settle(outcome)
         elif isinstance(outcome, list):
             store.accompany(item.seeds[0], outcome)
         else:

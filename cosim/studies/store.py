@@ -254,6 +254,24 @@ class RunStore:
         )
         write_atomically(self.folder / ONLINE, csv_text(("seed", "steps", "block", "J"), rows))
 
+    @property
+    def settling(self) -> float:
+        """Settling time in s in a run as long as the plan's, NaN where it is not known."""
+        known = self._about.get("settling", {}).get(str(self._run.sizes.steps))
+        return float("nan") if known is None else float(known)
+
+    def settle(self, seconds: float) -> None:
+        """Store the settling time, as text since NaN is no JSON."""
+        known = self._about.get("settling", {})
+        self.note(settling=known | {str(self._run.sizes.steps): repr(seconds)})
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether the settling time is wanted and has not been measured."""
+        return self._run.settle and str(self._run.sizes.steps) not in self._about.get(
+            "settling", {}
+        )
+
     def trajectory(self, trace: TrajectoryTable) -> Path:
         """File of a trajectory, which may not be there yet."""
         return self.folder / f"trajectory-{trace.name}-{trace.seed}-{trace.steps}.csv"
@@ -273,6 +291,7 @@ class RunStore:
             (self._run.training is None or bool(self.status))
             and not any(self.missing(file) for file in self._run.noise)
             and not self.missing_online()
+            and not self.unsettled
             and all(self.trajectory(trace).is_file() for trace in self._run.traces)
         )
 

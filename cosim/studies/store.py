@@ -257,8 +257,7 @@ class RunStore:
     @property
     def settling(self) -> float:
         """Settling time in s in a run as long as the plan's, NaN where it is not known."""
-        known = self._about.get("settling", {}).get(str(self._run.sizes.steps))
-        return float("nan") if known is None else float(known)
+        return float(self._about.get("settling", {}).get(str(self._run.sizes.steps), "nan"))
 
     def settle(self, seconds: float) -> None:
         """Store the settling time, as text since NaN is no JSON."""

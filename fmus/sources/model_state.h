@@ -12,4 +12,7 @@ typedef struct {
 /* Interfaces beside co-simulation. */
 enum { OFFERS_MODEL_EXCHANGE = 1 };
 
+/* Whether an input that is not finite is for the model to judge; else it is refused. */
+enum { JUDGES_INPUTS = 0 };
+
 #endif

@@ -85,6 +85,7 @@ static int plausible(const State *state) {
     for (unsigned vr = 0; vr < N_VARIABLES; vr++) {
         const VariableInfo *variable = &VARIABLES[vr];
         const double value = state->v[vr];
+        if (isnan(value) && JUDGES_INPUTS && variable->kind == INPUT) continue;
         if (!isfinite(value)) return 0;
         if ((variable->kind == INPUT || variable->kind == FIXED || variable->kind == TUNABLE) &&
             !(value >= variable->min && value <= variable->max))

@@ -9,7 +9,7 @@
 #define FMI3_FUNCTION_PREFIX evaporator_
 #endif
 
-#define MODEL_TOKEN "{5334973b-4686-5024-8a8b-66f9603a0ac8}"
+#define MODEL_TOKEN "{4b2ab9db-c6a8-56b3-80d2-38ec28c993f3}"
 
 /* Digest of the variables' names and order: marks the layout of a serialised state. */
 #define LAYOUT_DIGEST UINT64_C(0x9bf4eee7a86d70a1)

@@ -34,6 +34,7 @@ static const char *const CORE_MESSAGES[] = {
     "the QP solver reached its iteration limit",
     "the QP is not finite",
     "theta is not well posed: x_l must be below x_u and slack weights positive",
+    "the QP was solved too inaccurately",
 };
 
 static void core_reset(CoreState *state) {
@@ -70,7 +71,7 @@ static inline int core_plausible(const CoreState *state) {
            all_finite(&state->solution.x[0][0], sizeof state->solution / sizeof(double)) &&
            all_finite(state->action, N_U) && all_finite(state->applied, N_U) &&
            state->failures >= 0.0 && state->failures < 9e15 && state->status >= 0 &&
-           state->status <= RTI_ILL_POSED;
+           state->status <= RTI_INACCURATE;
 }
 
 /* Outputs in the order of the table of variables: action, value, status, residual, iterations,

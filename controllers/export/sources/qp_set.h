@@ -7,6 +7,12 @@
 
 enum { QP_LIMITS = QP_N + QP_ROWS };
 
+/* Large arrays are on the stack; where that is small, `static` puts them beside it, for one solver at
+ * a time. */
+#ifndef QP_SCRATCH
+#define QP_SCRATCH
+#endif
+
 typedef enum { QP_SOLVED, QP_NOT_CONVEX, QP_ITERATION_LIMIT, QP_NOT_FINITE } QpStatus;
 
 /* A member of the working set: inactive, at its limit, beyond it (soft rows), or an equation. */
@@ -56,7 +62,7 @@ static double qp_compliance(const Qp *qp, const QpWork *work, int i) {
 
 /* H = U Uᵀ from the last column on, then U⁻ᵀ into the first QP_N rows of M. */
 static QpStatus qp_factorise(const Qp *qp, QpWork *work) {
-    double U[QP_N][QP_N], inverse[QP_N]; /* U by columns: U[k][j], j ≤ k */
+    QP_SCRATCH double U[QP_N][QP_N], inverse[QP_N]; /* U by columns: U[k][j], j ≤ k */
     for (int k = QP_N - 1; k >= 0; k--) {
         double pivot = qp->H[k * QP_N + k];
         for (int l = k + 1; l < QP_N; l++) pivot -= U[l][k] * U[l][k];

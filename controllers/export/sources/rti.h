@@ -11,7 +11,10 @@
 #define QP_ROWS (HORIZON * N_X)
 #include "qp.h"
 
-enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1 };
+enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE };
+
+/* The largest KKT residual of a QP that counts as solved. */
+#define RTI_RESIDUAL 1e-6
 
 /* Where the next QP is linearised: states x_0 … x_{N−1}, actions, costates χ_1 … χ_N; and the
  * working set that its solver begins with. */
@@ -53,17 +56,17 @@ static int well_posed(const double theta[]) {
 /* V(s) and π(s) of the QP at the guess; anything but RTI_SOLVED leaves `solution` alone. */
 static int rti_sample(const RtiGuess *guess, const double theta[], const double s[],
                       RtiSolution *solution) {
-    double L[HORIZON * (N_X + N_U) * (N_X + N_U)], q[HORIZON * (N_X + N_U)];
-    double L_N[N_X * N_X], q_N[N_X], prepared[PREPARED_SIZE], embedded[EMBEDDED_SIZE];
-    double lower[QP_N], upper[QP_N], w[QP_ROWS], W[QP_ROWS], read[READ_SIZE];
+    QP_SCRATCH double L[HORIZON * N_W * N_W], q[HORIZON * N_W], L_N[N_X * N_X], q_N[N_X];
+    QP_SCRATCH double prepared[PREPARED_SIZE], embedded[EMBEDDED_SIZE], read[READ_SIZE];
+    QP_SCRATCH double lower[QP_N], upper[QP_N], w[QP_ROWS], W[QP_ROWS];
     const double *const x = guess->x[0], *const u = guess->u[0];
-    QpWork work;
     if (!well_posed(theta)) return RTI_ILL_POSED;
     const double constant = stage_costs(guess->x[0], guess->u[0], guess->costates[0], theta, L, q);
     terminal_cost(theta, L_N, q_N);
     {
         const double *arguments[PREPARED_ARG] = {x, u, L, q, L_N, q_N, theta};
-        double *results[PREPARED_RES] = {prepared}, w[PREPARED_W + 1];
+        QP_SCRATCH double w[PREPARED_W + 1];
+        double *results[PREPARED_RES] = {prepared};
         long long int iw[PREPARED_IW + 1];
         preparation(arguments, results, iw, w, 0);
     }
@@ -89,6 +92,7 @@ static int rti_sample(const RtiGuess *guess, const double theta[], const double 
     const Qp qp = {prepared + PREPARED_H,     embedded + EMBEDDED_f, lower, upper,
                    prepared + PREPARED_Gamma, embedded + EMBEDDED_lower,
                    embedded + EMBEDDED_upper, w,                     W};
+    QP_SCRATCH QpWork work; /* here, so that it takes the place of CasADi's work vector */
     QpStatus status = qp_load(&qp, &work);
     if (status == QP_SOLVED) status = qp_solve(&qp, &work, guess->set);
     if (status != QP_SOLVED) return status;
@@ -101,6 +105,8 @@ static int rti_sample(const RtiGuess *guess, const double theta[], const double 
         readout(arguments, results, iw, w, 0);
     }
     if (!all_finite(read, READ_SIZE)) return QP_NOT_FINITE;
+    const double residual = qp_residual(&qp, &work);
+    if (!(residual <= RTI_RESIDUAL)) return RTI_INACCURATE;
     for (int k = 0; k <= HORIZON; k++)
         for (int i = 0; i < N_X; i++)
             solution->x[k][i] = read[READ_xi + k * N_X + i] + REFERENCE_STATE[i];
@@ -112,7 +118,7 @@ static int rti_sample(const RtiGuess *guess, const double theta[], const double 
     memcpy(solution->next.costates, read + READ_next_chi, sizeof solution->next.costates);
     qp_remember(&work, solution->next.set);
     solution->value = read[READ_value];
-    solution->residual = qp_residual(&qp, &work);
+    solution->residual = residual;
     solution->iterations = work.iterations;
     return RTI_SOLVED;
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from controllers import Parameters, Problem, RtiNmpc
 from controllers.errors import ControllerError
 from controllers.export import core
+from controllers.export.core import STACK_LIMIT
 from controllers.factories import naive, tuned
 from controllers.theta import ThetaBlocks
 from cosim import FmuPlant, Scenario
@@ -138,3 +140,36 @@ def test_an_unknown_hessian_and_too_long_a_horizon_are_refused() -> None:
     problem = evaporator_problem(horizon=60)
     with pytest.raises(ControllerError):
         core(problem, Parameters.naive(problem))
+
+
+@pytest.mark.parametrize(
+    ("horizon", "hessian"), [(2, "exact"), (10, "gauss-newton"), (32, "exact")]
+)
+def test_no_controller_takes_more_stack_than_the_limit_that_refuses_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, horizon: int, hessian: str
+) -> None:
+    """The estimate holds against the compiler's own count of the longest chain of calls."""
+    problem = evaporator_problem(horizon=horizon)
+    made = core(problem, Parameters.naive(problem), hessian)
+    CompiledController(tmp_path, made, "-O2", "-fstack-usage")
+    frames = {}
+    for path in tmp_path.glob("*.su"):
+        for line in path.read_text().splitlines():
+            place, size, _ = line.split("\t")
+            frames[place.rpartition(":")[2].partition(".")[0]] = int(size)
+    used = frames["rti_sample"] + max(v for name, v in frames.items() if name != "rti_sample")
+    monkeypatch.setattr(sys.modules["controllers.export.core"], "STACK_LIMIT", used)
+    with pytest.raises(ControllerError, match="kB of stack a sample"):
+        core(problem, Parameters.naive(problem), hessian)
+    assert used < STACK_LIMIT
+
+
+def test_an_inaccurate_solution_is_none(tmp_path: Path) -> None:
+    """A state of 1e12 leaves a KKT residual of 1e-4 by rounding; the next sample recovers."""
+    problem = evaporator_problem()
+    made = CompiledController(tmp_path, core(problem, Parameters.naive(problem)))
+    before = made.sample(np.array([26.0, 50.0]))
+    wild = made.sample(np.array([1e12, 1e12]))
+    assert (wild["status"], wild["failures"]) == (5, 1)
+    assert np.array_equal(wild["action"], before["action"])
+    assert made.sample(np.array([26.0, 50.0]))["status"] == 0

@@ -22,8 +22,8 @@ typedef struct { double sum, seen, y; int64_t status; } CoreState;
 static const char *const CORE_MESSAGES[] = {"fine", "the input is negative"};
 static void core_reset(CoreState *s) { s->sum = s->seen = s->y = 0.0; s->status = 0; }
 static void core_evaluate(CoreState *s, const double u[], const double gain[]) {
-    s->status = u[0] < 0.0;
-    s->seen = u[0];
+    s->status = !(u[0] >= 0.0);
+    s->seen = isfinite(u[0]) ? u[0] : 0.0;
     if (s->status == 0) s->y = gain[0] * u[0] + s->sum;
 }
 static void core_commit(CoreState *s) { s->sum += s->seen; }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -130,3 +131,17 @@ def test_damaged_bytes_are_refused(make: Callable) -> None:
     data[len(data) // 2] ^= 1
     with pytest.raises(FMICallException):
         fmu.deserialise(bytes(data))
+
+
+def test_an_input_that_is_not_finite_reaches_the_core_and_the_state_can_still_be_saved(
+    make: Callable,
+) -> None:
+    """A sensor fails while the loop goes on; what to do is the controller's to decide."""
+    fmu, other = make().start(), make().start()
+    fmu.set("u", math.nan)
+    fmu.step(0.0)
+    assert math.isnan(fmu.get("u"))
+    other.restore(other.deserialise(fmu.serialise(fmu.snapshot())))
+    assert math.isnan(other.get("u"))
+    fmu.set("u", math.inf)
+    assert math.isnan(fmu.get("u"))

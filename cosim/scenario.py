@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import math
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from importlib.resources import files
@@ -252,6 +254,7 @@ class Scenario(Table):
     def load(cls, source: str | Path) -> Scenario:
         """Load a preset by name or a TOML file by path; raises ScenarioError.
 
+        `random-SEED` is the evaporator with the random errors of a seed, see `random_plant`.
         A document with `extends = NAME_OR_PATH` states only what differs from another one.
         """
         document, origin = read(source)
@@ -412,6 +415,50 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return result
 
 
+RANDOM = re.compile(r"random-(0|[1-9]\d{0,8})")
+"""Name of the plant with random errors that a seed draws, `random-7` say."""
+
+
+def random_plant(seed: int) -> dict[str, Any]:
+    """What a plant with random errors changes in `paper`; its controller is told nothing of it.
+
+    Drawn in this order, uniformly unless stated, and rounded to four digits: sampling time 30, 60
+    or 120 s; UA2 and C by −20 … +30 %; F3 and Cp by ±5 %, both latent heats by ±3 %; the nominal
+    disturbances by ±5 %; the law, uniform or normal; the disturbances' standard deviations by a
+    factor of 0.5 … 2, common to all, log-uniform.
+    """
+    rng, paper = np.random.default_rng(seed), read("paper")[0]
+    sampling_time = float(rng.choice([30.0, 60.0, 120.0]))
+    parameters = {
+        name: _rounded(value * rng.uniform(low, high))
+        for name, value, low, high in (
+            ("UA2", 6.84, 0.8, 1.3),
+            ("C", 4.0, 0.8, 1.3),
+            ("F3", 50.0, 0.95, 1.05),
+            ("Cp", 0.07, 0.95, 1.05),
+            ("lambda_", 38.5, 0.97, 1.03),
+            ("lambda_s", 36.6, 0.97, 1.03),
+        )
+    }
+    law = paper["disturbance"]
+    nominal = [_rounded(value * rng.uniform(0.95, 1.05)) for value in law["nominal"]]
+    kind = str(rng.choice(["uniform", "normal"]))
+    factor = 2.0 ** rng.uniform(-1.0, 1.0) / (1.0 if kind == "uniform" else math.sqrt(3.0))
+    ranges = [_rounded(value * factor) for value in law["ranges"]]
+    return {
+        "name": f"random-{seed}",
+        "description": f"The evaporator with the random errors that seed {seed} draws; the "
+        "controller is not told",
+        "sampling_time": sampling_time,
+        "plant": paper["plant"] | {"parameters": parameters},
+        "disturbance": {"law": kind, "nominal": nominal, "ranges": ranges},
+    }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
 def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any], str]:
     """Read a preset or file and what it extends; returns the document and its origin's name.
 
@@ -419,6 +466,8 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     file that names it. Raises ScenarioError.
     """
     path = Path(source)
+    if (drawn := RANDOM.fullmatch(str(source))) is not None:
+        return read("paper")[0] | random_plant(int(drawn[1])), f"preset '{source}'"
     if str(source) in presets():
         origin = f"preset '{source}'"
         preset = files("cosim.presets").joinpath(f"{source}.toml").read_text("utf-8")
@@ -429,7 +478,7 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     else:
         raise ScenarioError(
             f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
-            f"{', '.join(presets())}, or give the path of a TOML file"
+            f"{', '.join(presets())} and random-SEED, or give the path of a TOML file"
         )
     return resolved(document, origin, folder, (*seen, str(path.resolve()))), origin
 
@@ -461,7 +510,7 @@ def _extended(
 ) -> dict[str, Any]:
     if not isinstance(base, str):
         raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
-    if folder is not None and base not in presets():
+    if folder is not None and base not in presets() and not RANDOM.fullmatch(base):
         base = str(folder / base)
     if "\0" in base:
         raise ScenarioError(f"{origin}: extends must be a path, not {base!r}")

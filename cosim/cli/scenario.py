@@ -32,7 +32,7 @@ app = typer.Typer(
 @app.command()
 def show(
     name: Annotated[
-        str | None, typer.Argument(help="Preset or TOML file; none lists the presets.")
+        str | None, typer.Argument(help="Preset, random-SEED or TOML file; none lists the presets.")
     ] = None,
     json: JsonOption = False,
 ) -> None:

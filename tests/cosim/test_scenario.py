@@ -246,3 +246,46 @@ def test_any_junk_in_any_field_is_accepted_or_refused_by_name(data):
         assert path[0] in message
     else:
         assert Scenario.from_dict(tomllib.loads(scenario.to_toml())) == scenario
+
+
+def test_a_seed_draws_the_same_random_plant_for_ever():
+    first = Scenario.load("random-0")
+    assert (first.name, first.sampling_time) == ("random-0", 120.0)
+    assert first.plant.parameters == {
+        "UA2": 6.395,
+        "C": 3.282,
+        "F3": 47.58,
+        "Cp": 0.07219,
+        "lambda_": 39.45,
+        "lambda_s": 36.83,
+    }
+    assert first.disturbance.law == "normal"
+    assert first.disturbance.ranges == (0.2898, 0.5795, 2.318, 1.449)
+    assert Scenario.load("random-15").hash == "8a9a2a69910fa894"
+
+
+def test_random_plants_differ_from_paper_in_what_the_controller_is_not_told(paper):
+    family = [Scenario.load(f"random-{seed}") for seed in range(64)]
+    assert len({scenario.hash for scenario in family}) == 64
+    for scenario in family:
+        assert scenario.controller == paper.controller
+        assert scenario.bounds == paper.bounds
+        assert 0.8 * 6.84 - 1e-3 <= scenario.plant.parameters["UA2"] <= 1.3 * 6.84 + 1e-3
+        scale = 1.0 if scenario.disturbance.law == "uniform" else 3.0**0.5
+        factors = scale * np.array(scenario.disturbance.ranges) / paper.disturbance.ranges
+        np.testing.assert_allclose(factors, factors[0], rtol=1e-3)
+        assert 0.499 < factors[0] < 2.001
+    assert {scenario.sampling_time for scenario in family} == {30.0, 60.0, 120.0}
+    assert {scenario.disturbance.law for scenario in family} == {"uniform", "normal"}
+
+
+@pytest.mark.parametrize("name", ["random", "random-", "random-x", "random-01", "random--1"])
+def test_what_names_no_seed_is_no_random_plant(name):
+    with pytest.raises(ScenarioError, match="unknown scenario"):
+        Scenario.load(name)
+
+
+def test_a_scenario_can_extend_a_random_plant(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('extends = "random-3"\nname = "mine"\n')
+    assert Scenario.load(path).hash == Scenario.load("random-3").hash

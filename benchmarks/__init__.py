@@ -1,4 +1,4 @@
 """Times of plant, controllers, learning, export and evaluation, beside references of the same run.
 
-Not part of the wheel: `cosim benchmark NAME` runs `python -m benchmarks NAME` in a checkout.
+Not part of the wheel: `python -m benchmarks NAME` runs one in a checkout.
 """

@@ -19,7 +19,7 @@ STEPS = {
 
 
 def main():
-    parser = argparse.ArgumentParser("cosim benchmark", description=__doc__)
+    parser = argparse.ArgumentParser("python -m benchmarks", description=__doc__)
     parser.add_argument("name", choices=STEPS)
     parser.add_argument("--scenario", "-s", default="paper")
     parser.add_argument("--steps", "--samples", "-n", type=int, help="samples at a time")

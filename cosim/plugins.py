@@ -22,6 +22,7 @@ from types import ModuleType
 from typing import Any
 
 from cosim.errors import ControllerLookupError
+from cosim.processes import watch
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -74,6 +75,8 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
     if not TARGET.fullmatch(target):
         raise error(f"{what} must be given as module:Name, not '{target}'")
     module, _, attribute = target.partition(":")
+    if module.partition(".")[0] not in OURS:
+        watch(f"plug-in '{target}'")
     before = set(sys.modules)
     try:
         with _importable():

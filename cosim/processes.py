@@ -262,18 +262,50 @@ def _holder(folder: Path) -> str:
     return f"folder '{folder}' is being written by {who}"
 
 
+_stdout: list[int] = []
+"""Descriptor of standard output while it is turned aside."""
+
+
+@contextmanager
+def output_turned_aside() -> Iterator[int | None]:
+    """Let what is printed, by native code too, go to standard error; yields the true descriptor.
+
+    It is None where standard output is not this process's own, a test runner's say.
+    """
+    try:
+        own = sys.stdout.fileno() == 1
+    except (OSError, ValueError, AttributeError):
+        own = False
+    if not own:
+        yield None
+        return
+    sys.stdout.flush()
+    _stdout.append(os.dup(1))
+    os.dup2(2, 1)
+    try:
+        yield _stdout[-1]
+    finally:
+        sys.stdout.flush()
+        os.dup2(_stdout[-1], 1)
+        os.close(_stdout.pop())
+
+
 MARK = "COSIM_FINISHED"
 """Environment variable of a watched command: its parent's number and the file that it leaves."""
 _marks: list[str | None] = []
 """Of a process of the command line: its mark, or None where nobody watches it."""
 
 
+class Finished(BaseException):
+    """A watched command has ended; its argument is the exit code."""
+
+
 @contextmanager
 def command_process() -> Iterator[None]:
     """Mark this process as the command line's: one that may be watched, or that is.
 
-    An FMU may call `exit(0)`, be killed, or close what the process has open: a process that is
-    watched leaves word that the command came to its end, whatever its exit code.
+    Foreign code may call `exit(0)`, be killed, or close what the process has open: a process that
+    is watched leaves word that the command came to its end, whatever its exit code.
     """
     # Taken out, so that what this command starts does not take itself for it.
     _marks.append(os.environ.pop(MARK, None))
@@ -287,23 +319,31 @@ def command_process() -> Iterator[None]:
                 Path(mark.partition(" ")[2]).touch()
 
 
-def watch(fmu: Path, stdout: int | None) -> None:
+def watch(suspect: str) -> None:
     """Run this command again in a process of its own, and exit as that does; else return.
 
-    It returns in that process, and where the command line was not the one called. `stdout` is the
-    descriptor of standard output where another is in its place. Raises PlantError where the
-    process ended before the command did.
+    To be called before foreign code is loaded; `suspect` is what messages call it. Returns in that
+    process, and where no command line was called. Raises PlantError where the process ended before
+    the command did.
     """
     if not _marks or _marks[-1] is not None:
         return
     flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
-    command = [sys.executable, *flags, "-m", "cosim", *sys.argv[1:]]
+    # With this process's import path: a folder of the user's may have the name of a package.
+    program = f"import sys; sys.path[:] = {sys.path}; from cosim.cli import main; main()"
+    command = [sys.executable, *flags, "-c", program, *sys.argv[1:]]
     folders = release()  # for the process that does the work
     with temporary_folder("cosim-") as temporary:
         mark = temporary / "finished"
         environment = os.environ | {MARK: f"{os.getpid()} {mark}"}
-        child = subprocess.Popen(command, stdout=stdout, env=environment)
-        code = _outcome(child)
+        child = subprocess.Popen(command, stdout=(*_stdout, None)[0], env=environment)
+        try:
+            code = child.wait()
+        except BaseException as error:
+            if not isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the child, too
+                child.terminate()
+            child.wait()
+            raise
         finished = mark.exists()
     if finished and code >= 0:
         raise Finished(code)
@@ -311,21 +351,4 @@ def watch(fmu: Path, stdout: int | None) -> None:
         with suppress(CosimError, OSError):
             hold(folder)
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
-    raise PlantError(
-        f"FMU '{fmu}', or other native code, ended the process {how} before the command finished"
-    )
-
-
-class Finished(BaseException):
-    """A watched command has ended; its argument is the exit code."""
-
-
-def _outcome(child: subprocess.Popen[bytes]) -> int:
-    """The child's exit code; what ends this process meanwhile ends the child first."""
-    try:
-        return child.wait()
-    except BaseException as error:
-        if not isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the child, too: it unwinds
-            child.terminate()
-        child.wait()
-        raise
+    raise PlantError(f"{suspect} ended the process {how} before the command finished")

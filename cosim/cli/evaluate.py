@@ -18,7 +18,7 @@ from cosim.cli.options import (
     StepsOption,
     count,
 )
-from cosim.cli.output import Output, again, dump, open_folder, output, resumable
+from cosim.cli.output import Output, dump, load_scenario, open_folder, output, resumable
 
 
 def evaluate(
@@ -51,20 +51,18 @@ def evaluate(
     with output(json) as out_:
         from loky import cpu_count
 
-        from cosim.cli.compose import announce
         from cosim.evaluation import evaluate as run
         from cosim.files import write_atomically
-        from cosim.scenario import Scenario
 
-        task, named = Scenario.load(scenario), named_controllers(controllers)
+        task, named = load_scenario(scenario), named_controllers(controllers)
         options: dict[str, Any] = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
         options |= {"first-seed": first_seed} if first_seed else {}
         options |= {"steps": steps} | ({"burn-in": burn_in} if burn_in else {})
         words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
         folder = open_folder(out).absolute()
-        announce(task, out_)
+        out_.announce(task)
         total = (len(named) + ("optimal" not in named)) * seeds * (burn_in + steps)
-        with resumable(again), out_.progress(f"samples on {task.name}", total) as progress:
+        with resumable(), out_.progress(f"samples on {task.name}", total) as progress:
 
             def report(samples: int, line: str) -> None:
                 progress(samples)

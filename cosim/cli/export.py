@@ -39,9 +39,9 @@ def export(
     with output(json) as out_:
         from importlib.util import find_spec
 
-        from cosim.cli.compose import build_plant
         from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
         from cosim.errors import CosimError
+        from cosim.plant import FmuPlant
         from cosim.scenario import Scenario
         from fmus.build import PLATFORMS, present
         from fmus.model import FmiVersion
@@ -51,7 +51,8 @@ def export(
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
         loaded = Scenario.load(scenario)
         rti = rti_controller(controller, loaded)
-        with build_plant(loaded, out_) as plant:
+        out_.announce(loaded)
+        with FmuPlant(loaded) as plant:
             units = plant.units
         system = sampled_controller(rti, loaded, units)
         every_platform = not local and find_spec("ziglang") is not None

@@ -90,10 +90,9 @@ def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     with output(json) as out_:
         from dataclasses import astuple
 
-        from cosim.cli.compose import announce_fmu
         from fmus.check import check as run_checks
 
-        announce_fmu(file, out_)
+        out_.announce_fmu(file)
         findings = run_checks(_path(file))
         out_.table(str(_path(file)), ("check", "result", "detail"), list(map(astuple, findings)))
         passed = all(f.status != "failed" for f in findings)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated, Any
 
@@ -13,7 +12,6 @@ import typer
 from typer.core import TyperGroup
 
 from cosim.cli import (
-    benchmark,
     compare,
     demo,
     evaluate,
@@ -88,35 +86,33 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("demo")(demo.demo)
-app.command("simulate")(simulate.simulate)
-app.command("evaluate")(evaluate.evaluate)
-app.command("train")(train.train)
-app.command("view")(view.view)
-app.command("compare")(compare.compare)
-app.command("optimum")(optimum.optimum)
-app.command("tuning")(tuning.tuning)
-app.command("export")(export.export)
-app.add_typer(scenario.app, name="scenario")
-app.command(
-    "benchmark", context_settings={"ignore_unknown_options": True, "help_option_names": []}
-)(benchmark.benchmark)
-app.add_typer(study.app, name="study")
-app.command("reproduce")(reproduce.reproduce)
-app.add_typer(results.app, name="results")
-app.add_typer(fmu.app, name="fmu", no_args_is_help=True)
+for command in (
+    demo.demo,
+    simulate.simulate,
+    evaluate.evaluate,
+    train.train,
+    view.view,
+    compare.compare,
+    optimum.optimum,
+    tuning.tuning,
+    export.export,
+    reproduce.reproduce,
+):
+    app.command()(command)
+for group in (scenario, study, results, fmu):
+    app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
-# Looked up only among modules that are loaded: an error's class cannot come from another one.
-_ERRORS = (
-    ("fmus", "FmuError"),
-    ("cosim.errors", "CosimError"),
-    ("controllers.errors", "ControllerError"),
-    ("learning.errors", "LearningError"),
+KNOWN = (
+    "fmus.FmuError",
+    "cosim.errors.CosimError",
+    "controllers.errors.ControllerError",
+    "learning.errors.LearningError",
 )
+"""Errors whose message is meant for the user, by name: importing them would load their package."""
 
 
 def _version(wanted: bool) -> None:
@@ -183,39 +179,29 @@ def _open_streams() -> None:
 def _run() -> None:
     try:
         app()
-    except tuple(_known_errors()) as error:
-        _fail(str(error))
-    except Finished as error:
-        sys.exit(error.args[0])
+    except (SystemExit, Finished) as error:
+        sys.exit(error.args[0] if error.args else 0)
+    except (Interrupted, Terminated) as error:
+        unwound()
+        stopped = isinstance(error, Interrupted)
+        notes = error.args if stopped else getattr(error, "__notes__", ())
+        print("; ".join(["interrupted" if stopped else "terminated", *notes]), file=sys.stderr)
+        sys.exit(EXIT_INTERRUPTED if stopped else EXIT_TERMINATED)
+    except MemoryError as error:
+        _fail(f"not enough memory ({error}); ask for fewer samples")
     except OSError as error:
         name = f"'{error.filename}': " if error.filename else ""
         _fail(f"{name}{error.strerror or error}")
-    except MemoryError as error:
-        _fail(f"not enough memory ({error}); ask for fewer samples")
-    except Interrupted as error:
-        unwound()
-        _end("interrupted", error.args, EXIT_INTERRUPTED)
-    except Terminated as error:
-        unwound()
-        _end("terminated", getattr(error, "__notes__", ()), EXIT_TERMINATED)
-    except SystemExit:
-        raise
     except BaseException as error:
+        names = [f"{kind.__module__}.{kind.__qualname__}" for kind in type(error).__mro__]
+        if set(names) & set(KNOWN):
+            _fail(str(error))
         _report(error)
-
-
-def _known_errors() -> list[type[Exception]]:
-    return [getattr(sys.modules[module], name) for module, name in _ERRORS if module in sys.modules]
 
 
 def _fail(message: str) -> None:
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(EXIT_BAD_INPUT)
-
-
-def _end(word: str, notes: Sequence[str], code: int) -> None:
-    print("; ".join([word, *notes]), file=sys.stderr)
-    sys.exit(code)
 
 
 def _report(error: BaseException) -> None:

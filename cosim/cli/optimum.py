@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli.options import JsonOption, ScenarioOption
-from cosim.cli.output import Output, output
+from cosim.cli.output import Output, load_scenario, output
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming.policy_iteration import Figure, Optimum, Progress
@@ -54,7 +54,6 @@ def optimum(
     A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is.
     """
     from controllers.optimum import QuasiStaticPolicy, change_of
-    from cosim.cli.compose import load_scenario
 
     with output(json) as out_:
         task = load_scenario(scenario)

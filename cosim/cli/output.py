@@ -1,4 +1,4 @@
-"""What a command prints and writes: tables, progress, JSON, files."""
+"""What a command prints and writes: tables, progress, notes, JSON; its folder."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from cosim.errors import CosimError
-from cosim.processes import Terminated, hold, release
+from cosim.processes import Terminated, hold, output_turned_aside, release, watch
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from cosim.scenario import Scenario
 
-class Progressing(Protocol):
-    """Takes the number of things done, and a few words to show behind the bar."""
-
-    def __call__(self, done: int, remark: str = "") -> None:
-        """Show them."""
+LONG = 200
+"""Stages of a horizon above which building a controller takes seconds."""
+AGAIN = "what is finished is kept: the same command goes on from there"
+"""How a command goes on that finds again what it has finished."""
 
 
 class Output:
@@ -30,13 +30,8 @@ class Output:
 
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
-        self._stdout = -1
+        self._stdout: int | None = None
         self._live: Console | None = None
-
-    @property
-    def stdout(self) -> int | None:
-        """The descriptor of standard output while another stands in its place, else None."""
-        return self._stdout if self._stdout >= 0 else None
 
     def console(self) -> Console:
         """Console of standard error, for progress and notes; a note goes above a bar."""
@@ -63,17 +58,18 @@ class Output:
 
         console = Console()
         columns = [[row[number] for row in rows] for number in range(len(header))]
-        numeric = [all(map(_is_number, column)) for column in columns]
+        # Numbers are never folded, words of a heading and texts may be.
         widths = [
-            max(map(len, [*(column if number else ()), *name.split(), ""])) + 3
-            for name, column, number in zip(header, columns, numeric, strict=True)
+            max(map(len, [*(cells if k else ()), *name.split(), ""])) + 3
+            for k, (name, cells) in enumerate(zip(header, columns, strict=True))
         ]
         widths[0] = max(map(len, [header[0], *columns[0]])) + 3
         for part in _parts(widths, console.width - 1 if console.is_terminal else 1 << 30):
             table = Table(title=escape(title), title_justify="left", min_width=len(title))
             for k in part:
-                side = "right" if numeric[k] else "left"
-                table.add_column(escape(header[k]), justify=side, overflow="fold")  # type: ignore[arg-type]
+                right = all(map(_is_number, columns[k]))
+                justify: Any = "right" if right else "left"
+                table.add_column(escape(header[k]), justify=justify, overflow="fold")
             for row in rows:
                 table.add_row(*(escape(row[k]) for k in part))
             if not console.is_terminal:
@@ -84,15 +80,16 @@ class Output:
 
     def json(self, document: Mapping[str, Any]) -> None:
         """Print the document if JSON was asked for."""
-        if self.as_json:
-            text = dump(document)
-            if self._stdout >= 0:
-                os.write(self._stdout, text.encode())
-            else:
-                sys.stdout.write(text)
+        if not self.as_json:
+            return
+        text = dump(document)
+        if self._stdout is not None:
+            os.write(self._stdout, text.encode())
+        else:
+            sys.stdout.write(text)
 
     @contextmanager
-    def progress(self, label: str, total: int) -> Iterator[Progressing]:
+    def progress(self, label: str, total: int) -> Iterator[Callable[..., None]]:
         """Progress bar on standard error; yields a function of the number done and a remark."""
         if self.as_json or not sys.stderr.isatty():
             yield lambda done, remark="": None
@@ -110,15 +107,29 @@ class Output:
         ends = (TimeRemainingColumn(), TextColumn("{task.fields[remark]}"))
         with Progress(*columns, *ends, console=console) as bar:
             task = bar.add_task(label, total=total, remark="")
-
-            def update(done: int, remark: str = "") -> None:
-                bar.update(task, completed=done, remark=remark)
-
             self._live = console
             try:
-                yield update
+                yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
             finally:
                 self._live = None
+
+    def announce(self, scenario: Scenario) -> None:
+        """Say which foreign native code is about to run, and that a long horizon takes its time."""
+        self.announce_fmu(scenario.plant.fmu)
+        if (stages := scenario.controller.horizon) > LONG:
+            self.note(
+                f"horizon {stages}: building the controller takes its time "
+                "(1000 stages: 25 s of CPU, 1.4 GB)"
+            )
+
+    def announce_fmu(self, name: str) -> None:
+        """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""
+        from cosim.plant.archive import SHIPPED, unpack
+
+        if name not in SHIPPED:
+            fmu = unpack(name)
+            watch(f"FMU '{fmu.path}', or other native code,")
+            self.note(f"native code of {fmu.path}, sha256 {fmu.sha256}")
 
 
 def _parts(widths: Sequence[int], room: int) -> list[list[int]]:
@@ -144,33 +155,21 @@ def _is_number(cell: str) -> bool:
 
 @contextmanager
 def output(as_json: bool) -> Iterator[Output]:
-    """Open a command's output.
+    """Open a command's output; its folders' locks are released at the end.
 
     With JSON, file descriptor 1 is turned to standard error meanwhile, since an FMU or a solver
     is native code that may print.
     """
     result = Output(as_json)
-    if not as_json or not _has_descriptor():
+    with output_turned_aside() if as_json else nullcontext(None) as result._stdout:
         try:
             yield result
         finally:
             release()
-        return
-    sys.stdout.flush()
-    result._stdout = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        yield result
-    finally:
-        release()
-        sys.stdout.flush()
-        os.dup2(result._stdout, 1)
-        os.close(result._stdout)
-        result._stdout = -1
 
 
 @contextmanager
-def resumable(how: Callable[[], str]) -> Iterator[None]:
+def resumable(how: Callable[[], str] = lambda: AGAIN) -> Iterator[None]:
     """Where the block is interrupted or terminated, say `how` to go on, if that is not empty."""
     try:
         yield
@@ -178,19 +177,6 @@ def resumable(how: Callable[[], str]) -> Iterator[None]:
         if words := how():
             error.add_note(words)
         raise
-
-
-def again() -> str:
-    """How a command goes on that finds again what it has finished."""
-    return "what is finished is kept: the same command goes on from there"
-
-
-def _has_descriptor() -> bool:
-    """Whether standard output is the process's own (a test runner may have replaced it)."""
-    try:
-        return sys.stdout.fileno() == 1
-    except (OSError, ValueError, AttributeError):
-        return False
 
 
 def dump(document: Mapping[str, Any]) -> str:
@@ -226,3 +212,16 @@ def writable_folder(folder: Path) -> Path:
         reason = getattr(error, "strerror", None) or error
         raise CosimError(f"cannot write to folder '{folder}': {reason}") from None
     return folder
+
+
+def load_scenario(name: str) -> Scenario:
+    """Load a preset or TOML file, so that its `module:function` may lie beside it or here.
+
+    Raises ScenarioError.
+    """
+    from cosim.plugins import import_from
+    from cosim.scenario import Scenario
+
+    if Path(name).is_file():
+        import_from(Path(name).resolve().parent)
+    return Scenario.load(name)

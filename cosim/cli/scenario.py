@@ -84,7 +84,6 @@ def init(
     whose native code this runs.
     """
     with output(json) as out_:
-        from cosim.cli.compose import announce_fmu
         from cosim.errors import CosimError
         from cosim.files import write_atomically
         from cosim.plant.draft import NO_NOISE, draft_scenario
@@ -95,7 +94,7 @@ def init(
             raise CosimError(
                 f"'{target}' is there already; replace it by --overwrite, or use --out"
             )
-        announce_fmu(fmu, out_)
+        out_.announce_fmu(fmu)
         text = draft_scenario(
             fmu,
             target,

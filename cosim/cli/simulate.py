@@ -15,7 +15,7 @@ from cosim.cli.options import (
     SeedOption,
     StepsOption,
 )
-from cosim.cli.output import Output, dump, open_folder, output
+from cosim.cli.output import Output, dump, load_scenario, open_folder, output
 
 
 def simulate(
@@ -43,7 +43,6 @@ def simulate(
     """
     with output(json) as out_:
         from controllers import compile_functions
-        from cosim.cli.compose import announce, load_scenario
         from cosim.files import write_atomically
         from cosim.plant import FmuPlant
         from cosim.plugins import build_controller
@@ -51,7 +50,7 @@ def simulate(
 
         loaded = load_scenario(scenario)
         folder = open_folder(out).absolute()  # an FMU may change the working directory
-        announce(loaded, out_)
+        out_.announce(loaded)
         with FmuPlant(loaded) as plant:
             law = build_controller(controller, loaded)
             compile_functions(law, steps)

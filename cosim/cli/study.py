@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cosim.cli.options import JobsOption, JsonOption, OutOption, SchedulerOption
-from cosim.cli.output import Output, again, dump, open_folder, output, resumable
+from cosim.cli.output import Output, dump, open_folder, output, resumable
 
 if TYPE_CHECKING:
     from cosim.studies.results import StudyResults
@@ -70,10 +70,10 @@ def execute(
     definition = Study.load(file)
     folder = open_folder(out)
     for scenario in definition.scenarios.values():
-        _announce(scenario, out_)
+        out_.announce(scenario)
     planned = plan(definition)
     label, total = f"{definition.name}, thousands of samples", _thousands(planned.samples)
-    with resumable(again), out_.progress(label, total) as bar:
+    with resumable(), out_.progress(label, total) as bar:
 
         def report(state: State, line: str) -> None:
             failed = f", {state.failed} failed" if state.failed else ""
@@ -142,12 +142,6 @@ def report(
         show(results, out_, columns)
         out_.note(f"the report is {page.resolve()}")
         out_.json({"report": str(page), "runs": len(results.runs)})
-
-
-def _announce(scenario: Any, out_: Output) -> None:
-    from cosim.cli.compose import announce
-
-    announce(scenario, out_)
 
 
 def _thousands(samples: int) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import fields
 from math import isnan
 from pathlib import Path
@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from cosim.cli.options import JsonOption, OutOption, RecordOption, ScenarioOption, count
-from cosim.cli.output import Output, Progressing, dump, open_folder, output, resumable
+from cosim.cli.options import JsonOption, OutOption, RecordOption, ScenarioOption
+from cosim.cli.output import Output, dump, load_scenario, open_folder, output, resumable
+from cosim.errors import CosimError
 
 if TYPE_CHECKING:
     from learning.log import LogRow
     from learning.training import Training
-    from learning.training_run import TrainingRun
 
 FILES = (
     "checkpoint.npz",
@@ -81,8 +81,9 @@ def train(
     """
     with output(json) as out_:
         from cosim.files import write_atomically
-        from cosim.scenario import Scenario
         from learning.algorithm import load_algorithm
+        from learning.evaluation import stored_optimum
+        from learning.training import CHECKPOINT, run_training
         from learning.training_run import prepare
 
         found = load_algorithm(algorithm)
@@ -93,11 +94,28 @@ def train(
             return
         settings = found.Configuration.from_assignments(assignments or [])
         samples = options.pop("samples")
-        run = prepare(algorithm, Scenario.load(scenario), samples, settings, options)
+        run = prepare(algorithm, load_scenario(scenario), samples, settings, options)
         folder = open_folder(out).absolute()
-        if not (resume or overwrite):
-            _require_no_run(folder)
-        training = _execute(run, folder, optimum, resume, out_)
+        there = [name for name in FILES if (folder / name).exists()]
+        if there and not (resume or overwrite):
+            raise CosimError(
+                f"folder '{folder}' holds another training ({there[0]}); go on with it by "
+                "--resume, begin anew by --overwrite, or choose another --out"
+            )
+        out_.announce(run.scenario)
+        checkpoint = folder / CHECKPOINT
+
+        def how() -> str:
+            go_on = f"the same command with --resume goes on from {checkpoint}"
+            return go_on if checkpoint.is_file() else ""
+
+        with resumable(how), out_.progress(algorithm, run.samples) as progress:
+            best = optimum or stored_optimum(run.scenario)
+            training = run_training(
+                run, folder, resume=resume, optimum=best, progress=remark(progress)
+            )
+        if reason := training.without_checkpoint:
+            out_.note(f"left no checkpoint, --resume is not possible: {reason}")
         summary = training.summary()
         summary["timing"] = {
             "wall_seconds": training.wall_seconds,
@@ -133,19 +151,20 @@ def command() -> Any:
 
     types = get_type_hints(TrainingRun)
     parameters = list(inspect.signature(train).parameters.values())
-    for field in fields(TrainingRun):
-        if field.metadata:
-            default = DEFAULTS.get(field.name, field.default)
-            kind: Any = types[field.name] | None if default is None else types[field.name]
-            annotation = Annotated[kind, _option(field.name, field.metadata)]
-            parameters.append(
-                inspect.Parameter(
-                    field.name,
-                    inspect.Parameter.KEYWORD_ONLY,
-                    default=default,
-                    annotation=annotation,
-                )
+    for field in (field for field in fields(TrainingRun) if field.metadata):
+        default, about = DEFAULTS.get(field.name, field.default), field.metadata
+        kind: Any = types[field.name] | None if default is None else types[field.name]
+        names = [f"--{field.name.replace('_', '-')}", *(["-n"] if field.name == "samples" else [])]
+        bounds = {"min": about["least"], "max": about["most"]} if about["least"] is not None else {}
+        option = typer.Option(*names, help=about["text"], **bounds)
+        parameters.append(
+            inspect.Parameter(
+                field.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=default,
+                annotation=Annotated[kind, option],
             )
+        )
 
     def complete(**values: Any) -> None:
         train(**values)
@@ -157,62 +176,14 @@ def command() -> Any:
     return typer.main.get_command(app)
 
 
-def _option(name: str, about: Mapping[str, Any]) -> Any:
-    names = [f"--{name.replace('_', '-')}", *(["-n"] if name == "samples" else [])]
-    if about["least"] is None:
-        return typer.Option(*names, help=about["text"])
-    return count(*names, least=about["least"], most=about["most"], text=about["text"])
-
-
-def _require_no_run(folder: Path) -> None:
-    from cosim.errors import CosimError
-
-    if found := [name for name in FILES if (folder / name).exists()]:
-        raise CosimError(
-            f"folder '{folder}' holds another training ({found[0]}); go on with it by --resume, "
-            "begin anew by --overwrite, or choose another --out"
-        )
-
-
-def _execute(
-    run: TrainingRun, folder: Path, optimum: str | None, resume: bool, output: Output
-) -> Training:
-    from cosim.cli.compose import announce
-    from learning.evaluation import stored_optimum
-    from learning.training import CHECKPOINT, run_training
-
-    announce(run.scenario, output)
-    checkpoint = folder / CHECKPOINT
-
-    def how() -> str:
-        there = f"the same command with --resume goes on from {checkpoint}"
-        return there if checkpoint.is_file() else ""
-
-    with resumable(how), output.progress(run.algorithm, run.samples) as progress:
-        training = run_training(
-            run,
-            folder,
-            resume=resume,
-            optimum=optimum or stored_optimum(run.scenario),
-            progress=_remark(progress),
-        )
-    if reason := training.without_checkpoint:
-        output.note(f"left no checkpoint, --resume is not possible: {reason}")
-    return training
-
-
-def _remark(progress: Progressing) -> Callable[[int, LogRow], None]:
+def remark(progress: Callable[..., None]) -> Callable[[int, LogRow], None]:
     """Show J, TD error, regret and the smallest eigenvalue of the log's rows behind the bar."""
     last: dict[str, float] = {}
 
     def update(done: int, row: LogRow) -> None:
         last.update({name: value for name, value in row.items() if not isnan(value)})
-        figures = [
-            f"{text} {scale * last[name]:{form}}"
-            for name, text, scale, form in FIGURES
-            if name in last
-        ]
-        progress(done, "  ".join(figures))
+        shown = [f"{t} {scale * last[n]:{form}}" for n, t, scale, form in FIGURES if n in last]
+        progress(done, "  ".join(shown))
 
     return update
 

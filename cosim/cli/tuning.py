@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from cosim.cli.options import JsonOption, ScenarioOption
-from cosim.cli.output import output
+from cosim.cli.output import load_scenario, output
 
 
 def tuning(
@@ -27,7 +27,6 @@ def tuning(
         from controllers.economic import tune
         from controllers.factories import value_offset
         from controllers.problem import Problem
-        from cosim.cli.compose import load_scenario
 
         loaded = load_scenario(scenario)
         problem = Problem.from_scenario(loaded)

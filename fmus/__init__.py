@@ -1,12 +1,13 @@
-"""The evaporator as an FMU: C sources, table of variables, build and the built files."""
+"""The plants as FMUs: C sources, tables of variables, build and the built files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["NAMES", "BuildError", "CheckError", "FmuError", "path"]
+__all__ = ["NAMES", "PLANTS", "BuildError", "CheckError", "FmuError", "path"]
 
 NAMES = ("evaporator", "evaporator_fmi3")
+PLANTS = ("reactor", "tanks")
 
 
 class FmuError(Exception):
@@ -22,10 +23,10 @@ class CheckError(FmuError):
 
 
 def path(name: str = "evaporator") -> Path:
-    """The path of a shipped FMU: ``evaporator`` (FMI 2.0) or ``evaporator_fmi3`` (FMI 3.0).
+    """The path of a shipped FMU: ``evaporator_fmi3`` is FMI 3.0, the others FMI 2.0.
 
     Raises FmuError for another name.
     """
-    if name not in NAMES:
-        raise FmuError(f"there is no FMU {name!r}; shipped are {', '.join(NAMES)}")
+    if name not in (*NAMES, *PLANTS):
+        raise FmuError(f"there is no FMU {name!r}; shipped are {', '.join((*NAMES, *PLANTS))}")
     return Path(__file__).parent / f"{name}.fmu"

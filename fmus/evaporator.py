@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 
 from cosim.files import temporary_folder
-from fmus import BuildError
+from fmus import BuildError, plants
 from fmus.build import (
     COMPILER_FLAGS,
     PACKAGE,
@@ -346,11 +346,11 @@ def differences(built: Path, shipped: Path) -> list[str]:
 def compare_with_shipped() -> dict[str, list[str]]:
     """Build anew for every platform; file name → `differences` from the shipped file."""
     with temporary_folder("cosim-") as folder:
-        built = build(folder, every_platform=True)
+        built = [*build(folder, every_platform=True), *plants.build(folder, every_platform=True)]
         return {path.name: differences(path, PACKAGE / path.name) for path in built}
 
 
 def build_in_place() -> list[Path]:
     """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
     (SOURCES / HEADER).write_text(header(model_token()))
-    return build(PACKAGE, every_platform=True)
+    return [*build(PACKAGE, every_platform=True), *plants.build(PACKAGE, every_platform=True)]

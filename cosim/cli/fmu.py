@@ -18,14 +18,14 @@ SHOWN = 500
 app = typer.Typer(help="Look into an FMU, check it, build ours.")
 
 FileArgument = Annotated[
-    str, typer.Argument(help="FMU file, or evaporator or evaporator_fmi3 (shipped).")
+    str, typer.Argument(help="FMU file, or evaporator, evaporator_fmi3, reactor, tanks (shipped).")
 ]
 
 
 def _path(name: str) -> Path:
     import fmus
 
-    return fmus.path(name) if name in fmus.NAMES else Path(name)
+    return fmus.path(name) if name in (*fmus.NAMES, *fmus.PLANTS) else Path(name)
 
 
 def _short(number: object) -> str:

@@ -21,7 +21,7 @@ import fmus
 from cosim.errors import PlantError
 from cosim.files import cache_folder, temporary_folder
 
-SHIPPED = ("evaporator", "evaporator_fmi3")
+SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
 DESCRIPTION = "modelDescription.xml"
 MAX_ENTRIES = 20_000
 MAX_BYTES = 1 << 30

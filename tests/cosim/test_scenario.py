@@ -18,6 +18,8 @@ def test_presets_are_those_that_the_design_names():
         "mismatched",
         "nominal",
         "paper",
+        "reactor",
+        "tanks",
     ]
 
 
@@ -54,6 +56,7 @@ def test_other_presets_differ_from_paper_in_what_their_name_says(paper):
             if value != paper.to_dict()[key] and key not in ("name", "description")
         }
         for name in presets()
+        if name not in ("reactor", "tanks")
     }
     assert differing == {
         "paper": set(),

@@ -1,8 +1,7 @@
-"""The example plants: built, in agreement with the controller's model, run and learnt from."""
+"""The reactor and the tanks: built, in agreement with the controller's model, run."""
 
 import json
 import re
-import shutil
 from pathlib import Path
 
 import casadi as ca
@@ -10,51 +9,41 @@ import numpy as np
 import pytest
 
 from controllers.factories import naive
+from controllers.problem import load_model
 from cosim import FmuPlant, Scenario, simulate
 from cosim.files import CACHE_VARIABLE
+from fmus import plants
 from fmus.plant import build_plant
 from tests.helpers import importers
 from tests.helpers.command import run_cosim
 from tests.helpers.tank import edited, without_attribute
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
-NAMES = ("quadruple_tank", "reactor")
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "fmu.md"
 
 
-class Example:
-    """A copy of an example with its FMU built, for FMI 2.0 and 3.0."""
+class Plant:
+    """A preset with its model, and its FMU built here for FMI 2.0 and 3.0."""
 
     def __init__(self, name, folder):
         self.name, self.folder = name, folder
-        for path in (EXAMPLES / name).glob("*.[pth]*"):
-            shutil.copy(path, folder)
-        self.module = __import__(name)
-        self.equations = (folder / "equations.h").read_bytes()
         self.fmu = self.build(folder / f"{name}.fmu", 2)
         self.fmu3 = self.build(folder / f"{name}3.fmu", 3)
-        self.scenario = Scenario.load(folder / f"{name}.toml")
+        self.scenario = Scenario.load(name)
+        self.model = load_model(self.scenario.controller.model)
 
     def build(self, target, version):
-        return build_plant(self.module.table(), self.equations, target, version)
+        return build_plant(plants.PLANTS[self.name](), plants.equations(self.name), target, version)
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=plants.PLANTS)
 def example(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp(request.param)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(EXAMPLES / request.param))
-        yield Example(request.param, folder)
+    return Plant(request.param, tmp_path_factory.mktemp(request.param))
 
 
 def result_of(folder, *words):
     result = run_cosim(*words, "--json", folder=folder)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
-
-
-def test_each_is_a_hundred_lines_of_equations_table_and_model(example):
-    files = ["equations.h", f"{example.name}.py", f"{example.name}.toml"]
-    assert sum(len((example.folder / name).read_text().splitlines()) for name in files) <= 200
 
 
 @pytest.mark.slow
@@ -85,7 +74,7 @@ def test_both_fmi_versions_give_the_same_bits(example):
 def test_plant_and_model_agree_where_their_parameters_do(example):
     """CVODES on the controller's model against the FMU's steps, under random actions."""
     scenario = example.scenario
-    model = example.module.model()
+    model = example.model
     n, m, k = len(model.states), len(model.actions), len(model.disturbances)
     x, u, d = ca.MX.sym("x", n), ca.MX.sym("u", m), ca.MX.sym("d", k)
     p = ca.DM([quantity.nominal for quantity in model.parameters])
@@ -134,7 +123,7 @@ def test_snapshots_are_carried_to_another_process(example):
 
 @pytest.mark.slow
 def test_it_runs_from_the_command_line(example):
-    words = ["simulate", "--scenario", f"{example.name}.toml", "--steps", "200", "--out", "run"]
+    words = ["simulate", "--scenario", example.name, "--steps", "200", "--out", "run"]
     summary = result_of(example.folder, *words)
     assert summary["failures"] == 0
     assert summary["statuses"] == {"solved": 200}
@@ -150,10 +139,8 @@ def test_a_bound_is_active_so_that_the_naive_controller_pays(example):
 
 
 @pytest.mark.slow
-def test_tuning_finds_the_stored_reference_from_beside_the_scenario(example, tmp_path):
-    found = result_of(
-        tmp_path, "tuning", "--scenario", str(example.folder / f"{example.name}.toml")
-    )
+def test_tuning_finds_the_stored_reference(example, tmp_path):
+    found = result_of(tmp_path, "tuning", "--scenario", example.name)
     steady = found["steady_state"]
     np.testing.assert_allclose(steady["states"], example.scenario.reference_state, rtol=1e-6)
     np.testing.assert_allclose(steady["actions"], example.scenario.reference_action, rtol=1e-6)
@@ -161,14 +148,14 @@ def test_tuning_finds_the_stored_reference_from_beside_the_scenario(example, tmp
 
 @pytest.mark.slow
 def test_the_optimum_of_an_own_model_is_the_documented_one(example, tmp_path, monkeypatch):
-    """By the documented route, from beside the scenario; the tanks have too many states."""
+    """The tanks have too many states."""
     if len(example.scenario.plant.states) > 2:
         pytest.skip("a grid over four states is out of reach")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    scenario = str(example.folder / f"{example.name}.toml")
-    found = result_of(tmp_path, "optimum", "--scenario", scenario)
-    page = (EXAMPLES.parent / "docs" / "how-to" / "fmu.md").read_text("utf-8")
-    stated = re.search(rf"`{example.name}`.*J\* = ([\d.]+) by `cosim optimum`", page)
+    found = result_of(tmp_path, "optimum", "--scenario", example.name, "--recompute")
+    stated = re.search(
+        rf"`{example.name}`.*J\* = ([\d.]+) by `cosim optimum`", PAGE.read_text("utf-8")
+    )
     assert stated is not None
     assert found["J"] == pytest.approx(float(stated[1]), rel=5e-4)
 
@@ -177,8 +164,8 @@ def test_the_optimum_of_an_own_model_is_the_documented_one(example, tmp_path, mo
 def test_a_plant_that_cannot_save_its_state_leaves_no_checkpoint_and_says_so(example):
     drop = without_attribute("canGetAndSetFMUstate", "canSerializeFMUstate")
     plain = edited(example.fmu, example.folder / "plain.fmu", drop)
-    text = (example.folder / f"{example.name}.toml").read_text()
-    (example.folder / "plain.toml").write_text(text.replace(example.fmu.name, plain.name))
+    plainly = example.scenario.replace({"plant": {"fmu": str(plain)}})
+    (example.folder / "plain.toml").write_text(plainly.to_toml())
     words = ["train", "-s", "plain.toml", "-a", "q-learning"]
     words += ["--samples", "60", "--log-every", "60", "--evaluate-every", "60"]
     words += ["--checkpoint-every", "60", "--out", "short"]

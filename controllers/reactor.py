@@ -1,0 +1,50 @@
+"""The reactor as the controller knows it: mass and heat balance, nominal feed, clean jacket."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from controllers.model import Model, Quantity
+
+
+def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
+    """Rates of concentration and temperature per minute."""
+    V, k0, E, heat, UA, *_ = ca.vertsplit(p)
+    rate = k0 * ca.exp(-E / x[1]) * x[0]
+    return ca.vertcat(
+        u[0] / V * (d[0] - x[0]) - rate,
+        u[0] / V * (d[1] - x[1]) + heat * rate + UA * (u[1] - x[1]),
+    )
+
+
+def _economic_cost(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
+    """Feed, pumping and cooling less the product, per minute."""
+    feed, pump, cooling, fixed = ca.vertsplit(p[5:])
+    product = u[0] * (d[0] - x[0])
+    quadratic = pump * u[0] ** 2 + cooling * (d[1] - u[1]) ** 2
+    return fixed + feed * u[0] * d[0] - product + quadratic
+
+
+def model() -> Model:
+    """An exothermic reaction A → B in a stirred tank with a cooling jacket; time in minutes."""
+    return Model(
+        name="reactor",
+        states=(Quantity("cA", "mol/L", 0.5), Quantity("T", "K", 345.0)),
+        actions=(Quantity("q", "L/min", 100.0), Quantity("Tc", "K", 320.0)),
+        disturbances=(Quantity("cAf", "mol/L", 1.0), Quantity("Tf", "K", 350.0)),
+        parameters=(
+            Quantity("V", "L", 100.0),
+            Quantity("k0", "1/min", 9.2e4),
+            Quantity("E", "K", 4000.0),
+            Quantity("heat", "K.L/mol", 120.0),
+            Quantity("UA", "1/min", 2.09),
+            Quantity("feed_price", "1", 0.1),
+            Quantity("pump_price", "1", 0.004),
+            Quantity("cooling_price", "1", 0.01),
+            Quantity("fixed_cost", "1", 50.0),
+        ),
+        ode=_ode,
+        economic_cost=_economic_cost,
+        time_unit=60.0,
+        uncertain=("UA",),  # the jacket fouls
+    )

@@ -6,6 +6,7 @@ import hashlib
 import importlib.util
 import os
 import platform as host
+import re
 import shutil
 import struct
 import subprocess
@@ -230,6 +231,44 @@ def cross_compiler(platform: Platform) -> Compiler:
         raise BuildError("no cross-compiler: pip install 'rti-cosim[cross]'")
     command = (sys.executable, "-m", "ziglang", "cc", "-target", platform.target)
     return Compiler(platform, command, _CROSS_FLAGS[platform.suffix])
+
+
+PROCESSORS = {
+    "Cortex-M7, double FPU": ("-target", "thumb-linux-musleabihf", "-mcpu=cortex_m7+fp_armv8d16"),
+    "Cortex-M4, no double FPU": ("-target", "thumb-linux-musleabihf", "-mcpu=cortex_m4"),
+    "RISC-V RV32GC": ("-target", "riscv32-linux-musl"),
+}
+"""Zig's flags for micro-controllers."""
+_FRAME = re.compile(r"stack frame size \((\d+)\)")
+_ALLOCATED, _NO_BITS, _WRITABLE = 2, 8, 1
+
+
+def footprint(sources: Mapping[str, bytes], target: Sequence[str]) -> dict[str, int]:
+    """Bytes that C takes on a processor of `PROCESSORS`, by clang -Os: flash, static, stack.
+
+    `flash` is code and constants without libm and what is called for arithmetic, `static` memory
+    of its own, `stack` the sum of all frames, a bound without recursion. Raises BuildError.
+    """
+    with temporary_folder("cosim-") as folder:
+        for name, data in sources.items():
+            (folder / name).write_bytes(data)
+        units = [name for name in sources if name.endswith(".c")]
+        command = [
+            sys.executable, "-m", "ziglang", "cc", *target, "-std=c99", "-Os", "-ffp-contract=off",
+            "-Wframe-larger-than=0", "-c", *units, "-o", "object.o",
+        ]  # fmt: skip
+        result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if result.returncode != 0:
+            raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
+        elf = (folder / "object.o").read_bytes()
+    sizes = {"flash": 0, "static": 0}
+    (start,) = struct.unpack_from("<I", elf, 0x20)
+    size, count = struct.unpack_from("<HH", elf, 0x2E)
+    for k in range(count):
+        kind, flags, _, _, length = struct.unpack_from("<5I", elf, start + k * size + 4)
+        if flags & _ALLOCATED:
+            sizes["static" if kind == _NO_BITS or flags & _WRITABLE else "flash"] += length
+    return sizes | {"stack": sum(map(int, _FRAME.findall(result.stderr)))}
 
 
 _QUIET = ("-w",)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from controllers import RtiNmpc
-from controllers.export import STATUSES, core
+from controllers.export import STATUSES, core, plain_c
 from cosim.errors import ControllerLookupError
+from cosim.files import write_atomically
 from cosim.plant.archive import unpack
 from cosim.plant.wiring import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
+from fmus.build import PROCESSORS, footprint
 from fmus.model import FmiVersion
 from fmus.sampled import SampledSystem, Signal, build_sampled
 from fmus.ssp import Component, Connection, write_ssp
@@ -94,6 +98,26 @@ def sampled_controller(
         ),
         sources=exported.sources,
     )
+
+
+def write_c(controller: RtiNmpc, scenario: Scenario, folder: Path) -> dict[str, Any]:
+    """Write the controller as C into `folder`, whose name its functions begin with.
+
+    Returns a summary with the bytes that it takes on `PROCESSORS`, none without a cross-compiler.
+    """
+    exported = core(controller.problem, controller.parameters, scenario.controller.hessian)
+    name = re.sub(r"\W", "_", folder.absolute().name)
+    files = plain_c(exported, name, scenario)
+    folder.mkdir(exist_ok=True)
+    for file, text in files.items():
+        write_atomically(folder / file, text)
+    measured = {}
+    if find_spec("ziglang") is not None:
+        code = {file: files[file].encode() for file in (f"{name}.c", f"{name}.h")}
+        memory = sum(map(int, re.findall(r"_(?:MEMORY|THETA) = (\d+)", files[f"{name}.h"])))
+        for processor, target in PROCESSORS.items():
+            measured[processor] = footprint(code, target) | {"instance": 8 * memory}
+    return {"folder": str(folder), "files": list(files), "name": name, "bytes": measured}
 
 
 def _structured(label: str) -> str:

@@ -1,7 +1,8 @@
-"""`cosim export`: the learnt controller as an FMU, and the closed loop as an SSP."""
+"""`cosim export`: the learnt controller as an FMU or as C, and the closed loop as an SSP."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -11,12 +12,24 @@ from cosim.cli.options import JsonOption, ScenarioOption
 from cosim.cli.output import output
 
 
+class Format(StrEnum):
+    """What the controller is written as."""
+
+    FMU = "fmu"
+    C = "c"
+
+
 def export(
     controller: Annotated[
         str, typer.Argument(help="naive, tuned or a parameters file (.toml) of a training.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Write the controller's FMU here.")],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The FMU's file; with --format c a folder.")
+    ],
     scenario: ScenarioOption = "paper",
+    format_: Annotated[
+        Format, typer.Option("--format", help="fmu, or c: one .c and .h, no FMI.")
+    ] = Format.FMU,
     fmi: Annotated[int, typer.Option("--fmi", help="FMI version: 2 or 3.", min=2, max=3)] = 2,
     local: Annotated[
         bool,
@@ -31,7 +44,7 @@ def export(
     ] = 0,
     json: JsonOption = False,
 ) -> None:
-    """Write an RTI-NMPC as a self-contained co-simulation FMU that needs no Python.
+    """Write an RTI-NMPC as a self-contained co-simulation FMU, or C, that needs no Python.
 
     For Linux, Windows and macOS, x86_64 and ARM64 (pip install 'rti-cosim\\[cross]'); without that
     package, or with --local, for this machine by its C compiler. θ are tunable parameters.
@@ -51,6 +64,18 @@ def export(
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
         loaded = Scenario.load(scenario)
         rti = rti_controller(controller, loaded)
+        if format_ is Format.C:
+            if ssp is not None:
+                raise CosimError("--ssp connects FMUs: leave --format c out")
+            from cosim.cli.controller_fmu import write_c
+
+            summary = write_c(rti, loaded, out)
+            out_.note(f"wrote {', '.join(summary['files'])} to {out}")
+            header = ("processor", "flash", "static", "stack", "instance")
+            rows = [(name, *map(str, sizes.values())) for name, sizes in summary["bytes"].items()]
+            out_.table("bytes, by clang -Os", header, rows)
+            out_.json(summary)
+            return
         out_.announce(loaded)
         with FmuPlant(loaded) as plant:
             units = plant.units

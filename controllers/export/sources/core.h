@@ -76,7 +76,7 @@ static inline int core_plausible(const CoreState *state) {
 
 /* Outputs in the order of the table of variables: action, value, status, residual, iterations,
  * failures, predicted states by stage, predicted actions by stage. */
-static void core_outputs(const CoreState *state, double y[]) {
+static inline void core_outputs(const CoreState *state, double y[]) {
     const RtiSolution *solution = &state->solution;
     for (int i = 0; i < N_U; i++) *y++ = state->action[i];
     *y++ = solution->value;

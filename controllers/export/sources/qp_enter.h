@@ -4,7 +4,10 @@
 
 #include "qp_set.h"
 
-enum { QP_ITERATIONS = 40 * QP_LIMITS };
+/* Steps after which a QP is given up. */
+#ifndef QP_ITERATIONS
+#define QP_ITERATIONS (40 * QP_LIMITS)
+#endif
 
 /* Changes of a multiplier that are zero, relative to the constraints' norms. */
 #define QP_ROUNDING 1e-11

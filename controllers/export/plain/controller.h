@@ -1,0 +1,62 @@
+/* $title
+ *
+ * Written by `cosim export --format c` of rti-cosim $version (MIT licence). C99, no FMI, no
+ * allocation, no files; of libm only sqrt, besides what the model calls.
+ *
+ *     static $Name controller;
+ *     ${name}_init(&controller);
+ *     every $sampling_time s:
+ *         status = ${name}_step(&controller, measured, action);
+ */
+#ifndef ${NAME}_H
+#define ${NAME}_H
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define ${NAME}_SAMPLING_TIME $sampling_time /* s */
+
+enum {
+    ${NAME}_STATES = $n,  /* $states */
+    ${NAME}_ACTIONS = $m, /* $actions */
+    ${NAME}_THETA = $parameters,
+    ${NAME}_MEMORY = $memory
+};
+
+/* What a sample may end with. All but the first hold the last action (at first the reference). */
+enum {
+$statuses
+};
+
+/* theta may be changed between samples; the other members are the controller's own. */
+typedef struct {
+    double theta[${NAME}_THETA];
+    double memory[${NAME}_MEMORY];
+} $Name;
+
+typedef struct {
+    double value;        /* V of the state */
+    double kkt_residual; /* the largest, of the last QP that was solved */
+    int iterations;      /* of the QP solver, in that QP */
+    double failures;     /* samples that held the last action, so far */
+} ${Name}Report;
+
+/* The trained theta, the reference action, no memory of earlier samples. */
+void ${name}_init($Name *controller);
+
+/* The action for a measured state, within its bounds; returns the status. A state that is not
+ * finite is a failure like any other. */
+int ${name}_step($Name *controller, const double state[${NAME}_STATES], double action[${NAME}_ACTIONS]);
+
+/* A status in words. */
+const char *${name}_message(int status);
+
+/* On the last sample. */
+void ${name}_report(const $Name *controller, ${Name}Report *report);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,103 @@
+"""The controller as plain C: built as a user builds it, held to the Python controller."""
+
+import os
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from controllers import RtiNmpc
+from controllers.errors import ControllerError
+from controllers.export import core, plain_c
+from controllers.factories import tuned
+from cosim import FmuPlant, Scenario, simulate
+from tests.helpers.command import run_cosim
+
+CC = os.environ.get("CC", "cc")
+pytestmark = pytest.mark.skipif(shutil.which(CC) is None, reason="there is no C compiler")
+FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-ffp-contract=off")
+
+
+def built(folder, *flags):
+    """The example program of the C in `folder`, built."""
+    program = folder / "example"
+    names = sorted(path.name for path in folder.glob("*.c"))
+    subprocess.run([CC, *FLAGS, *flags, *names, "-o", program, "-lm"], cwd=folder, check=True)
+    return program
+
+
+def rows(program, states):
+    """Action, status, iterations and value of each sample."""
+    text = "\n".join(" ".join(map(repr, s)) for s in np.asarray(states).tolist())
+    result = subprocess.run([program], input=text, capture_output=True, text=True, check=True)
+    return np.array([list(map(float, line.split())) for line in result.stdout.splitlines()])
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plain") / "evaporator_nmpc"
+    run_cosim("export", "tuned", "--format", "c", "--out", folder, "--json", check=True)
+    return folder
+
+
+def test_the_program_gives_the_actions_of_the_python_controller(exported):
+    scenario = Scenario.load("paper")
+    with FmuPlant(scenario) as plant:
+        run = simulate(plant, tuned(scenario), 200, 4)
+    states = np.stack([run[name] for name in scenario.plant.states], axis=1)
+    found = rows(built(exported), states)
+    expected = np.stack([run[name] for name in scenario.plant.actions], axis=1)
+    np.testing.assert_allclose(found[:, :2], expected, rtol=0, atol=1e-10)
+    assert set(found[:, 2]) == {0}
+
+
+def test_a_failed_sensor_holds_the_last_action_and_the_iteration_cap_is_a_failure(exported):
+    first, failed, after = rows(built(exported), [(25, 50), (np.nan, 50), (25, 50)])
+    assert (failed[2], after[2]) == (3, 0)
+    np.testing.assert_array_equal(failed[:2], first[:2])
+    capped = rows(built(exported, "-DQP_ITERATIONS=1"), [(20, 40)])
+    assert capped[0, 2] == 2
+
+
+def test_it_calls_no_more_than_it_says(exported):
+    """No allocation, no input or output; of libm what the header lists."""
+    subprocess.run(
+        [CC, "-std=c99", "-O2", "-c", "evaporator_nmpc.c", "-o", "object.o"], cwd=exported,
+        check=True,
+    )  # fmt: skip
+    result = subprocess.run(
+        ["nm", "-u", exported / "object.o"], capture_output=True, text=True, check=True
+    )
+    called = set(re.findall(r" U (\w+)", result.stdout)) - {"_GLOBAL_OFFSET_TABLE_"}
+    assert called <= {"memcpy", "memmove", "memset", "sqrt", "__stack_chk_fail"}
+    header = (exported / "evaporator_nmpc.h").read_text()
+    assert "EVAPORATOR_NMPC_STATES = 2,  /* X2, P2 */" in header
+
+
+def test_two_controllers_link_into_one_program(exported, tmp_path):
+    for name in ("one", "other"):
+        scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})
+        controller = tuned(scenario)
+        assert type(controller) is RtiNmpc
+        files = plain_c(core(controller.problem, controller.parameters), name, scenario)
+        for file in (f"{name}.c", f"{name}.h"):
+            (tmp_path / file).write_text(files[file])
+    calls = "static One a; static Other b; one_init(&a); other_init(&b); return 0;"
+    text = f'#include "one.h"\n#include "other.h"\nint main(void) {{ {calls} }}\n'
+    (tmp_path / "main.c").write_text(text)
+    built(tmp_path)
+    with pytest.raises(ControllerError, match="no name for C"):
+        plain_c(core(controller.problem, controller.parameters), "1x", scenario)
+
+
+@pytest.mark.slow
+def test_the_worst_case_of_the_qp_solver(exported):
+    """Iterations over states about and beyond the bounds, each a jump from the one before."""
+    rng = np.random.default_rng(0)
+    states = rng.uniform((15, 35), (40, 80), (20_000, 2))
+    found = rows(built(exported), states)
+    print(f"\nworst of {len(found)}: {found[:, 3].max():.0f} iterations, mean {found[:, 3].mean()}")
+    assert set(found[:, 2]) == {0}
+    assert found[:, 3].max() < 100

@@ -386,3 +386,26 @@ class IdentifiedSimulator(Identified):
     """`Identified` on a plant that is put back before each stretch of the search."""
 
     asks_for = "simulator"
+
+
+class Held:
+    """θ as it starts, all the time: what learning in operation is compared with."""
+
+    Configuration: ClassVar = GreedyConfiguration
+    asks_for: ClassVar = "operation"
+    needs_action_value: ClassVar = False
+    needs_points: ClassVar = False
+    explores: ClassVar = False
+
+    def __init__(self, *_: Any) -> None: ...
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Learn nothing."""
+        return None
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Nothing to keep."""
+        return {}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Nothing to take back."""

@@ -83,6 +83,16 @@ def document(plan: Plan) -> dict[str, Any]:
         "pictures": [],
         "made_with": dict(plan.provenance) | {"commit": commit()},
     }
+    if (table := definition.table.operation) is not None:
+        about["operation"] = {
+            name: {
+                "sampling_time": scenario.sampling_time,
+                "marks": (marks := definition.marks(name)),
+                "columns": [m for m in definition.samples_of(table.columns, name) if m in marks]
+                or marks,
+            }
+            for name, scenario in definition.scenarios.items()
+        }
     if (settings := definition.table.theta) is not None:
         about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
     found: dict[str, Any] = json.loads(json.dumps(about))
@@ -147,11 +157,14 @@ def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.Data
 
 
 def timing(plan: Plan, out: Path) -> pd.DataFrame:
-    """Seconds that each run's training took."""
+    """Seconds that each run's training took; in operation the processor's up to each mark, too."""
     rows = []
     for run in plan.runs:
         path = out / run.key.folder / RUN
         document = read_json(path, f"'{path}'", StudyError) if path.is_file() else {}
-        seconds = document.get("timing", {}).get("wall_seconds", 0.0)
-        rows.append({"run": str(run.key), "training_seconds": float(seconds)})
+        clock = document.get("timing", {})
+        seconds = {str(run.key): clock.get("wall_seconds", 0.0)}
+        marks = clock.get("processor_seconds", {})
+        seconds |= {f"{run.key}, sample {mark}": value for mark, value in marks.items()}
+        rows += [{"run": name, "training_seconds": float(value)} for name, value in seconds.items()]
     return pd.DataFrame(rows, columns=["run", "training_seconds"])

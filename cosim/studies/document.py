@@ -33,6 +33,8 @@ Source = Annotated[str, Field(min_length=1)]
 PerScenario = Count | dict[str, Count]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""
 DEFAULT = "default"
+Hour = Annotated[float, Field(gt=0.0)]
+Hours = Annotated[list[Hour], Field(min_length=1)]
 
 
 class Table(BaseModel):
@@ -96,6 +98,19 @@ class OnlineTable(Table):
         if self.period % self.block:
             raise ValueError(f"period: must be a multiple of block = {self.block}")
         return self
+
+
+class OperationTable(Table):
+    """Learning in operation: every training runs from one plant sample to the next, without reset.
+
+    Its θ is judged, greedily, at the given times, each on the plant as it is then, on the noise of
+    `[curves]`. Algorithms ask for `operation`; the last time is the length of every run.
+    """
+
+    hours: Hours | dict[str, Hours]
+    """Times in hours of operation, for all scenarios or by a scenario's name, with `default`."""
+    columns: list[Hour] = []
+    """Those of them that tables show; all, if left out."""
 
 
 class ThetaTable(Table):
@@ -206,6 +221,8 @@ class StudyTable(Table):
     """Table `[curves]`."""
     online: OnlineTable | None = None
     """Table `[online]`: what the runs themselves cost; not measured, if left out."""
+    operation: OperationTable | None = None
+    """Table `[operation]`: runs are judged at given times of operation."""
     theta: ThetaTable | None = None
     """Table `[theta]`: where θ went; not shown, if left out."""
     case: Annotated[list[CaseTable], Field(min_length=1)]

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
+from math import gcd
 from pathlib import Path
-from typing import Any, Self, get_args, get_origin
+from typing import Any, Self, TypeVar, get_args, get_origin
+
+import numpy as np
 
 from controllers.problem import Problem
 from controllers.theta import Parameters
@@ -23,7 +26,6 @@ from cosim.scenario import Scenario, resolved
 from cosim.studies.document import (
     DEFAULT,
     CaseTable,
-    PerScenario,
     StudyTable,
     TrajectoryTable,
     read,
@@ -42,6 +44,7 @@ HELD_OUT = 1_000_000
 """First of the held-out seeds of greedy evaluations during training."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
+T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
 
 
@@ -88,14 +91,15 @@ class Training:
             self.algorithm, self.scenario, self.samples, self.settings, dict(self.options)
         )
 
-    def controller(self, parameters: str) -> Controller:
-        """The greedy controller of the θ that a TOML text holds."""
+    def controller(self, parameters: str, theta: Sequence[float] = ()) -> Controller:
+        """The greedy controller of the θ that a TOML text holds, or of another θ of its blocks."""
         problem = Problem.from_scenario(self.scenario)
         with temporary_folder("cosim-theta-") as folder:
             path = folder / "parameters.toml"
             path.write_text(parameters, "utf-8")
-            theta = Parameters.load(path, problem)
-        return build_controller(self.options["controller"], self.scenario, theta)
+            found = Parameters.load(path, problem)
+        found = found.with_theta(np.array(theta)) if theta else found
+        return build_controller(self.options["controller"], self.scenario, found)
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,11 @@ class Online:
     seeds: tuple[int, ...]
     steps: int
     block: int
+
+
+def greedy_file(mark: int) -> str:
+    """File of a run's greedy evaluation of θ after `mark` samples of operation."""
+    return f"greedy-{mark}.csv"
 
 
 def safe(name: str) -> str:
@@ -163,7 +172,8 @@ class Run:
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
     training. `greedy` says whether a controller runs on the noise of the learning curves, too;
-    `settle` whether its settling time is wanted; `traces` are runs kept sample by sample.
+    `settle` whether its settling time is wanted; `traces` are runs kept sample by sample. `marks`
+    are the samples of operation at which θ, or the optimum, is judged.
     """
 
     key: RunKey
@@ -177,20 +187,20 @@ class Run:
     traces: tuple[TrajectoryTable, ...] = ()
     online: Online | None = None
     settle: bool = False
+    marks: tuple[int, ...] = ()
 
     @property
     def noise(self) -> dict[str, tuple[tuple[int, ...], int]]:
         """Seeds and samples on each, by the file that keeps the indicators."""
         sizes = self.sizes
         found = {EVALUATION: (sizes.seeds, sizes.steps)}
-        if self.greedy:
-            held_out = tuple(HELD_OUT + k for k in range(sizes.curve_seeds))
-            found[GREEDY] = (held_out, sizes.curve_steps)
-        return found
+        held_out = tuple(HELD_OUT + k for k in range(sizes.curve_seeds))
+        files = [*([GREEDY] if self.greedy else []), *map(greedy_file, self.marks)]
+        return found | dict.fromkeys(files, (held_out, sizes.curve_steps))
 
     def burn_in(self, file: str) -> int:
         """Samples run before those that count; learning curves have none."""
-        return self.sizes.burn_in if file == EVALUATION else 0
+        return 0 if file == GREEDY else self.sizes.burn_in
 
     @property
     def samples(self) -> int:
@@ -394,8 +404,20 @@ class Study:
             self._of(curves.steps, scenario, "curves.steps"),
         )
 
-    def _of(self, value: PerScenario, scenario: str, field: str) -> int:
-        if isinstance(value, int):
+    def marks(self, scenario: str) -> tuple[int, ...]:
+        """Samples of operation at which a scenario's runs are judged; none of another study."""
+        if self.table.operation is None:
+            return ()
+        hours = self._of(self.table.operation.hours, scenario, "operation.hours")
+        return self.samples_of(hours, scenario)
+
+    def samples_of(self, hours: Iterable[float], scenario: str) -> tuple[int, ...]:
+        """Hours of operation as samples, increasing."""
+        h = self.scenarios[scenario].sampling_time
+        return tuple(sorted({max(1, round(3600.0 * hour / h)) for hour in hours}))
+
+    def _of(self, value: T | dict[str, T], scenario: str, field: str) -> T:
+        if not isinstance(value, dict):
             return value
         names = [*self.scenarios, DEFAULT]
         if unknown := [name for name in value if name not in names]:
@@ -411,8 +433,15 @@ class Study:
     def training(self, case: Case, scenario: str, seed: int) -> Training:
         """The training of a case on a scenario with one seed; raises ConfigurationError."""
         assert case.algorithm is not None
-        sizes = self.sizes(scenario)
-        between = max(1, case.samples // self.table.curves.points)
+        sizes, samples = self.sizes(scenario), case.samples
+        if marks := self.marks(scenario):
+            samples = marks[-1]
+            if (asked := load_algorithm(case.algorithm).asks_for) != "operation":
+                raise ConfigurationError(
+                    f"case '{case.name}': '{case.algorithm}' asks for a {asked}, and a study in "
+                    "operation has none"
+                )
+        between = max(1, samples // self.table.curves.points)
         rows = -(-between // ROW)
         log_every = max(1, between // rows)
         if (online := self.table.online) is not None:
@@ -430,7 +459,7 @@ class Study:
             **case.training,
         }
         return Training(
-            case.algorithm, self.scenarios[scenario], case.samples, dict(case.settings), options
+            case.algorithm, self.scenarios[scenario], samples, dict(case.settings), options
         )
 
 
@@ -479,6 +508,7 @@ def plan(study: Study) -> Plan:
                 "options": {**training.options, "start": study.relative(case.start)},
             }
         beside = None if training is not None else _online(study, case, scenario)
+        judged = training is not None or case.name == study.optima.get(scenario)
         runs.append(
             Run(
                 RunKey(scenario, case.name, seed),
@@ -491,6 +521,7 @@ def plan(study: Study) -> Plan:
                 training is None and any(case.algorithm for case in _on(study, scenario)),
                 _traces(study, case, scenario, seed),
                 beside,
+                marks=study.marks(scenario) if judged else (),
             )
         )
     _check_names(study)
@@ -539,11 +570,13 @@ def _traces(
 def _online(study: Study, controller: Case, scenario: str) -> Online | None:
     """The trainings that a controller of the study, or the optimum, runs beside."""
     trained = [case for case in _on(study, scenario) if case.algorithm]
-    wanted = controller in study.cases or controller.name == study.optima.get(scenario)
-    if study.table.online is None or not trained or not wanted:
+    best = controller.name == study.optima.get(scenario)
+    seeds = tuple(sorted({seed for case in trained for seed in case.training_seeds}))
+    if best and trained and (marks := study.marks(scenario)):
+        return Online(seeds, marks[-1], gcd(*marks))
+    if study.table.online is None or not trained or not (best or controller in study.cases):
         return None
-    seeds = sorted({seed for case in trained for seed in case.training_seeds})
-    return Online(tuple(seeds), max(case.samples for case in trained), study.table.online.block)
+    return Online(seeds, max(case.samples for case in trained), study.table.online.block)
 
 
 def _check_names(study: Study) -> None:

@@ -72,6 +72,10 @@ CAPTIONS = {
     "last point. Dashed: baselines on the noise of the curves.",
     "online": "Cost of the runs themselves, exploration included: regret against the optimum on "
     "the same noise, mean over training seeds; above, from the log of the first training seed.",
+    "operation": "Learning in operation, on one trajectory without a reset: left the greedy policy "
+    "of the θ that the run would hand over, on held-out noise; right the run's own samples, "
+    "exploration included. Medians over training seeds, bands from the best run to the worst; "
+    "baselines are dashed.",
     "profile": "Performance profile: the share of runs whose regret is at most so much.",
 }
 

@@ -26,7 +26,7 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import collect, figures, online, paper, report, theta
+from cosim.studies import collect, figures, online, operation, paper, report, theta
 from cosim.studies.plan import EVALUATION, safe
 from cosim.studies.report import COLUMNS, SHORT
 from cosim.studies.store import INDICATORS, ONLINE
@@ -42,6 +42,7 @@ Array = NDArray[np.float64]
 ABOUT = "study.json"
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
 THETA, TIMING, LOGS = "theta.csv", "timing.csv", "logs"
+OPERATION, GREEDY = "operation.csv", "greedy.csv"
 SUFFIXES = ("svg", "png")
 BASELINES = "baselines"
 LEVELS = 4
@@ -134,6 +135,8 @@ class StudyResults:
         }
         if self.about["online"] is not None:
             tables[ONLINE] = online.collected(runs, self.curves, out)
+        if self.about.get("operation"):
+            tables[OPERATION], tables[GREEDY] = operation.collected(runs, out)
         if "theta" in self.about:
             tables[THETA] = theta.collected(runs, out)
         if len(self.aggregate):
@@ -427,6 +430,11 @@ class StudyResults:
                 optimum = self.about["optimum"].get(scenario, "")
                 own = self.online[self.online.scenario == scenario]
                 found.append(online.table(own, scenario, optimum, self.about["online"]))
+        for scenario in self.about.get("operation") or ():
+            about = self.about["operation"][scenario]
+            found += operation.tables(
+                self._judged(scenario), scenario, about, self._against, self._seconds(scenario)
+            )
         if self.about.get("theta") is not None:
             frame = read_table(self.folder / THETA)
             trained = [name for name, case in self.cases.items() if case["trained"]]
@@ -459,6 +467,7 @@ class StudyResults:
             "curves": self._curves,
             "regret": self._regret,
             "online": self._online,
+            "operation": self._operation,
             "profile": self._profile,
         }
 
@@ -534,6 +543,38 @@ class StudyResults:
             return None
         logs = {case: log for case in courses if (log := self.log(case, scenario)) is not None}
         return online.online_figure(courses, logs, self._looks, self.about["online"], optimum)
+
+    def _judged(self, scenario: str) -> operation.Judged:
+        lives = read_table(self.folder / OPERATION, types={"samples": int})
+        greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
+        optimum = self.about["optimum"].get(scenario, "")
+        return operation.judged(
+            lives[lives.scenario == scenario], greedy[greedy.scenario == scenario], optimum
+        )
+
+    @property
+    def _against(self) -> dict[str, str | None]:
+        return {name: case.get("against") for name, case in self.cases.items()}
+
+    def _seconds(self, scenario: str) -> dict[str, float]:
+        """Median processor time in s of a case's runs, up to their last sample."""
+        path = self.folder / TIMING
+        if not path.is_file():
+            return {}
+        clock = read_table(path, types={"run": str}).set_index("run").training_seconds
+        last = self.about["operation"][scenario]["columns"][-1]
+        own = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
+        names = own.case + " on " + scenario + ", seed " + own.training_seed.astype(str)
+        seconds = (names + f", sample {last}").map(clock)
+        found: dict[str, float] = seconds.groupby(own.case).median().to_dict()
+        return found
+
+    def _operation(self, scenario: str) -> Figure | None:
+        if scenario not in (self.about.get("operation") or {}):
+            return None
+        baselines = [name for name, case in self.cases.items() if case["group"] == BASELINES]
+        about, judged = self.about["operation"][scenario], self._judged(scenario)
+        return operation.operation_figure(judged, about, self._looks, baselines)
 
     def _profile(self, scenario: str) -> Figure | None:
         """Of one scenario, or, for "", of all whose J* is known, where they are several."""

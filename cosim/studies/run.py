@@ -27,9 +27,10 @@ from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
+from cosim.studies import operation
 from cosim.studies.cluster import on_cluster
 from cosim.studies.document import TrajectoryTable
-from cosim.studies.plan import EVALUATION, Plan, Run, Study, Training, plan
+from cosim.studies.plan import EVALUATION, Plan, Run, Study, Training, greedy_file, plan
 from cosim.studies.results import StudyResults
 from cosim.studies.store import CHECKPOINT, INDICATORS, Figures, RunStore, Trained
 from learning.log import COLUMNS, LogRow, to_csv
@@ -76,7 +77,8 @@ class Item:
     `file`; the run itself, where a `trace` is asked for; means over `block` samples, where that is
     not 0; the time in which it comes to rest, where it shall `settle`. `samples` are those of all
     the controller's items. The controller is a text for `build_controller`, a factory(scenario),
-    or the `training`'s with θ = `parameters`.
+    or the `training`'s with θ = `parameters`. A training in operation is judged at its `marks`; a
+    policy at the one that is its last, with the `theta` that it had then.
     """
 
     run: str
@@ -93,6 +95,8 @@ class Item:
     trace: TrajectoryTable | None = None
     block: int = 0
     settle: bool = False
+    marks: tuple[int, ...] = ()
+    theta: tuple[float, ...] = ()
     samples: int = 0
 
 
@@ -120,7 +124,7 @@ def perform(item: Item) -> tuple[Item, Outcome]:
     try:
         item.place.enter(item.scenario)
         if item.training is not None and not item.parameters:
-            return item, _train(item.training, item.folder)
+            return item, _train(item.training, item.folder, item.marks)
         return item, _simulate(item)
     except (KeyboardInterrupt, Terminated):
         raise
@@ -133,8 +137,15 @@ def perform(item: Item) -> tuple[Item, Outcome]:
         return item, Failure(message, traceback.format_exc(), kind)
 
 
-def _train(training: Training, folder: Path | None) -> Trained:
+def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> Trained:
     run, begin = training.prepare(), perf_counter()
+    if marks:
+        lived, status, clock, taken = operation.live(run, marks)
+        with temporary_folder("cosim-training-") as own:
+            lived[-1].parameters.save(own / "theta.toml")
+            theta = (own / "theta.toml").read_text("utf-8")
+        seconds = perf_counter() - begin
+        return Trained(marks[-1], status, to_csv(lived), theta, taken, seconds, clock)
     with temporary_folder("cosim-training-") as own:
         out = folder or own
         result = run_training(run, out, resume=(out / CHECKPOINT).is_file())
@@ -158,6 +169,8 @@ def _simulate(item: Item) -> Measured | str | list[float] | float:
     compile_functions(controller, item.samples)
     scenario = displaced(item.scenario) if item.settle else item.scenario
     assert scenario is not None
+    if item.marks:
+        scenario = operation.plant_at(scenario, item.marks[-1] * scenario.sampling_time)
     with FmuPlant(scenario) as plant:
         if item.settle:
             return settling_time(simulate(plant, controller, item.steps, 0, residuals=False))
@@ -177,7 +190,9 @@ def _simulate(item: Item) -> Measured | str | list[float] | float:
 
 def _controller(item: Item) -> Controller:
     if item.training is not None:
-        return item.training.controller(item.parameters)
+        return item.training.controller(item.parameters, item.theta)
+    if item.marks:
+        return operation.optimum_at(item.scenario, item.marks[-1])
     if isinstance(item.controller, str):
         return build_controller(item.controller, item.scenario)
     controller: Controller = item.controller(item.scenario)
@@ -268,7 +283,8 @@ class Runner:
             base = replace(base, training=run.training)
             if not store.status:
                 store.unseal()
-                yield replace(base, folder=store.folder.absolute() if shared_disk else None)
+                shared = store.folder.absolute() if shared_disk else None
+                yield replace(base, folder=shared, marks=run.marks)
                 return
             base = replace(base, parameters=store.parameters)
             self._done[name] = trained
@@ -276,9 +292,14 @@ class Runner:
             missing, burn_in = store.missing(file), run.burn_in(file)
             self._done[name] += (len(seeds) - len(missing)) * (burn_in + steps)
             size = max(1, BLOCK // (burn_in + steps))
+            mark = next((mark for mark in run.marks if greedy_file(mark) == file), None)
+            at_mark = base
+            if mark is not None and missing:
+                theta = () if run.training is None else operation.theta_at(store.log, mark)
+                at_mark = replace(base, marks=(mark,), theta=theta)
             for first in range(0, len(missing), size):
                 block = tuple(missing[first : first + size])
-                yield replace(base, file=file, seeds=block, steps=steps, burn_in=burn_in)
+                yield replace(at_mark, file=file, seeds=block, steps=steps, burn_in=burn_in)
         for trace in run.traces:
             if store.trajectory(trace).is_file():
                 self._done[name] += trace.steps

@@ -14,7 +14,7 @@ import hashlib
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ RUN, CHECKPOINT = "run.json", "checkpoint.npz"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
 FAILURE, ONLINE, TIMING = "failure.txt", "online.csv", "timing.csv"
 OURS = (CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, ONLINE, TIMING)
-TRACE = "trajectory-*.csv"
+PATTERNS = ("trajectory-*.csv", "greedy-*.csv")
 INDICATORS = (
     "J",
     "economic_cost",
@@ -47,7 +47,8 @@ Figures = dict[str, float]
 @dataclass(frozen=True)
 class Trained:
     """A training at its end: `status` is `finished` or `diverged: …`, `log` learning.csv,
-    `parameters` θ as text, `plant_samples` all that the plant gave for it."""
+    `parameters` θ as text, `plant_samples` all that the plant gave for it; `clock` the processor
+    time in s up to each mark of operation."""
 
     samples: int
     status: str
@@ -55,6 +56,7 @@ class Trained:
     parameters: str
     plant_samples: int
     wall_seconds: float
+    clock: Mapping[int, float] = field(default_factory=dict)
 
 
 class RunStore:
@@ -85,7 +87,7 @@ class RunStore:
         """run.json, where it and the files that it vouches for are whole; else {}."""
         path = self.folder / RUN
         if not path.is_file():
-            if any(p.name in OURS or p.match(TRACE) for p in self.folder.glob("*")):
+            if any(map(_ours, self.folder.glob("*"))):
                 raise StudyError(
                     f"'{self.folder}' has no {RUN} and is no run of a study; move it away, or "
                     "choose another --out"
@@ -114,7 +116,7 @@ class RunStore:
     def _begin(self) -> None:
         """Delete what the run has left, file by file, and mark the folder as its own."""
         for path in self.folder.glob("*"):
-            if path.name in OURS or path.match(TRACE):
+            if _ours(path):
                 path.unlink()
         self.folder.mkdir(parents=True, exist_ok=True)
         self._about = {"facts": self._facts}
@@ -154,7 +156,7 @@ class RunStore:
             status=trained.status,
             samples=trained.samples,
             plant_samples=trained.plant_samples,
-            timing={"wall_seconds": trained.wall_seconds},
+            timing={"wall_seconds": trained.wall_seconds, "processor_seconds": trained.clock},
         )
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
@@ -297,7 +299,7 @@ class RunStore:
     def seal(self) -> None:
         """Note the hashes of a finished run's files, so that a torn or edited one is noticed."""
         self.flush()
-        paths = [path for path in self.folder.glob("*") if path.name in OURS or path.match(TRACE)]
+        paths = filter(_ours, self.folder.glob("*"))
         files = {path.name: _digest(path) for path in sorted(paths) if path.name != TIMING}
         if self._about.get("files") != files:
             self.note(files=files)
@@ -306,6 +308,11 @@ class RunStore:
         """Forget the hashes before more is written."""
         if self._about.get("files"):
             self.note(files={})
+
+
+def _ours(path: Path) -> bool:
+    """Whether a file is one that a run of a study writes."""
+    return path.name in OURS or any(map(path.match, PATTERNS))
 
 
 def _digest(path: Path) -> str:

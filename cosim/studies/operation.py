@@ -1,0 +1,327 @@
+"""Learning in operation: what the samples of a run cost, and how good its θ is at given times."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import process_time
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, NullFormatter
+from numpy.typing import NDArray
+
+from controllers import compile_functions
+from controllers.optimum import Fouling, QuasiStaticPolicy, change_of
+from cosim.figures.style import (
+    DASHED,
+    REFERENCE,
+    EndLabel,
+    Look,
+    figure,
+    label_ends,
+    plain,
+    regret_axis,
+)
+from cosim.penalty import VIOLATING
+from cosim.plant import FmuPlant
+from cosim.plugins import build_controller
+from cosim.protocols import Controller
+from cosim.scenario import Scenario
+from cosim.statistics import paired_difference, shown
+from cosim.studies.plan import Run, greedy_file
+from cosim.studies.store import LOG, ONLINE
+from cosim.studies.tables import KEYS, read_table
+from learning.algorithm import load_algorithm
+from learning.errors import DivergenceError
+from learning.log import LogRow
+from learning.loop import begin
+from learning.training_run import TrainingRun
+
+Array = NDArray[np.float64]
+Table = tuple[str, Sequence[str], list[list[str]]]
+"""Title, header and rows."""
+WINDOW = 100
+"""Samples in a row of which the dearest are reported."""
+LIFE = ["J", "violating", "dearest", "first_change", "updates", "model_samples"]
+COLUMNS = [*KEYS, "samples", *LIFE]
+GREEDY_COLUMNS = [*KEYS, "samples", "seed", "J"]
+
+
+def plant_at(scenario: Scenario, time: float) -> Scenario:
+    """The scenario of a plant that stays as it is at a time in s."""
+    law = change_of(scenario)
+    if isinstance(law, Fouling):
+        return scenario.replace(
+            {"plant": {"parameters": law.present(time) | {"fouling_rate": 0.0}}}
+        )
+    return scenario.at(time)
+
+
+class StoppedPolicy(QuasiStaticPolicy):
+    """The reference of a plant that fouls, its clock stopped at a `sample`."""
+
+    sample = 0
+
+    def prepare(self) -> None:
+        """Leave the clock where it stopped."""
+        self._sample = self.sample
+
+
+def optimum_at(scenario: Scenario, sample: int) -> Controller:
+    """The optimal policy of the plant as it is at a sample."""
+    if not isinstance(change_of(scenario), Fouling):
+        return build_controller("optimal", plant_at(scenario, sample * scenario.sampling_time))
+    moving = QuasiStaticPolicy.from_scenario(scenario)
+    found = StoppedPolicy(moving.law, moving.policies, scenario.sampling_time)
+    found.sample = sample
+    return found
+
+
+def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dict[int, float], int]:
+    """Take the samples of a run on its plant; rows of `LIFE` and θ after each of the `marks`.
+
+    Also the status, the processor time in s by mark, and the plant samples taken. `J` is the mean
+    cost of all samples so far; since the first change of θ (since the start, where θ rests)
+    `violating` is the share of violating samples and `dearest` the largest mean cost of `WINDOW`
+    samples in a row. A run that diverges keeps its θ, and costs without bound from there on.
+    """
+    cost, violating = np.full(run.samples, np.inf), np.ones(run.samples, dtype=bool)
+    rows: list[LogRow] = []
+    clock: dict[int, float] = {}
+    status, first, updates, start = "finished", 0, 0, process_time()
+    with FmuPlant(run.scenario) as plant:
+        loop = begin(run, load_algorithm(run.algorithm), plant)
+        compile_functions(loop.controller, run.samples)
+        theta, penalty = loop.controller.theta.copy(), run.scenario.state_penalty
+        for k in range(run.samples):
+            if status == "finished":
+                violating[k] = float(penalty.violation(loop.s).sum()) > VIOLATING
+                try:
+                    cost[k], update = loop.advance()
+                    updates += update is not None
+                    if not first and not np.array_equal(theta, loop.controller.theta):
+                        first = k + 1
+                except DivergenceError as error:
+                    status = f"diverged: {error} at sample {k + 1}"
+            if k + 1 not in marks:
+                continue
+            clock[k + 1] = process_time() - start
+            figures = {
+                "samples": k + 1,
+                "J": float(cost[: k + 1].mean()),
+                "violating": float(violating[first : k + 1].mean()),
+                "dearest": dearest(cost[first : k + 1]),
+                "first_change": first or np.nan,
+                "updates": updates,
+                "model_samples": int(getattr(loop.algorithm, "model_samples", 0)),
+            }
+            rows.append(LogRow(figures, loop.parameters))
+        return rows, status, clock, loop.counts.number
+
+
+def dearest(cost: Array) -> float:
+    """Largest mean of `WINDOW` samples in a row of K, (K,); of all where there are fewer."""
+    if not np.isfinite(cost).all() or not len(cost):
+        return float("inf") if len(cost) else float("nan")
+    width = min(WINDOW, len(cost))
+    total = np.concatenate([[0.0], np.cumsum(cost)])
+    return float((total[width:] - total[:-width]).max() / width)
+
+
+def theta_at(log: str, mark: int) -> tuple[float, ...]:
+    """θ that a run would have handed over after `mark` samples, from the text of its log."""
+    rows = csv.DictReader(log.splitlines())
+    row = next(row for row in rows if int(row["samples"]) == mark)
+    return tuple(float(value) for name, value in row.items() if name.startswith("theta "))
+
+
+def collected(runs: Sequence[Run], out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows of the lives, by run and mark, and of the greedy evaluations, by noise seed, too.
+
+    The optimum has a life on the noise of every training seed, of which J is known.
+    """
+    lives, greedy = [], []
+    for run in (run for run in runs if run.marks):
+        folder, key = out / run.key.folder, run.key
+        names = {"scenario": key.scenario, "case": key.case}
+        for mark in run.marks:
+            rows = read_table(folder / greedy_file(mark), types={"seed": int})
+            greedy.append(rows.assign(**names, training_seed=key.seed, samples=mark))
+        if run.training is not None:
+            rows = read_table(folder / LOG, types={"samples": int})
+            lives.append(rows.assign(**names, training_seed=key.seed))
+        elif run.online is not None:
+            blocks = read_table(folder / ONLINE, types={"seed": int})
+            for seed, own in blocks.groupby("seed"):
+                ends = run.online.block * np.arange(1, len(own) + 1)
+                so_far = own.J.expanding().mean().to_numpy()
+                rows = pd.DataFrame({"samples": ends, "J": so_far})
+                rows = rows[rows.samples.isin(run.marks)]
+                lives.append(rows.assign(**names, training_seed=seed))
+    return tuple(
+        pd.concat(found, ignore_index=True)
+        .reindex(columns=columns)
+        .astype({"training_seed": "Int64"})
+        if found
+        else pd.DataFrame(columns=columns)
+        for found, columns in ((lives, COLUMNS), (greedy, GREEDY_COLUMNS))
+    )
+
+
+class Judged(NamedTuple):
+    """Operation on one scenario: by case and samples the greedy costs (R, S), and each run's life.
+
+    `greedy[case][samples]` (R, S), `optimum[samples]` (S,); `lives` has a row for each run and
+    mark with `regret` (greedy), `life_regret`, and `dearest` as a regret.
+    """
+
+    greedy: dict[str, dict[int, Array]]
+    optimum: dict[int, Array]
+    lives: pd.DataFrame
+
+
+def judged(lives: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> Judged:
+    """Regrets of the rows of a scenario; NaN without an optimum."""
+    costs: dict[str, dict[int, Array]] = {}
+    for (case, samples), rows in greedy.groupby(["case", "samples"], sort=False):
+        table = rows.assign(run=rows.training_seed.fillna(-1)).pivot(
+            index="run", columns="seed", values="J"
+        )
+        costs.setdefault(case, {})[int(samples)] = table.to_numpy(dtype=np.float64)
+    best = {samples: cost[0] for samples, cost in costs.pop(optimum, {}).items()}
+    where = ["training_seed", "samples"]
+    own = lives[lives.case == optimum][[*where, "J"]].rename(columns={"J": "optimal_J"})
+    found = lives[lives.case != optimum].merge(own, on=where, how="left")
+    mean = greedy.groupby([*KEYS[1:], "samples"]).J.mean().rename("greedy_J").reset_index()
+    found = found.merge(mean, on=[*KEYS[1:], "samples"], how="left")
+    level = found.samples.map({samples: float(cost.mean()) for samples, cost in best.items()})
+    found["regret"] = (found.greedy_J - level) / level.abs()
+    found["life_regret"] = (found.J - found.optimal_J) / found.optimal_J.abs()
+    found["dearest"] = (found.dearest - found.optimal_J) / found.optimal_J.abs()
+    return Judged(costs, best, found)
+
+
+def duration(seconds: float) -> str:
+    """A time of operation in words of a calendar: `8 h`, `7 d`."""
+    day = seconds / 86400.0
+    return f"{day:.3g} d" if day >= 1.0 else f"{seconds / 3600.0:.3g} h"
+
+
+def tables(
+    found: Judged,
+    scenario: str,
+    about: Mapping[str, Any],
+    against: Mapping[str, str | None],
+    seconds: Mapping[str, float],
+) -> list[Table]:
+    """Title, header and rows of a scenario's tables.
+
+    `about` holds its `sampling_time` and the samples of the `columns`; `against` the counterpart
+    of each case; `seconds` the processor time by case at the last of the samples.
+    """
+    marks, lives = about["columns"], found.lives
+    times = [duration(mark * about["sampling_time"]) for mark in marks]
+    result: list[Table] = []
+    for name, title in (
+        ("regret", "Greedy regret in % of the θ that a run would hand over, median (worst)"),
+        ("life_regret", "Regret in % of the run so far, exploration included, median (worst)"),
+    ):
+        grid = lives.pivot_table(
+            index="case", columns="samples", values=name, aggfunc=["median", "max"], sort=False
+        )
+        rows = [
+            [case, *(f"{_percent(row['median'][m])} ({_percent(row['max'][m])})" for m in marks)]
+            for case, row in grid.iterrows()
+        ]
+        result.append((f"{title}: `{scenario}`", ("case", *times), rows))
+    last = lives[lives.samples == marks[-1]].groupby("case", sort=False)
+    header = (
+        "case", "runs", "first change, samples", "violating % since", "dearest 100 samples %",
+        "updates", "model samples", "processor s",
+    )  # fmt: skip
+    middle = last.median(numeric_only=True)
+    rows = [
+        [
+            case, str(last.size()[case]), _whole(row.first_change),
+            f"{100 * row.violating:.2f}", f"{100 * row.dearest:.1f}", _whole(row.updates),
+            _whole(row.model_samples), _whole(seconds.get(str(case), np.nan)),
+        ]
+        for case, row in middle.iterrows()
+    ]  # fmt: skip
+    result.append((f"What {times[-1]} of operation took on `{scenario}`, medians", header, rows))
+    rows = []
+    for case, other in against.items():
+        pairs = [found.greedy.get(str(name), {}) for name in (case, other)]
+        if other and all(pairs) and found.optimum:
+            line = [f"{case} − {other}"]
+            for mark in marks:
+                one, two = np.broadcast_arrays(*(costs[mark] for costs in pairs))
+                value, ends, p = paired_difference(one, two, found.optimum[mark])
+                line.append(shown(value, ends, 100, 3) + ("" if np.isnan(p) else f", p {p:.2f}"))
+            rows.append(line)
+    if rows:
+        title = f"Greedy regret less the counterpart's, percentage points [95 %]: `{scenario}`"
+        result.append((title, ("case", *times), rows))
+    return result
+
+
+def _percent(share: float) -> str:
+    return shown(float(share), None, 100.0, 3)
+
+
+def _whole(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.0f}"
+
+
+def operation_figure(
+    found: Judged, about: Mapping[str, Any], looks: Mapping[str, Look], baselines: Sequence[str]
+) -> Figure:
+    """Greedy regret and regret so far against the plant's samples, on log axes.
+
+    Lines are medians over the training seeds, bands from the best to the worst; `baselines` are
+    dashed and have no bands. Vertical lines stand at an hour, a shift, a day, a week.
+    """
+    named = {"hour": 1, "shift": 8, "day": 24, "week": 168}
+    lives, h = found.lives, about["sampling_time"]
+    with figure(3.4) as drawn:
+        panels = drawn.subplots(1, 2, sharey=True)
+        titles = ("of θ, run greedily", "of the run so far, exploration included")
+        reached = 100 * lives[["regret", "life_regret"]].to_numpy(dtype=np.float64)
+        for axes, name, title in zip(panels, ("regret", "life_regret"), titles, strict=True):
+            ends = []
+            for case, rows in lives.groupby("case", sort=False):
+                runs = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
+                color, line = looks[str(case)]
+                known = case in baselines
+                axes.plot(
+                    runs.index, runs["median"], color=color, linestyle=DASHED if known else line,
+                    linewidth=0.9 if known else 1.5,
+                )  # fmt: skip
+                if not known:
+                    axes.fill_between(
+                        runs.index, runs["min"], runs["max"], color=color, alpha=0.12, linewidth=0
+                    )
+                ends.append(EndLabel(plain(str(case)), float(runs["median"].iloc[-1]), color))
+            axes.set_xscale("log")
+            first, end = float(lives.samples.min()), float(lives.samples.max())
+            axes.set_xlim(first, end)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            regret_axis(axes, "y", reached)
+            for text, hours in named.items():
+                if first <= (samples := hours * 3600.0 / h) <= end:
+                    axes.axvline(samples, color=REFERENCE, linewidth=0.7, linestyle=(0, (1, 2)))
+                    axes.annotate(
+                        text, (samples, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
+                        textcoords="offset points", ha="center", fontsize=6.5, color=REFERENCE,
+                    )  # fmt: skip
+            axes.set_title(title, pad=12)
+            axes.set_xlabel("samples of the plant")
+        panels[0].set_ylabel("regret %")
+        drawn.draw_without_rendering()
+        label_ends(panels[1], ends)
+    return drawn

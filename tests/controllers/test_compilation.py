@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from controllers import (
-    ControllerError,
     ConvergedNmpc,
     Parameters,
     Problem,
@@ -17,7 +16,7 @@ from controllers import (
     ThetaBlocks,
     functions,
 )
-from controllers.functions import BufferedFunction, bind_compiled, description, find_compiler
+from controllers.functions import BufferedFunction, bind_compiled, find_compiler
 from cosim.scenario import Scenario, presets
 from tests.helpers.command import run_cosim
 from tests.helpers.sampling import evaporator_problem
@@ -114,20 +113,6 @@ def test_a_long_run_compiles_and_a_shorter_one_finds_the_library(folder):
     assert len(list(folder.glob("*.lib"))) == 1
 
 
-@needs_compiler
-def test_a_library_in_a_folder_open_to_others_is_not_loaded(folder):
-    bind_compiled([small_function()])
-    folder.chmod(0o777)
-    functions.cache_folder.__globals__["_caches"].clear()
-    assert bind_compiled([small_function()], functions.LOOK) == "interpreted"
-
-
-def test_without_a_compiler_the_interpreter_works_and_says_so(folder, monkeypatch):
-    monkeypatch.setenv("CC", "no-such-compiler")
-    assert bind_compiled([small_function()]) == "interpreted"
-    assert "no C compiler" in description()
-
-
 def test_a_compiler_that_fails_or_hangs_leaves_the_interpreter(folder, monkeypatch, tmp_path):
     monkeypatch.setenv("CC", shutil.which("false") or sys.executable)
     assert bind_compiled([small_function()]) == "interpreted"
@@ -138,17 +123,6 @@ def test_a_compiler_that_fails_or_hangs_leaves_the_interpreter(folder, monkeypat
     monkeypatch.setattr(functions, "PATIENCE", 0.5)
     assert bind_compiled([small_function()]) == "interpreted"
     assert list(folder.glob("*.lib")) == []
-
-
-def test_never_means_never(folder, monkeypatch):
-    monkeypatch.setenv("COSIM_COMPILE", "never")
-    assert bind_compiled([small_function()]) == "interpreted"
-
-
-def test_an_unknown_word_in_the_switch_is_refused(monkeypatch):
-    monkeypatch.setenv("COSIM_COMPILE", "yes")
-    with pytest.raises(ControllerError):
-        RtiNmpc(evaporator_problem(), Parameters.naive(evaporator_problem()))
 
 
 @needs_compiler

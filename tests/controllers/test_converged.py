@@ -157,41 +157,6 @@ def test_too_few_iterations_raise_and_the_qp_is_carried(problem):
     assert caught.value.qp is not None
 
 
-def test_few_qps_are_enough_from_a_near_guess(problem, blocks):
-    # A θ as it is learnt, flat in the actions: QPs that are lifted all along take dozens here.
-    B_l = [
-        [1.71, -0.087, 0.113, 0.032],
-        [-0.087, 3.79, 0.4, -0.1087],
-        [0.113, 0.4, 0.0568, -0.0127],
-        [0.032, -0.1087, -0.0127, 0.0135],
-    ]
-    theta = Parameters.naive(problem, blocks).replace(
-        {
-            "B_l": B_l,
-            "b_l": [2.66, -33.06, 34.45, -2.94],
-            "B_Vf": [[1.11, 0.126], [0.126, 1.207]],
-            "b_Vf": [5.8, -1.4],
-            "c_f": [0.16, 0.004],
-            "x_l": [27.67, 40.0],
-            "w_sigma": [349.0, 100.0],
-            "W_sigma": [1.0, 1000.0],
-        }
-    )
-    converged = ConvergedNmpc(problem, theta)
-    converged.feedback([28.5, 52.0])
-    count, linearise = 0, converged._linearise
-
-    def counted():
-        nonlocal count
-        count += 1
-        linearise()
-
-    converged._linearise = counted
-    converged.prepare()
-    converged.feedback([29.5, 53.0])
-    assert count <= 8
-
-
 @pytest.mark.parametrize("where", ["load", "solve"])
 def test_a_qp_that_is_not_convex_is_lifted_and_read_out_as_it_is(
     where, converged, problem, blocks, monkeypatch

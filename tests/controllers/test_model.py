@@ -3,8 +3,6 @@ from math import exp
 import numpy as np
 import pytest
 
-from controllers.errors import ModelError
-from controllers.evaporator import model as evaporator
 from controllers.model import Model, Quantity, discretise
 
 
@@ -44,11 +42,3 @@ def test_the_error_falls_with_the_fourth_power_of_the_step():
 def test_the_time_unit_scales_the_rate():
     model = scalar_model(lambda x, u, d, p: p[0] * x, time_unit=60.0)
     assert advance(model, 60.0, 20, [1.0], [0.0])[0] == pytest.approx(exp(-0.7), rel=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("sampling_time", "substeps"), [(0.0, 1), (-1.0, 1), (np.nan, 1), (1.0, 0)]
-)
-def test_discretise_refuses_no_time_and_no_steps(sampling_time, substeps):
-    with pytest.raises(ModelError):
-        discretise(evaporator(), sampling_time, substeps)

@@ -19,15 +19,6 @@ def test_the_papers_theta_has_its_blocks_in_order(problem):
     assert blocks.size == 3 + 2 + 1 + 3 + 2 + 10 + 4 + 2 + 2 + 2
 
 
-def test_labels_name_each_entry(problem):
-    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2", "h"))
-    assert len(set(blocks.labels)) == blocks.size
-    part = blocks.labels[blocks.slices["B_l"]]
-    assert part[:5] == ("B_l[0,0]", "B_l[0,1]", "B_l[0,2]", "B_l[0,3]", "B_l[1,1]")
-    assert blocks.labels[blocks.slices["c_lambda"]] == ("c_lambda",)
-    assert blocks.labels[blocks.slices["p"]] == ("p[UA2]", "p[h]")
-
-
 @given(st.lists(FINITE, min_size=6, max_size=6))
 def test_packing_undoes_unpacking_bit_for_bit(entries):
     packed = np.array(entries)

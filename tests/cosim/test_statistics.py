@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import trim_mean, wilcoxon
 
+from cosim import statistics
 from cosim.statistics import (
     gain,
     gap_closed,
@@ -139,16 +140,6 @@ def test_the_bootstrap_over_runs_stays_within_its_strata():
     assert (low, high) == over_runs([spread]).bootstrap
 
 
-def test_an_interval_over_runs_and_noise_covers_the_median_of_the_runs_it_was_drawn_from():
-    rng, covered = np.random.default_rng(5), 0
-    for _ in range(60):
-        optimum = 100.0 + rng.normal(0.0, 1.0, 20)
-        runs = 2.0 + rng.normal(0.0, 0.5, (10, 1))
-        low, high = two_way(optimum + runs + rng.normal(0.0, 0.5, (10, 20)), optimum)
-        covered += low <= 0.02 <= high
-    assert covered >= 55
-
-
 def test_an_interval_over_noise_alone_is_too_narrow_where_runs_differ():
     rng = np.random.default_rng(6)
     optimum = 100.0 + rng.normal(0.0, 1.0, 20)
@@ -175,3 +166,42 @@ def test_p_of_paired_differences_is_that_of_the_exact_signed_rank_test(count):
     assert difference == pytest.approx(np.median(each) / 10.0)
     assert low <= difference <= high
     assert p == pytest.approx(wilcoxon(each, method="exact").pvalue, abs=1e-12)
+
+
+SHAPES = [
+    (10, 50, 0.5, 0.5),
+    pytest.param(5, 50, 0.5, 0.5, marks=pytest.mark.slow),
+    pytest.param(10, 20, 0.5, 0.5, marks=pytest.mark.slow),
+    pytest.param(10, 50, 0.05, 0.5, marks=pytest.mark.slow),
+    pytest.param(10, 50, 1.0, 0.1, marks=pytest.mark.slow),
+]
+"""Training seeds, noise seeds, and the spread that each brings about in J."""
+
+
+@pytest.mark.parametrize(("runs", "seeds", "by_run", "by_noise"), SHAPES)
+def test_the_two_way_interval_covers_the_median_at_its_level(
+    runs, seeds, by_run, by_noise, monkeypatch
+):
+    """Random effects of run, noise seed and both; 2000 studies, with fewer resamples for speed."""
+    monkeypatch.setattr(statistics, "RESAMPLES", 299)
+    rng, covered = np.random.default_rng(7), 0
+    for _ in range(2000):
+        optimum = 100.0 + rng.normal(size=seeds)
+        effects = rng.normal(0.0, by_run, (runs, 1)) + rng.normal(0.0, by_noise, seeds)
+        cost = optimum + 2.0 + effects + rng.normal(0.0, by_noise, (runs, seeds))
+        low, high = two_way(cost, optimum)
+        covered += low <= 0.02 <= high
+    assert 0.92 < covered / 2000 < 0.98
+
+
+@pytest.mark.parametrize("runs", [5, 10])
+def test_p_is_uniform_where_nothing_differs(runs, monkeypatch):
+    """At each value that p can take, so small a p is as likely as p says."""
+    monkeypatch.setattr(statistics, "RESAMPLES", 2)  # the interval is not asked for
+    rng, optimum, found = np.random.default_rng(runs), np.full(6, 100.0), []
+    for _ in range(2000):
+        cost = optimum + rng.normal(size=(2, runs, 1)) + rng.normal(size=(2, runs, 6))
+        found.append(paired_difference(*cost, optimum)[2])
+    for p in np.unique(found):
+        spread = np.sqrt(p * (1 - p) / 2000)
+        assert np.mean(np.array(found) <= p) == pytest.approx(p, abs=4.5 * spread + 1e-3)

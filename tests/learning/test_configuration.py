@@ -40,12 +40,6 @@ def test_a_bad_assignment_gets_one_clear_message(assignment, message):
         QLearning.Configuration.from_assignments([assignment])
 
 
-def test_an_option_of_another_rule_is_refused_and_its_default_is_not():
-    with pytest.raises(ConfigurationError, match="step_every: has no part in the rule fit"):
-        QLearning.Configuration.from_dict({"rule": "fit", "step_every": 10})
-    QLearning.Configuration.from_dict({"rule": "fit", "step_every": 50})
-
-
 @pytest.mark.parametrize(
     ("algorithm", "assignment", "message"),
     [
@@ -59,21 +53,6 @@ def test_an_option_of_another_rule_is_refused_and_its_default_is_not():
 def test_what_acts_nowhere_is_refused(algorithm, assignment, message):
     with pytest.raises(ConfigurationError, match=message):
         load_algorithm(algorithm).Configuration.from_assignments(assignment.split())
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "settings", "schedules"),
-    [
-        ("q-learning", {}, []),
-        ("actor-critic", {}, ["radius"]),
-        ("search", {}, ["samples (shared out by the search)"]),
-        ("policy-search", {}, []),
-        ("backoff", {}, ["samples (shared out among the stages)"]),
-    ],
-)
-def test_only_what_a_rule_reads_depends_on_the_samples(algorithm, settings, schedules):
-    configuration = load_algorithm(algorithm).Configuration.from_dict(settings)
-    assert configuration.depends_on_samples() == schedules
 
 
 @pytest.mark.parametrize("cls", CLASSES)

@@ -1,9 +1,7 @@
 import numpy as np
 import pytest
 
-from learning.configuration import Configuration
-from learning.errors import ConfigurationError
-from learning.exploration import Geometric, Strategy, build_strategy, linear
+from learning.exploration import Geometric, Strategy, linear
 
 LOWER, UPPER = np.array([100.0, 100.0]), np.array([400.0, 400.0])
 POLICY = np.array([190.0, 215.0])
@@ -26,12 +24,6 @@ def test_additive_noise_has_the_moments_asked_for(rng):
     assert actions.std(axis=0) == pytest.approx([10.0, 3.0], rel=0.03)
 
 
-def test_a_greedy_sample_returns_nothing(rng):
-    explore = make("additive", probability=0.3)
-    greedy = [explore(POLICY, rng, 0) is None for _ in range(5000)]
-    assert np.mean(greedy) == pytest.approx(0.7, abs=0.03)
-
-
 def test_literal_reading_always_ends_in_the_lower_corner(rng):
     assert (draws(make("literal"), rng, count=100) == LOWER).all()
 
@@ -41,10 +33,6 @@ def test_bias_is_the_mean_that_saturation_leaves(rng, action):
     explore = make("additive")
     measured = (draws(explore, rng, action, 60_000) - action).mean(axis=0)
     assert explore.bias(action[None], FIRST)[0] == pytest.approx(measured, abs=0.15)
-
-
-def test_bias_of_the_literal_reading_is_the_way_to_the_corner():
-    assert make("literal").bias(POLICY[None], FIRST)[0] == pytest.approx(LOWER - POLICY, abs=1e-6)
 
 
 def test_noise_is_drawn_alike_whatever_the_probability():
@@ -58,24 +46,9 @@ def test_noise_is_drawn_alike_whatever_the_probability():
     assert paired[0] == paired[1]
 
 
-def test_a_wrong_number_of_deviations_is_refused(scenario):
-    with pytest.raises(ConfigurationError, match="3 entries"):
-        build_strategy(Configuration(exploration_deviation=(1.0, 2.0, 3.0)), scenario, 100)
-
-
-def test_no_exploration_is_greedy(scenario, rng):
-    explore = build_strategy(Configuration(exploration="none"), scenario, 100)
-    assert all(explore(scenario.reference_action, rng, k) is None for k in range(20))
-
-
 def test_a_linear_schedule_is_linear_and_then_constant():
     values = linear((10.0,), (2.0,), 100)
     assert values(0) == 10.0 and values(50) == 6.0 and values(100) == 2.0 and values(500) == 2.0
-
-
-def test_without_an_end_it_is_constant():
-    values = linear((10.0, 3.0), None, 100)
-    assert values(0).tolist() == values(70).tolist() == [10.0, 3.0]
 
 
 def test_values_at_many_samples_are_those_of_each():

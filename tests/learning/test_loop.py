@@ -132,23 +132,6 @@ def make_run(scenario, seed=3):
     return TrainingRun("q-learning", scenario, 100, seed, configuration)
 
 
-class Counting(QLearning):
-    """Moves nothing, but says on every sample that it did and that two QPs failed."""
-
-    def observe(self, sample):
-        return Update(td_error=1.0, step=0.0, smallest_eigenvalue=1.0, failures=2)
-
-
-def costs(plant, seed):
-    loop = begin(make_run(plant.scenario, seed), QLearning, plant)
-    return [loop.advance()[0] for _ in range(30)]
-
-
-def test_the_runs_seed_gives_the_samples(plant):
-    assert costs(plant, 3) == costs(plant, 3)
-    assert costs(plant, 3) != costs(plant, 4)
-
-
 def test_an_update_is_reported_where_theta_moves(plant):
     loop = begin(make_run(plant.scenario), QLearning, plant)
     for number in range(40):
@@ -157,13 +140,6 @@ def test_an_update_is_reported_where_theta_moves(plant):
         assert (update is not None) == (number % 20 == 19)
         assert np.array_equal(before, loop.controller.theta) == (update is None)
     assert not np.array_equal(loop.start_parameters.theta, loop.controller.theta)
-
-
-def test_failures_of_an_update_count_with_those_of_the_loop(plant):
-    loop = begin(make_run(plant.scenario), Counting, plant)
-    for _ in range(5):
-        loop.advance()
-    assert loop.counts.failures == 10
 
 
 def test_a_rule_that_rests_neither_moves_nor_explores(plant):

@@ -12,7 +12,6 @@ from learning.search_plan import (
     PairedComparison,
     SearchPlan,
     Settle,
-    Spent,
     Trial,
 )
 
@@ -101,16 +100,6 @@ def test_the_final_leaves_the_cheapest_and_begins_anew(scenario, start, rival):
     assert plant.run[2.0] == 1, "given up where it cannot win any more"
 
 
-def test_the_budget_is_kept(scenario, start, rival):
-    made = comparison(scenario, start, samples=100 * (1 + BLOCKS) + 250)
-    plant = Plant(start, {1.0: [100.0] * BLOCKS, 2.0: [90.0] * BLOCKS})
-    plant.drive(made.renew(BLOCKS))
-    with pytest.raises(Spent):
-        plant.drive(made.compare(rival))
-    assert made.spent == made.limit - 50
-    assert np.array_equal(made.incumbent.theta, start.theta)
-
-
 @pytest.mark.parametrize(
     ("block", "value"), [("x_l", [101.0, 40.0]), ("x_u", [24.0, 80.0]), ("b_l", [np.nan, 0, 0, 0])]
 )
@@ -186,15 +175,6 @@ def test_the_inputs_weights_are_found_each_with_its_own_back_off(lines, far):
     assert found["x_l"][0] == pytest.approx(25.5, abs=0.5)
     assert minimiser(found) == pytest.approx(minimiser(far))
     assert 0 < comparison.least < 1e-2, "smaller weights are admissible from now on"
-
-
-def test_weights_that_do_not_pay_leave_all_as_it_was(lines, far):
-    comparison, lines = lines
-    plant, least = Bowl(far, 1.0), comparison.least
-    plant.drive(comparison.renew(BLOCKS))
-    assert plant.drive(lines.rescale(-1.0)) == pytest.approx(0.7), "shorter, the other way"
-    assert np.array_equal(comparison.incumbent.theta, far.theta)
-    assert comparison.least == least
 
 
 def test_a_line_is_searched_both_ways_in_steps_that_double(lines, far):
@@ -321,11 +301,3 @@ def test_what_is_reported_has_won_and_every_win_is_counted(scenario, problem):
         costs.append(plant.cost(incumbent))
     assert changes == sought.comparison.accepted > 3
     assert (np.diff(costs) <= 0).all(), "without noise no winner is dearer than what it beat"
-
-
-def test_a_rule_that_knows_the_way_is_followed(scenario, problem):
-    sought = search(scenario, problem, 4000)
-    plant = Quadratic(scenario, sought._start)
-    plant.learner = lambda theta, width: plant.best
-    run(sought, plant)
-    assert plant.cost(sought.comparison.incumbent.theta) == pytest.approx(6300.0, abs=0.1)

@@ -6,11 +6,10 @@ import pytest
 
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.rti.solution import RtiSolution
 from controllers.theta import Parameters
 from cosim import FmuPlant
 from learning.algorithm import Update, load_algorithm
-from learning.errors import CheckpointError, ConfigurationError
+from learning.errors import CheckpointError
 from learning.evaluation import HELD_OUT, held_out_costs
 from learning.log import LogRow, late_movement, to_csv
 from learning.q_learning import QLearning
@@ -66,23 +65,6 @@ def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(
     assert evaluated == [100, 200, 300, 400, 450]
     assert result.rows[-1]["greedy_J"] == pytest.approx(result.evaluation["J"])
     assert all(row["smallest_eigenvalue"] >= 1e-3 for row in result.rows)
-
-
-def test_the_log_keeps_the_least_certificate_of_all_updates(scenario):
-    run = make_run(scenario, "q-learning")
-    seen = []
-
-    class Watched(load_algorithm("q-learning")):
-        def observe(self, sample):
-            update = super().observe(sample)
-            if update is not None:
-                seen.append((sample.number, update.smallest_eigenvalue))
-            return update
-
-    for row in train(run, rule=Watched).rows:
-        part = [v for number, v in seen if row["samples"] - 50 <= number < row["samples"]]
-        if part:
-            assert row["smallest_eigenvalue"] == min(part)
 
 
 def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
@@ -220,27 +202,6 @@ def test_scenarios_that_differ_in_open_points_train_differently(scenario):
         other = dataclasses.replace(run, scenario=scenario.replace(stated))
         theta.add(train(other).parameters.hash)
     assert len(theta) == 3
-
-
-def test_the_log_counts_flags_of_the_policies(scenario, monkeypatch):
-    run = make_run(scenario, "q-learning", samples=100)
-    monkeypatch.setattr(RtiSolution, "weakly_active", True)
-    monkeypatch.setattr(RtiSolution, "licq", False)
-    rows = train(run).rows
-    assert [row["weakly_active"] for row in rows] == [5, 10]
-    assert [row["licq_failed"] for row in rows] == [5, 10]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"samples": 0}, "samples must be at least 1"),
-        ({"evaluate_every": 70}, "multiple of log_every"),
-    ],
-)
-def test_counts_that_make_no_run_are_refused(scenario, change, message):
-    with pytest.raises(ConfigurationError, match=message):
-        make_run(scenario, "q-learning", **change)
 
 
 def written(path):

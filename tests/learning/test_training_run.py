@@ -1,15 +1,13 @@
 import numpy as np
 import pytest
 
-from controllers.converged import ConvergedNmpc
 from controllers.economic import tune
-from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.exploration import build_strategy
-from learning.training_run import build_controller, starting_parameters
+from learning.training_run import starting_parameters
 
 
 def test_the_papers_theta_is_the_naive_guess(problem):
@@ -26,13 +24,6 @@ def test_the_extended_theta_starts_at_the_configured_slack_weights(problem):
     assert theta["w_sigma"].tolist() == [100.0, 100.0]
     assert theta["W_sigma"].tolist() == [500.0, 500.0]
     assert theta["c_lambda"] == pytest.approx(problem.reference_cost / (1 - problem.discount))
-
-
-def test_controllers_by_name(scenario, problem, parameters):
-    assert type(build_controller("rti", scenario, parameters)) is RtiNmpc
-    assert type(build_controller("converged", scenario, parameters)) is ConvergedNmpc
-    with pytest.raises(ConfigurationError, match="'mpc'"):
-        build_controller("mpc", scenario, parameters)
 
 
 STATED = {
@@ -57,17 +48,6 @@ def test_what_the_user_sets_stands_against_the_scenario(scenario):
         0.7,
     )
     assert configuration.exploration == "literal"
-
-
-def test_a_scenario_that_leaves_them_open_changes_nothing(scenario):
-    configuration = QLearning.Configuration()
-    assert configuration.for_scenario(scenario) == configuration
-
-
-def test_the_level_of_the_value_follows_the_discount_of_the_td_error(problem):
-    configuration = QLearning.Configuration(discount=0.9)
-    theta = starting_parameters(problem, configuration)
-    assert theta["c_lambda"] == pytest.approx(10 * problem.reference_cost)
 
 
 def test_a_tuned_start_has_the_configured_slack_weights_and_level(problem):

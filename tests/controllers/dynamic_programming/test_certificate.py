@@ -29,7 +29,3 @@ def test_figures_apart_are_no_optimum(name):
 
 def test_a_search_below_the_solution_is_an_objection():
     assert "a policy search found 999.00" in certificate(search=999.0).objection()
-
-
-def test_a_certificate_survives_json():
-    assert Certificate.from_list(certificate(search=1001.0).to_list()) == certificate(search=1001.0)

@@ -52,13 +52,6 @@ def unsettled(nmpc, rng, count=5):
 # the two phases -------------------------------------------------------------------------------
 
 
-def test_a_new_controller_is_prepared_at_the_reference(nmpc, problem):
-    point = nmpc.linearisation_point
-    np.testing.assert_array_equal(point.x, np.tile(problem.reference_state, (10, 1)))
-    np.testing.assert_array_equal(point.u, np.tile(problem.reference_action, (10, 1)))
-    np.testing.assert_array_equal(point.costates, np.zeros((10, 2)))
-
-
 def test_a_second_preparation_changes_nothing(nmpc, problem, rng):
     unsettled(nmpc, rng)
     s = random_state(problem, rng)
@@ -88,15 +81,6 @@ def test_two_feedbacks_use_the_same_linearisation(nmpc, problem, rng):
     nmpc.feedback(random_state(problem, rng), random_action(problem, rng))
     assert bits(nmpc.feedback(s)) == bits(first)
     assert nmpc.linearisation_point is point
-
-
-def test_read_outs_leave_the_guess_alone(nmpc, problem, rng):
-    last = unsettled(nmpc, rng)
-    s, a = random_state(problem, rng), random_action(problem, rng)
-    assert nmpc.value(s) <= nmpc.action_value(s, a)
-    assert nmpc.action_value(s, nmpc.policy(s)) == pytest.approx(nmpc.value(s), rel=1e-9)
-    nmpc.prepare()
-    np.testing.assert_array_equal(nmpc.linearisation_point.x, last.predicted_states[1:])
 
 
 def test_repeated_iterations_at_one_state_converge(nmpc, problem):

@@ -5,14 +5,11 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures import (
-    Costs,
-    evaluation_figure,
     overlay_figure,
     save,
     trajectory_figure,
 )
 from cosim.figures.evaluation import nondominated
-from cosim.figures.style import spread
 from tests.helpers.loop import Failing, Proportional
 
 
@@ -60,16 +57,6 @@ def test_an_overlay_shows_each_run_and_its_cost(trajectory):
     assert [J in text for text in legend] == [True, True, False]
 
 
-def test_a_bound_is_named_whether_it_is_drawn_or_too_far_away(trajectory, paper):
-    axes = axes_by_label(trajectory_figure(trajectory, paper))
-    said = {name: [text.get_text() for text in axis.texts] for name, axis in axes.items()}
-    assert said["$X_{2}$ [%]"] == ["≥ 25", "bound ≤ 100"]
-    assert said["$F_{200}$ [kg/min]"] == ["bound ≥ 100, ≤ 400"]
-    bound = axes["$X_{2}$ [%]"].texts[0]
-    assert bound.xy == (1.0, 25.0)
-    assert bound.get_ha() == "left", "beside the axes, where no curve hides it"
-
-
 def test_runs_side_by_side_have_the_same_axes(trajectory, paper):
     with FmuPlant(paper) as plant:
         other = simulate(plant, Proportional(paper), 120, 1)
@@ -95,18 +82,3 @@ def test_the_front_is_what_no_other_point_beats(rng):
         for i, p in enumerate(points)
     ]
     assert nondominated(points).tolist() == expected
-
-
-def test_a_plant_at_rest_draws(tmp_path):
-    rest = {"rest": Costs(np.full(5, 6210.0), np.full(5, 6210.0), np.zeros(5))}
-    save(evaluation_figure(rest, title="rest"), tmp_path / "c.png")
-
-
-def test_labels_at_line_ends_do_not_overlap_and_stay_within_the_axes(rng):
-    wanted = np.sort(rng.random(8) ** 3)[::-1]
-    placed = spread(wanted, 0.1)
-    assert np.diff(placed).max() <= -0.1 + 1e-6
-    assert placed[0] <= 1.0 + 1e-9
-    assert spread(np.array([0.9, 0.1]), 0.1).tolist() == [0.9, 0.1], "what is apart stays"
-    crowded = spread(np.array([0.95, 0.02, 0.01, 0.0]), 0.1)
-    assert crowded == pytest.approx([0.95, 0.2, 0.1, 0.0]), "a crowd below moves nothing above"

@@ -1,9 +1,8 @@
 import matplotlib as mpl
 import pytest
 
-from cosim.errors import FigureError
 from cosim.figures import save
-from cosim.figures.style import figure, label, palette
+from cosim.figures.style import figure, label
 
 
 def drawing():
@@ -31,23 +30,9 @@ def test_the_users_settings_neither_matter_nor_change(tmp_path):
     assert styled == plain
 
 
-def test_another_format_is_refused(tmp_path):
-    with pytest.raises(FigureError, match=r"must end in \.png or \.svg"):
-        save(drawing(), tmp_path / "a.pdf")
-
-
 def test_names_become_mathematics_with_units():
     assert label("X2", "%") == "$X_{2}$ [%]"
     assert label("T200", "degC") == "$T_{200}$ [°C]"
     assert label("stage_cost", "1") == "stage cost"
     assert label("tank[1].level", "m") == "tank[1].level [m]"
     assert label("price_$", "$") == r"price \$ [\$]"
-
-
-def test_a_rule_has_its_colour_and_each_of_its_cases_a_line():
-    looks = palette(["naive", "q(start=naive)", "q(start=tuned)", "mine", "optimal"])
-    colors = [look.color for look in looks.values()]
-    assert len(set(colors)) == 4
-    assert looks["q(start=naive)"].color == looks["q(start=tuned)"].color
-    assert len(set(looks.values())) == len(looks)
-    assert palette(["tuned", "naive"])["naive"] == looks["naive"]

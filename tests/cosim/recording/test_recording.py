@@ -26,7 +26,7 @@ from cosim.recording.read import telling_moment
 from cosim.recording.stream import Channel, Stream, drawable
 from cosim.trajectory import Signal, read_csv
 from tests.helpers.blocks import random_block
-from tests.helpers.loop import Failing, Proportional
+from tests.helpers.loop import Proportional
 
 CONTROLLER = SimpleNamespace(name="mine", parameters=SimpleNamespace(hash="0123456789abcdef"))
 numbers = st.floats(-1e6, 1e6)
@@ -87,19 +87,6 @@ def test_a_block_that_the_loop_overwrites_is_recorded_as_it_was(tmp_path, paper,
     assert np.array_equal(recording.signals["prediction/X2"], predicted[:, :, 0])
 
 
-def test_a_controller_without_predictions_is_recorded(tmp_path, paper, rng):
-    recording = recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng, predicts=False)])
-    assert len(recording.samples) == 10
-    assert not [name for name in recording.signals if name.startswith("prediction/")]
-
-
-def test_status_is_recorded_sample_by_sample(tmp_path, paper):
-    with FmuPlant(paper) as plant:
-        recorder = RerunRecorder(tmp_path / "run.rrd")
-        trajectory = simulate(plant, Failing(paper, [3, 4, 9]), 12, 0, recorder=recorder)
-    assert read_recording(tmp_path / "run.rrd").status == trajectory.status
-
-
 def test_a_run_that_breaks_off_leaves_the_samples_it_made(tmp_path, paper):
     class Breaking(Proportional):
         def prepare(self):
@@ -156,18 +143,6 @@ def test_the_file_is_whole_or_not_there(tmp_path, paper, rng):
     assert hashlib.sha256(path.read_bytes()).hexdigest() == digest
 
 
-def test_a_run_without_a_sample_leaves_no_file(tmp_path, paper):
-    recorder = RerunRecorder(tmp_path / "run.rrd")
-    recorder.start(paper, CONTROLLER, 0, 10, {})
-    recorder.close()
-    assert not list(tmp_path.iterdir())
-
-
-def test_an_unwritable_folder_is_refused(tmp_path, paper):
-    with pytest.raises(RecordingError, match=r"none/run\.rrd"):
-        RerunRecorder(tmp_path / "none" / "run.rrd").start(paper, CONTROLLER, 0, 10, {})
-
-
 def test_samples_are_sent_block_by_block(tmp_path, paper, monkeypatch):
     """A call to Rerun takes 30 µs, whatever it sends: one a sample would double the step."""
     sent = []
@@ -189,14 +164,6 @@ def test_the_window_holds_all_values_seen(values, lower, width):
     low, high = channel.window()
     assert low < min(values)
     assert max(values) < high
-
-
-def test_the_window_shows_a_bound_that_is_near_and_not_one_that_is_far():
-    low, high = Channel("x", "x", bounds=(25.0, 100.0)).see(np.array([26.0, 28.0, np.nan])).window()
-    assert low < 25.0
-    assert 28.0 < high < 30.0
-    low, _ = Channel("x", "x", bounds=(25.0, 100.0)).see(np.array([56.0, 58.0])).window()
-    assert low > 50.0
 
 
 def test_a_training_comes_back_as_its_log_and_the_change_of_each_block(tmp_path, rng):
@@ -232,12 +199,6 @@ def test_two_runs_are_overlaid_with_their_difference(tmp_path):
         "B: b/P2": [1.0, 2.5],
         "difference/P2": [0.0, -0.5],
     }
-
-
-def test_three_runs_are_overlaid_without_differences(tmp_path):
-    runs = {name: run(name, P2=[1.0, 2.0]) for name in "abc"}
-    record_overlay(tmp_path / "c.rrd", runs, "")
-    assert list(read_recording(tmp_path / "c.rrd").signals) == ["a/P2", "b/P2", "c/P2"]
 
 
 def test_the_summary_has_units_and_ranges(tmp_path, paper, rng, units):

@@ -6,8 +6,8 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures import palette
-from cosim.studies.figures import Dots, learning_curve, profile_figure, regret_figure
-from cosim.studies.pictures import density_figure, increments, phase_figure
+from cosim.studies.figures import learning_curve, profile_figure
+from cosim.studies.pictures import density_figure, increments
 from tests.helpers.loop import Proportional
 
 
@@ -31,12 +31,6 @@ def test_a_densitys_bins_part_at_the_bound(runs, paper):
         assert float(np.sum(heights * np.diff(edges))) == pytest.approx(np.mean(shown), abs=1e-12)
 
 
-def test_a_portrait_has_an_arrow_for_each_point_of_the_grid(runs, paper):
-    policies = dict.fromkeys(runs, lambda s: np.array([200.0 - s[0], 215.0 + s[1]]))
-    drawn = phase_figure(runs, policies, paper)
-    assert [axes.get_title() for axes in drawn.axes] == ["naive", r"\$mine"]
-
-
 def test_a_curve_averages_training_since_the_point_before_and_holds_diverged_runs():
     nan = float("nan")
     log = pd.DataFrame(
@@ -58,12 +52,6 @@ def test_a_profile_is_the_share_of_runs_at_most_so_bad():
     axes = profile_figure({"q": [values]}, palette(["q"])).axes[0]
     regret, share = axes.lines[0].get_data()
     assert share.tolist() == [np.mean(values <= level) for level in regret]
-
-
-def test_a_diverged_run_is_a_cross():
-    dots = Dots("q", np.array([1.0, 2.0]), np.array([True, False]), 1.5, 1.0, 2.0)
-    axes = regret_figure([dots], palette(["q"])).axes[0]
-    assert [len(points.get_offsets()) for points in axes.collections[:2]] == [1, 1]
 
 
 def test_increments_are_of_each_block_since_its_first_row():

@@ -1,14 +1,12 @@
 """What the runs of a study cost themselves: blocks, regret by period, and the figure."""
 
 import csv
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import StudyError
 from cosim.studies import run as engine
 from cosim.studies.results import StudyResults
 from tests.helpers.toy_study import GROW, run_toy
@@ -73,13 +71,6 @@ def test_the_report_has_table_and_figure_and_needs_no_runs(results, tmp_path):
     assert 'alt="online-paper' in page
 
 
-def test_a_signal_that_no_log_has_is_named(results, tmp_path):
-    about = dict(results.about) | {"online": ONLINE | {"signals": ["td_eror"]}}
-    damaged = replace(results, about=about)
-    with pytest.raises(StudyError, match=r"no log has a column 'td_eror'.*'td_error'"):
-        damaged.report(tmp_path)
-
-
 @pytest.mark.slow
 def test_two_workers_give_the_bytes_of_one(results, tmp_path):
     again = online(tmp_path, jobs=2)
@@ -91,22 +82,3 @@ def test_a_run_that_goes_on_does_nothing_twice(results, monkeypatch):
     monkeypatch.setattr(engine, "perform", lambda *_: pytest.fail("was done"))
     again = online(results.folder)
     assert rows(again, "optimal")
-
-
-def test_a_study_without_it_has_no_such_table(tmp_path):
-    plain = run_toy(tmp_path)
-    assert plain.further() == []
-    assert not (tmp_path / "online.csv").exists()
-
-
-def test_a_period_is_made_of_whole_blocks(tmp_path):
-    with pytest.raises(StudyError, match="period: must be a multiple of block = 500"):
-        online(tmp_path, period=750)
-
-
-def test_of_the_references_only_the_optimum_runs_beside(tmp_path):
-    case = [{"name": "grow", "algorithm": GROW, "samples": 500}]
-    found = run_toy(tmp_path, online=ONLINE, case=case)
-    assert rows(found, "optimal")
-    assert not rows(found, "naive")
-    assert len(found.of("naive", "paper"))

@@ -85,12 +85,6 @@ def test_an_own_reader_finds_the_stored_summary():
         assert row.regret_worst == pytest.approx(own.max() / best - 1, rel=1e-6, abs=1e-9)
 
 
-def test_one_point_is_no_curve(results, tmp_path):
-    last = results.curves.groupby(KEYS, dropna=False).tail(1)
-    drawn = replace(results, curves=last).draw(tmp_path)
-    assert not any(name.startswith("curves") for name in drawn["paper"])
-
-
 def test_all_rules_are_in_one_panel_under_the_names_of_the_table(results):
     _, greedy = results.figure("curves-paper").axes
     named = {text.get_text() for text in greedy.texts}

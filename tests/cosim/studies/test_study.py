@@ -218,15 +218,6 @@ def test_nothing_is_deleted_but_files_of_runs(tmp_path):
     assert precious.read_text() == "mine"
 
 
-def test_a_folder_of_somebody_else_is_refused(tmp_path):
-    other = tmp_path / "runs" / "paper" / "naive" / "evaluation.csv"
-    other.parent.mkdir(parents=True)
-    other.write_text("mine")
-    with pytest.raises(StudyError):
-        run_toy(tmp_path, case=[{"controller": "naive"}])
-    assert other.read_text() == "mine"
-
-
 def test_a_run_s_folder_does_not_lead_elsewhere(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "out" / "runs").mkdir(parents=True)
@@ -259,12 +250,6 @@ def test_lists_are_a_grid_and_name_what_varies():
         "c(start=tuned rate=2)",
     ]
     assert found[3].settings == {"rate": 2, "marker": "x"}
-
-
-def test_a_setting_that_is_a_list_itself_takes_a_list_of_lists_as_a_grid():
-    assert [one.settings["weights"] for one in cases(settings={"weights": [1, 2]})] == [[1, 2]]
-    found = cases(settings={"weights": [[1, 2], [3]]})
-    assert [one.settings["weights"] for one in found] == [[1, 2], [3]]
 
 
 def test_files_are_seen_from_the_study():

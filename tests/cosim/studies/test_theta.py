@@ -1,14 +1,12 @@
 """Where the trainings of a study led θ: the table of its course and of differences."""
 
 import csv
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.errors import StudyError
 from cosim.studies import run as engine
 from cosim.studies.results import StudyResults
 from cosim.studies.store import Trained
@@ -88,33 +86,3 @@ def test_the_report_has_both_tables_and_needs_no_runs(results, tmp_path):
     page = StudyResults.load(results.folder).report(tmp_path).read_text("utf-8")
     assert "Where θ went, in scaled entries without h" in page
     assert "training seed by training seed" in page
-
-
-def test_a_block_that_no_log_has_is_named(tmp_path):
-    found = wandering(tmp_path, without=["hh"])
-    with pytest.raises(StudyError, match=r"no log has a block 'hh'.*'h'.*there are g, h"):
-        found.further()
-
-
-def test_pairs_are_the_study_s_in_its_order(results):
-    about = dict(results.about)
-    settings = dict(about["theta"]["settings"])
-    for pairs, expected in (
-        ([["go(rate=3.0)", "go(rate=1.0)"]], "go(rate=1.0) − go(rate=3.0)"),
-        ([["go(rate=3.0)", "go(rate=1)"]], None),
-    ):
-        about["theta"] = dict(about["theta"]) | {"settings": settings | {"pairs": pairs}}
-        other = replace(results, about=about)
-        if expected is None:
-            with pytest.raises(StudyError, match=r"no trained case 'go\(rate=1\)'"):
-                other.further()
-        else:
-            assert [line["cases"] for line in lines_of(other, 1)] == [expected]
-
-
-def test_how_far_it_went_late_is_left_out_where_the_study_says_so(results):
-    about = dict(results.about)
-    settings = dict(about["theta"]["settings"]) | {"late": False}
-    about["theta"] = dict(about["theta"]) | {"settings": settings}
-    _, header, _ = replace(results, about=about).further()[0]
-    assert header == ("case", "runs", "way, median", "between seeds")

@@ -1,0 +1,269 @@
+"""A model of a plant from its own operation: what the controller's nominal model lacks.
+
+(s₊, ℓ) = y(s, a) + G(s, a) c + W (1, s, a) + h(s, a) r: y is the nominal model and economic cost, G
+has their derivatives with respect to each parameter and nominal disturbance times its value, h is
+the size that disturbances in proportion to their values would give the error. c, one coefficient
+a parameter for all outputs, and W are estimated by Bayesian generalised least squares from
+transitions; the residuals r are kept and drawn anew. It knows no parameter of the plant and no law
+of its disturbances.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from importlib.resources import files
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.export.core import core
+from controllers.functions import c_source, library
+from controllers.model import discretise, economic_cost
+from controllers.problem import Problem
+from controllers.rti import RtiNmpc
+from controllers.theta import Parameters
+from cosim.protocols import recover
+from learning.prediction_errors import SortedErrors
+
+Array = NDArray[np.float64]
+PARAMETER_DEVIATION = 0.15
+"""Prior standard deviation of a parameter's error, as a share of its value."""
+SLOPE_DEVIATION = 0.1
+"""That of W's slopes, in standard deviations of the error over one of the input."""
+FLOOR = 0.1
+"""Least h, as a share of its value at the reference."""
+ROUNDS = 2
+"""Fits, each with the residuals' covariance of the one before."""
+
+
+class Features:
+    """y (K,), G (K, p) and h (K,) of a problem's nominal model; K = n + 1, the cost is last."""
+
+    def __init__(self, problem: Problem) -> None:
+        model = problem.model
+        x, u, d, p = model.symbols()
+        step = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
+        outputs = ca.vertcat(step, economic_cost(model)(x, u, d, p))
+        disturbance, parameters = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
+        by_disturbance = ca.jacobian(outputs, d) @ ca.diag(disturbance)
+        by_parameter = ca.jacobian(outputs, p) @ ca.diag(parameters)
+        size = ca.sqrt(ca.sum2(by_disturbance**2))
+        y, by_both, size = ca.substitute(
+            [outputs, ca.horzcat(by_parameter, by_disturbance), size],
+            [d, p],
+            [disturbance, parameters],
+        )
+        at = ca.Function("size", [x, u], [size])
+        reference = at(problem.reference_state, problem.reference_action).full()[:, 0]
+        h = ca.vertcat(
+            *(
+                ca.fmax(size[i], FLOOR * value) if value > 0 else 1.0
+                for i, value in enumerate(reference)
+            )
+        )
+        results = [ca.densify(part) for part in (y, by_both, h)]
+        self.function = ca.Function("nominal", [x, u], results, ["x", "u"], ["y", "G", "h"])
+        self.outputs, self.count = by_both.shape
+        self.inputs = problem.n_states + problem.n_actions
+
+    def __call__(self, inputs: Array) -> tuple[Array, Array, Array]:
+        """y (M, K), G (M, K, p) and h (M, K) at M inputs (s, a), (M, n+m)."""
+        n = self.outputs - 1
+        y, G, h = (part.full() for part in self.function(inputs[:, :n].T, inputs[:, n:].T))
+        stacked = G.T.reshape(len(inputs), self.count, self.outputs)
+        return y.T, stacked.transpose(0, 2, 1), h.T
+
+
+@dataclass(frozen=True)
+class EmpiricalModel:
+    """The estimate from M transitions.
+
+    `mean` (p + K(1+n+m),) has c, then W row by row for the inputs (1, s, a), standardised by
+    `centre` and `unit` (n+m,); `covariance` is its posterior's;
+    `residuals` (M, K) are r, mean zero.
+    """
+
+    features: Features
+    centre: Array
+    unit: Array
+    mean: Array
+    covariance: Array
+    residuals: Array
+
+    @classmethod
+    def fit(
+        cls, features: Features, inputs: Array, outputs: Array, pool: Array | None = None
+    ) -> EmpiricalModel:
+        """Estimate from inputs (s, a), (M, n+m), and outputs (s₊, ℓ), (M, K).
+
+        `pool` has residuals (·, K) of an earlier estimate, which are kept beside the new ones.
+        """
+        centre, unit = inputs.mean(axis=0), inputs.std(axis=0)
+        unit = np.where(unit > 0, unit, 1.0)
+        y, G, h = features(inputs)
+        target = (outputs - y) / h
+        design = _design(G, (inputs - centre) / unit) / h[:, :, None]
+        older = np.empty((0, features.outputs)) if pool is None else pool
+        deviation = (outputs - y).std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
+        slopes = np.full(features.inputs, SLOPE_DEVIATION)
+        prior = np.concatenate(
+            [
+                np.full(features.count, PARAMETER_DEVIATION),
+                np.outer(deviation, np.append(1.0, slopes)).reshape(-1),
+            ]
+        )
+        residuals = target - target.mean(axis=0)
+        for _ in range(ROUNDS):
+            known = np.concatenate([residuals, older])
+            noise = known.T @ known / len(known)
+            noise += np.diag(1e-9 * np.diag(noise) + np.finfo(float).tiny)
+            whiten = np.linalg.inv(np.linalg.cholesky(noise))
+            rows = (whiten @ design).reshape(-1, design.shape[2]) * prior
+            precision = rows.T @ rows + np.eye(prior.size)
+            covariance = np.linalg.inv(precision) * np.outer(prior, prior)
+            mean = covariance @ (rows.T @ (target @ whiten.T).reshape(-1) / prior)
+            residuals = target - design @ mean
+        residuals = np.concatenate([residuals - residuals.mean(axis=0), older])
+        return cls(features, centre, unit, mean, covariance, residuals)
+
+    def arrays(self) -> dict[str, Array]:
+        """All but the features, by name."""
+        names = ("centre", "unit", "mean", "covariance", "residuals")
+        return {name: getattr(self, name) for name in names}
+
+    def mean_error(self, inputs: Array, outputs: Array) -> tuple[Array, Array]:
+        """Mean of the errors of prediction over h, (K,), and its derivative by `mean`, negative."""
+        y, G, h = self.features(inputs)
+        design = _design(G, (inputs - self.centre) / self.unit) / h[:, :, None]
+        return ((outputs - y) / h - design @ self.mean).mean(axis=0), design.mean(axis=0)
+
+    def cost_row(self, inputs: Array) -> Array:
+        """Derivative of the mean cost at inputs (M, n+m) by `mean`."""
+        _, G, _ = self.features(inputs)
+        row: Array = _design(G, (inputs - self.centre) / self.unit)[:, -1].mean(axis=0)
+        return row
+
+    @property
+    def coefficients(self) -> tuple[Array, Array]:
+        """c (p,) and W (K, 1+n+m) for inputs in their own units."""
+        c, W = self.mean[: self.features.count], self.mean[self.features.count :]
+        W = W.reshape(self.features.outputs, -1)
+        slopes = W[:, 1:] / self.unit
+        return c, np.column_stack([W[:, 0] - slopes @ self.centre, slopes])
+
+
+class Rollout:
+    """The RTI-NMPC of a problem in closed loop with empirical models.
+
+    In C; without a compiler in Python, many times slower. θ and the model are arguments of each
+    call, so that one library serves a problem.
+    """
+
+    def __init__(self, problem: Problem, parameters: Parameters, features: Features) -> None:
+        self._problem, self._features = problem, features
+        self._controller = RtiNmpc(problem, parameters)
+        function = features.function
+        sizes = {
+            "K": features.outputs,
+            "FEATURES": features.count,
+            "NOMINAL_ARG": function.sz_arg(),
+            "NOMINAL_RES": function.sz_res(),
+            "NOMINAL_W": function.sz_w(),
+            "NOMINAL_IW": function.sz_iw(),
+        }
+        sources: dict[str, str | bytes] = {
+            **core(problem, parameters).sources,
+            "sizes.h": "".join(f"#define {name} {value}\n" for name, value in sizes.items()),
+            "nominal.c": c_source([function]),
+            "rollout.c": (files("learning") / "rollout.c").read_bytes(),
+        }
+        path = library(sources, ("rollout.c", "nominal.c"))
+        self.compiled = None if path is None else ctypes.CDLL(str(path)).rollout
+
+    def __call__(
+        self, theta: Array, start: Array, model: EmpiricalModel, picks: NDArray[np.int32]
+    ) -> tuple[Array, Array, Array]:
+        """Inputs (s, a), predictions of (s₊, ℓ) without r, and h, (T, …) each, of T samples.
+
+        θ (n_θ,); `start` (n,); `picks` (T,) says which of the model's residuals each sample meets.
+        Where the QP fails the last action is repeated. Fewer samples where a state is not finite.
+        """
+        shape, steps = (len(picks), self._features.outputs), len(picks)
+        inputs = np.empty((steps, self._features.inputs))
+        predicted, h = np.empty(shape), np.empty(shape)
+        if self.compiled is None:
+            steps = self._interpreted(theta, start, model, picks, inputs, predicted, h)
+        else:
+            given = (theta, start, *model.coefficients, model.residuals, picks)
+            arrays = [np.ascontiguousarray(array) for array in given]
+            where = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
+            results = [array.ctypes.data_as(ctypes.c_void_p) for array in (inputs, predicted, h)]
+            steps = self.compiled(*where, steps, *results)
+        return inputs[:steps], predicted[:steps], h[:steps]
+
+    def _interpreted(
+        self,
+        theta: Array,
+        start: Array,
+        model: EmpiricalModel,
+        picks: NDArray[np.int32],
+        inputs: Array,
+        predicted: Array,
+        h: Array,
+    ) -> int:
+        problem, controller, s = self._problem, self._controller, start
+        (c, W), a = model.coefficients, problem.reference_action
+        controller.theta = theta
+        controller.reset()
+        for step, pick in enumerate(picks):
+            if not np.isfinite(s).all():
+                return step
+            try:
+                controller.prepare()
+                a = np.clip(
+                    controller.feedback(s).action, problem.action_lower, problem.action_upper
+                )
+            except Exception as error:
+                recover(controller, error)
+            inputs[step] = np.concatenate([s, a])
+            y, G, size = self._features(inputs[step][None])
+            predicted[step] = y[0] + G[0] @ c + W @ np.append(1.0, inputs[step])
+            h[step] = size[0]
+            s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
+        return len(picks)
+
+
+def bound_costs(
+    problem: Problem, predicted: Array, scales: Array, errors: SortedErrors, widened: float
+) -> Array:
+    """Mean penalty of each bound, lower then upper, (2n,): its expectation over all errors.
+
+    `predicted` states f and `scales` h, (M, n) each; s₊ = f + `widened` h e.
+    """
+    n = problem.n_states
+    costs = np.zeros(2 * n)
+    for i in range(n):
+        h = widened * scales[:, i]
+        for above, bound in ((False, problem.state_lower[i]), (True, problem.state_upper[i])):
+            if not np.isfinite(bound):
+                continue
+            first, second = errors.beyond(i, (bound - predicted[:, i]) / h, above=above)
+            penalty = (
+                problem.penalty_linear[i] * h * first + problem.penalty_quadratic[i] * h**2 * second
+            )
+            costs[i + n * above] = penalty.mean()
+    return costs
+
+
+def _design(G: Array, standardised: Array) -> Array:
+    """Rows (M, K, p + K(1+n+m)) of the regression."""
+    M, K, p = G.shape
+    inputs = np.column_stack([np.ones(M), standardised])
+    q = inputs.shape[1]
+    design = np.zeros((M, K, p + K * q))
+    design[:, :, :p] = G
+    for i in range(K):
+        design[:, i, p + i * q : p + (i + 1) * q] = inputs
+    return design

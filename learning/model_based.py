@@ -1,0 +1,345 @@
+"""`model-based`: θ searched on a model of the plant that its own operation has taught.
+
+The cost is tuned on the nominal model; what is searched are the back-offs of the state bounds. A θ
+costs what the empirical model promises: the mean stage cost of one long rollout and the expectation
+of the penalty over all errors of prediction. Of back-offs between which the model cannot tell the
+smallest is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.stats import chi2
+
+from controllers.economic import tune
+from controllers.errors import TuningError
+from controllers.problem import Problem
+from controllers.theta import Parameters
+from cosim.scenario import Scenario
+from learning.algorithm import LearnableController, Transition, Update
+from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.configuration import Configuration, Count
+from learning.empirical_model import EmpiricalModel, Features, Rollout, bound_costs
+from learning.exploration import Strategy
+from learning.prediction_errors import SortedErrors
+from learning.step import certificate
+
+Array = NDArray[np.float64]
+
+BURN, COARSE, FINE = 300, 1800, 5300
+"""Samples of a rollout before it counts, of one on the grid, and of one about its best point."""
+LEVELS = (0.0, 2.0, 3.0, 7.0, 18.0, 50.0)
+"""Back-offs of the grid, in standard deviations of the one-step error."""
+FACTORS = ((0.72, 0.85, 1.18, 1.4), (0.93, 1.07))
+"""Of a back-off, in the two sweeps about the best point of the grid."""
+ROOM = 0.45
+"""Largest back-off, as a share of the distance of the bounds."""
+DOUBT = 1.0
+"""Standard deviations of a difference of costs within which the model cannot tell."""
+PLATEAU = 2e-5
+"""Least deviation of such a difference, as a share of the cost."""
+WORTH = 1e-6
+"""Share of the cost that the penalty of a bound must reach for its back-off to be searched."""
+TAIL, TAIL_SAMPLES = 0.1, 120
+"""The errors' tails are widened by `TAIL` √(`TAIL_SAMPLES` / their number)."""
+ALARM = 1e-7
+"""Probability below which the mean error since the last fit speaks of another plant."""
+WINDOWS = (15, 60, 240)
+"""Latest samples of which that mean is taken, every `WINDOWS[0]` samples."""
+POOL = 480
+"""Number of residuals up to which those from before a change are kept."""
+RECENT = 1440
+"""Latest samples by which the size of the errors is measured."""
+THINNED = 10
+"""Of so many samples of a rollout one tells what the model knows of it."""
+
+
+class ModelBasedConfiguration(Configuration):
+    """Hyperparameters of `model-based`."""
+
+    theta: Literal["back-offs"] = Field("back-offs", description="what of θ is searched")
+    first_update: Count = Field(30, description="samples before the first update of θ")
+    longest_interval: Count = Field(
+        1440, description="most samples between updates, which double with the model's data"
+    )
+    memory: Count = Field(20_000, description="samples that the model remembers")
+    exploration_samples: Count = Field(
+        480, description="samples that explore after the start and after a change of the plant"
+    )
+
+
+@dataclass
+class Progress:
+    """How far a run is: what a checkpoint has beside θ and the model.
+
+    `rows` (memory, 2n+m+1) has the transitions (s, a, s₊, ℓ), a ring; `count` samples so far, of
+    which the present plant's begin at `era`; the last update was at `updated`, the next is `due`.
+    `back_off` (2n,) is that of θ; `pool` has the residuals from before the last change.
+    `model_samples` counts the samples of rollouts.
+    """
+
+    rows: Array
+    back_off: Array
+    pool: Array
+    due: int
+    count: int = 0
+    era: int = 0
+    updated: int = 0
+    model_samples: int = 0
+
+
+class ModelBased:
+    """Operates with θ, fits the empirical model, searches on it, and operates on.
+
+    An update is due whenever the model's data have doubled or `longest_interval` has passed, and as
+    soon as the errors since the last update have a mean that the model makes improbable: then the
+    plant has changed, and the data from there on count. θ moves only where the model, on new noise,
+    promises less for the new one.
+    """
+
+    Configuration = ModelBasedConfiguration
+    asks_for: ClassVar[Literal["operation"]] = "operation"
+    budget: ClassVar[int] = 10_080
+    needs_action_value = False
+    needs_points = False
+
+    def __init__(
+        self,
+        controller: LearnableController,
+        scenario: Scenario,
+        configuration: ModelBasedConfiguration,
+        samples: int,
+        strategy: Strategy,
+        rng: np.random.Generator,
+    ) -> None:
+        self._controller, self._configuration, self._rng = controller, configuration, rng
+        self._problem = problem = Problem.from_scenario(scenario)
+        start, n = controller.parameters, problem.n_states
+        self._base = _tuned(problem, start)
+        self._features = Features(problem)
+        self._rollout = Rollout(problem, start, self._features)
+        self._model: EmpiricalModel | None = None
+        self._progress = Progress(
+            rows=np.zeros((configuration.memory, self._features.inputs + n + 1)),
+            back_off=np.zeros(2 * n),
+            pool=np.zeros((0, n + 1)),
+            due=configuration.first_update,
+        )
+
+    @property
+    def explores(self) -> bool:
+        """Whether the samples explore now."""
+        now = self._progress
+        return now.count - now.era < self._configuration.exploration_samples
+
+    @property
+    def model_samples(self) -> int:
+        """Samples of the model that its rollouts have taken so far."""
+        return self._progress.model_samples
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Keep a transition; move θ where it is time."""
+        now = self._progress
+        row = (transition.s, transition.a, transition.next_s, [transition.stage_cost])
+        now.rows[now.count % len(now.rows)] = np.concatenate(row)
+        now.count += 1
+        if self._model is not None and (now.count - now.updated) % WINDOWS[0] == 0:
+            window = self._changed(self._model)
+            if window:
+                now.era, now.due = now.count - window, now.count
+                now.pool = self._model.residuals[-POOL:]
+        return self._update() if now.count >= now.due else None
+
+    def _latest(self, count: int) -> tuple[Array, Array]:
+        """Inputs (s, a) and outputs (s₊, ℓ) of the latest samples, oldest first."""
+        now = self._progress
+        rows = now.rows[np.arange(now.count - count, now.count) % len(now.rows)]
+        return rows[:, : self._features.inputs], rows[:, self._features.inputs :]
+
+    def _changed(self, model: EmpiricalModel) -> int:
+        """Number of latest samples that speak of another plant than the model's, or 0."""
+        noise = np.cov(model.residuals.T)
+        for window in WINDOWS:
+            if window > self._progress.count - self._progress.updated:
+                return 0
+            mean, design = model.mean_error(*self._latest(window))
+            covariance = noise / window + design @ model.covariance @ design.T
+            if chi2.sf(mean @ np.linalg.solve(covariance, mean), mean.size) < ALARM:
+                return window
+        return 0
+
+    def _update(self) -> Update:
+        now = self._progress
+        age = now.count - now.era
+        inputs, outputs = self._latest(min(age, len(now.rows)))
+        self._model = EmpiricalModel.fit(
+            self._features, inputs, outputs, now.pool[: max(POOL - age, 0)]
+        )
+        now.updated = now.count
+        interval = max(age, self._configuration.first_update)
+        now.due = now.count + min(interval, self._configuration.longest_interval)
+        search = BackOffs(
+            self._problem, self._rollout, self._base, self._model, inputs[-RECENT:], self._rng
+        )
+        found, present = search.best(now.back_off), self._controller.parameters
+        new = search.theta(found)
+        search.draw(FINE)
+        better = search.excess(search.promise(new), search.promise(present.theta)) <= 0
+        if better:
+            now.back_off = found
+            self._controller.theta = new
+        now.model_samples += search.samples
+        step = self._controller.theta - present.theta
+        return Update(
+            td_error=float("nan"),
+            step=float(np.linalg.norm(step / present.blocks.scale)),
+            smallest_eigenvalue=certificate(present.blocks, self._controller.theta).smallest,
+            refused=not better,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The data, the model and how far the run is."""
+        model = {} if self._model is None else self._model.arrays()
+        return arrays_of(self._progress) | prefixed("model ", model)
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        take_up(self._progress, state)
+        if model := group({k: v for k, v in state.items() if k.startswith("model ")}, "model "):
+            self._model = EmpiricalModel(self._features, **model)
+
+
+class Promise(NamedTuple):
+    """Mean `cost` that a model promises, and its derivative by the model's coefficients, `row`."""
+
+    cost: float
+    row: Array
+
+
+class BackOffs:
+    """Searches back-offs δ (2n,) of the lower, then the upper state bounds on an empirical model.
+
+    `visited` are the latest inputs (s, a), (M, n+m), oldest first; rollouts begin at the last one's
+    state. All θ meet the same noise until the next `draw`. δ are multiples of a twentieth of the
+    error's order of magnitude, so that no last digit decides.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        rollout: Rollout,
+        base: Parameters,
+        model: EmpiricalModel,
+        visited: Array,
+        rng: np.random.Generator,
+    ) -> None:
+        n = problem.n_states
+        self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
+        self._start, self._rng = visited[-1, :n], rng
+        errors = model.residuals[:, :n]
+        self._errors = SortedErrors(errors)
+        self._widened = 1 + TAIL * (TAIL_SAMPLES / len(errors)) ** 0.5
+        deviation = errors.std(axis=0) * model.features(visited)[2][:, :n].mean(axis=0)
+        self._unit = np.tile(np.maximum(deviation, 1e-6 * problem.units.state), 2)
+        self._most = np.tile(ROOM * (problem.state_upper - problem.state_lower), 2)
+        self._worth = np.zeros(2 * n)  # largest penalty of each bound so far, as a share of cost
+        self.samples = 0
+        self.draw(COARSE)
+
+    def draw(self, steps: int) -> None:
+        """Take new noise for rollouts of so many samples."""
+        residuals = len(self._model.residuals)
+        self._picks = self._rng.integers(residuals, size=steps, dtype=np.int32)
+
+    def theta(self, delta: Array) -> Array:
+        """θ with its bounds backed off by δ."""
+        n, base = self._problem.n_states, self._base
+        moved = {"x_l": base["x_l"] + delta[:n], "x_u": base["x_u"] - delta[n:]}
+        return base.replace(moved).theta
+
+    def promise(self, theta: Array) -> Promise:
+        """What the model promises of a θ; infinite cost where the loop does not stay finite."""
+        n, picks, model = self._problem.n_states, self._picks, self._model
+        parts = self._rollout(theta, self._start, model, picks)
+        self.samples += len(parts[0])
+        inputs, predicted, h = (part[BURN:] for part in parts)
+        if len(inputs) < len(picks) - BURN or not np.isfinite(predicted).all():
+            return Promise(np.inf, np.zeros_like(model.mean))
+        penalties = bound_costs(self._problem, predicted, h, self._errors, self._widened)
+        stage = float(predicted[:, n].mean())
+        self._worth = np.maximum(self._worth, penalties / abs(stage))
+        return Promise(stage + float(penalties.sum()), model.cost_row(inputs[::THINNED]))
+
+    def excess(self, one: Promise, other: Promise) -> float:
+        """Cost of one above another's, in deviations of what the model knows of the difference."""
+        if not np.isfinite(one.cost):
+            return np.inf
+        row = one.row - other.row
+        deviation = float(row @ self._model.covariance @ row) ** 0.5
+        return float((one.cost - other.cost) / max(deviation, PLATEAU * abs(one.cost)))
+
+    def best(self, delta: Array) -> Array:
+        """The smallest δ whose cost the model cannot tell from the least one.
+
+        First a grid, at once over the bounds whose penalty shows anywhere, up to two, and one by
+        one over what others there are; then each about the best point, on longer rollouts.
+        """
+        grids = [
+            self._rounded(i, [level * unit for level in LEVELS])
+            for i, unit in enumerate(self._unit)
+        ]
+        active: list[int] = []
+        points = [delta, np.zeros_like(delta)]
+        while True:
+            delta = self._least(points)
+            worth = np.where(delta > 0, np.inf, self._worth)
+            new = [int(i) for i in np.argsort(-worth) if worth[i] > WORTH and i not in active]
+            if not new:
+                break
+            active.append(new[0])
+            together = active if len(active) <= 2 else active[-1:]
+            corners = product(*(grids[i] for i in together))
+            points = [delta, *(_with(delta, together, corner) for corner in corners)]
+        self.draw(FINE)
+        for factors in FACTORS:
+            for i in active:
+                wanted = [delta[i] * factor for factor in factors] if delta[i] else [self._unit[i]]
+                values = self._rounded(i, wanted)
+                delta = self._least([delta, *(_with(delta, [i], [value]) for value in values)])
+        return delta
+
+    def _rounded(self, i: int, values: Sequence[float]) -> list[float]:
+        """Back-offs of a bound as multiples of its step, within its room, ascending."""
+        step = 10.0 ** np.floor(np.log10(self._unit[i])) / 20
+        return sorted({float(min(round(v / step) * step, self._most[i])) for v in values})
+
+    def _least(self, points: Sequence[Array]) -> Array:
+        distinct = list({tuple(point): point for point in points}.values())
+        promises = [self.promise(self.theta(point)) for point in distinct]
+        least = min(promises, key=lambda promise: promise.cost)
+        told = [self.excess(promise, least) <= DOUBT for promise in promises]
+        close = [point for point, like in zip(distinct, told, strict=True) if like]
+        return min(close or distinct[:1], key=lambda point: float((point / self._unit).sum()))
+
+
+def _with(delta: Array, bounds: Sequence[int], values: Sequence[float]) -> Array:
+    changed = delta.copy()
+    changed[list(bounds)] = values
+    return changed
+
+
+def _tuned(problem: Problem, start: Parameters) -> Parameters:
+    """θ with the cost tuned on the nominal model and the true bounds, all else the start's."""
+    try:
+        tuned = tune(problem, start.blocks).parameters
+    except TuningError:
+        return start
+    kept = ("c_lambda", "c_f", "w_sigma", "W_sigma", "p")
+    return tuned.replace({name: start[name] for name in kept if name in start.blocks})

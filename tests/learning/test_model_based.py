@@ -1,0 +1,139 @@
+"""The empirical model, its rollouts in two languages, the back-offs found on it, and the rule."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from controllers.factories import tuned
+from controllers.functions import find_compiler
+from learning import model_based
+from learning.empirical_model import EmpiricalModel, Features, Rollout
+from learning.log import to_csv
+from learning.model_based import BackOffs, ModelBased
+from tests.helpers.training import killed_and_resumed, make_run, train
+
+
+@pytest.fixture(scope="module")
+def features(problem):
+    return Features(problem)
+
+
+@pytest.fixture(scope="module")
+def base(scenario):
+    return tuned(scenario).parameters
+
+
+def plant_data(features, rng, count, error, offset=0.0):
+    """Inputs about the steady state and outputs of a plant whose parameter errors are `error`."""
+    inputs = rng.normal([27.0, 60.0, 220.0, 230.0], [2.0, 6.0, 20.0, 20.0], (count, 4))
+    y, G, h = features(inputs)
+    noise = rng.uniform(-0.1, 0.1, y.shape)
+    return inputs, y + G @ error + h * (noise + offset)
+
+
+@pytest.fixture
+def fitted(features, rng):
+    error = np.zeros(features.count)
+    error[0] = -0.2
+    return EmpiricalModel.fit(features, *plant_data(features, rng, 2000, error))
+
+
+def test_the_fit_predicts_a_plant_with_another_parameter(features, rng):
+    error = rng.normal(scale=0.1, size=features.count)
+    model = EmpiricalModel.fit(features, *plant_data(features, rng, 4000, error))
+    inputs, outputs = plant_data(features, rng, 4000, error)
+    y, G, h = features(inputs)
+    c, W = model.coefficients
+    predicted = y + G @ c + np.column_stack([np.ones(4000), inputs]) @ W.T
+    wrong = np.abs((predicted - y - G @ error) / h)
+    assert wrong.max() < 0.03
+    assert np.abs((y - outputs) / h).mean() > 5 * wrong.mean()
+    assert np.allclose(model.residuals.std(axis=0), 0.1 / np.sqrt(3), rtol=0.05)
+
+
+def test_the_deviation_of_the_mean_cost_is_what_the_fits_scatter(features, rng):
+    at = plant_data(features, rng, 50, np.zeros(features.count))[0]
+    costs, deviations = [], []
+    for _ in range(30):
+        error = rng.normal(scale=0.15, size=features.count)
+        model = EmpiricalModel.fit(features, *plant_data(features, rng, 200, error))
+        row = model.cost_row(at)
+        true = (features(at)[1][:, -1] @ error).mean()
+        costs.append(row @ model.mean - true)
+        deviations.append(np.sqrt(row @ model.covariance @ row))
+    assert 0.4 < np.std(costs) / np.mean(deviations) < 1.6
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_the_compiled_rollout_is_the_interpreted_one(
+    problem, base, features, fitted, rng, monkeypatch
+):
+    monkeypatch.setenv("COSIM_COMPILE", "now")
+    rollout = Rollout(problem, base, features)
+    assert rollout.compiled is not None
+    theta = base.replace({"x_l": base["x_l"] + [2.0, 0.0]}).theta
+    picks = rng.integers(2000, size=40, dtype=np.int32)
+    compiled = rollout(theta, np.array([30.0, 78.0]), fitted, picks)
+    rollout.compiled = None
+    interpreted = rollout(theta, np.array([30.0, 78.0]), fitted, picks)
+    for one, other in zip(compiled, interpreted, strict=True):
+        assert np.allclose(one, other, rtol=1e-9, atol=0.0)
+
+
+def riding(problem, base, n, slope):
+    """A rollout of a loop whose first state rides its lower bound, at `slope` of cost a unit."""
+    where = base.blocks.slices["x_l"].start
+
+    def rollout(theta, start, model, picks):
+        predicted = np.tile([theta[where], 60.0, 0.0], (len(picks), 1))
+        predicted[:, 2] = 6000.0 + slope * (theta[where] - problem.state_lower[0])
+        inputs = np.tile([theta[where], 60.0, 220.0, 230.0], (len(picks), 1))
+        return inputs, predicted, np.ones((len(picks), n + 1))
+
+    return rollout
+
+
+def test_the_back_off_of_a_known_loop_is_found(problem, base, features, rng):
+    residuals = np.column_stack([rng.uniform(-1.0, 1.0, (20_000, 1)), np.zeros((20_000, 2))])
+    model = SimpleNamespace(
+        residuals=residuals,
+        mean=np.zeros(1),
+        covariance=np.zeros((1, 1)),
+        features=lambda visited: (None, None, np.ones((len(visited), 3))),
+        cost_row=lambda inputs: np.zeros(1),
+    )
+    visited = np.tile([27.0, 60.0, 220.0, 230.0], (10, 1))
+    slope = 10_000.0
+    loop = riding(problem, base, 2, slope)
+    found = BackOffs(problem, loop, base, model, visited, rng).best(np.zeros(4))
+    # slope = 1e5 · P(noise < −δ) at the optimum; the tails are widened by a per cent.
+    assert found[0] == pytest.approx(0.8, abs=0.06)
+    assert (found[1:] == 0).all()
+
+
+def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, features, fitted, rng):
+    run = make_run("model-based", scenario)
+    controller = SimpleNamespace(parameters=base, theta=base.theta)
+    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+    error = np.zeros(features.count)
+    error[0] = -0.2
+    for offset, window in ((0.0, 0), (0.3, 15)):
+        inputs, outputs = plant_data(features, rng, 240, error, offset)
+        rule._progress.rows[:240] = np.column_stack([inputs, outputs])
+        rule._progress.count = 240
+        assert rule._changed(fitted) == window
+
+
+def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch):
+    for name, samples in (("BURN", 20), ("COARSE", 60), ("FINE", 80)):
+        monkeypatch.setattr(model_based, name, samples)
+    settings = {"first_update": 15}
+    every = {"samples": 80, "log_every": 20, "evaluate_every": 80, "checkpoint_every": 20}
+    run = make_run("model-based", scenario, settings, start="tuned", **every)
+    whole = train(run)
+    assert whole.asks_for == "operation"
+    resumed = killed_and_resumed(run, tmp_path, 40)
+    assert to_csv(resumed.rows) == to_csv(whole.rows)
+    assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
+    assert whole.parameters["x_l"][0] > scenario.state_lower[0]

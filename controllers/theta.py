@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ModelError, ParameterError
 from controllers.problem import Problem
 from cosim.files import read_toml, write_atomically
+from cosim.shown import Shown
 
 Vector = NDArray[np.float64]
 
@@ -241,8 +242,8 @@ SCHEMA = 1
 KEYS = ("schema", "hash", "theta", "model_parameters")
 
 
-@dataclass(frozen=True)
-class Parameters:
+@dataclass(frozen=True, repr=False)
+class Parameters(Shown):
     """A value `theta` of θ, (blocks.size,), with its blocks; `parameters["B_l"]` is a whole block.
 
     Raises ParameterError on a vector of wrong length or with an entry that is not finite.
@@ -265,6 +266,16 @@ class Parameters:
     def __getitem__(self, name: str) -> Vector:
         """Unpacked value of a block."""
         return self.blocks.block(name).unpack(self.theta[self.blocks.slices[name]])
+
+    def _facts(self) -> dict[str, object]:
+        return {"hash": self.hash, "blocks": ", ".join(self.blocks.slices), "size": len(self.theta)}
+
+    def to_pandas(self) -> Any:
+        """The entries of θ by their labels, with their learning scales, as a pandas data frame."""
+        import pandas as pd  # noqa: PLC0415 - half a second
+
+        columns = {"theta": self.theta, "scale": self.blocks.scale}
+        return pd.DataFrame(columns, index=list(self.blocks.labels))
 
     def replace(self, blocks: Mapping[str, ArrayLike]) -> Parameters:
         """Copy with the named blocks set to new values."""

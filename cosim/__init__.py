@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from controllers.theta import Parameters as Parameters
     from cosim.evaluation import Evaluation as Evaluation
     from cosim.evaluation import evaluate as evaluate
     from cosim.plant import FmuPlant as FmuPlant
+    from cosim.plugins import build_controller as build_controller
     from cosim.scenario import Scenario as Scenario
     from cosim.simulation import simulate as simulate
     from cosim.studies.plan import Study as Study
@@ -28,8 +30,10 @@ _HOMES = {
     "Scenario": "cosim.scenario",
     "Study": "cosim.studies.plan",
     "StudyResults": "cosim.studies.results",
+    "Parameters": "controllers.theta",
     "Training": "learning.training",
     "Trajectory": "cosim.trajectory",
+    "build_controller": "cosim.plugins",
     "evaluate": "cosim.evaluation",
     "study": "cosim.studies.run",
     "simulate": "cosim.simulation",
@@ -38,11 +42,13 @@ _HOMES = {
 __all__ = [
     "Evaluation",
     "FmuPlant",
+    "Parameters",
     "Scenario",
     "Study",
     "StudyResults",
     "Training",
     "Trajectory",
+    "build_controller",
     "evaluate",
     "simulate",
     "study",

@@ -25,6 +25,7 @@ from cosim.plugins import (
 )
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
+from cosim.shown import Shown
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, check_folders
 from cosim.studies.run import Runner
@@ -208,8 +209,8 @@ def _check(
         raise EvaluationError(f"steps must be at least 1, not {steps}; burn-in at least 0")
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Shown):
     """Indicators of controllers × seeds on common random numbers.
 
     `columns` and `timing` hold, by controller, what was measured over the seeds by name, (S,)
@@ -224,6 +225,16 @@ class Evaluation:
     settling: Mapping[str, float]
     parameters: Mapping[str, str]
     facts: Mapping[str, Any]
+
+    def _facts(self) -> dict[str, object]:
+        known = {f"J of {name}": float(self.column(name, "J").mean()) for name in self.controllers}
+        if self.optimum is not None:
+            known["J*"] = float(self.optimal.mean())
+        facts = {name: self.facts[name] for name in ("scenario", "steps")}
+        return facts | {"seeds": len(self.seeds)} | known
+
+    def _picture(self) -> Figure | None:
+        return self.figure()
 
     @property
     def optimum(self) -> str | None:

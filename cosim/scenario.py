@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from cosim.errors import ScenarioError
 from cosim.files import parse_toml, read_toml
 from cosim.penalty import Penalty
+from cosim.shown import Shown
 from cosim.validation import describe, suggestion
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -170,7 +171,7 @@ class ControllerTable(Table):
     """ℓ_s."""
 
 
-class Scenario(Table):
+class Scenario(Shown, Table):
     """A benchmark task: plant, sampling, cost, disturbances, bounds and the controller's settings.
 
     Load one with `Scenario.load`; derive another with `replace`. Times in s, everything else in
@@ -249,6 +250,18 @@ class Scenario(Table):
         if law != "none" and not (mapping.law and law in mapping.law_codes):
             raise _misfit("disturbance.law", f"'{law}' needs plant.mapping.law and its law_codes")
         return self
+
+    def _facts(self) -> dict[str, object]:
+        plant = self.plant
+        return {
+            "name": self.name,
+            "hash": self.hash,
+            "sampling_time": self.sampling_time,
+            "fmu": plant.fmu,
+            "states": ", ".join(plant.states),
+            "actions": ", ".join(plant.actions),
+            "disturbances": f"{', '.join(plant.disturbances)} ({self.disturbance.law})",
+        }
 
     @classmethod
     def load(cls, source: str | Path) -> Scenario:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,12 @@ from cosim.errors import TrajectoryError
 from cosim.files import write_atomically
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
+from cosim.shown import Shown
 from cosim.signals import signal_names, whole
 from cosim.text_tables import PIECE, csv_pieces
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 STATUS = "status"
@@ -40,8 +44,8 @@ class Signal:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Shown):
     """The K samples of a closed-loop run on a scenario.
 
     Signals, each (K,): `time` [s]; the scenario's states, actions and disturbances under their
@@ -86,6 +90,28 @@ class Trajectory:
         return (
             np.stack([self[name] for name in names], axis=1) if names else np.empty((len(self), 0))
         )
+
+    def _facts(self) -> dict[str, object]:
+        found = self.summary()
+        names = ("samples", "J", "economic_cost", "violating_share", "failures")
+        about = {"scenario": self.scenario.name, "controller": self.controller, "seed": self.seed}
+        return about | {name: found[name] for name in names}
+
+    def _picture(self) -> Figure | None:
+        return self.figure()
+
+    def to_pandas(self) -> Any:
+        """The signals as a pandas data frame, a row for each sample, a column for each signal."""
+        import pandas as pd  # noqa: PLC0415 - half a second
+
+        columns = {name: signal.values for name, signal in self.signals.items()}
+        return pd.DataFrame(columns | {STATUS: list(self.status)})
+
+    def figure(self) -> Figure:
+        """States, actions, disturbances and costs over time, with their bounds."""
+        from cosim.figures.trajectory import trajectory_figure  # noqa: PLC0415 - matplotlib
+
+        return trajectory_figure(self, self.scenario)
 
     @property
     def time(self) -> Array:

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from itertools import islice
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import functions_of
 from cosim.scenario import Scenario
+from cosim.shown import Shown
 from cosim.statistics import shown
 from learning import checkpoint
 from learning.algorithm import Algorithm, LearnableController, Privilege, load_algorithm
@@ -33,7 +34,7 @@ from learning.evaluation import FIGURES, Judge, stored_optimum
 from learning.log import COLUMNS, LogRow, Totals, late_movement, to_csv
 from learning.loop import TrainingLoop, begin
 from learning.step import certificate
-from learning.training_run import TrainingRun, prepare
+from learning.training_run import Options, TrainingRun, prepare
 from learning.training_run import build_controller as build_learnt
 
 if TYPE_CHECKING:
@@ -44,8 +45,8 @@ CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
 
 
-@dataclass(frozen=True)
-class Training:
+@dataclass(frozen=True, repr=False)
+class Training(Shown):
     """A training that has ended.
 
     `parameters` are θ as the run hands it over, `rows` its log. `evaluation` is the greedy policy
@@ -69,6 +70,28 @@ class Training:
     functions: str | None = None
     without_checkpoint: str | None = None
     wall_seconds: float = field(default=float("nan"), compare=False)
+
+    def _facts(self) -> dict[str, object]:
+        run = self.run
+        return {
+            "algorithm": run.algorithm,
+            "scenario": run.scenario.name,
+            "start": run.start,
+            "samples": self.plant_samples,
+            "seed": run.seed,
+            "status": self.status,
+            "J": self.J,
+            "regret": self.regret,
+        }
+
+    def _picture(self) -> Figure | None:
+        return self.figure() if self.rows else None
+
+    def to_pandas(self) -> Any:
+        """The training's log as a pandas data frame."""
+        import pandas as pd  # noqa: PLC0415 - half a second
+
+        return pd.DataFrame(self.log())
 
     @property
     def J(self) -> float:
@@ -172,7 +195,7 @@ def train(
     resume: bool = False,
     optimum: str | None = None,
     progress: Callable[[int, LogRow], None] | None = None,
-    **options: Any,
+    **options: Unpack[Options],
 ) -> Training:
     """Train a controller's θ on a scenario's plant.
 
@@ -193,7 +216,7 @@ def train(
     resume : go on from the checkpoint in `out`.
     optimum : name of the controller whose J is J*; None is `optimal` where its solution is stored.
     progress : called with the samples done and the last row of the log.
-    options : further fields of `TrainingRun`, `evaluate_every=1000` say.
+    options : further fields of `TrainingRun`, `evaluate_every=1000` say; see `Options`.
     """
     if not isinstance(scenario, Scenario):
         scenario = Scenario.load(scenario)

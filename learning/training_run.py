@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.plugins import OURS, depends_on
 from cosim.scenario import Scenario
+from cosim.validation import suggestion
 from learning.algorithm import LearnableController, load_algorithm
 from learning.commissioning import back_off
 from learning.configuration import Configuration
@@ -112,6 +113,19 @@ class TrainingRun:
         return np.random.default_rng(np.random.SeedSequence(self.seed).spawn(3)[2])
 
 
+class Options(TypedDict, total=False):
+    """The fields of `TrainingRun` that `train` takes as further keywords."""
+
+    controller: str
+    log_every: int
+    evaluate_every: int
+    checkpoint_every: int
+    evaluation_seeds: int
+    evaluation_steps: int
+    divergence: float
+    rest_after: int | None
+
+
 def prepare(
     algorithm: str,
     scenario: Scenario,
@@ -124,18 +138,19 @@ def prepare(
     Raises AlgorithmLookupError; ConfigurationError on settings or options that make no run.
     """
     found = load_algorithm(algorithm)
+    known = [option.name for option in fields(TrainingRun)]
+    for name in options:
+        if name not in known:
+            raise ConfigurationError(f"training has no option '{name}'{suggestion(name, known)}")
     if not isinstance(settings, Configuration):
         settings = found.Configuration.from_dict(dict(settings or {}))
-    try:
-        return TrainingRun(
-            algorithm=algorithm,
-            scenario=scenario,
-            samples=getattr(found, "budget", SAMPLES) if samples is None else samples,
-            configuration=settings,
-            **options,
-        )
-    except TypeError as error:
-        raise ConfigurationError(f"training: {error}") from None
+    return TrainingRun(
+        algorithm=algorithm,
+        scenario=scenario,
+        samples=getattr(found, "budget", SAMPLES) if samples is None else samples,
+        configuration=settings,
+        **options,
+    )
 
 
 def starting_parameters(

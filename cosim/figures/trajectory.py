@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,14 +23,44 @@ from cosim.figures.style import (
     plain,
 )
 from cosim.scenario import Scenario
-from cosim.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 
-def trajectory_figure(
-    trajectory: Trajectory, scenario: Scenario, *, beside: Sequence[Trajectory] = ()
-) -> Figure:
+class Run(Protocol):
+    """What a figure asks of a run; a `Trajectory`, which draws itself, has it."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario that was run."""
+
+    @property
+    def signals(self) -> Mapping[str, Any]:
+        """Signals by name, each with `unit` and `values`."""
+
+    @property
+    def time(self) -> Array:
+        """Sample instants in s, (K,)."""
+
+    @property
+    def controller(self) -> str:
+        """The controller's name."""
+
+    @property
+    def seed(self) -> int | None:
+        """The noise's seed."""
+
+    def summary(self) -> dict[str, Any]:
+        """Means of the run and its counts."""
+
+    def __getitem__(self, name: str) -> Array:
+        """Values of a signal, (K,)."""
+
+    def __len__(self) -> int:
+        """Return the number of samples K."""
+
+
+def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[Run] = ()) -> Figure:
     """States and inputs with bounds (red) and operating point (grey), disturbances and costs.
 
     Inputs, disturbances and costs hold from one sample to the next. Violated bounds are shaded,
@@ -93,7 +123,7 @@ def trajectory_figure(
     return drawn
 
 
-def overlay_figure(runs: Mapping[str, Trajectory]) -> Figure:
+def overlay_figure(runs: Mapping[str, Run]) -> Figure:
     """States and inputs of runs of one scenario over time, a line for each controller.
 
     Below a violated lower bound, and above an upper one, the area is shaded in the controller's

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cosim.errors import StudyError
 from cosim.figures.style import palette, save
 from cosim.files import read_json, write_atomically
+from cosim.shown import Shown
 from cosim.statistics import (
     Estimate,
     gap_closed,
@@ -65,8 +66,8 @@ AGGREGATE_COLUMNS = [
 ]  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class StudyResults:
+@dataclass(frozen=True, eq=False, repr=False)
+class StudyResults(Shown):
     """Measurements of a study in `folder`, as pandas frames of its finished runs.
 
     `about` is the document study.json: cases, scenarios, and the versions that made them.
@@ -417,6 +418,15 @@ class StudyResults:
     def table(self, scenario: str) -> str:
         """A scenario's table as Markdown, least J first."""
         return markdown_table(*self.lines(scenario))
+
+    def _facts(self) -> dict[str, object]:
+        return {
+            "name": self.name,
+            "scenarios": len(self.scenarios),
+            "cases": len(self.cases),
+            "runs": len(self.state),
+            "folder": self.folder,
+        }
 
     def _repr_html_(self) -> str:
         """Tables of all scenarios, for notebooks."""

@@ -121,18 +121,13 @@ def _parameter_set(component: Component) -> str:
         if kind not in _TYPES:
             raise BuildError(f"{component.name}.{name}: no start value of type {kind} in an SSP")
         parameter = ElementTree.SubElement(parameters, _tag("ssv", "Parameter"), name=name)
-        text = repr(float(value)) if kind == "Real" else str(_signed(int(value)))
+        text = repr(float(value)) if kind == "Real" else str(int(value))
         if kind == "Boolean":
             text = "true" if value else "false"
         # Importers of FMI 2.0 set an enumeration through its number.
         tag = "Integer" if kind == "Enumeration" else kind
         ElementTree.SubElement(parameter, _tag("ssv", tag), value=text)
     return _document(root, "ssv")
-
-
-def _signed(value: int) -> int:
-    """The same 32 bits as FMI 2.0's Integer, which has a sign."""
-    return value - (1 << 32) if value >= 1 << 31 else value
 
 
 def _tag(space: str, name: str) -> str:

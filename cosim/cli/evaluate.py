@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,6 +19,9 @@ from cosim.cli.options import (
     count,
 )
 from cosim.cli.output import Output, dump, load_scenario, open_folder, output, resumable
+
+if TYPE_CHECKING:
+    from cosim.scenario import Scenario
 
 
 def evaluate(
@@ -39,6 +42,15 @@ def evaluate(
         int, count("--burn-in", least=0, text="Samples run before those that count.")
     ] = 0,
     out: OutOption = Path("cosim-evaluation"),
+    trajectories: Annotated[
+        Path | None,
+        typer.Option(
+            "--trajectories",
+            help="In place of controllers: judge a folder of loops that another tool ran, one CSV "
+            "file a seed (run-7.csv) with the states and the actions applied.",
+            show_default=False,
+        ),
+    ] = None,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
     json: JsonOption = False,
@@ -54,7 +66,11 @@ def evaluate(
         from cosim.evaluation import evaluate as run
         from cosim.files import write_atomically
 
-        task, named = load_scenario(scenario), named_controllers(controllers)
+        task = load_scenario(scenario)
+        if trajectories is not None:
+            _judge(task, trajectories, out, out_)
+            return
+        named = named_controllers(controllers)
         options: dict[str, Any] = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
         options |= {"first-seed": first_seed} if first_seed else {}
         options |= {"steps": steps} | ({"burn-in": burn_in} if burn_in else {})
@@ -88,6 +104,33 @@ def evaluate(
         show(summary, out_)
         out_.note(f"files are in {folder.resolve()}")
         out_.json(summary)
+
+
+def _judge(scenario: Scenario, trajectories: Path, out: Path, output: Output) -> None:
+    """Judge recorded runs: judged.csv and summary.json in `out`, a table of means."""
+    from cosim.files import write_atomically
+    from cosim.judge import judge
+    from cosim.statistics import mean, regret, shown
+
+    table = judge(scenario, trajectories)
+    cost, optimum = table["J"].to_numpy(), table["optimum"].to_numpy()
+    summary = {
+        "scenario": scenario.name,
+        "scenario_hash": scenario.hash,
+        "seeds": table["seed"].tolist(),
+        "J": mean(cost).to_dict(),
+        "regret": regret(cost, optimum).to_dict(),
+        "violating_share": float(table["violating_share"].mean()),
+    }
+    folder = open_folder(out)
+    write_atomically(folder / "judged.csv", table.to_csv(index=False))
+    write_atomically(folder / "summary.json", dump(summary))
+    rows = [
+        (row.file, str(row.seed), str(row.steps), shown(row.J, digits=6), f"{100 * row.regret:.3f}")
+        for row in table.itertuples()
+    ]
+    output.table("judged runs", ("file", "seed", "steps", "J", "regret %"), rows)
+    output.json(summary)
 
 
 def named_controllers(text: str) -> dict[str, str]:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from json import dumps
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer.core import TyperGroup
 
 from cosim.cli.options import JsonOption
 from cosim.cli.output import output
+
+if TYPE_CHECKING:
+    from cosim.scenario import Scenario
 
 SHOW = "show"
 
@@ -34,6 +39,15 @@ def show(
     name: Annotated[
         str | None, typer.Argument(help="Preset, random-SEED or TOML file; none lists the presets.")
     ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            "--seed-values",
+            min=0,
+            help="Print the start values of the plant's FMU (FMI 2.0) for a run of this seed.",
+            show_default=False,
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """List the presets, or print a scenario with every field written out, as TOML."""
@@ -47,10 +61,24 @@ def show(
             out_.json({"presets": {item.name: item.hash for item in loaded}})
             return
         chosen = Scenario.load(name)
+        if seed is not None:
+            values = _seed_values(chosen, seed)
+            out_.note("\n".join(f"{key} = {dumps(value)}" for key, value in values.items()))
+            out_.json({"hash": chosen.hash, "seed": seed, "start_values": values})
+            return
         if json:
             out_.json(chosen.to_dict() | {"hash": chosen.hash})
         else:
             print(f"# hash {chosen.hash}\n{chosen.to_toml()}", end="")
+
+
+def _seed_values(scenario: Scenario, seed: int) -> dict[str, float | bool | int]:
+    from cosim.plant.wiring import start_values
+    from cosim.simulation import spawn_seeds
+
+    types: dict[str, Callable[[float], float | bool | int]] = {"Real": float, "Boolean": bool}
+    starts = start_values(scenario, spawn_seeds(seed)[0])
+    return {name: types.get(kind, int)(value) for name, (kind, value) in starts.items()}
 
 
 @app.command()

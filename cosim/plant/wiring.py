@@ -262,7 +262,8 @@ def seed_words(seed: int, variables: Sequence[SeedWord]) -> list[tuple[str, int,
 def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, float]]:
     """FMI 2.0 type and value of each parameter that differs by scenario, the seed's words too.
 
-    `plant_seed` is the first of `cosim.simulation.spawn_seeds`. Raises PlantError where the
+    `plant_seed`, 64 bits, is the first of `cosim.simulation.spawn_seeds`; an Integer, which has
+    32 bits and a sign, takes its low word, the next one the high word. Raises PlantError where the
     scenario's FMU does not fit it.
     """
     fmu = unpack(scenario.plant.fmu)
@@ -276,5 +277,6 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
         for start in wirer.wiring().starts
     }
     for kind, reference, value in seed_words(plant_seed, wirer.seeds()):
-        found[names[reference, kind]] = (kind, value)
+        signed = value - (1 << 32) if value >= 1 << 31 and kind == "Integer" else value
+        found[names[reference, kind]] = (kind, signed)
     return found

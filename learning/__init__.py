@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from learning.errors import AlgorithmLookupError as AlgorithmLookupError
     from learning.errors import CheckpointError as CheckpointError
     from learning.errors import ConfigurationError as ConfigurationError
-    from learning.errors import DefinitenessError as DefinitenessError
     from learning.errors import DivergenceError as DivergenceError
     from learning.errors import LearningError as LearningError
     from learning.errors import PrivilegeError as PrivilegeError
@@ -41,7 +40,6 @@ _HOMES = {
         "AlgorithmLookupError",
         "CheckpointError",
         "ConfigurationError",
-        "DefinitenessError",
         "DivergenceError",
         "LearningError",
         "PrivilegeError",

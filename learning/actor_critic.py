@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, Transition, Update
 from learning.configuration import Configuration, Count, Positive
-from learning.exploration import Geometric, Strategy
+from learning.exploration import Strategy
 from learning.step import ConstrainedStep, policy_gradient_fit
 
 Vector = NDArray[np.float64]
@@ -23,16 +23,9 @@ class ActorCriticConfiguration(Configuration):
     """Hyperparameters of the actor-critic."""
 
     batch_size: Count = Field(1000, description="samples per step of θ, all at one θ")
-    critic_discount: float = Field(
-        1.0,
-        gt=0,
-        le=1,
-        description="discount of the critic; 1 is the mean cost, the benchmark's yardstick",
-    )
     forgetting: float = Field(
         0.8, ge=0, lt=1, description="weight of a batch in the advantage, relative to the next one"
     )
-    natural: bool = Field(True, description="natural gradient, else the plain one")
     ridge: Positive = Field(
         1e-4, description="ridge of regression and metric, relative to the mean of their diagonals"
     )
@@ -45,6 +38,10 @@ class ActorCriticConfiguration(Configuration):
     radius_end: Positive = Field(
         0.04, description="trust region at the end, approached geometrically"
     )
+
+    def depends_on_samples(self) -> list[str]:
+        """The trust region shrinks over the run."""
+        return [] if self.radius == self.radius_end else ["radius"]
 
     def narrowed(self, width: float) -> Self:
         """Copy whose trust region is `width` times as wide."""
@@ -59,7 +56,8 @@ class ActorCritic:
     Each batch at one θ: LSTDV fits the smooth part W of V = penalty + W, LSTDQ the weights w of
     the advantage A(s, a) = (a − π(s) − bias)ᵀ ∇π(s)ᵀ w, where `bias` is the mean that saturation
     gives to the exploration. The known penalty is moved to the next state, r = ℓ + γ·penalty(s₊),
-    so that the critic meets no kink.
+    so that the critic meets no kink. Its discount γ is 1, that of
+    the mean cost, the benchmark's yardstick.
     """
 
     Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
@@ -77,8 +75,7 @@ class ActorCritic:
         rng: np.random.Generator,
     ) -> None:
         self._configuration, self._strategy = configuration, strategy
-        self._radius = Geometric(configuration.radius, configuration.radius_end, samples)
-        self._discount = configuration.critic_discount
+        self._samples = samples
         self._step = ConstrainedStep(controller, configuration)
         # Actions count in the exploration's standard deviations.
         self._unit = np.broadcast_to(configuration.deviation(scenario), scenario.action_lower.shape)
@@ -91,7 +88,6 @@ class ActorCritic:
             "policy": np.empty((rows, m)),
             "deviation": np.empty((rows, m)),
             "explored": np.empty(rows, dtype=bool),
-            "number": np.empty(rows, dtype=np.int64),
             "jacobian": np.empty((rows, m, size)),
         }
         self._advantage = AdvantageRegression(size, configuration.forgetting, configuration.ridge)
@@ -101,10 +97,10 @@ class ActorCritic:
         """Take one sample; the last of a batch moves θ."""
         batch, row = self._batch, self._filled
         batch["states"][row], batch["next_states"][row] = transition.s, transition.next_s
-        batch["reward"][row] = transition.stage_cost + self._discount * transition.next_penalty
+        batch["reward"][row] = transition.stage_cost + transition.next_penalty
         policy = transition.policy.action
         batch["policy"][row], batch["deviation"][row] = policy, transition.a - policy
-        batch["explored"][row], batch["number"][row] = transition.explored, transition.number
+        batch["explored"][row] = transition.explored
         batch["jacobian"][row] = transition.policy.policy_jacobian
         self._filled += 1
         if self._filled < self._configuration.batch_size:
@@ -116,29 +112,30 @@ class ActorCritic:
         """a − π(s) of the batch, (K, m), less its mean under saturation; zero in greedy samples."""
         batch = self._batch
         explored = batch["explored"]
-        bias = self._strategy.bias(batch["policy"][explored], batch["number"][explored])
+        bias = self._strategy.bias(batch["policy"][explored])
         deviation = np.zeros_like(batch["deviation"])
         deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
         return deviation / self._unit
 
     def _update(self, number: int) -> Update:
         settings, batch = self._configuration, self._batch
-        errors = lstdv(batch["states"], batch["next_states"], batch["reward"], self._discount)
+        errors = lstdv(batch["states"], batch["next_states"], batch["reward"])
         jacobian = batch["jacobian"] * self._step.scale / self._unit[:, None]
         advantage = np.einsum("kmi,km->ki", jacobian, self._deviation())
         self._advantage.add(advantage, errors)
         weights = self._advantage.weights()
         fisher = np.einsum("kmi,kmj->ij", jacobian, jacobian) / len(errors)
         gradient = fisher @ weights
-        metric = None
-        if settings.natural:
-            floor = settings.ridge * float(np.trace(fisher)) / weights.size
-            metric = fisher + (floor + np.finfo(float).tiny) * np.eye(weights.size)
+        floor = settings.ridge * float(np.trace(fisher)) / weights.size
+        metric = fisher + (floor + np.finfo(float).tiny) * np.eye(weights.size)
         fit = policy_gradient_fit(gradient, settings.step_size, metric)
         # A step that the policy does not feel has no length here, and is none to take.
         if not fit.minimiser @ fisher @ fit.minimiser > 0:
             fit = fit.shrunk(0.0)
-        fit = fit.within(self._radius(number), lambda d: float(max(d @ fisher @ d, 0.0)) ** 0.5)
+        # From the one radius to the other by equal ratios.
+        share = min(number / self._samples, 1.0)
+        radius = settings.radius * (settings.radius_end / settings.radius) ** share
+        fit = fit.within(radius, lambda d: float(max(d @ fisher @ d, 0.0)) ** 0.5)
         return self._step.take(fit, float(np.sqrt(np.mean(errors * errors))))
 
     def state(self) -> dict[str, NDArray[Any]]:
@@ -165,18 +162,17 @@ def quadratic_features(states: Matrix, centre: Vector, spread: Vector) -> Matrix
     return np.hstack([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]])
 
 
-def lstdv(states: Matrix, next_states: Matrix, reward: Vector, discount: float) -> Vector:
+def lstdv(states: Matrix, next_states: Matrix, reward: Vector) -> Vector:
     """TD errors of the quadratic value function that LSTD fits to transitions, (K,).
 
-    W(s) = vᵀφ(s) with E[φ (r + γW(s₊) − W(s))] = 0. At γ = 1 the mean cost per sample g takes the
-    place of the constant feature, W(s) = r − g + W(s₊): the differential value.
+    W(s) = vᵀφ(s) with E[φ (r − g + W(s₊) − W(s))] = 0, the differential value: the mean cost per
+    sample g takes the place of the constant feature.
     """
     centre, spread = states.mean(axis=0), states.std(axis=0)
     spread = np.where(spread > 0, spread, 1.0)
     features = quadratic_features(states, centre, spread)
-    change = features - discount * quadratic_features(next_states, centre, spread)
-    if discount == 1.0:
-        change[:, 0] = 1.0
+    change = features - quadratic_features(next_states, centre, spread)
+    change[:, 0] = 1.0
     weights = np.linalg.lstsq(features.T @ change, features.T @ reward)[0]
     errors: Vector = reward - change @ weights
     return errors

@@ -52,7 +52,7 @@ class GreedyConfiguration(Configuration):
     def without_part(self) -> Mapping[str, str]:
         """What is of exploration and of steps."""
         explored = [name for name in type(self).model_fields if name.startswith("exploration_")]
-        stepped = ["definiteness", "smallest_eigenvalue", "slack_linear_minimum"]
+        stepped = ["smallest_eigenvalue"]
         return dict.fromkeys([*explored, *stepped], "a rule that tries θ, not actions")
 
 
@@ -92,7 +92,6 @@ class IdentifiedConfiguration(GreedyConfiguration):
         description="fit again after so many samples, to these; once, at the end of the estimate, "
         "if not given",
     )
-    retune: bool = Field(True, description="tune the cost by economics with the fitted model")
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """The parameters to fit."""
@@ -328,7 +327,7 @@ class Identified(Baseline):
         return fitted
 
     def conclude(self) -> Parameters:
-        """θ with the fitted p and, unless told otherwise, the cost tuned with it.
+        """θ with the fitted p, and the cost tuned with it.
 
         Raises DivergenceError where the fitted model has no economically optimal steady state.
         """
@@ -336,8 +335,6 @@ class Identified(Baseline):
         if "p" not in start.blocks or not self._rows:
             return start
         fitted = start.replace({"p": self._fit()})
-        if not self._configuration.retune:
-            return fitted
         model = self._problem.model
         values = self._model.parameters(fitted)
         quantities = tuple(

@@ -20,9 +20,7 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # The rules differ in how much exploration they need, so these two have other defaults in each.
-ExplorationProbability = Annotated[
-    Share, Field(description="share of samples that explore, at the start")
-]
+ExplorationProbability = Annotated[Share, Field(description="share of samples that explore")]
 ExplorationShare = Annotated[
     Positive, Field(description="standard deviation of e as a share of the input's range")
 ]
@@ -32,10 +30,9 @@ class Configuration(BaseModel):
     """Hyperparameters that every algorithm has; an algorithm adds its own in a subclass.
 
     What a scenario states of exploration and c_lambda's start takes the place of an algorithm's
-    defaults, but not of what the user set (`for_scenario`). A field `x_end` beside `x` makes a
-    schedule over the run's samples. A field's description is its documentation
-    (`documentation`). Scaled coordinates are θ / blocks.scale, so that one step size fits all
-    entries.
+    defaults, but not of what the user set (`for_scenario`). A field's description is its
+    documentation (`documentation`). Scaled coordinates are θ / blocks.scale, so that one step size
+    fits all entries.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -48,25 +45,8 @@ class Configuration(BaseModel):
         "discounted",
         description="c_lambda at the start: ℓ_s (paper) or ℓ_s/(1−γ), unless the scenario says",
     )
-    slack_linear_weight: Positive | None = Field(
-        None,
-        description="w_sigma at the start, extended θ; if not given, of the problem's scale: the "
-        "power of ten above the dearest multiplier of a state bound (`controllers.units`)",
-    )
-    slack_linear_minimum: Positive | None = Field(
-        None,
-        description="lower limit of w_sigma; if not given, just above what exactness asks for",
-    )
-    slack_quadratic_weight: Positive | None = Field(
-        None,
-        description="W_sigma at the start, extended θ; if not given, what makes it as large as the "
-        "linear part at a thousandth of the bounds' width",
-    )
     model_parameters: tuple[str, ...] = Field(
         (), description="parameters of the controller's model that θ has, in its block p"
-    )
-    definiteness: Literal["lmi", "cholesky"] = Field(
-        "lmi", description="how B_l and B_Vf are kept positive definite"
     )
     smallest_eigenvalue: Positive = Field(
         1e-3,
@@ -78,16 +58,10 @@ class Configuration(BaseModel):
         "scenario has a table [exploration]",
     )
     exploration_probability: ExplorationProbability = 1.0
-    exploration_probability_end: Share | None = Field(
-        None, description="share at the end, approached linearly; the same if not given"
-    )
     exploration_share: ExplorationShare = 1 / 60
     exploration_deviation: tuple[NonNegative, ...] | None = Field(
         None,
         description="the same in the units of u, one or one per action, in place of the share",
-    )
-    exploration_deviation_end: tuple[NonNegative, ...] | None = Field(
-        None, description="the same at the end, approached linearly"
     )
 
     @classmethod
@@ -125,9 +99,7 @@ class Configuration(BaseModel):
             stated = {
                 "exploration": table.kind,
                 "exploration_probability": table.probability,
-                "exploration_probability_end": None,
                 "exploration_deviation": table.standard_deviation or (0.0,),
-                "exploration_deviation_end": None,
             }
         if scenario.controller.value_offset is not None:
             stated["value_offset"] = scenario.controller.value_offset
@@ -135,7 +107,7 @@ class Configuration(BaseModel):
         return self.model_copy(update={k: v for k, v in stated.items() if k not in chosen})
 
     def deviation(self, scenario: Scenario) -> NDArray[np.float64]:
-        """Standard deviation of the exploration at the start in the units of u, (m,) or (1,)."""
+        """Standard deviation of the exploration in the units of u, (m,) or (1,)."""
         if self.exploration_deviation is not None:
             return np.array(self.exploration_deviation)
         return self.exploration_share * (scenario.action_upper - scenario.action_lower)
@@ -156,15 +128,8 @@ class Configuration(BaseModel):
         return self
 
     def depends_on_samples(self) -> list[str]:
-        """Names of what changes over the run, so that a longer run would not begin as this one."""
-        without = self.without_part()
-        return [
-            name
-            for name in type(self).model_fields
-            if name not in without
-            and (end := getattr(self, f"{name}_end", None)) is not None
-            and end != getattr(self, name)
-        ]
+        """Names of what the run's length alters: a longer run would not begin as this one."""
+        return []
 
     @classmethod
     def documentation(cls) -> list[tuple[str, str, str]]:

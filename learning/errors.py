@@ -9,10 +9,6 @@ class ConfigurationError(LearningError):
     """A hyperparameter has an unknown name or a value out of its range."""
 
 
-class DefinitenessError(LearningError):
-    """A Hessian of θ cannot be kept positive definite as asked."""
-
-
 class CheckpointError(LearningError):
     """A checkpoint is missing, damaged, or belongs to another run."""
 

@@ -195,7 +195,7 @@ class TrainingLoop:
         """The action to apply, (m,), within the actuators' bounds, and whether it explores."""
         explored: Vector | None = None
         if not self.rests and getattr(self.algorithm, "explores", True):
-            explored = self._strategy(action, self.rng, self.counts.number)
+            explored = self._strategy(action, self.rng)
         # The QP keeps bounds to its tolerance, the actuator exactly.
         if explored is None:
             return self._saturate(action), False
@@ -304,7 +304,7 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
     All random numbers come from the run's seed.
     """
     controller = build_controller(run.controller, run.scenario, run.starting_parameters())
-    strategy = build_strategy(run.configuration, run.scenario, run.samples)
+    strategy = build_strategy(run.configuration, run.scenario)
     plant_seed, rng = spawn_seeds(run.seed)
     own = run.algorithm_rng()
     rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from controllers.errors import QpError
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, Transition, Update
 from learning.checkpoint import arrays_of, group, prefixed, take_up
@@ -25,7 +24,7 @@ from learning.configuration import (
 from learning.errors import DivergenceError
 from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel, PredictionErrors
-from learning.step import ConstrainedStep, Fit, line_search, measured_prior, td_fit, td_step
+from learning.step import ConstrainedStep, Fit, measured_prior, td_fit, td_step
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -96,9 +95,6 @@ class QLearningConfiguration(Configuration):
         "learning goes on where the plant changes",
     )
     step_size: Positive = Field(1e-3, description="rules td and fit: α")
-    line_search: bool = Field(
-        False, description="rules td and fit: shorten a step until its TD error does not rise"
-    )
     scaled: bool = Field(
         True, description="rules td and fit: step in coordinates θ/scale, else in θ itself"
     )
@@ -110,7 +106,7 @@ class QLearningConfiguration(Configuration):
     def without_part(self) -> Mapping[str, str]:
         """What belongs to other rules than the chosen one."""
         if self.rule == "kalman":
-            names = ["step_size", "line_search", "scaled"]
+            names = ["step_size", "scaled"]
         else:
             names = ["prior_width", "prior_samples", "measure_offset", "step_every"]
             names += ["innovation_clip", "variance_memory", "prediction_errors", "parameter_drift"]
@@ -123,6 +119,7 @@ class QLearning:
     Configuration: ClassVar[type[Configuration]] = QLearningConfiguration
     asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
     needs_action_value = True
+    needs_points = False
 
     def __init__(
         self,
@@ -135,7 +132,6 @@ class QLearning:
     ) -> None:
         form = KalmanFilter if configuration.rule == "kalman" else SampleSteps
         self._form: KalmanFilter | SampleSteps = form(controller, scenario, configuration)
-        self.needs_points = configuration.line_search
 
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; move θ and say so, or return None."""
@@ -324,7 +320,7 @@ class SampleSteps:
         scenario: Scenario,
         configuration: QLearningConfiguration,
     ) -> None:
-        self._controller, self._configuration = controller, configuration
+        self._configuration = configuration
         self._step = ConstrainedStep(controller, configuration, scaled=configuration.scaled)
         self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
         self._fit = td_fit if configuration.rule == "fit" else td_step
@@ -335,30 +331,7 @@ class SampleSteps:
         td_error = target - transition.action_value.value
         gradient = transition.action_value.value_gradient * self._step.scale
         fit = self._fit(td_error, gradient, self._configuration.step_size)
-        if self._configuration.line_search:
-            fit = fit.shrunk(line_search(self._error_along(transition, target, fit)))
         return self._step.take(self._average_cost.take(fit), abs(td_error))
-
-    def _error_along(
-        self, transition: Transition, target: float, fit: Fit
-    ) -> Callable[[float], float]:
-        """TD error of a sample with the step scaled by t, its target and its QP's guess held."""
-        controller, theta = self._controller, self._controller.theta
-        point = transition.point
-        assert point is not None
-
-        def error(t: float) -> float:
-            new, _ = self._step.proposal(fit.shrunk(t))
-            try:
-                controller.theta = new
-                controller.prepare_at(point)
-                return target - controller.feedback(transition.s, transition.a).value
-            except QpError:
-                return float("nan")
-            finally:
-                controller.theta = theta
-
-        return error
 
     def state(self) -> dict[str, NDArray[Any]]:
         """The mean cost."""

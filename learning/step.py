@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from controllers import sdp
 from controllers.theta import Parameters, ThetaBlocks
 from learning.algorithm import LearnableController, Update
 from learning.configuration import Configuration
-from learning.errors import DefinitenessError, DivergenceError
+from learning.errors import DivergenceError
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -102,21 +102,6 @@ def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix | Non
         return Fit(half, step_size * half, lambda: np.eye(gradient.size) / step_size)
     minimiser = step_size * cho_solve(cho_factor(metric), half)
     return Fit(half, minimiser, lambda: metric / step_size)
-
-
-def line_search(error: Callable[[float], float], *, shrink: float = 0.5, trials: int = 8) -> float:
-    """Largest of the steps 1, β, β², … that does not raise |TD error|, else 0.
-
-    `error(t)` is the TD error with the fit's step scaled by t, its target held (paper.tex, after
-    eq. q_solution); it may be NaN where the QP fails, which counts as a rise.
-    """
-    start = abs(error(0.0))
-    step = 1.0
-    for _ in range(trials):
-        if abs(error(step)) <= start:
-            return step
-        step *= shrink
-    return 0.0
 
 
 @dataclass(frozen=True)
@@ -206,48 +191,6 @@ class LinearMatrixInequality:
         ).x
 
 
-class CholeskyParametrisation:
-    """The step taken in the factor L of B = LLᵀ + εI, so that B ≻ εI by construction.
-
-    dL is the change that reproduces the free step D of B to first order, dL Lᵀ + L dLᵀ = D:
-    dL = L Φ(X), X = L⁻¹ D L⁻ᵀ, where Φ takes the lower triangle and halves the diagonal. To first
-    order means little where ‖X‖₂ > 1, where the free step would double B or lose it: the block's
-    step is shortened to ‖X‖₂ = 1 then.
-    """
-
-    FLOOR = 1e-9
-
-    def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
-        self._blocks, self._smallest = blocks, smallest
-
-    def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
-        """Move the factors; raises DefinitenessError where B(θ) ⪰ εI does not hold already."""
-        blocks = self._blocks
-        step = blocks.scale * fit.minimiser
-        result = theta + step
-        corrected = certificate(blocks, result).smallest < self._smallest
-        for name in HESSIANS:
-            block, where = blocks.block(name), blocks.slices[name]
-            shift = (self._smallest - self.FLOOR) * np.eye(block.dimension)
-            try:
-                factor = np.linalg.cholesky(matrix_of(blocks, theta, name) - shift)
-            except np.linalg.LinAlgError as error:
-                raise DefinitenessError(
-                    f"θ block {name} does not have all eigenvalues above {self._smallest}; "
-                    "choose a smaller smallest_eigenvalue or start from another θ"
-                ) from error
-            unit = block.packed_unit
-            inner = solve_triangular(factor, block.unpack(step[where] / unit), lower=True)
-            inner = solve_triangular(factor, inner.T, lower=True)
-            inner /= max(1.0, float(np.linalg.norm(inner, 2)))
-            lower = np.tril(inner)
-            np.fill_diagonal(lower, np.diag(inner) / 2)
-            moved = factor + factor @ lower
-            matrix = moved @ moved.T + self._smallest * np.eye(block.dimension)
-            result[where] = unit * block.pack((matrix + matrix.T) / 2)
-        return result, certificate(blocks, result, corrected=corrected)
-
-
 def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vector:
     """Copy of θ whose Hessian blocks have no eigenvalue below `smallest`."""
     theta = theta.copy()
@@ -287,15 +230,9 @@ class ConstrainedStep:
         else:
             self.blocks = blocks if scaled else rescaled(blocks, np.ones(blocks.size))
         self.scale: Vector = self.blocks.scale
-        kind = (
-            CholeskyParametrisation
-            if configuration.definiteness == "cholesky"
-            else LinearMatrixInequality
-        )
-        self._enforce = kind(self.blocks, least_eigenvalue(configuration, controller.parameters))
+        least = least_eigenvalue(configuration, controller.parameters)
+        self._enforce = LinearMatrixInequality(self.blocks, least)
         self._least = {block.name: np.array(block.least) for block in blocks if block.least}
-        if (chosen := configuration.slack_linear_minimum) is not None and "w_sigma" in blocks:
-            self._least["w_sigma"] = np.full(blocks.block("w_sigma").size, chosen)
 
     def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
         """The new θ that a fit leads to, and its certificate; the controller stays as it is.
@@ -333,7 +270,7 @@ class ConstrainedStep:
     def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
         """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), and say so.
 
-        Nearest in the scaled coordinates where definiteness is kept by the LMI.
+        Nearest in the scaled coordinates.
         """
         step = (theta - self._controller.theta) / self.scale
         return self.take(Fit(step, step, lambda: np.eye(step.size)), td_error)

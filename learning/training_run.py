@@ -159,7 +159,7 @@ def starting_parameters(
     """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
 
     `start` is `naive`, `tuned` or the path of a parameters file. `naive` and `tuned` take c_lambda
-    and, with the extended θ, the slack weights from the configuration; blocks that a file has
+    from the configuration; blocks that a file has
     stand as they are, those of the configuration's parametrisation that it lacks start as with
     `naive`. Raises ConfigurationError where the file has slack weights and the parametrisation
     none, ParameterError on a bad file, TuningError where the tuning fails.
@@ -172,10 +172,10 @@ def starting_parameters(
     offset = _value_offset(problem, configuration)
     naive = Parameters.naive(problem, blocks, value_offset=offset)
     if start == "naive":
-        return naive.replace(_slack_weights(blocks, configuration))
+        return naive.replace(_slack_weights(blocks))
     if start == "tuned":
         tuned = tune(problem, blocks, value_offset=offset).parameters
-        return tuned.replace(_slack_weights(blocks, configuration))
+        return tuned.replace(_slack_weights(blocks))
     return _extended(problem, configuration, start)
 
 
@@ -185,19 +185,10 @@ def _value_offset(problem: Problem, configuration: Configuration) -> float | Non
     return problem.value_level(chosen) if configuration.value_offset == "discounted" else None
 
 
-def _slack_weights(blocks: ThetaBlocks, configuration: Configuration) -> dict[str, Vector]:
-    """The slack weights at the start by block, none for the paper's θ."""
-    chosen = {
-        "w_sigma": configuration.slack_linear_weight,
-        "W_sigma": configuration.slack_quadratic_weight,
-    }
-    return {
-        name: blocks.scale[blocks.slices[name]]
-        if weight is None
-        else np.full(blocks.block(name).size, weight)
-        for name, weight in chosen.items()
-        if name in blocks
-    }
+def _slack_weights(blocks: ThetaBlocks) -> dict[str, Vector]:
+    """The slack weights at the start by block, of the problem's scale; none for the paper's θ."""
+    names = [name for name in ("w_sigma", "W_sigma") if name in blocks]
+    return {name: blocks.scale[blocks.slices[name]] for name in names}
 
 
 def _extended(problem: Problem, configuration: Configuration, path: str) -> Parameters:
@@ -220,7 +211,7 @@ def _extended(problem: Problem, configuration: Configuration, path: str) -> Para
     )
     values: dict[str, ArrayLike] = {block.name: found[block.name] for block in found.blocks}
     if not learned:
-        values |= _slack_weights(blocks, configuration)
+        values |= _slack_weights(blocks)
     if more:
         chosen = problem.model.parameter_indices(more)
         nominal = problem.model.nominal_parameters[chosen]

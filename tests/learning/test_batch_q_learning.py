@@ -28,7 +28,7 @@ class Bench:
             }
         )
         self.controller = controller or RtiNmpc(task.problem, task.wrong())
-        strategy = build_strategy(configuration, task.scenario, 1000)
+        strategy = build_strategy(configuration, task.scenario)
         self.algorithm = BatchQLearning(
             self.controller, task.scenario, configuration, 1000, strategy, np.random.default_rng(0)
         )
@@ -86,14 +86,13 @@ def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenar
 @pytest.fixture(scope="module")
 def collected(scenario, problem):
     """Samples of a run at one θ, with their points, and the controller."""
-    configuration = QLearning.Configuration(
-        line_search=True, rule="fit", exploration_probability=0.4
-    )
+    configuration = QLearning.Configuration(rule="fit", exploration_probability=0.4)
     controller = RtiNmpc(problem, starting_parameters(problem, configuration))
-    strategy = build_strategy(configuration, scenario, 100)
+    strategy = build_strategy(configuration, scenario)
     algorithm = QLearning(
         controller, scenario, configuration, 100, strategy, np.random.default_rng(0)
     )
+    algorithm.needs_points = True
     with FmuPlant(scenario) as plant:
         interaction = TrainingLoop(plant, controller, algorithm, strategy, np.random.default_rng(0))
         interaction.start(plant.reset(5))

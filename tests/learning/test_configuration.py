@@ -32,7 +32,7 @@ def test_assignments_are_read_as_toml_and_bare_words_as_text():
         ("prior_width=nan", "prior_width"),
         ("rule=newton", "rule.*td"),
         ("step_every=many", "step_every"),
-        ("line_search=true", "line_search: has no part in the rule kalman"),
+        ("step_size=0.1", "step_size: has no part in the rule kalman"),
     ],
 )
 def test_a_bad_assignment_gets_one_clear_message(assignment, message):
@@ -46,7 +46,11 @@ def test_a_bad_assignment_gets_one_clear_message(assignment, message):
         ("batch-q-learning", "parameter_drift=0.1", "no hyperparameter 'parameter_drift'"),
         ("search", "phase=100", "phase: has no part in a search without a rule"),
         ("backoff", "exploration_share=0.1", "exploration_share: has no part in a rule that tries"),
-        ("policy-search", "definiteness=cholesky", "definiteness: has no part in a rule that"),
+        (
+            "policy-search",
+            "smallest_eigenvalue=0.1",
+            "smallest_eigenvalue: has no part in a rule that",
+        ),
         ("q-learning", "block=4", "no hyperparameter 'block'"),
     ],
 )

@@ -21,7 +21,7 @@ def train(task, cls, samples, noise, controller=None, **settings):
         {"parametrisation": "paper", "value_offset": "stage-cost", **settings}
     )
     controller = controller or RtiNmpc(task.problem, task.wrong())
-    strategy = build_strategy(configuration, task.scenario, samples)
+    strategy = build_strategy(configuration, task.scenario)
     algorithm = cls(
         controller, task.scenario, configuration, samples, strategy, np.random.default_rng(0)
     )

@@ -9,7 +9,7 @@ from learning import QLearning
 from learning.exploration import build_strategy
 from learning.loop import TrainingLoop
 from learning.q_learning import AS_PRINTED, AverageCost, KalmanRegression
-from learning.step import Fit, line_search
+from learning.step import Fit
 from learning.training_run import starting_parameters
 
 
@@ -20,7 +20,7 @@ class Bench:
         self.scenario = plant.scenario
         configuration = QLearning.Configuration.from_dict(settings)
         self.controller = RtiNmpc(problem, starting_parameters(problem, configuration))
-        strategy = build_strategy(configuration, self.scenario, 1000)
+        strategy = build_strategy(configuration, self.scenario)
         self.algorithm = QLearning(
             self.controller, self.scenario, configuration, 1000, strategy, np.random.default_rng(0)
         )
@@ -55,26 +55,6 @@ def test_the_papers_rule_takes_the_closed_form_step(plant, problem):
     update = bench.algorithm.observe(sample)
     assert bench.controller.theta - before == pytest.approx(expected, rel=1e-6, abs=1e-9)
     assert update.td_error == pytest.approx(abs(delta))
-
-
-def test_a_line_searched_step_never_raises_the_sampled_td_error(plant, problem, monkeypatch):
-    lengths = []
-
-    def watched(error):
-        lengths.append(line_search(error))
-        return lengths[-1]
-
-    monkeypatch.setattr("learning.q_learning.line_search", watched)
-    bench = Bench(plant, problem, **{**AS_PRINTED, "line_search": True, "step_size": 10.0})
-    for _ in range(60):
-        sample, _ = bench.interaction.next()
-        before, target = bench.td_error(sample)
-        bench.algorithm.observe(sample)
-        after, _ = bench.td_error(sample, target)
-        assert abs(after) <= abs(before) * (1 + 1e-9) + 1e-6
-        bench.interaction.renew()
-    assert len(lengths) == 60
-    assert min(lengths) < 1.0 == max(lengths), "some steps are shortened, some are not"
 
 
 def test_state_and_restore_carry_all_memory(plant, problem):

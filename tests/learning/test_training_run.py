@@ -19,10 +19,10 @@ def test_the_papers_theta_is_the_naive_guess(problem):
     assert np.array_equal(theta["B_l"], np.eye(4))
 
 
-def test_the_extended_theta_starts_at_the_configured_slack_weights(problem):
-    theta = starting_parameters(problem, Configuration(slack_quadratic_weight=500.0))
+def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(problem):
+    theta = starting_parameters(problem, Configuration())
     assert theta["w_sigma"].tolist() == [100.0, 100.0]
-    assert theta["W_sigma"].tolist() == [500.0, 500.0]
+    assert theta["W_sigma"].tolist() == [1000.0, 1000.0]
     assert theta["c_lambda"] == pytest.approx(problem.reference_cost / (1 - problem.discount))
 
 
@@ -34,9 +34,9 @@ STATED = {
 
 def test_what_the_scenario_states_takes_the_place_of_defaults(scenario):
     configuration = QLearning.Configuration().for_scenario(scenario.replace(STATED))
-    strategy = build_strategy(configuration, scenario, 100)
+    strategy = build_strategy(configuration, scenario)
     assert strategy.kind == "literal"
-    assert (strategy.probability(0), strategy.deviation(0).tolist()) == (0.2, [3.0, 4.0])
+    assert (strategy.probability, strategy.deviation.tolist()) == (0.2, [3.0, 4.0])
     assert configuration.value_offset == "stage-cost"
 
 

@@ -1,8 +1,9 @@
-"""What a practitioner would do: an estimate from plant data, then a search of the back-off.
+"""What a practitioner would do, from plant data: back-off, an offset, parameters of the model.
 
-Each baseline has two forms. In operation the plant goes on from stretch to stretch as it is; on a
-simulator (`…Simulator`) it is put back before each, and the stretches of a round meet the same
-noise.
+In operation (`BackOff`, `OffsetFree`, `Identified`) the plant goes on as it is, and offset and
+parameters are followed to the end of the run. On a simulator (`…Simulator`) an estimate comes
+first and a `BackOffSearch` after it, whose stretches begin with the plant put back and meet the
+same noise.
 """
 
 from __future__ import annotations
@@ -32,9 +33,11 @@ from learning.prediction_errors import OneStepModel
 from learning.step import certificate
 
 Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 BackOffToo = Annotated[bool, Field(description="search the back-off of the active bounds")]
 EstimationShare = Annotated[Share, Field(description="share of the samples for the estimate")]
-SHARED_OUT = "samples (shared out among the stages)"
+SHIFT = 8 * 3600.0
+"""Seconds between two identifications, unless told otherwise."""
 
 
 class GreedyConfiguration(Configuration):
@@ -61,52 +64,54 @@ class BackOffConfiguration(GreedyConfiguration):
 
     def depends_on_samples(self) -> list[str]:
         """The shares of the samples that each round has."""
-        return [SHARED_OUT]
+        return ["samples (shared out among the stages)"]
 
 
 class OffsetFreeConfiguration(GreedyConfiguration):
-    """Settings of the offset-free baseline."""
+    """Settings of the offset-free baseline in operation."""
 
     back_off: BackOffToo = True
-    estimation_share: EstimationShare = 0.25
     update_every: Count = Field(10, description="samples between two steps of c_f")
     memory: Count = Field(
         1000, description="samples of the filter: a running mean over fewer, exponential beyond"
     )
 
-    def depends_on_samples(self) -> list[str]:
-        """The shares of the samples that each stage has."""
-        return [SHARED_OUT]
+
+class OffsetFreeSimulatorConfiguration(OffsetFreeConfiguration, BackOffConfiguration):
+    """Settings of the offset-free baseline whose back-off is searched for."""
+
+    estimation_share: EstimationShare = 0.25
 
 
 class IdentifiedConfiguration(GreedyConfiguration):
-    """Settings of the identified baseline."""
+    """Settings of the identified baseline in operation."""
 
     back_off: BackOffToo = True
-    estimation_share: EstimationShare = 0.25
     model_parameters: tuple[str, ...] = Field(
         (), description="parameters to fit; the model's uncertain ones if not given"
     )
     every: Count | None = Field(
         None,
-        description="fit again after so many samples, to these; once, at the end of the estimate, "
-        "if not given",
+        description="fit again after so many samples, to these; in operation a shift of eight "
+        "hours, on a simulator once, at the end of the estimate, if not given",
     )
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """The parameters to fit."""
         return self.model_parameters or model.uncertain
 
-    def depends_on_samples(self) -> list[str]:
-        """The shares of the samples that each stage has."""
-        return [SHARED_OUT]
+
+class IdentifiedSimulatorConfiguration(IdentifiedConfiguration, BackOffConfiguration):
+    """Settings of the identified baseline whose back-off is searched for."""
+
+    estimation_share: EstimationShare = 0.25
 
 
 class Baseline:
-    """First an estimate, on `estimation_share` of the samples, then a `BackOffSearch` from it.
+    """An estimate from the samples, all of them in operation; on a simulator a search comes after.
 
-    A subclass says how it `learn`s from a transition and how it `conclude`s; it reports θ with the
-    best back-off found so far, whatever it is trying.
+    A subclass says how it `learn`s from a transition and how it `conclude`s. It reports θ as
+    estimated, or with the best back-off found so far, whatever it is trying.
     """
 
     Configuration: ClassVar[type[Configuration]]
@@ -138,12 +143,31 @@ class Baseline:
     @property
     def _searches(self) -> bool:
         """Whether a search of the back-off follows the estimate."""
-        return bool(getattr(self._configuration, "back_off", True))
+        return self.asks_for == "simulator" and bool(self._configuration.back_off)
 
     def estimation_samples(self) -> int:
         """Samples before the search begins."""
-        share = self._configuration.estimation_share if self._searches else 1.0
+        if not self._searches:
+            return self._samples
+        share: float = self._configuration.estimation_share
         return max(round(share * self._samples), 1)
+
+    def backed_off(self, parameters: Parameters, errors: Matrix) -> Parameters:
+        """θ in operation, its bounds set back by the greatest of its prediction errors (K, n).
+
+        None of these would have led from within the bounds of θ to beyond the scenario's. Bounds
+        that would cross stay as they are.
+        """
+        if self._searches or not self._configuration.back_off:
+            return parameters
+        lower = self._scenario.state_lower + np.maximum(-errors.min(axis=0), 0.0)
+        upper = self._scenario.state_upper - np.maximum(errors.max(axis=0), 0.0)
+        crossed = lower >= upper
+        lower, upper = (
+            np.where(crossed, parameters[name], bound)
+            for name, bound in (("x_l", lower), ("x_u", upper))
+        )
+        return parameters.replace({"x_l": lower, "x_u": upper})
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Take a sample of the estimation; the θ to go on with, or None."""
@@ -180,7 +204,7 @@ class Baseline:
         if self._search is not None:
             return self._searched(self._search, transition)
         moved = None if transition is None else self.learn(transition)
-        if self._count == self._estimation:
+        if self._count == self._estimation and self.asks_for == "simulator":
             moved = self._reported = self.conclude()
             if self._searches:
                 search = self._begin_search(moved)
@@ -246,6 +270,10 @@ class BackOff(Baseline):
 
     Configuration = BackOffConfiguration
 
+    @property
+    def _searches(self) -> bool:
+        return True
+
     def estimation_samples(self) -> int:
         """None: the search begins at once."""
         return 0
@@ -260,7 +288,8 @@ class BackOffSimulator(BackOff):
 class OffsetFree(Baseline):
     """c_f ← mean of s₊ − f(s, a), the integrating disturbance model of offset-free MPC.
 
-    With `back_off` the bounds are then backed off on the rest of the samples, c_f held.
+    With `back_off` the bounds stand back by the greatest of the last `memory` errors about that
+    mean; while fewer are known, by the start's back-off where that is more.
     """
 
     Configuration = OffsetFreeConfiguration
@@ -269,35 +298,50 @@ class OffsetFree(Baseline):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._model = OneStepModel(self._scenario)
-        self._parameters = self._model.parameters(self._reported)
-        self._offset = self._reported["c_f"]
+        self._start = self._reported
+        self._parameters = self._model.parameters(self._start)
+        self._offset = self._start["c_f"]
+        self._errors = np.zeros((self._configuration.memory, len(self._offset)))
         self._seen = 0
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Filter the error of one prediction."""
         predicted = self._model.predict(transition.s, transition.a, self._parameters)[0]
+        error = transition.next_s - predicted
+        self._errors[self._seen % len(self._errors)] = error
         self._seen += 1
-        weight = 1.0 / min(self._seen, self._configuration.memory)
-        self._offset = self._offset + weight * (transition.next_s - predicted - self._offset)
+        weight = 1.0 / min(self._seen, len(self._errors))
+        self._offset = self._offset + weight * (error - self._offset)
         return None if self._seen % self._configuration.update_every else self.conclude()
 
     def conclude(self) -> Parameters:
-        """θ with the offset as it is."""
-        return self._reported.replace({"c_f": self._offset})
+        """θ with the offset and the back-off as they are."""
+        start, errors = self._start, self._errors[: self._seen] - self._offset
+        if not len(errors):
+            return self._reported
+        found = self.backed_off(self._reported.replace({"c_f": self._offset}), errors)
+        if self._seen >= len(self._errors) or not self._configuration.back_off:
+            return found
+        lower = np.maximum(found["x_l"], start["x_l"])
+        upper = np.minimum(found["x_u"], start["x_u"])
+        return found.replace({"x_l": lower, "x_u": upper}) if (lower < upper).all() else found
 
     def state(self) -> dict[str, NDArray[Any]]:
         """The filter too."""
-        return super().state() | {"offset": np.append(self._offset, self._seen)}
+        offset = np.append(self._offset, self._seen)
+        return super().state() | {"offset": offset, "errors": self._errors}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         super().restore(state)
         self._offset, self._seen = state["offset"][:-1], int(state["offset"][-1])
+        self._errors = state["errors"].copy()
 
 
 class OffsetFreeSimulator(OffsetFree):
-    """`OffsetFree` on a plant that is put back before each stretch of the search."""
+    """`OffsetFree`, then a search of the back-off with the plant put back, c_f held."""
 
+    Configuration = OffsetFreeSimulatorConfiguration
     asks_for = "simulator"
 
 
@@ -305,8 +349,9 @@ class Identified(Baseline):
     """p̂ = argmin Σ ‖(s₊ − f(s, a; p))/σ‖², the prediction-error method, carried in θ's block p.
 
     σ is the standard deviation of the errors at the start's parameters. Then the cost is tuned at
-    the fitted model's optimal steady state and the bounds are backed off: what a practitioner does
-    who knows which parameters of the plant have drifted. With `every` he does so again and again.
+    the fitted model's optimal steady state and the bounds are backed off, by the greatest of the
+    fitted model's errors: what a practitioner does who knows which parameters of the plant have
+    drifted. In operation he does so every eight hours.
     """
 
     Configuration = IdentifiedConfiguration
@@ -316,11 +361,14 @@ class Identified(Baseline):
         super().__init__(*arguments)
         self._model = OneStepModel(self._scenario)
         self._rows: list[Vector] = []
+        self._every = self._configuration.every
+        if self._every is None and self.asks_for == "operation":
+            self._every = max(round(SHIFT / self._scenario.sampling_time), 1)
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Keep a transition; the last of every `every` gives a new fit."""
         self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
-        if len(self._rows) != self._configuration.every:
+        if len(self._rows) != self._every:
             return None
         fitted = self.conclude()
         self._rows.clear()
@@ -348,12 +396,17 @@ class Identified(Baseline):
         except TuningError as error:
             raise DivergenceError(f"the fitted model cannot be tuned ({error})") from error
         kept = ("c_lambda", "c_f", "x_l", "x_u", "w_sigma", "W_sigma")
-        return tuned.replace({name: start[name] for name in kept if name in start.blocks})
+        tuned = tuned.replace({name: start[name] for name in kept if name in start.blocks})
+        return self.backed_off(tuned, self._model.errors(*self._transitions(), tuned))
+
+    def _transitions(self) -> tuple[Matrix, Matrix, Matrix]:
+        """States, actions and next states of the rows."""
+        n, rows = self._problem.n_states, np.array(self._rows)
+        return rows[:, :n], rows[:, n:-n], rows[:, -n:]
 
     def _fit(self) -> Vector:
         """p̂, (n_p,), positive where its nominal value is."""
-        n, start, rows = self._problem.n_states, self._reported, np.array(self._rows)
-        states, actions, following = rows[:, :n], rows[:, n:-n], rows[:, -n:]
+        start, (states, actions, following) = self._reported, self._transitions()
         indices = self._problem.model.parameter_indices(start.blocks.block("p").labels)
         values, nominal = self._model.parameters(start), self._problem.model.nominal_parameters
         unit = np.where(nominal[indices] != 0, np.abs(nominal[indices]), 1.0)
@@ -380,8 +433,9 @@ class Identified(Baseline):
 
 
 class IdentifiedSimulator(Identified):
-    """`Identified` on a plant that is put back before each stretch of the search."""
+    """`Identified`, then a search of the back-off with the plant put back."""
 
+    Configuration = IdentifiedSimulatorConfiguration
     asks_for = "simulator"
 
 

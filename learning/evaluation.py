@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from math import isfinite
 from typing import Any
@@ -13,10 +12,10 @@ from numpy.typing import NDArray
 from controllers.optimum import yardstick
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim.kpis import indicators_of
 from cosim.plant.archive import SHIPPED
 from cosim.protocols import Controller, Plant
 from cosim.scenario import Scenario
-from cosim.simulation import simulate
 from cosim.statistics import gap_closed, regret
 from learning.training_run import TrainingRun, build_controller
 
@@ -24,14 +23,6 @@ Array = NDArray[np.float64]
 HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 FIGURES = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
-
-
-def held_out_costs(
-    plant: Plant, controller: Controller, steps: int, seeds: Sequence[int]
-) -> dict[str, Array]:
-    """`FIGURES` of a run of `steps` samples from the initial state for each seed, (seeds,) each."""
-    runs = [simulate(plant, controller, steps, seed, residuals=False).summary() for seed in seeds]
-    return {name: np.array([float(run[name]) for run in runs]) for name in FIGURES}
 
 
 class Judge:
@@ -45,7 +36,6 @@ class Judge:
         self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
     ) -> None:
         self._run, self._plant, self._start, self._optimum = run, plant, start, optimum
-        self._problem = Problem.from_scenario(run.scenario)
         self._controller = build_controller(run.controller, run.scenario, start)
 
     def verdict(self, theta: Array) -> dict[str, Any]:
@@ -54,7 +44,7 @@ class Judge:
         `regret_interval` is its 95 % interval over the runs; `failures` is a sum; None is unknown.
         """
         costs = self._costs(theta)
-        means: dict[str, Any] = {name: float(values.mean()) for name, values in costs.items()}
+        means: dict[str, Any] = {name: float(costs[name].mean()) for name in FIGURES}
         beyond = regret(costs["J"], self._optimal_cost)
         gap = gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value
         known = isfinite(beyond.value)
@@ -86,21 +76,18 @@ class Judge:
         return worst + (self._run.divergence - 1) * abs(worst)
 
     def _costs(self, policy: Array | Controller) -> dict[str, Array]:
-        """Figures on the held-out seeds of the greedy policy at θ, or of a controller."""
-        controller: Controller
+        """Indicators on the held-out seeds of the greedy policy at θ, or of a controller."""
         if isinstance(policy, np.ndarray):
             self._controller.theta = policy
-            controller = self._controller
-        else:
-            controller = policy
+            policy = self._controller
         seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
-        return held_out_costs(self._plant, controller, self._run.evaluation_steps, seeds)
+        return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)
 
     @cached_property
     def _naive_cost(self) -> Array:
         run = self._run
-        naive = build_controller(run.controller, run.scenario, Parameters.naive(self._problem))
-        return self._costs(naive)["J"]
+        naive = Parameters.naive(Problem.from_scenario(run.scenario))
+        return self._costs(build_controller(run.controller, run.scenario, naive))["J"]
 
     @cached_property
     def _optimal_cost(self) -> Array:

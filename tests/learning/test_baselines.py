@@ -120,6 +120,21 @@ def test_offset_free_predicts_without_bias_under_a_wrong_model():
     assert abs(after[1]) < 0.1 * abs(before[1])
 
 
+@pytest.mark.parametrize("name", ["offset-free", "identified"])
+def test_in_operation_it_goes_on_and_backs_off_by_its_own_errors(name, scenario):
+    run = make_run(name, "fouled", samples=1400)
+    with FmuPlant(run.scenario) as plant:
+        loop, moved, bounds = begin(run, load_algorithm(name), plant), [], []
+        for sample in range(1400):
+            if loop.advance()[1] is not None:
+                moved.append(sample)
+                bounds.append([loop.parameters["x_l"][0], loop.parameters["x_u"][1]])
+    lower, upper = np.array(bounds).T
+    assert moved[-1] >= 950 and len(moved) >= 2
+    assert (lower > 25.5).sum() > len(lower) / 2 and (upper < 79.9).any()
+    assert (lower >= 25.0).all() and (upper <= 80.0).all()
+
+
 def test_identification_finds_the_fouled_condenser_and_tunes_with_it():
     run = make_run("identified", "fouled", samples=1200)
     theta = train(run).parameters

@@ -2,19 +2,11 @@ import numpy as np
 import pytest
 
 from controllers.rti import RtiNmpc
-from cosim import FmuPlant, simulate
+from cosim import FmuPlant
+from cosim.kpis import indicators_of
 from learning import QLearning
-from learning.evaluation import HELD_OUT, Judge, held_out_costs
+from learning.evaluation import FIGURES, HELD_OUT, Judge
 from learning.training_run import TrainingRun
-
-
-def test_evaluation_is_the_closed_loop_on_the_held_out_seeds(scenario, problem, parameters):
-    with FmuPlant(scenario) as plant:
-        controller = RtiNmpc(problem, parameters)
-        costs = held_out_costs(plant, controller, 30, [HELD_OUT, HELD_OUT + 1])
-        runs = [simulate(plant, controller, 30, HELD_OUT + k).summary() for k in range(2)]
-    for name in costs:
-        assert costs[name].tolist() == [run[name] for run in runs]
 
 
 def judge(plant, parameters, divergence=1.5, optimum=None):
@@ -29,8 +21,8 @@ def test_the_judge_sets_theta_and_evaluates_greedily(scenario, problem, paramete
     other = parameters.replace({"x_l": np.array([26.0, 40.0])})
     with FmuPlant(scenario) as plant:
         found = judge(plant, parameters).verdict(other.theta)
-        own = held_out_costs(plant, RtiNmpc(problem, other), 30, [HELD_OUT])
-    assert {name: found[name] for name in own} == {name: values[0] for name, values in own.items()}
+        own = indicators_of(plant, RtiNmpc(problem, other), [HELD_OUT], 30)
+    assert [found[name] for name in FIGURES] == [own[name][0] for name in FIGURES]
 
 
 def test_the_naive_controller_is_the_judges_zero_and_the_optimum_its_one(
@@ -41,7 +33,7 @@ def test_the_naive_controller_is_the_judges_zero_and_the_optimum_its_one(
         judged = judge(plant, parameters, optimum=other)
         naive, optimum = judged.verdict(parameters.theta), judged.verdict(other.theta)
         assert (naive["gap_closed"], optimum["gap_closed"]) == (0.0, 1.0)
-        best = held_out_costs(plant, other, 30, [HELD_OUT])["J"][0]
+        best = indicators_of(plant, other, [HELD_OUT], 30)["J"][0]
         assert naive["regret"] == pytest.approx(naive["J"] / best - 1)
         assert optimum["regret"] == 0.0
         assert judged.limit == pytest.approx(1.5 * naive["J"])

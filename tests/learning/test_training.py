@@ -8,9 +8,10 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim import FmuPlant
+from cosim.kpis import indicators_of
 from learning.algorithm import Update, load_algorithm
 from learning.errors import CheckpointError
-from learning.evaluation import HELD_OUT, held_out_costs
+from learning.evaluation import HELD_OUT
 from learning.log import LogRow, late_movement, to_csv
 from learning.q_learning import QLearning
 from tests.helpers import training
@@ -117,7 +118,7 @@ def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tm
     assert result.rows[-1].parameters["x_l"][0] == result.parameters["x_l"][0]
     with FmuPlant(scenario) as plant:
         own = RtiNmpc(Problem.from_scenario(scenario), result.parameters)
-        assert result.evaluation["J"] == held_out_costs(plant, own, 20, [HELD_OUT])["J"]
+        assert result.evaluation["J"] == indicators_of(plant, own, [HELD_OUT], 20)["J"]
 
 
 class Trying(QLearning):

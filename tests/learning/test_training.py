@@ -159,7 +159,7 @@ def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
 
 
-FADING = load_algorithm("q-learning").Configuration(exploration_probability_end=0.1)
+FADING = load_algorithm("actor-critic").Configuration(batch_size=100)
 
 
 def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
@@ -175,8 +175,8 @@ def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
     ("first", "message"),
     [
         (
-            lambda s: make_run(s, "q-learning", samples=200, configuration=FADING),
-            "exploration_probability would have gone another way",
+            lambda s: make_run(s, "actor-critic", samples=200, configuration=FADING),
+            "radius would have gone another way",
         ),
         (
             lambda s: make_run(s, "q-learning", samples=250),

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -292,6 +293,7 @@ def output_turned_aside() -> Iterator[int | None]:
 
 MARK = "COSIM_FINISHED"
 """Environment variable of a watched command: its parent's number and the file that it leaves."""
+PATIENCE = 3.0
 _marks: list[str | None] = []
 """Of a process of the command line: its mark, or None where nobody watches it."""
 
@@ -311,12 +313,18 @@ def command_process() -> Iterator[None]:
     _marks.append(os.environ.pop(MARK, None))
     if _marks[-1] is not None:
         follow_parent(int(_marks[-1].partition(" ")[0]))
+    code: object = 1
     try:
         yield
+    except SystemExit as error:
+        code = error.code
+        raise
     finally:
         if (mark := _marks.pop()) is not None:
+            with suppress(OSError, ValueError):
+                sys.stdout.flush()
             with suppress(OSError):
-                Path(mark.partition(" ")[2]).touch()
+                Path(mark.partition(" ")[2]).write_text(str(code or 0), "utf-8")
 
 
 def watch(suspect: str) -> None:
@@ -338,7 +346,7 @@ def watch(suspect: str) -> None:
         environment = os.environ | {MARK: f"{os.getpid()} {mark}"}
         child = subprocess.Popen(command, stdout=(*_stdout, None)[0], env=environment)
         try:
-            code = child.wait()
+            code = _outcome(child, mark)
         except BaseException as error:
             if not isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the child, too
                 child.terminate()
@@ -352,3 +360,16 @@ def watch(suspect: str) -> None:
             hold(folder)
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
     raise PlantError(f"{suspect} ended the process {how} before the command finished")
+
+
+def _outcome(child: subprocess.Popen[bytes], mark: Path) -> int:
+    """The child's exit code; it is killed where a thread keeps it `PATIENCE` s beyond its end."""
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            return child.wait(1.0)
+        with suppress(OSError, ValueError):
+            if time.time() - mark.stat().st_mtime > PATIENCE:
+                code = int(mark.read_text("utf-8"))
+                child.kill()
+                child.wait()
+                return code

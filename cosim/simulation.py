@@ -116,6 +116,7 @@ class _Run:
         self._controller.reset()
         applied = self._scenario.reference_action
         for k in range(self._steps):
+            s.flags.writeable = False  # a controller reads the state, and changes nothing
             solution, prepare_time, feedback_time = solve(s)
             action, explores = applied if solution is None else solution.action, False
             if exploration is not None:
@@ -123,11 +124,14 @@ class _Run:
                 # A failed sample draws its noise too, so that paired runs stay in step.
                 if solution is not None and explored is not None:
                     action, explores = explored, True
-            if action.shape != shape:
-                raise CosimError(
-                    f"{controller_name(self._controller)} gave an action of shape {action.shape}, "
-                    f"not {shape}, at step {k}"
-                )
+            if (
+                not isinstance(action, np.ndarray)
+                or action.shape != shape
+                or action.dtype.kind not in "fiu"
+            ):
+                array = isinstance(action, np.ndarray) and action.dtype.kind in "fiu"
+                given = f"shape {action.shape}" if array else f"{type(action).__name__} {action}"
+                raise self._wrong(f"an action of {given}, not {shape}", k)
             applied = saturate(action)
             begin = perf_counter()
             step = plant.step(applied)
@@ -148,7 +152,7 @@ class _Run:
             )
             s = step.s
             if keeps_predictions and solution is not None:
-                self._keep_prediction(k % BLOCK, solution)
+                self._keep_prediction(k, solution)
             if (k + 1) % BLOCK == 0 or k + 1 == self._steps:
                 record(self._block(k // BLOCK * BLOCK, k + 1))
                 if progress is not None:
@@ -165,21 +169,30 @@ class _Run:
             middle = perf_counter()
             solution = controller.feedback(s)
             end = perf_counter()
+            if not hasattr(solution, "action"):
+                raise self._wrong(f"a {type(solution).__name__}, which is no solution")
         except Exception as error:
             end = perf_counter()
             recover(controller, error)
         self._status.append(FALLBACK if solution is None else solution.status)
         return solution, middle - begin, end - middle
 
-    def _keep_prediction(self, row: int, solution: Solution) -> None:
+    def _wrong(self, given: str, k: int | None = None) -> CosimError:
+        at = "" if k is None else f", at step {k}"
+        return CosimError(f"{controller_name(self._controller)} gave {given}{at}")
+
+    def _keep_prediction(self, k: int, solution: Solution) -> None:
         states, actions = solution.predicted_states, solution.predicted_actions
         if states is None or actions is None:
             return
         if self._predicted_states is None or self._predicted_actions is None:
-            self._predicted_states = np.full((BLOCK, *states.shape), np.nan)
-            self._predicted_actions = np.full((BLOCK, *actions.shape), np.nan)
-        self._predicted_states[row] = states
-        self._predicted_actions[row] = actions
+            self._predicted_states = np.full((BLOCK, *np.shape(states)), np.nan)
+            self._predicted_actions = np.full((BLOCK, *np.shape(actions)), np.nan)
+        try:
+            self._predicted_states[k % BLOCK] = states
+            self._predicted_actions[k % BLOCK] = actions
+        except (TypeError, ValueError) as error:
+            raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
 
     def _block(self, first: int, end: int) -> SampleBlock:
         count = end - first

@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 
 import fmpy
 
-from cosim.files import temporary_folder
+from cosim.files import replacing, temporary_folder
 from fmus import BuildError
 from fmus.description import build_description, c_header, model_description
 from fmus.model import C_IDENTIFIER, FmiVersion, Model, Variable
@@ -129,14 +129,13 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 def write_archive(files: Mapping[str, bytes], target: Path) -> Path:
     """Write `files`, by their path in the archive, to `target`, whole or not at all."""
-    partial = target.with_name(f".{target.name}.partial")
-    with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as container:
+    with replacing(target) as partial, zipfile.ZipFile(partial, "x") as container:
         for name in sorted(files):
             entry = zipfile.ZipInfo(name, _DATE)
             entry.create_system = 3
             entry.external_attr = 0o100644 << 16
             container.writestr(entry, files[name])
-    return partial.replace(target)
+    return target
 
 
 def read_archive(path: Path) -> dict[str, bytes]:

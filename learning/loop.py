@@ -169,6 +169,8 @@ class TrainingLoop:
             self.counts.weakly_active += policy.weakly_active
             self.counts.licq_failed += not policy.licq
         step = self._plant.step(a)
+        for array in (s, a, step.s, step.disturbance):
+            array.flags.writeable = False  # a rule reads what was measured, and changes nothing
         self._applied, self.s, self.counts.number = a, step.s, number + 1
         self._policy = self._solve()
         cost = step.stage_cost + step.penalty

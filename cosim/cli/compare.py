@@ -41,8 +41,10 @@ def compare(
     """
     with output(json) as out_:
         from cosim import comparison
+        from cosim.files import protect
 
         runs = comparison.load_run(a), comparison.load_run(b)
+        protect(run.name for run in runs)  # of a folder, the file in it
         result = comparison.compare(*runs, _tolerances(tolerance or []), relative=relative)
         found = result.lines() or ["no signal differs by more than its tolerance"]
         if record is not None:

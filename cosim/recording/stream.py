@@ -19,7 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.errors import RecordingError
-from cosim.files import publish
+from cosim.files import check_target, publish
 from cosim.protocols import Array
 
 TIME, SAMPLE = "time", "sample"
@@ -96,7 +96,7 @@ class Stream:
     """
 
     def __init__(self, path: str | Path, name: str, layout: rrb.Blueprint) -> None:
-        self.path = Path(path)
+        self.path = check_target(path)
         try:
             handle, name_of_partial = tempfile.mkstemp(
                 dir=self.path.parent, prefix=f".{self.path.stem}.", suffix=".partial.rrd"

@@ -1,5 +1,7 @@
 import pytest
 
+from tests.cosim.conftest import cosim  # noqa: F401 (a fixture)
+
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory):

@@ -1,0 +1,398 @@
+"""The rows of the review's attacks, and about a hundred of our own, as tables."""
+
+import errno
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim import FmuPlant, Scenario, simulate
+from cosim.comparison import compare, load_run
+from cosim.errors import CosimError, StudyError
+from cosim.files import check_target, protect, write_atomically
+from cosim.studies.plan import RunKey
+from tests.helpers.command import run_cosim
+from tests.helpers.loop import Answer, Proportional
+
+PAPER = Scenario.load("paper")
+ROOT = str(Path(__file__).parents[2])
+
+
+@pytest.fixture(scope="module")
+def plant():
+    with FmuPlant(PAPER) as plant:
+        yield plant
+
+
+class Plugin:
+    """A controller whose `feedback` is a function of the sample's number and the state."""
+
+    def __init__(self, answer):
+        self._answer, self._k = answer, -1
+
+    def reset(self):
+        pass
+
+    def prepare(self):
+        self._k += 1
+
+    def feedback(self, s, a=None):
+        return self._answer(self._k, s)
+
+
+class Keep:
+    """A recorder, so that predictions are looked at."""
+
+    def start(self, *_):
+        pass
+
+    def record(self, block):
+        pass
+
+    def close(self):
+        pass
+
+
+def one_line(error):
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+# What a plug-in gives back ----------------------------------------------------------------------
+
+GOOD = [200.0, 200.0]
+ACTIONS = {
+    "list": GOOD,
+    "tuple": tuple(GOOD),
+    "float": 200.0,
+    "None": None,
+    "text": "200 200",
+    "bytes": bytes(2),
+    "dict": {"P100": 200.0, "F200": 200.0},
+    "set": {200.0, 201.0},
+    "generator": (x for x in GOOD),
+    "class": np.ndarray,
+    "scalar array": np.array(200.0),
+    "short": np.array([200.0]),
+    "long": np.array([200.0] * 3),
+    "column": np.array([GOOD]).T,
+    "row": np.array([GOOD]),
+    "empty": np.array([]),
+    "complex": np.array(GOOD, complex),
+    "objects": np.array(GOOD, object),
+    "words": np.array(["200", "200"]),
+    "truths": np.array([True, False]),
+    "dates": np.array([0, 1], "datetime64[s]"),
+    "NaN": np.array([np.nan, 200.0]),
+}
+SOLUTIONS = {
+    "None": None,
+    "an action": np.array(GOOD),
+    "a list": GOOD,
+    "a dict": {"action": np.array(GOOD)},
+    "a class": object,
+    "a number": 0.0,
+    "a coroutine's like": iter(GOOD),
+}
+
+
+@pytest.mark.parametrize("kind", ACTIONS)
+def test_an_action_of_a_wrong_kind_shape_or_value_is_one_line(plant, kind):
+    with pytest.raises(CosimError) as error:
+        simulate(plant, Plugin(lambda k, s: Answer(ACTIONS[kind])), 2, 0)
+    assert "action" in one_line(error)
+
+
+@pytest.mark.parametrize("kind", SOLUTIONS)
+def test_what_is_no_solution_is_one_line_and_no_failure_to_solve(plant, kind):
+    with pytest.raises(CosimError, match="no solution") as error:
+        simulate(plant, Plugin(lambda k, s: SOLUTIONS[kind]), 2, 0)
+    one_line(error)
+
+
+X, U = np.zeros((11, 2)), np.zeros((10, 2))
+PREDICTIONS = {
+    "shorter later": lambda k: (X[: 11 - k], U),
+    "longer later": lambda k: (np.zeros((11 + k, 2)), U),
+    "actions shorter later": lambda k: (X, U[: 10 - k]),
+    "another dimension later": lambda k: (X if k == 0 else X[0, 0] + np.zeros((3, 4, 5)), U),
+    "words later": lambda k: (X if k == 0 else "predicted", U),
+    "objects later": lambda k: (X if k == 0 else np.full((11, 2), object()), U),
+    "ragged later": lambda k: (X, U if k == 0 else [[1.0], [1.0, 2.0]] * 5),
+}
+
+
+@pytest.mark.parametrize("kind", PREDICTIONS)
+def test_a_prediction_that_changes_its_shape_or_kind_is_one_line(plant, kind):
+    def answer(k, s):
+        states, actions = PREDICTIONS[kind](k)
+        return Answer(np.array(GOOD), predicted_states=states, predicted_actions=actions)
+
+    with pytest.raises(CosimError, match="prediction") as error:
+        simulate(plant, Plugin(answer), 3, 0, recorder=Keep())
+    one_line(error)
+
+
+# What a plug-in is given ------------------------------------------------------------------------
+
+WRITES = {
+    "an entry": lambda s: s.__setitem__(0, 0.0),
+    "all": lambda s: s.__setitem__(slice(None), 0.0),
+    "in place": lambda s: s.__imul__(0.0),
+    "fill": lambda s: s.fill(0.0),
+    "sort": lambda s: s.sort(),
+    "out of a ufunc": lambda s: np.add(s, 1.0, out=s),
+    "through a view": lambda s: s[:].__setitem__(0, 0.0),
+    "put": lambda s: s.put(0, 0.0),
+    "copyto": lambda s: np.copyto(s, 0.0),
+    "shuffle": lambda s: np.random.default_rng(0).shuffle(s),
+}
+
+
+@pytest.mark.parametrize("way", WRITES)
+def test_the_state_that_a_controller_reads_cannot_be_written(plant, way):
+    def answer(k, s):
+        WRITES[way](s)
+        return Answer(np.array(GOOD))
+
+    with pytest.raises(ValueError, match="read-only"):
+        simulate(plant, Plugin(answer), 2, 0)
+
+
+@pytest.mark.parametrize("name", ["s", "a", "next_s"])
+def test_what_a_rule_observes_cannot_be_written(name):
+    from learning.algorithm import load_algorithm
+    from learning.loop import begin
+    from tests.helpers.training import make_run
+
+    run = make_run(samples=20)
+    with FmuPlant(PAPER) as plant:
+        loop = begin(run, load_algorithm(run.algorithm), plant)
+        transition, _ = loop.next()
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(transition, name)[0] = 0.0
+
+
+# Names ------------------------------------------------------------------------------------------
+
+NAMES = [".", "..", "...", " ", "", ". .", "/", "/etc", "a/b", "../a", "a/..", "./a", "a/", "\\",
+         "a\\b", "..\\a", "C:\\a", "//a"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_that_leads_elsewhere_is_refused_for_scenarios_and_cases(name):
+    for scenario, case in ((name, "q"), ("paper", name)):
+        with pytest.raises(StudyError):
+            RunKey(scenario, case)
+
+
+# Files ------------------------------------------------------------------------------------------
+
+SAYS = {name: getattr(errno, name) for name in ("EACCES", "EBUSY", "EPERM", "ENOSPC", "EIO",
+        "EROFS", "EDQUOT", "ESTALE", "ENOLCK")}  # fmt: skip
+"""What Windows says of a file that another process has open (EACCES), disks, network folders."""
+
+
+@pytest.mark.parametrize("call", ["replace", "open", "chmod"])
+@pytest.mark.parametrize("word", SAYS)
+def test_a_file_system_that_says_no_leaves_the_old_file_and_no_other(
+    tmp_path, monkeypatch, call, word
+):
+    path = tmp_path / "result.csv"
+    path.write_text("old")
+
+    def refuse(self, *_, **__):
+        raise OSError(SAYS[word], os.strerror(SAYS[word]), str(self))
+
+    with monkeypatch.context() as context:
+        context.setattr(Path, call, refuse)
+        with pytest.raises(OSError, match=os.strerror(SAYS[word])) as error:
+            write_atomically(path, "new")
+    assert error.value.filename == str(path)
+    assert path.read_text() == "old"
+    assert [file.name for file in tmp_path.iterdir()] == ["result.csv"]
+
+
+LINKS = {
+    "itself": lambda path: path,
+    "by another way": lambda path: path.parent / "." / ".." / path.parent.name / path.name,
+    "a symbolic link": lambda path: linked(path, os.symlink),
+    "a hard link": lambda path: linked(path, os.link),
+}
+
+
+def linked(path, make):
+    make(path, link := path.with_name("link"))
+    return link
+
+
+@pytest.mark.parametrize("way", LINKS)
+def test_an_input_is_never_replaced_whatever_it_is_called(tmp_path, way):
+    path = tmp_path / "theta.toml"
+    path.touch()
+    protect([path])
+    try:
+        with pytest.raises(FileExistsError, match="input of this command"):
+            check_target(LINKS[way](path))
+    finally:
+        protect([])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "compare a b --record a/trajectory.csv",
+        "compare a b --record b/trajectory.csv",
+        "compare a/trajectory.csv b --record a/trajectory.csv",
+        "compare a b --record=./a/../a/trajectory.csv",
+        "train -a q-learning -n 200 --start out/parameters.toml --out out --overwrite",
+        "tuning -s mine.toml --out mine.toml",
+        "export out/parameters.toml --local --out out/parameters.toml",
+    ],
+)
+def test_no_command_writes_in_the_place_of_what_it_reads(cosim, tmp_path, runs, words):
+    from controllers.factories import naive
+
+    (tmp_path / "out").mkdir()
+    naive(PAPER).parameters.save(tmp_path / "out" / "parameters.toml")
+    (tmp_path / "mine.toml").write_text('extends = "paper"\n')
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    code, _, err = cosim(*words.split())
+    assert code == 2
+    assert "input of this command" in err
+    assert before == {path: path.read_bytes() for path in before}
+
+
+# Comparisons ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def runs(plant, tmp_path):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        simulate(plant, Proportional(PAPER), 6, 0).write_csv(tmp_path / name / "trajectory.csv")
+    return tmp_path
+
+
+def cells(text, change):
+    rows = [line.split(",") for line in text.splitlines()]
+    change(rows)
+    return "\n".join(",".join(row) for row in rows) + "\n"
+
+
+def swap(rows):
+    for row in rows:
+        row[1], row[2] = row[2], row[1]
+
+
+def double(rows):
+    for row in rows:
+        row.append(row[1])
+
+
+def rename(rows):
+    rows[0][1] = rows[0][1].replace("X2", "X3")
+
+
+def unit(rows):
+    rows[0][1] = rows[0][1].replace("%", "1")
+
+
+def last_bit(rows):
+    rows[3][1] = repr(float(np.nextafter(float(rows[3][1]), 1e9)))
+
+
+CHANGES = {
+    "a unit": unit,
+    "a name": rename,
+    "a doubled column": double,
+    "the columns' order": swap,
+    "one bit": last_bit,
+    "full-width digits": lambda rows: rows[3].__setitem__(1, "２５.0"),
+    "a sign of nought": lambda rows: [row.__setitem__(1, "-0.0") for row in rows[2:3]],
+    "a NaN": lambda rows: rows[3].__setitem__(1, ""),
+    "a row less": lambda rows: rows.pop(),
+    "a status": lambda rows: rows[3].__setitem__(rows[0].index("status"), "fallback"),
+    "a column less": lambda rows: [row.pop(1) for row in rows],
+    "a cell less": lambda rows: rows[3].pop(),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_comparison_sees_every_change(runs, what):
+    path = runs / "b" / "trajectory.csv"
+    path.write_text(cells(path.read_text(), CHANGES[what]))
+    try:
+        found = compare(load_run(runs / "a"), load_run(runs / "b"))
+    except CosimError as error:
+        assert "\n" not in str(error)
+    else:
+        assert not found.equal
+        assert found.lines()
+
+
+# What a plug-in does to its process -------------------------------------------------------------
+
+ENDS = {
+    "os._exit(0)": ("os._exit(0)", 2, "with exit code 0"),
+    "os._exit(3)": ("os._exit(3)", 2, "with exit code 3"),
+    "sys.exit(0)": ("sys.exit(0)", 2, "exit(0)"),
+    "sys.exit()": ("sys.exit()", 2, "exit(None)"),
+    "a closed pipe": ("raise BrokenPipeError", 2, "pipe"),
+    "a signal": ("os.kill(os.getpid(), 9)", 2, "SIGKILL"),
+    "abort": ("os.abort()", 2, "SIGABRT"),
+    "no Exception": ("raise BaseException('x')", 70, "BaseException: x"),
+    "GeneratorExit": ("raise GeneratorExit", 70, "GeneratorExit"),
+    "an end without a word": ("os.close(1); os.close(2); os._exit(0)", 2, "with exit code 0"),
+    "a thread that stays": ("threading.Thread(target=time.sleep, args=(900,)).start()", 0, ""),
+    "a process that stays": ("subprocess.Popen(['sleep', '5'], stderr=-3)", 0, ""),
+}
+PLUGIN = """\
+import os, subprocess, sys, threading, time
+from tests.helpers.loop import Proportional
+
+class Mine(Proportional):
+    def feedback(self, s, a=None):
+        {body}
+        return super().feedback(s)
+
+def make(scenario):
+    return Mine(scenario)
+"""
+FAST = {"os._exit(0)", "a thread that stays"}
+
+
+@pytest.mark.parametrize(
+    "what", [pytest.param(what, marks=[] if what in FAST else pytest.mark.slow) for what in ENDS]
+)
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
+def test_exit_code_0_means_results_whatever_a_plug_in_does(tmp_path, what):
+    body, code, words = ENDS[what]
+    (tmp_path / "mine.py").write_text(PLUGIN.format(body=body))
+    done = run_cosim("simulate", "-c", "mine:make", "-n", 2, "--out", "out", folder=tmp_path,
+                     env={"TMPDIR": str(tmp_path), "PYTHONPATH": ROOT})  # fmt: skip
+    assert done.returncode == code, done.stderr
+    assert (tmp_path / "out" / "summary.json").exists() is (code == 0)
+    if code:
+        assert words in done.stderr
+        assert "Traceback" not in done.stderr
+        assert done.stderr.count("error: ") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["import", "factory", "evaluate", "workers"])
+def test_an_early_exit_elsewhere_is_one_line_too(tmp_path, where):
+    text = PLUGIN.format(body="os._exit(0)" if where in ("evaluate", "workers") else "pass")
+    if where == "import":
+        text = "import os; os._exit(0)"
+    elif where == "factory":
+        text = text.replace("return Mine", "os._exit(0)\n    return Mine")
+    (tmp_path / "mine.py").write_text(text)
+    jobs = 2 if where == "workers" else 1
+    words = f"evaluate -c mine:make --seeds 2 -n 2 --jobs {jobs} --out out"
+    done = run_cosim(*words.split(), folder=tmp_path, env={"PYTHONPATH": ROOT})
+    assert done.returncode == 2
+    assert done.stderr.count("error: ") == 1
+    assert not (tmp_path / "out" / "summary.json").exists()

@@ -282,23 +282,6 @@ def _reference(name: str, model: Model) -> int:
     return model.value_reference(name)
 
 
-_TYPES = {
-    Type.REAL: "REAL",
-    Type.BOOLEAN: "BOOLEAN",
-    Type.LAW: "LAW",
-    Type.SEED: "SEED",
-    Type.SEED_HIGH: "SEED_HIGH",
-    Type.LAW_NUMBER: "LAW_NUMBER",
-}
-_KINDS = {
-    Kind.INDEPENDENT: "INDEPENDENT",
-    Kind.INPUT: "INPUT",
-    Kind.STATE: "STATE",
-    Kind.DERIVATIVE: "DERIVATIVE",
-    Kind.OUTPUT: "OUTPUT",
-    Kind.FIXED: "FIXED",
-    Kind.TUNABLE: "TUNABLE",
-}
 _SEED_MAX = 4294967295.0
 
 
@@ -332,9 +315,9 @@ enum {{
     N_VARIABLES = {len(variables)}
 }};
 
-typedef enum {{ {", ".join(_TYPES.values())} }} VariableType;
+typedef enum {{ {", ".join(Type.__members__)} }} VariableType;
 
-typedef enum {{ {", ".join(_KINDS.values())} }} VariableKind;
+typedef enum {{ {", ".join(Kind.__members__)} }} VariableKind;
 
 typedef struct {{
     const char *name;
@@ -365,4 +348,4 @@ def _row(variable: Variable) -> str:
         1.0 if variable.nominal is None else variable.nominal,
     )
     values = ", ".join(repr(float(number or 0.0)) for number in numbers)
-    return f'{{"{variable.name}", {_TYPES[variable.type]}, {_KINDS[variable.kind]}, {values}}}'
+    return f'{{"{variable.name}", {variable.type.name}, {variable.kind.name}, {values}}}'

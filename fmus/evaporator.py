@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
+import re
 import uuid
 from html import escape
 from pathlib import Path
@@ -24,175 +26,46 @@ from fmus.build import (
     write_archive,
 )
 from fmus.description import LICENSE, build_description, c_header, model_description
-from fmus.model import LAW_NUMBER, SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
+from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable
 
-UNITS = (
-    Unit("1"),
-    Unit("s", 1.0, 0.0, (("s", 1),)),
-    Unit("d", 86400.0, 0.0, (("s", 1),)),
-    Unit("1/d", 1 / 86400, 0.0, (("s", -1),)),
-    Unit("%", 0.01),
-    Unit("%/s", 0.01, 0.0, (("s", -1),)),
-    Unit("kg", 1.0, 0.0, (("kg", 1),)),
-    Unit("kPa", 1e3, 0.0, (("kg", 1), ("m", -1), ("s", -2))),
-    Unit("kPa/s", 1e3, 0.0, (("kg", 1), ("m", -1), ("s", -3))),
-    Unit("kg/min", 1 / 60, 0.0, (("kg", 1), ("s", -1))),
-    Unit("kg/kPa", 1e-3, 0.0, (("m", 1), ("s", 2))),
-    Unit("degC", 1.0, 273.15, (("K", 1),)),
-    Unit("K", 1.0, 0.0, (("K", 1),)),
-    Unit("K/kPa", 1e-3, 0.0, (("kg", -1), ("m", 1), ("s", 2), ("K", 1))),
-    Unit("K/%", 100.0, 0.0, (("K", 1),)),
-    Unit("kW", 1e3, 0.0, (("kg", 1), ("m", 2), ("s", -3))),
-    Unit("kW/K", 1e3, 0.0, (("kg", 1), ("m", 2), ("s", -3), ("K", -1))),
-    Unit("kW.min/kg", 6e4, 0.0, (("m", 2), ("s", -2))),
-    Unit("kW.min/(kg.K)", 6e4, 0.0, (("m", 2), ("s", -2), ("K", -1))),
+_EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
+
+
+def _rows(file: str) -> list[dict[str, str]]:
+    return list(csv.DictReader((RESOURCES / file).read_text(encoding="utf-8").splitlines()))
+
+
+def _number(text: str) -> float | None:
+    return float(text) if text else None
+
+
+UNITS = tuple(
+    Unit(
+        row["name"],
+        float(row["factor"]),
+        float(row["offset"]),
+        tuple((base, int(power)) for base, power in _EXPONENT.findall(row["exponents"])),
+    )
+    for row in _rows("units.csv")
 )
-
 DISTURBANCES = ("X1", "F1", "T1", "T200")
 STATES = ("X2", "P2")
 
-_SWITCHES = (
-    "stochastic",
-    "override",
-    "law",
-    "law_number",
-    "seed",
-    "seedHigh",
-    "sampling_time",
-    "time",
+VARIABLES = tuple(
+    Variable(
+        row["name"],
+        Kind[row["kind"]],
+        Type[row["type"]],
+        row["unit"],
+        _number(row["start"]),
+        _number(row["min"]),
+        _number(row["max"]),
+        _number(row["nominal"]),
+        row["description"],
+        tuple(row["uses"].split()),
+    )
+    for row in _rows("evaporator.csv")
 )
-
-
-def _input(name: str, unit: str, start: float, low: float, high: float, text: str) -> Variable:
-    return Variable(name, Kind.INPUT, Type.REAL, unit, start, low, high, start, text)
-
-
-def _tunable(name: str, unit: str, start: float, low: float, high: float, text: str) -> Variable:
-    return Variable(name, Kind.TUNABLE, Type.REAL, unit, start, low, high, start, text)
-
-
-def _output(
-    name: str, unit: str, low: float, high: float, nominal: float, text: str, uses: str
-) -> Variable:
-    return Variable(
-        name, Kind.OUTPUT, Type.REAL, unit, None, low, high, nominal, text, tuple(uses.split())
-    )
-
-
-def _disturbance(
-    name: str, unit: str, nominal: float, low: float, high: float, text: str
-) -> Variable:
-    uses = (f"{name}_in", f"{name}_nominal", f"{name}_range", *_SWITCHES)
-    return Variable(
-        name, Kind.OUTPUT, Type.REAL, unit, None, low, high, nominal, f"realised {text}", uses
-    )
-
-
-def _state(name: str, unit: str, high: float, nominal: float, text: str) -> Variable:
-    return Variable(
-        name, Kind.STATE, Type.REAL, unit, None, 0.0, high, nominal, text, (f"{name}_start",)
-    )
-
-
-def _range(disturbance: str, unit: str, start: float, high: float) -> Variable:
-    text = "half width (uniform) or standard deviation (normal)"
-    return _tunable(f"{disturbance}_range", unit, start, 0.0, high, text)
-
-
-def _start(state: str, unit: str, start: float, high: float, nominal: float) -> Variable:
-    return Variable(
-        f"{state}_start", Kind.FIXED, Type.REAL, unit, start, 0.0, high, nominal,
-        f"{state} at the start",
-    )  # fmt: skip
-
-
-def _derivative(state: str, unit: str, nominal: float, uses: str) -> Variable:
-    return Variable(
-        f"der({state})", Kind.DERIVATIVE, Type.REAL, unit, None, -1e3, 1e3, nominal,
-        f"time derivative of {state}", tuple(uses.split()),
-    )  # fmt: skip
-
-
-def _switch(name: str, kind: Kind, start: bool, text: str) -> Variable:
-    return Variable(name, kind, Type.BOOLEAN, "", float(start), 0.0, 1.0, None, text)
-
-
-def _seed(name: str, type_: Type, text: str) -> Variable:
-    return Variable(name, Kind.FIXED, type_, "", 0.0, None, None, None, text)
-
-
-VARIABLES: tuple[Variable, ...] = (
-    Variable("time", Kind.INDEPENDENT, Type.REAL, "s", None, None, None, None, "simulation time"),
-    _state("X2", "%", 100.0, 25.0, "product composition"),
-    _state("P2", "kPa", 400.0, 50.0, "operating pressure"),
-    _derivative("X2", "%/s", 0.01, "F1 X1 F2 X2 M"),
-    _derivative("P2", "kPa/s", 0.01, "F4 F5 C"),
-    _input("P100", "kPa", 191.71322, 100.0, 400.0, "steam pressure (manipulated)"),
-    _input("F200", "kg/min", 215.88844, 100.0, 400.0, "cooling water flow (manipulated)"),
-    _input("X1_in", "%", 5.0, 0.0, 50.0, "feed composition, used while override is true"),
-    _input("F1_in", "kg/min", 10.0, 0.0, 100.0, "feed flow, used while override is true"),
-    _input("T1_in", "degC", 40.0, -100.0, 300.0, "feed temperature, used while override is true"),
-    _input("T200_in", "degC", 25.0, -100.0, 300.0,
-           "cooling water inlet temperature, used while override is true"),
-    _disturbance("X1", "%", 5.0, -200.0, 250.0, "feed composition"),
-    _disturbance("F1", "kg/min", 10.0, -400.0, 500.0, "feed flow"),
-    _disturbance("T1", "degC", 40.0, -1000.0, 1200.0, "feed temperature"),
-    _disturbance("T200", "degC", 25.0, -1000.0, 1200.0, "cooling water inlet temperature"),
-    _output("economic_cost", "1", -1e6, 1e6, 6000.0,
-            "operating cost rate 10.09 (F2 + F3) + 600 F100 + 0.6 F200", "F2 F3 F100 F200"),
-    _output("F2", "kg/min", -1e3, 1e3, 2.0, "product flow", "F1 F4"),
-    _output("F4", "kg/min", -1e3, 1e3, 8.0, "vapour flow", "Q100 F1 Cp T2 T1 lambda_"),
-    _output("F5", "kg/min", -1e3, 1e3, 8.0, "condensate flow", "Q200 lambda_"),
-    _output("F100", "kg/min", -1e3, 1e3, 9.0, "steam flow", "Q100 lambda_s"),
-    _output("T2", "degC", -1e3, 1e3, 80.0, "product temperature", "a P2 b X2 c"),
-    _output("T3", "degC", -1e3, 1e3, 80.0, "vapour temperature", "d P2 e"),
-    _output("T100", "degC", -1e3, 1e3, 120.0, "steam temperature", "f P100 g"),
-    _output("UA1", "kW/K", -1e3, 1e3, 10.0, "heat transfer of the heater", "h F1 F3"),
-    _output("Q100", "kW", -1e5, 1e5, 350.0, "heater duty", "UA1 T100 T2"),
-    _output("Q200", "kW", -1e5, 1e5, 300.0, "condenser duty", "UA2_present T3 T200 Cp F200"),
-    _switch("stochastic", Kind.TUNABLE, True, "draw the disturbances; false: the nominal plant"),
-    _switch("override", Kind.TUNABLE, False, "take the disturbances from the inputs *_in"),
-    Variable("law", Kind.FIXED, Type.LAW, "", 1.0, 1.0, 2.0, None, "law of the disturbances"),
-    _seed("seed", Type.SEED, "seed of the disturbances"),
-    _seed("seedHigh", Type.SEED_HIGH, "upper 32 bits of the seed (FMI 2.0 Integers have 32)"),
-    Variable("sampling_time", Kind.FIXED, Type.REAL, "s", 60.0, 0.01, 86400.0, 60.0,
-             "the disturbances are redrawn at its multiples and held in between"),
-    _tunable("X1_nominal", "%", 5.0, 0.0, 50.0, "nominal feed composition"),
-    _tunable("F1_nominal", "kg/min", 10.0, 0.1, 100.0, "nominal feed flow"),
-    _tunable("T1_nominal", "degC", 40.0, 0.0, 200.0, "nominal feed temperature"),
-    _tunable("T200_nominal", "degC", 25.0, 0.0, 200.0, "nominal cooling water inlet temperature"),
-    _range("X1", "%", 1.0, 20.0),
-    _range("F1", "kg/min", 2.0, 40.0),
-    _range("T1", "K", 8.0, 100.0),
-    _range("T200", "K", 5.0, 100.0),
-    _start("X2", "%", 25.0, 100.0, 25.0),
-    _start("P2", "kPa", 49.74297, 400.0, 50.0),
-    _tunable("a", "K/kPa", 0.5616, 0.0, 10.0, "slope of T2 in P2"),
-    _tunable("b", "K/%", 0.3126, 0.0, 10.0, "slope of T2 in X2"),
-    _tunable("c", "degC", 48.43, -100.0, 200.0, "offset of T2"),
-    _tunable("d", "K/kPa", 0.507, 0.0, 10.0, "slope of T3 in P2"),
-    _tunable("e", "degC", 55.0, -100.0, 200.0, "offset of T3"),
-    _tunable("f", "K/kPa", 0.1538, 0.0, 10.0, "slope of T100 in P100"),
-    _tunable("g", "degC", 90.0, -100.0, 200.0, "offset of T100"),
-    _tunable("h", "kW.min/(kg.K)", 0.16, 0.0, 10.0, "heat transfer of the heater per flow"),
-    _tunable("M", "kg", 20.0, 1.0, 1e4, "liquid holdup"),
-    _tunable("C", "kg/kPa", 4.0, 0.1, 1e4, "vapour holdup per pressure"),
-    _tunable("UA2", "kW/K", 6.84, 0.0, 1e3, "heat transfer of the clean condenser"),
-    _tunable("Cp", "kW.min/(kg.K)", 0.07, 0.001, 10.0, "heat capacity of liquor and cooling water"),
-    _tunable("lambda_", "kW.min/kg", 38.5, 1.0, 1e3, "latent heat of the evaporated water"),
-    _tunable("lambda_s", "kW.min/kg", 36.6, 1.0, 1e3, "latent heat of the steam"),
-    _tunable("F3", "kg/min", 50.0, 0.0, 1e3, "circulating flow"),
-    Variable("fouling_rate", Kind.TUNABLE, Type.REAL, "1/d", 0.0, 0.0, 1e3, 0.1,
-             "rate at which the condenser fouls; 0: it does not"),
-    _tunable("fouling_floor", "1", 0.7, 0.0, 1.0, "share of UA2 that fouling leaves in the end"),
-    _tunable("cleaning_period", "d", 6.0, 0.0, 1e5,
-             "the condenser is cleaned at its multiples; 0: never"),
-    _output("UA2_present", "kW/K", 0.0, 1e3, 6.84,
-            "present heat transfer of the condenser: UA2 while it is clean",
-            "UA2 fouling_rate fouling_floor cleaning_period sampling_time time"),
-    _switch("saturate", Kind.FIXED, False, SATURATE),
-    Variable("law_number", Kind.FIXED, Type.LAW_NUMBER, "", 0.0, 0.0, 2.0, None, LAW_NUMBER),
-)  # fmt: skip
 
 EVAPORATOR = Model(
     name="Evaporator",
@@ -227,7 +100,7 @@ def documentation_page(version: FmiVersion, build_file: str) -> str:
 
 def _row(variable: Variable) -> str:
     numbers = "".join(
-        f'<td class="n">{_number(value)}</td>'
+        f'<td class="n">{"" if value is None else f"{value:.10g}"}</td>'
         for value in (variable.start, variable.min, variable.max)
     )
     reference = EVAPORATOR.value_reference(variable.name)
@@ -236,10 +109,6 @@ def _row(variable: Variable) -> str:
         f"<td>{variable.kind}</td><td>{escape(variable.unit)}</td>{numbers}"
         f"<td>{escape(variable.description)}</td></tr>"
     )
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.10g}"
 
 
 FILE_NAMES: dict[FmiVersion, str] = {2: "evaporator.fmu", 3: "evaporator_fmi3.fmu"}

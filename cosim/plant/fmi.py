@@ -127,6 +127,10 @@ class Instance:
     real: ClassVar[str]
     state_suffix: ClassVar[str]
     setters: ClassVar[dict[str, tuple[str, Any]]]
+    _deserialise_name: ClassVar[str]
+    _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
+    """The calls that initialise, with their arguments after the instance."""
+    _step_arguments: tuple[Any, ...]
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         self.fmu = fmu
@@ -149,6 +153,14 @@ class Instance:
         self.inputs, _, self._set_inputs = self._exchange(wiring.inputs)
         self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs)
         self.states, self.states_view, self._get_states = self._exchange(wiring.states)
+        self._reset = self._function("Reset")
+        self._set_values = self._function(f"Set{self.real}")
+        self._get_values = self._function(f"Get{self.real}")
+        self._do_step = self._function("DoStep")
+        if self._can_save:
+            self._get_state = self._function(f"Get{self.state_suffix}")
+            self._set_state = self._function(f"Set{self.state_suffix}")
+            self._free_state = self._function(f"Free{self.state_suffix}")
         self._starts: list[tuple[str, Any, tuple[Any, ...]]] = []
         self._slots: dict[tuple[str, int], tuple[Any, int]] = {}
         for kind in dict.fromkeys(start.type for start in wiring.starts):
@@ -170,11 +182,26 @@ class Instance:
 
     def initialise(self, started: bool) -> None:
         """Reset (if started before), write the start values, initialise and read the states."""
-        raise NotImplementedError
+        if started and (status := self._reset(self._component)) not in ACCEPTED:
+            self.fail("Reset", status)
+        self._write_starts()
+        for name, arguments in self._begin:
+            if (status := self._function(name)(self._component, *arguments)) not in ACCEPTED:
+                self.fail(name, status)
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
+            self.fail(f"Get{self.real}", status)
 
     def advance(self, time: float) -> None:
         """Write the inputs, read the outputs at `time`, step, and read the states after it."""
-        raise NotImplementedError
+        self._time.value = time
+        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
+            self.fail(f"Set{self.real}", status)
+        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
+            self.fail(f"Get{self.real}", status)
+        if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
+            self.fail("DoStep", status)
+        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
+            self.fail(f"Get{self.real}", status)
 
     def _instantiate(self, library: str) -> Any:
         raise NotImplementedError
@@ -272,17 +299,6 @@ class Instance:
         if (status := self._function(name)(self._component, buffer, size, pointer)) not in ACCEPTED:
             self.fail(name, status)
 
-    _deserialise_name: ClassVar[str]
-
-    def _bind(self, setter: str) -> None:
-        self._set_values = self._function(f"Set{setter}")
-        self._get_values = self._function(f"Get{setter}")
-        self._do_step = self._function("DoStep")
-        if self._can_save:
-            self._get_state = self._function(f"Get{self.state_suffix}")
-            self._set_state = self._function(f"Set{self.state_suffix}")
-            self._free_state = self._function(f"Free{self.state_suffix}")
-
     def _lacks(self, ability: str, flag: str) -> None:
         raise CapabilityError(
             f"FMU '{self.fmu.path}' cannot {ability}: its model description lacks {flag}"
@@ -340,6 +356,11 @@ class Fmi2Instance(Instance):
     prefix = "fmi2"
     state_suffix = "FMUstate"
     _deserialise_name = "DeSerializeFMUstate"
+    _begin = (
+        ("SetupExperiment", (_FALSE, _ZERO, _ZERO, _FALSE, _ZERO)),
+        ("EnterInitializationMode", ()),
+        ("ExitInitializationMode", ()),
+    )
     real = "Real"
     setters: ClassVar[dict[str, tuple[str, Any]]] = {
         "Real": ("Real", ctypes.c_double),
@@ -350,11 +371,8 @@ class Fmi2Instance(Instance):
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         super().__init__(fmu, wiring, step_size)
-        self._bind("Real")
-        self._reset = self._function("Reset")
-        self._setup = self._function("SetupExperiment")
-        self._enter = self._function("EnterInitializationMode")
-        self._exit = self._function("ExitInitializationMode")
+        # The last argument is false: a snapshot may take the FMU back before this step.
+        self._step_arguments = (self._component, self._time, self._step_size, _FALSE)
 
     def _instantiate(self, library: str) -> FMU2Slave:
         name = f"cosim-{next(_numbers)}"
@@ -374,36 +392,6 @@ class Fmi2Instance(Instance):
         pointers = (ctypes.c_uint * count)(*references)
         return (self._component, pointers, ctypes.c_size_t(count), values)
 
-    def initialise(self, started: bool) -> None:
-        """Reset (if started before), write the start values, initialise and read the states."""
-        component = self._component
-        if started and (status := self._reset(component)) not in ACCEPTED:
-            self.fail("Reset", status)
-        self._write_starts()
-        if (status := self._setup(component, _FALSE, _ZERO, _ZERO, _FALSE, _ZERO)) not in ACCEPTED:
-            self.fail("SetupExperiment", status)
-        if (status := self._enter(component)) not in ACCEPTED:
-            self.fail("EnterInitializationMode", status)
-        if (status := self._exit(component)) not in ACCEPTED:
-            self.fail("ExitInitializationMode", status)
-        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
-            self.fail("GetReal", status)
-
-    def advance(self, time: float) -> None:
-        """Write the inputs, read the outputs at `time`, step, and read the states after it."""
-        self._time.value = time
-        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
-            self.fail("SetReal", status)
-        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
-            self.fail("GetReal", status)
-        # The last argument is false: a snapshot may take the FMU back before this step.
-        if (
-            status := self._do_step(self._component, self._time, self._step_size, _FALSE)
-        ) not in ACCEPTED:
-            self.fail("DoStep", status)
-        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
-            self.fail("GetReal", status)
-
 
 _NO = ctypes.c_bool(False)
 
@@ -414,6 +402,10 @@ class Fmi3Instance(Instance):
     prefix = "fmi3"
     state_suffix = "FMUState"
     _deserialise_name = "DeserializeFMUState"
+    _begin = (
+        ("EnterInitializationMode", (_NO, _ZERO, _ZERO, _NO, _ZERO)),
+        ("ExitInitializationMode", ()),
+    )
     real = "Float64"
     setters: ClassVar[dict[str, tuple[str, Any]]] = {
         "Float64": ("Float64", ctypes.c_double),
@@ -432,10 +424,6 @@ class Fmi3Instance(Instance):
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         super().__init__(fmu, wiring, step_size)
-        self._bind("Float64")
-        self._reset = self._function("Reset")
-        self._enter = self._function("EnterInitializationMode")
-        self._exit = self._function("ExitInitializationMode")
         self._event = ctypes.c_bool()
         self._terminate = ctypes.c_bool()
         self._early = ctypes.c_bool()
@@ -471,30 +459,9 @@ class Fmi3Instance(Instance):
         pointers = (ctypes.c_uint * len(references))(*references)
         return (self._component, pointers, count, values, count)
 
-    def initialise(self, started: bool) -> None:
-        """Reset (if started before), write the start values, initialise and read the states."""
-        component = self._component
-        if started and (status := self._reset(component)) not in ACCEPTED:
-            self.fail("Reset", status)
-        self._write_starts()
-        if (status := self._enter(component, _NO, _ZERO, _ZERO, _NO, _ZERO)) not in ACCEPTED:
-            self.fail("EnterInitializationMode", status)
-        if (status := self._exit(component)) not in ACCEPTED:
-            self.fail("ExitInitializationMode", status)
-        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
-            self.fail("GetFloat64", status)
-
     def advance(self, time: float) -> None:
-        """Write the inputs, read the outputs at `time`, step, and read the states after it."""
-        self._time.value = time
-        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
-            self.fail("SetFloat64", status)
-        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
-            self.fail("GetFloat64", status)
-        if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
-            self.fail("DoStep", status)
+        """Step as in FMI 2.0; an FMU that ends the step early is an error."""
+        super().advance(time)
         if self._terminate.value or self._early.value:
             self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
             self.fail("DoStep", DISCARD)
-        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
-            self.fail("GetFloat64", status)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 import fmus
-from fmus import CheckError, check
+from fmus import check
 from tests.helpers import importers
 
 
@@ -22,12 +21,4 @@ def test_every_installed_importer_passes(name: str) -> None:
 def test_the_shipped_files_pass(version: int) -> None:
     findings = check.check(fmus.path(fmus.NAMES[version - 2]))
     assert [f.status for f in findings] == ["passed"] * 3
-    assert "bit-identical" in findings[-1].detail
-
-
-def test_rounding_is_no_fault_of_an_own_fmu_but_one_of_the_shipped_files() -> None:
-    rows = check.reference(fmus.path())
-    rows[50, 0] = np.nextafter(rows[50, 0], 100.0)
-    assert "equal to" in check.require_equal(rows, fmus.path(), check.ROUNDING)
-    with pytest.raises(CheckError):
-        check.require_equal(rows, fmus.path())
+    assert "all finite" in findings[-1].detail

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import fmus
 from fmus import crosscheck
-from fmus.check import relative_difference
+from tests.helpers.importers import relative_difference
 
 
 @pytest.mark.parametrize("name", fmus.NAMES)

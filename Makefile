@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One process a core; tests of one file share what they build.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test check campaign clean
+.PHONY: demo test check docs campaign clean
 
 demo: $(VENV)/installed
 	$(BIN)/cosim demo --out demo
@@ -19,9 +19,14 @@ check: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m mkdocs build --strict --site-dir build/site
 	$(PYTEST) -m slow
 	$(BIN)/cosim results check
 	$(BIN)/cosim demo --samples 2000 --steps 200 --out build/demo
+
+# The documentation as a site, in build/site; any warning is an error.
+docs: $(VENV)/installed-dev
+	$(BIN)/python -m mkdocs build --strict --site-dir build/site
 
 # What takes many minutes a test and is run by hand.
 campaign: $(VENV)/installed-dev

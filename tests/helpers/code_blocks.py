@@ -105,7 +105,7 @@ class Session:
             tomllib.loads(block.text)
         elif kind == "json":
             json.loads(block.text)
-        elif kind not in ("text", "bibtex"):
+        elif kind not in ("text", "bibtex", "c"):
             raise AssertionError(f"{where}: nothing here executes a block of '{kind}'")
 
     def _type(self, text: str, where: str) -> None:

@@ -36,32 +36,40 @@ class BufferedFunction:
     `inputs[name]` and `outputs[name]` are flat float64 arrays in CasADi's column-major order:
     write the inputs, call, read the outputs. A call allocates nothing. The inputs follow each other
     in one array, `arguments`, but for the `shared` ones, which are read from somebody else's
-    memory, such as another function's output. Every input and output of the function must be dense.
-    Raises ValueError where a shared array has the wrong size.
+    memory, such as another function's output. Own inputs and outputs are one array, `memory`: a
+    given one, or one with `room` behind them for more, by name and size; `places` says by name
+    where all of it stands. Every input and output of the function must be dense. Raises ValueError
+    where a shared array has the wrong size.
     """
 
-    def __init__(self, function: ca.Function, shared: Mapping[str, Vector] | None = None) -> None:
+    def __init__(
+        self,
+        function: ca.Function,
+        shared: Mapping[str, Vector] | None = None,
+        *,
+        room: Mapping[str, int] | None = None,
+        memory: Vector | None = None,
+    ) -> None:
         self.function = function
         shared = shared or {}
         sizes = {function.name_in(i): function.numel_in(i) for i in range(function.n_in())}
         own = {name: size for name, size in sizes.items() if name not in shared}
-        self.arguments: Vector = np.zeros(sum(own.values()))
-        ends = np.cumsum(list(own.values()))
-        self.positions = {
-            name: slice(int(end) - size, int(end))
-            for (name, size), end in zip(own.items(), ends, strict=True)
+        results = {function.name_out(i): function.numel_out(i) for i in range(function.n_out())}
+        all_sizes = own | results | dict(room or {})
+        ends = np.cumsum(list(all_sizes.values())).tolist()
+        self.memory: Vector = np.zeros(ends[-1]) if memory is None else memory
+        self.places = {
+            name: slice(end - size, end)
+            for (name, size), end in zip(all_sizes.items(), ends, strict=True)
         }
-        """Where an input of its own stands in `arguments`."""
         for name, array in shared.items():
             if array.shape != (sizes[name],) or not array.flags.c_contiguous:
                 raise ValueError(f"{function.name()}: shared input {name} does not fit")
         self.inputs = {
-            name: shared[name] if name in shared else self.arguments[self.positions[name]]
+            name: shared[name] if name in shared else self.memory[self.places[name]]
             for name in sizes
         }
-        self.outputs = {
-            function.name_out(i): np.zeros(function.numel_out(i)) for i in range(function.n_out())
-        }
+        self.outputs = {name: self.memory[self.places[name]] for name in results}
         self.bind(function)
 
     def bind(self, function: ca.Function) -> None:
@@ -82,6 +90,9 @@ def stacked(
     arguments: Mapping[str, Expression],
     results: Mapping[str, Expression],
     shared: Mapping[str, Vector] | None = None,
+    *,
+    room: Mapping[str, int] | None = None,
+    memory: Vector | None = None,
 ) -> StackedFunction:
     """Buffered function whose results share one flat array, so that one copy keeps them all.
 
@@ -102,7 +113,7 @@ def stacked(
         for key, size, end in zip(results, sizes, ends, strict=True)
     }
     shapes = {key: value.shape for key, value in results.items()}
-    return StackedFunction(function, slices, shapes, shared)
+    return StackedFunction(function, slices, shapes, shared, room=room, memory=memory)
 
 
 class StackedFunction(BufferedFunction):
@@ -114,11 +125,17 @@ class StackedFunction(BufferedFunction):
         slices: dict[str, slice],
         shapes: dict[str, tuple[int, int]],
         shared: Mapping[str, Vector] | None = None,
+        *,
+        room: Mapping[str, int] | None = None,
+        memory: Vector | None = None,
     ) -> None:
-        super().__init__(function, shared)
+        super().__init__(function, shared, room=room, memory=memory)
         self.slices = slices
         self.shapes = shapes
         self.stack: Vector = self.outputs["stack"]
+        first = self.places["stack"].start
+        for name, part in slices.items():
+            self.places[name] = slice(first + part.start, first + part.stop)
         self._zeros = np.zeros(self.stack.size)
 
     def finite(self) -> bool:
@@ -132,16 +149,12 @@ class StackedFunction(BufferedFunction):
             return bool(np.isfinite(self.stack).all())
         return isfinite(np.vdot(self.stack, self._zeros))
 
-    def span(self, first: str, last: str) -> slice:
-        """Where the results from the `first` to the `last` stand in the stack."""
-        return slice(self.slices[first].start, self.slices[last].stop)
-
-    def part(self, name: str, stack: Vector | None = None) -> Vector:
+    def part(self, name: str, memory: Vector | None = None) -> Vector:
         """View of a result, transposed to row-major: shape (columns, rows), or flat for a column.
 
-        It looks into the function's own output or into a copy of it.
+        It looks into the function's own memory or into a copy of it.
         """
-        flat = (self.stack if stack is None else stack)[self.slices[name]]
+        flat = (self.memory if memory is None else memory)[self.places[name]]
         rows, columns = self.shapes[name]
         return flat if columns == 1 else flat.reshape(columns, rows)
 

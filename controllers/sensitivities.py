@@ -23,7 +23,7 @@ from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Matrix = NDArray[np.float64]
 SOLUTION = ("xi", "t", "chi", "v", "lam")
-"""First inputs of the sensitivities: three in the read-out's order, so that one copy moves them."""
+"""First inputs of the sensitivities: a solution's parts."""
 
 
 @dataclass(frozen=True)

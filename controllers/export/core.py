@@ -15,7 +15,7 @@ from controllers.functions import BufferedFunction, StackedFunction, c_source
 from controllers.problem import Problem
 from controllers.rti.feedback import embedding, readout
 from controllers.rti.preparation import Exact, make_hessian, preparation
-from controllers.theta import Parameters
+from controllers.theta import Parameters, ThetaBlocks
 
 SOURCES = Path(__file__).parent / "sources"
 QP_SOURCES = ("qp.h", "qp_enter.h", "qp_refine.h", "qp_residual.h", "qp_set.h")
@@ -59,46 +59,41 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     parameters.require_well_posed()
     blocks = parameters.blocks
     prepared = preparation(problem, blocks)
-    functions = {
+    read = readout(problem, blocks, prepared)
+    functions: dict[str, BufferedFunction] = {
         "PREPARED": prepared,
-        "EMBEDDED": embedding(problem, blocks, prepared),
-        "READ": readout(problem, blocks, prepared),
+        "EMBEDDED": embedding(problem, blocks, prepared, read),
+        "READ": read,
     }
-    rule = make_hessian(hessian, problem, blocks, prepared)
-    called: dict[str, BufferedFunction] = {**functions}
     if hessian == "exact":
-        (called["CURVATURE"],) = rule.functions
-    if (size := _stack(problem, functions, called)) > STACK_LIMIT:
+        (functions["CURVATURE"],) = make_hessian(hessian, problem, blocks, prepared).functions
+    if (size := stack_needed(problem, functions)) > STACK_LIMIT:
         raise ControllerError(
             f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "
             f"than the {STACK_LIMIT / 1e3:.0f} kB that an exported controller may take; shorten it"
         )
+    return Core(problem, parameters, controller_sources(problem, blocks, hessian, functions))
+
+
+def controller_sources(
+    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, BufferedFunction]
+) -> dict[str, bytes]:
+    """C files by name of a controller made of `functions`, by the prefix of their constants."""
     wanted = ("core.h", "rti.h", *QP_SOURCES, "costs.h", RULES[hessian])
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
-    sources["functions.h"] = _functions(list(called.values())).encode()
-    sources["problem.h"] = _constants(problem, parameters, hessian, functions, called).encode()
-    return Core(problem, parameters, sources)
+    sources["functions.h"] = _functions(list(functions.values())).encode()
+    sources["problem.h"] = _constants(problem, blocks, hessian, functions).encode()
+    return sources
 
 
-def _stack(
-    problem: Problem,
-    functions: Mapping[str, StackedFunction],
-    called: Mapping[str, BufferedFunction],
-) -> int:
-    """Bytes of stack of a sample, at least what compilers make of it.
-
-    CasADi's work vectors and the QP solver's arrays share their place; gcc and clang add 4 to 18 %
-    and up to 4 kB.
-    """
+def stack_needed(problem: Problem, functions: Mapping[str, BufferedFunction]) -> int:
+    """Bytes of stack of a sample, at least what compilers make of it: they add 4 to 18 %."""
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    variables, rows, n_w = horizon * m, horizon * n, n + m
-    limits = variables + rows
-    own = horizon * (n_w**2 + n_w) + n * (n + 1) + 2 * limits
-    own += sum(function.stack.size for function in functions.values())
-    solver = limits * (variables + limits + 10) + 2 * variables + 2 * rows
-    solver += variables * (variables + 1)
-    shared = max(solver, *(each.function.sz_w() for each in called.values()))
-    return 4000 + round(1.2 * 8 * (own + shared))
+    variables, limits = horizon * m, horizon * (m + n)
+    own = sum(functions[name].memory.size for name in ("PREPARED", "READ"))
+    solver = limits * (variables + limits + 10) + 2 * (variables + limits)
+    inner = max(variables * (variables + 1), *(each.function.sz_w() for each in functions.values()))
+    return 4000 + round(1.2 * 8 * (own + solver + inner))
 
 
 def _functions(functions: Sequence[BufferedFunction]) -> str:
@@ -121,19 +116,15 @@ def _functions(functions: Sequence[BufferedFunction]) -> str:
 
 
 def _constants(
-    problem: Problem,
-    parameters: Parameters,
-    hessian: str,
-    functions: Mapping[str, StackedFunction],
-    called: Mapping[str, BufferedFunction],
+    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, BufferedFunction]
 ) -> str:
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    blocks, gamma = parameters.blocks, problem.discount
+    gamma = problem.discount
     sizes = {"N_X": n, "N_U": m, "N_W": n + m, "HORIZON": horizon, "N_THETA": blocks.size}
-    for prefix, function in functions.items():
-        sizes |= {f"{prefix}_{name}": part.start for name, part in function.slices.items()}
-        sizes[f"{prefix}_SIZE"] = function.stack.size
-    for prefix, call in called.items():
+    for prefix, call in functions.items():
+        if isinstance(call, StackedFunction):
+            sizes |= {f"{prefix}_{name}": part.start for name, part in call.slices.items()}
+            sizes[f"{prefix}_SIZE"] = call.stack.size
         of = call.function
         work = {"ARG": of.sz_arg(), "RES": of.sz_res(), "IW": of.sz_iw(), "W": of.sz_w()}
         sizes |= {f"{prefix}_{name}": size for name, size in work.items()}

@@ -25,7 +25,7 @@ def plain_c(core: Core, name: str, scenario: Scenario) -> dict[str, str]:
         raise ControllerError(f"'{name}' is no name for C: letters, digits and _ only")
     problem = core.problem
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    guess = horizon * (2 * n + m) + horizon * (n + m)
+    guess = horizon * (2 * n + m)
     solution = (horizon + 1) * n + horizon * m + guess + 3
     words = [re.sub(r"\W", "_", text.replace("θ", "theta")).upper() for text in STATUSES]
     upper = name.upper()

@@ -9,11 +9,14 @@ from controllers.problem import Problem
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
 
-def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> StackedFunction:
+def embedding(
+    problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction, read: StackedFunction
+) -> StackedFunction:
     """Initial value embedding: the vectors of the QP that depend on the state s.
 
-    Inputs: s; theta and the rest are read from the preparation's memory. Results: the gradient f,
-    and the lower and upper limits that the soft rows Γ V must respect.
+    Inputs: s, read from the read-out's memory; theta and the rest from the preparation's. Results,
+    written to the read-out's memory: the gradient f, and the lower and upper limits that the soft
+    rows Γ V must respect.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
@@ -33,7 +36,8 @@ def embedding(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) 
         {"s": s, "theta": symbols.theta, **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
         {name: prepared.stack[prepared.slices[name]] for name in prior}
-        | {"theta": prepared.inputs["theta"]},
+        | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
+        memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
 
 
@@ -45,7 +49,9 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     t (n, N), chi (n, N+1), value. The costates χ solve the adjoint recursion, so χ_0 is the
     gradient of the value in s. The solution shifted by one stage is the next point of
     linearisation: next_x (n, N), next_u (m, N) in absolute units, next_chi (n, N), the costates of
-    stages that weigh 1/γ as much.
+    stages that weigh 1/γ as much. Behind them its memory has room for the rest of a solution: what
+    `embedding` gives, multipliers nu of the controls' limits `lower` and `upper` (Nm,), and what
+    compiled code gives, `residual` and `iterations` of the QP's solver and the gradient (n_θ,).
     """
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
     symbols = SymbolicTheta.of(problem, blocks)
@@ -112,4 +118,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
         },
         {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
         | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N", "theta")},
+        room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
+        | dict.fromkeys(("row_lower", "row_upper"), horizon * n)
+        | {"residual": 1, "iterations": 1, "gradient": blocks.size},
     )

@@ -10,17 +10,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.functions import INTERPRETED, LONG, BufferedFunction, bind_compiled, switch
+from controllers.functions import (
+    COMPILED,
+    INTERPRETED,
+    LONG,
+    LOOK,
+    BufferedFunction,
+    bind_compiled,
+    switch,
+)
 from controllers.problem import Problem
 from controllers.qp import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
+from controllers.rti.engine import NOT_FINITE, STATUSES, Engine
 from controllers.rti.feedback import embedding, readout
 from controllers.rti.preparation import (
     LEAST_CONTROLS,
     limits_of,
     make_hessian,
     preparation,
-    qp_in_memory,
+    qp_of,
     riccati,
 )
 from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
@@ -72,20 +81,26 @@ class RtiNmpc:
             raise ControllerError(f"iterations must be at least 1, not {iterations}")
         self.iterations = iterations
         self.problem = problem
+        self._compilable = hessian == "gauss-newton" and backend == "daqp"
         blocks = parameters.blocks
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
         self._backend = self._make_backend()
         self._prepare = preparation(problem, blocks)
-        self._embed = embedding(problem, blocks, self._prepare)
+        self._readout = readout(problem, blocks, self._prepare)
+        self._embed = embedding(problem, blocks, self._prepare, self._readout)
         self._hessian = make_hessian(hessian, problem, blocks, self._prepare)
         gradient, policy = sensitivities(problem, blocks, exact=hessian != "gauss-newton")
-        self._readout = readout(problem, blocks, self._prepare)
         self._functions = Functions(
             problem, self._prepare, self._embed, self._readout, gradient, policy
         )
         self._riccati = riccati(problem, self._prepare) if horizon * m >= LEAST_CONTROLS else None
-        self._qp = qp_in_memory(problem, self._prepare, self._embed)
+        before, after = self._prepare.memory, self._readout.memory
+        self._qp = qp_of(self._prepare, self._readout, before, after)
+        self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
+        self._qp.upper[:] = np.tile(problem.action_upper - problem.reference_action, horizon)
+        self._engine: Engine | None = None
+        self._prepared: Prepared | None = None
         if self._riccati is not None:
             self._qp.factor = partial(limits_of, self._riccati)
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)
@@ -97,18 +112,17 @@ class RtiNmpc:
         self._enforced = False
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
         self._u = self._prepare.inputs["u"].reshape(horizon, m)
-        self._costates = np.zeros((horizon, n))
+        self._costates = before[self._prepare.places["costates"]].reshape(horizon, n)
         # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
-        start, end = (self._prepare.positions[name] for name in ("x", "u"))
-        self._point = self._prepare.arguments[start.start : end.stop]
-        self._next_point = self._readout.span("next_x", "next_u")
-        self._next_costates = self._readout.slices["next_chi"]
-        self._value = self._readout.slices["value"].start
-        self._constant = 0.0
+        places = self._prepare.places
+        self._point = before[places["x"].start : places["u"].stop]
+        places = self._readout.places
+        self._next_point = slice(places["next_x"].start, places["next_u"].stop)
+        self._next_costates, self._value = places["next_chi"], places["value"].start
+        self._controls = slice(places["v"].start, places["v"].start + m)
+        self._status = 0
         self.parameters = parameters
         self.functions = INTERPRETED
-        if switch() == "now":
-            compile_functions(self)
         self.reset()
 
     def casadi_functions(self) -> list[BufferedFunction]:
@@ -119,6 +133,15 @@ class RtiNmpc:
             *self._hessian.functions,
             *([] if self._riccati is None else [self._riccati]),
         ]
+
+    def compile(self, samples: int = LONG) -> None:
+        """Compile if a run of `samples` is worth it; to be called before the first sample."""
+        if self._compilable and (samples >= LOOK or switch() == "now"):
+            self._engine = Engine.load(self._functions, self._parameters.blocks)
+            self.functions = INTERPRETED if self._engine is None else COMPILED
+        elif not self._compilable:
+            self.functions = bind_compiled(self.casadi_functions(), samples)
+        self._prepared = None
 
     # θ ------------------------------------------------------------------------------------------
 
@@ -142,11 +165,10 @@ class RtiNmpc:
         parameters.require_well_posed()
         self._parameters = parameters
         self._hessian.set_parameters(parameters)
-        self._blocks: tuple[Vector, Vector] | None = None  # that are kept; Gauss–Newton's stay
         self._prepare.inputs["theta"][:] = parameters.theta
         if "w_sigma" in parameters.blocks:
             self._weigh(parameters["w_sigma"], parameters["W_sigma"])
-        self._prepared: Prepared | None = None
+        self._prepared = None
 
     @property
     def theta(self) -> Vector:
@@ -175,9 +197,9 @@ class RtiNmpc:
         linearised, needs no state beyond the predicted x_N.
         """
         if self._pending is not None:
-            stack, self._pending = self._pending.stack, None
-            self._point[:] = stack[self._next_point]
-            self._costates.reshape(-1)[:] = stack[self._next_costates]
+            memory, self._pending = self._pending.memory, None
+            self._point[:] = memory[self._next_point]
+            self._costates.reshape(-1)[:] = memory[self._next_costates]
             self._prepared = None
         if self._prepared is None:
             self._linearise()
@@ -208,33 +230,40 @@ class RtiNmpc:
         """Give the slack of the predicted stages its weights (n,), discounted."""
         problem, horizon = self.problem, self.problem.horizon
         discounts = np.repeat(problem.discount ** np.arange(1, horizon + 1), problem.n_states)
-        self._qp.w, self._qp.W = discounts * np.tile(w, horizon), discounts * np.tile(W, horizon)
+        memory, places = self._prepare.memory, self._prepare.places
+        # New views: a backend sees by them that the weights are others.
+        self._qp.w, self._qp.W = memory[places["w"]], memory[places["W"]]
+        self._qp.w[:], self._qp.W[:] = (
+            discounts * np.tile(w, horizon),
+            discounts * np.tile(W, horizon),
+        )
 
     def _linearise(self) -> None:
         prepare = self._prepare
         self._prepared = None
-        self._constant = self._hessian.fill(self._x, self._u, self._costates)
-        prepare()
-        if not prepare.finite():
+        if self._engine is not None:
+            self._status = self._engine.prepare()
+            finite = self._status != NOT_FINITE
+        else:
+            constant = self._hessian.fill(self._x, self._u, self._costates)
+            prepare.memory[prepare.places["constant"]] = constant
+            prepare()
+            finite = prepare.finite()
+        if not finite:
             raise QpError(
                 "the QP is not finite: the model has no finite value or derivative at the point of "
                 "linearisation",
                 status="QP not finite",
                 qp=self._qp.copy(),
             )
-        self._backend.load(self._qp)
-        if self._blocks is None or self._hessian.spectrum is not None:
-            self._blocks = prepare.inputs["L"].copy(), prepare.inputs["L_N"].copy()
+        if self._engine is None:
+            self._backend.load(self._qp)
         self._prepared = Prepared(
-            point=LinearisationPoint(self._x.copy(), self._u.copy(), self._costates.copy()),
-            parameters=self._parameters,
-            stack=prepare.stack.copy(),
-            L=self._blocks[0],
-            L_N=self._blocks[1],
-            w=self._qp.w,
-            W=self._qp.W,
-            spectrum=self._hessian.spectrum,
-            functions=self._functions,
+            prepare.memory.copy(),
+            self._parameters,
+            self._hessian.spectrum,
+            self._functions,
+            None if self._engine is None else self._engine.policy,
         )
 
     @property
@@ -273,43 +302,67 @@ class RtiNmpc:
         s = _vector("state", s, problem.n_states)
         if self._prepared is None:
             self.prepare()
-        prepared, qp = self._prepared, self._qp
+        prepared = self._prepared
         assert prepared is not None
-        self._embed.inputs["s"][:] = s
+        self._readout.inputs["s"][:] = s
+        if a is not None:
+            a = _vector("action", a, problem.n_actions)
+        if self._engine is None:
+            self._solve_interpreted(s, a)
+        else:
+            self._solve_compiled(s, a)
+        memory = self._readout.memory.copy()
+        return RtiSolution(
+            action=memory[self._controls] + problem.reference_action,
+            value=float(memory[self._value]),
+            prepared=prepared,
+            memory=memory,
+            enforced=a is not None,
+        )
+
+    def _solve_compiled(self, s: Vector, a: Vector | None) -> None:
+        engine, status = self._engine, self._status
+        assert engine is not None
+        if a is not None:
+            engine.action[:] = a
+        if not status:
+            status = engine.feedback(a is not None)
+        if not status:
+            return
+        if status == NOT_FINITE:
+            raise self._not_finite(s, a)
+        reason = STATUSES[status]
+        raise QpError(f"the QP was not solved: {reason}", status=reason, qp=self._qp.copy())
+
+    def _solve_interpreted(self, s: Vector, a: Vector | None) -> None:
+        qp, read = self._qp, self._readout
         self._embed()
         known = self._embed.finite()
         if a is not None:
-            enforced = _vector("action", a, problem.n_actions) - problem.reference_action
+            enforced = a - self.problem.reference_action
             self._first_lower[:] = self._first_upper[:] = enforced
             known = known and all(map(isfinite, enforced.tolist()))
         elif self._enforced:
             self._first_lower[:], self._first_upper[:] = self._action_lower, self._action_upper
         self._enforced = a is not None
         if not known:
-            raise QpError(
-                f"the QP is not finite: state {s}, action {a!r}",
-                status="state or action not finite",
-                qp=qp.copy(),
-            )
+            raise self._not_finite(s, a)
         multipliers = self._backend.solve(qp)
         if a is not None:
             multipliers = multipliers_at_kink(
                 qp, multipliers, self._action_lower, self._action_upper
             )
-        inputs = self._readout.inputs
-        inputs["s"][:], inputs["constant"][0] = s, self._constant
+        inputs = read.inputs
+        inputs["constant"][0] = self._prepare.memory[-1]
         inputs["v"][:], inputs["lam"][:] = multipliers.v, multipliers.lam
-        self._readout()
-        stack = self._readout.stack.copy()
-        return RtiSolution(
-            action=multipliers.v[: problem.n_actions] + problem.reference_action,
-            value=float(stack[self._value]),
-            multipliers=multipliers,
-            prepared=prepared,
-            stack=stack,
-            embedded=self._embed.stack.copy(),
-            limits=(qp.lower.copy(), qp.upper.copy()),
-            enforced=a is not None,
+        read.memory[read.places["nu"]] = multipliers.nu
+        read()
+
+    def _not_finite(self, s: Vector, a: Vector | None) -> QpError:
+        return QpError(
+            f"the QP is not finite: state {s}, action {a!r}",
+            status="state or action not finite",
+            qp=self._qp.copy(),
         )
 
     # read-outs that leave the guess alone -------------------------------------------------------
@@ -333,7 +386,7 @@ def compile_functions(controller: object, samples: int = LONG) -> None:
     To be called before the first sample; see `controllers.functions.bind_compiled`.
     """
     if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
-        controller.functions = bind_compiled(controller.casadi_functions(), samples)
+        controller.compile(samples)
 
 
 def _vector(kind: str, values: ArrayLike, size: int) -> Vector:

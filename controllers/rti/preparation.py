@@ -26,7 +26,9 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     ½VᵀHV + (f + F ξ_0)ᵀV + const. for stage costs ½wᵀL_k w + q_kᵀw and terminal ½ξᵀL_N ξ + q_Nᵀξ.
 
     Inputs: x (n, N) and u (m, N), the linearisation points; L (n+m, N(n+m)), q (n+m, N),
-    L_N (n, n), q_N (n); theta. Results: A, B, r by stage; H, Γ by rows; Φ, g, f, F.
+    L_N (n, n), q_N (n); theta. Results: A, B, r by stage; H, Γ by rows; Φ, g, f, F. Behind them
+    its memory has room for the rest of the QP: the costates (N, n) of the linearisation point, the
+    discounted slack weights w and W (Nn,), and the constant of the stage costs.
 
     Two sweeps of N calls each make it, in O(N²) operations: the forward one carries the responses
     of ξ_k to every control, to ξ_0 and to the offsets, the backward one turns them into columns of
@@ -77,6 +79,7 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
             "f": ca.vertcat(*(part[:, -1] for part in rows)),
             "F": ca.vertcat(*(part[:, width:-1] for part in rows)).T,
         },
+        room={"costates": horizon * n, "w": horizon * n, "W": horizon * n, "constant": 1},
     )
 
 
@@ -149,23 +152,21 @@ def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     return positions
 
 
-def qp_in_memory(problem: Problem, prepared: StackedFunction, embedded: StackedFunction) -> SoftQp:
-    """The QP whose data are the memory of the preparation and the embedding.
-
-    Calling the two functions rewrites it in place. The inputs' bounds and the sizes stand; the
-    slack weights are the caller's to write.
-    """
-    n, horizon = problem.n_states, problem.horizon
+def qp_of(
+    prepared: StackedFunction, read: StackedFunction, before: Vector, after: Vector
+) -> SoftQp:
+    """The QP in memory of the preparation, `before`, and of the read-out, `after`, or copies."""
+    places = read.places
     return SoftQp(
-        H=prepared.part("H"),
-        f=embedded.part("f"),
-        lower=np.tile(problem.action_lower - problem.reference_action, horizon),
-        upper=np.tile(problem.action_upper - problem.reference_action, horizon),
-        rows=prepared.part("Gamma"),
-        row_lower=embedded.part("lower"),
-        row_upper=embedded.part("upper"),
-        w=np.zeros(n * horizon),
-        W=np.zeros(n * horizon),
+        H=prepared.part("H", before),
+        f=after[places["f"]],
+        lower=after[places["lower"]],
+        upper=after[places["upper"]],
+        rows=prepared.part("Gamma", before),
+        row_lower=after[places["row_lower"]],
+        row_upper=after[places["row_upper"]],
+        w=before[prepared.places["w"]],
+        W=before[prepared.places["W"]],
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -14,8 +15,8 @@ from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp.active_set import StageMatrices
 from controllers.qp.problem import QpSolution, Residuals, SoftQp
-from controllers.rti.preparation import Lift
-from controllers.sensitivities import adjoint_directions, curvature_directions
+from controllers.rti.preparation import Lift, qp_of
+from controllers.sensitivities import SOLUTION, adjoint_directions, curvature_directions
 from controllers.theta import Parameters
 
 Vector = NDArray[np.float64]
@@ -39,7 +40,8 @@ class Functions:
     """The CasADi functions that a controller of the `problem` calls.
 
     `preparation` and `embedding` make the QP, `readout` takes its value, `gradient` and `policy`
-    its derivatives in θ (`controllers.sensitivities`).
+    its derivatives in θ (`controllers.sensitivities`). The memory of the first and the third hold a
+    sample's QP and its solution.
     """
 
     problem: Problem
@@ -50,23 +52,35 @@ class Functions:
     policy: StackedFunction
 
 
-class Prepared(NamedTuple):
+Jacobians = Callable[[Vector, Vector], tuple[Matrix, Matrix] | None]
+"""dπ/dθ and dπ/ds of a prepared QP and its solution by compiled code; None where it cannot."""
+
+
+@dataclass(eq=False)
+class Prepared:
     """What the preparation phase fixed, kept for read-outs after the next one has begun.
 
-    The linearisation `point` and `parameters`; `stack` all that the preparation computed; `L`
-    (N, n+m, n+m) and `L_N` (n, n) the Hessians of the stages; `w` and `W` the slack weights of the
-    QP's rows; `spectrum` what convexified them, None for Gauss–Newton; `functions` its maker's.
+    `memory` is a copy of the preparation's, `parameters` the θ; `spectrum` says what convexified
+    the Hessians, None for Gauss–Newton; `functions` are the maker's, and its `jacobians` where it
+    is compiled.
     """
 
-    point: LinearisationPoint
+    memory: Vector
     parameters: Parameters
-    stack: Vector
-    L: Vector
-    L_N: Vector
-    w: Vector
-    W: Vector
     spectrum: Lift | None
     functions: Functions
+    jacobians: Jacobians | None = None
+
+    def part(self, name: str) -> Vector:
+        """An input, result or other part of the preparation's memory, flat."""
+        return self.memory[self.functions.preparation.places[name]]
+
+    @cached_property
+    def point(self) -> LinearisationPoint:
+        """Where the QP is linearised."""
+        horizon = self.functions.problem.horizon
+        x, u, costates = (self.part(name) for name in ("x", "u", "costates"))
+        return LinearisationPoint(*(part.reshape(horizon, -1).copy() for part in (x, u, costates)))
 
 
 @dataclass(eq=False)
@@ -77,38 +91,30 @@ class RtiSolution:
     the condensed QP `qp`. All derivatives are those of the QP that was solved, at the point where
     it was linearised (paper.tex, RTI Sensitivities); they are one-sided where `weakly_active`.
     `enforced` says which of the two it is; `status` is `solved`. What derivatives are computed from
-    when they are asked for: `prepared`, and the `stack` of the read-out, the `embedded` state and
-    the `limits` on the controls of this very feedback.
+    when they are asked for: `prepared`, and a copy of the read-out's `memory`.
     """
 
     action: Vector
     value: float
-    multipliers: QpSolution = field(repr=False)
     prepared: Prepared = field(repr=False)
-    stack: Vector = field(repr=False)
-    embedded: Vector = field(repr=False)
-    limits: tuple[Vector, Vector] = field(repr=False)
+    memory: Vector = field(repr=False)
     enforced: bool = False
     status: str = "solved"
 
     def _part(self, name: str) -> Matrix:
-        return self.prepared.functions.readout.part(name, self.stack)
+        return self.prepared.functions.readout.part(name, self.memory)
+
+    @cached_property
+    def multipliers(self) -> QpSolution:
+        """Primal-dual solution of the condensed QP."""
+        places = self.prepared.functions.readout.places
+        return QpSolution(*(self.memory[places[name]] for name in ("v", "nu", "lam")))
 
     @cached_property
     def qp(self) -> SoftQp:
         """The condensed QP that was solved."""
         functions, prepared = self.prepared.functions, self.prepared
-        return SoftQp(
-            H=functions.preparation.part("H", prepared.stack),
-            f=functions.embedding.part("f", self.embedded),
-            lower=self.limits[0],
-            upper=self.limits[1],
-            rows=functions.preparation.part("Gamma", prepared.stack),
-            row_lower=functions.embedding.part("lower", self.embedded),
-            row_upper=functions.embedding.part("upper", self.embedded),
-            w=prepared.w,
-            W=prepared.W,
-        )
+        return qp_of(functions.preparation, functions.readout, prepared.memory, self.memory)
 
     @cached_property
     def predicted_states(self) -> Matrix:
@@ -196,6 +202,8 @@ class RtiSolution:
     @cached_property
     def value_gradient(self) -> Vector:
         """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
+        if self.prepared.jacobians is not None:
+            return self.memory[self.prepared.functions.readout.places["gradient"]]
         function = self.prepared.functions.gradient
         self._write_solution(function)
         function()
@@ -218,17 +226,20 @@ class RtiSolution:
                 "the action was enforced, so this solution is Q(s, a) and has no policy; "
                 "call feedback(s) without an action"
             )
-        m = self.action.size
+        m, prepared = self.action.size, self.prepared
+        if prepared.jacobians is not None:
+            found = prepared.jacobians(prepared.memory, self.memory)
+            if found is not None:
+                return found
         dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m, self._stages)
-        function = self.prepared.functions.policy
+        function = prepared.functions.policy
         self._write_solution(function)
-        inputs, preparation = function.inputs, self.prepared.functions.preparation
-        for name in ("A", "B"):
-            inputs[name][:] = self.prepared.stack[preparation.slices[name]]
-        inputs["L"][:], inputs["L_N"][:] = self.prepared.L, self.prepared.L_N
+        inputs = function.inputs
+        for name in ("A", "B", "L", "L_N"):
+            inputs[name][:] = prepared.part(name)
         inputs["dv"][:], inputs["dt"][:] = dv.reshape(-1), dt.reshape(-1)
         inputs["dlam"][:] = dlam.reshape(-1)
-        if (spectrum := self.prepared.spectrum) is not None:
+        if (spectrum := prepared.spectrum) is not None:
             moved = curvature_directions(
                 self.qp.rows, dv, self._step_from_point(), spectrum.contract
             )
@@ -240,29 +251,27 @@ class RtiSolution:
         )
 
     def _stages(self) -> StageMatrices:
-        prepared = self.prepared
-        n, m = self.costates.shape[1], self.action.size
-        part = prepared.functions.preparation.part
+        part, n, m = self.prepared.part, self.costates.shape[1], self.action.size
         return StageMatrices(
-            A=part("A", prepared.stack).reshape(-1, n, n),
-            B=part("B", prepared.stack).reshape(-1, n, m),
-            L=prepared.L.reshape(-1, n + m, n + m),
-            L_N=prepared.L_N.reshape(n, n),
+            A=part("A").reshape(-1, n, n),
+            B=part("B").reshape(-1, n, m),
+            L=part("L").reshape(-1, n + m, n + m),
+            L_N=part("L_N").reshape(n, n),
         )
 
     def _write_solution(self, function: StackedFunction) -> None:
         """Give a read-out function the solution and the point of linearisation."""
-        inputs, point = function.inputs, self.prepared.point
-        read = self.prepared.functions.readout.slices["chi"].stop  # xi, t and chi begin both
-        function.arguments[:read] = self.stack[:read]
-        inputs["v"][:], inputs["lam"][:] = self.multipliers.v, self.multipliers.lam
-        inputs["x"][:], inputs["u"][:] = point.x.reshape(-1), point.u.reshape(-1)
-        inputs["theta"][:] = self.prepared.parameters.theta
-        if self.prepared.spectrum is not None:
+        inputs, prepared = function.inputs, self.prepared
+        places = prepared.functions.readout.places
+        for name in SOLUTION:
+            inputs[name][:] = self.memory[places[name]]
+        for name in ("x", "u", "theta"):
+            inputs[name][:] = prepared.part(name)
+        if prepared.spectrum is not None:
             step = self._step_from_point()
             seed = step[:, :, None] * step[:, None, :] / 2
-            inputs["M"][:] = self.prepared.spectrum.contract(seed).reshape(-1)
-            inputs["guess"][:] = point.costates.reshape(-1)
+            inputs["M"][:] = prepared.spectrum.contract(seed).reshape(-1)
+            inputs["guess"][:] = prepared.part("costates")
 
     def _step_from_point(self) -> Matrix:
         """Δw of each stage, shape (N, n+m)."""

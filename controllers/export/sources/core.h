@@ -19,11 +19,23 @@
 
 #include "rti.h"
 
+/* Where a QP is linearised. */
 typedef struct {
-    RtiGuess guess;
-    RtiSolution solution; /* of the last sample that was solved */
-    double action[N_U];   /* of the present sample */
-    double applied[N_U];  /* of the last one */
+    double x[HORIZON][N_X], u[HORIZON][N_U], costates[HORIZON][N_X];
+} CoreGuess;
+
+/* What a sample found: predicted x_0 … x_N and u_0 … u_{N−1}, and the guess for the next sample. */
+typedef struct {
+    double x[HORIZON + 1][N_X], u[HORIZON][N_U];
+    CoreGuess next;
+    double value, residual, iterations;
+} CoreSolution;
+
+typedef struct {
+    CoreGuess guess;
+    CoreSolution solution; /* of the last sample that was solved */
+    double action[N_U];    /* of the present sample */
+    double applied[N_U];   /* of the last one */
     double failures; /* among the samples before the present one */
     int64_t status; /* of the present sample */
 } CoreState;
@@ -37,15 +49,58 @@ static const char *const CORE_MESSAGES[] = {
     "the QP was solved too inaccurately",
 };
 
+static void core_keep(CoreGuess *guess, const RtiPrepared *prepared) {
+    memcpy(guess->x, prepared->x, sizeof guess->x);
+    memcpy(guess->u, prepared->u, sizeof guess->u);
+    memcpy(guess->costates, prepared->costates, sizeof guess->costates);
+}
+
+static void core_forget(CoreGuess *guess) {
+    memset(guess, 0, sizeof *guess);
+    for (int k = 0; k < HORIZON; k++) {
+        memcpy(guess->x[k], REFERENCE_STATE, sizeof guess->x[k]);
+        memcpy(guess->u[k], REFERENCE_ACTION, sizeof guess->u[k]);
+    }
+}
+
+/* V(s) and π(s) of the QP at the guess; anything but RTI_SOLVED leaves `solution` alone. */
+static int core_sample(const CoreGuess *guess, const double theta[], const double s[],
+                       CoreSolution *solution) {
+    QP_SCRATCH RtiPrepared prepared;
+    QP_SCRATCH RtiSolved solved;
+    QP_SCRATCH QpWork work;
+    if (!well_posed(theta)) return RTI_ILL_POSED;
+    memcpy(prepared.x, guess->x, sizeof prepared.x);
+    memcpy(prepared.u, guess->u, sizeof prepared.u);
+    memcpy(prepared.costates, guess->costates, sizeof prepared.costates);
+    memcpy(prepared.theta, theta, sizeof prepared.theta);
+    memcpy(solved.s, s, sizeof solved.s);
+    int status = rti_prepare(&prepared, &work);
+    if (status == RTI_SOLVED) status = rti_feedback(&prepared, &work, &solved, 0);
+    if (status != RTI_SOLVED) return status;
+    for (int k = 0; k <= HORIZON; k++)
+        for (int i = 0; i < N_X; i++)
+            solution->x[k][i] = solved.read[READ_xi + k * N_X + i] + REFERENCE_STATE[i];
+    for (int k = 0; k < HORIZON; k++)
+        for (int i = 0; i < N_U; i++)
+            solution->u[k][i] = solved.v[k * N_U + i] + REFERENCE_ACTION[i];
+    rti_shift(&prepared, &solved);
+    core_keep(&solution->next, &prepared);
+    solution->value = solved.read[READ_value];
+    solution->residual = solved.residual;
+    solution->iterations = solved.iterations;
+    return RTI_SOLVED;
+}
+
 static void core_reset(CoreState *state) {
     memset(state, 0, sizeof *state);
-    rti_reset(&state->guess);
+    core_forget(&state->guess);
     memcpy(state->applied, REFERENCE_ACTION, sizeof state->applied);
     memcpy(state->action, REFERENCE_ACTION, sizeof state->action);
 }
 
 static void core_evaluate(CoreState *state, const double s[], const double theta[]) {
-    state->status = rti_sample(&state->guess, theta, s, &state->solution);
+    state->status = core_sample(&state->guess, theta, s, &state->solution);
     for (int i = 0; i < N_U; i++)
         state->action[i] = state->status == RTI_SOLVED
                                ? qp_clip(state->solution.u[0][i], ACTION_LOWER[i], ACTION_UPPER[i])
@@ -59,14 +114,11 @@ static void core_commit(CoreState *state) {
         return;
     }
     state->failures += 1.0;
-    rti_reset(&state->guess);
+    core_forget(&state->guess);
 }
 
 /* Whether a state could be one that the functions above leave behind. */
 static inline int core_plausible(const CoreState *state) {
-    for (int i = 0; i < QP_LIMITS; i++)
-        if (!qp_is_mode(i, state->guess.set[i]) || !qp_is_mode(i, state->solution.next.set[i]))
-            return 0;
     return all_finite(&state->guess.x[0][0], sizeof state->guess / sizeof(double)) &&
            all_finite(&state->solution.x[0][0], sizeof state->solution / sizeof(double)) &&
            all_finite(state->action, N_U) && all_finite(state->applied, N_U) &&
@@ -77,7 +129,7 @@ static inline int core_plausible(const CoreState *state) {
 /* Outputs in the order of the table of variables: action, value, status, residual, iterations,
  * failures, predicted states by stage, predicted actions by stage. */
 static inline void core_outputs(const CoreState *state, double y[]) {
-    const RtiSolution *solution = &state->solution;
+    const CoreSolution *solution = &state->solution;
     for (int i = 0; i < N_U; i++) *y++ = state->action[i];
     *y++ = solution->value;
     *y++ = (double)state->status;

@@ -96,14 +96,9 @@ static QpStatus qp_solve(const Qp *qp, QpWork *work, const double guess[QP_LIMIT
 }
 
 /* The working set of the solution, as a guess for a QP like it. */
-static void qp_remember(const QpWork *work, double guess[QP_LIMITS]) {
+static inline void qp_remember(const QpWork *work, double guess[QP_LIMITS]) {
     static const double weight[] = {0.0, 1.0, 2.0, 0.0};
     for (int i = 0; i < QP_LIMITS; i++) guess[i] = work->side[i] * weight[work->mode[i]];
-}
-
-/* Whether `guess` is one of constraint i. */
-static inline int qp_is_mode(int i, double guess) {
-    return guess == 0.0 || fabs(guess) == 1.0 || (i >= QP_N && fabs(guess) == 2.0);
 }
 
 #if defined(__GNUC__) && !defined(__clang__)

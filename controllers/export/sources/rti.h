@@ -16,26 +16,40 @@ enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE
 /* The largest KKT residual of a QP that counts as solved. */
 #define RTI_RESIDUAL 1e-6
 
-/* Where the next QP is linearised: states x_0 … x_{N−1}, actions, costates χ_1 … χ_N; and the
- * working set that its solver begins with. */
+/* A QP without its state. Given: the point of linearisation (states x_0 … x_{N−1}, actions, costates
+ * χ_1 … χ_N) and θ. `stack` is what CasADi's `preparation` makes of it. Doubles only, in the order
+ * in which Python has them (`controllers.rti.nmpc`). */
 typedef struct {
-    double x[HORIZON][N_X], u[HORIZON][N_U], costates[HORIZON][N_X];
-    double set[QP_LIMITS];
-} RtiGuess;
+    double x[HORIZON][N_X], u[HORIZON][N_U];
+    double L[HORIZON * N_W * N_W], q[HORIZON * N_W], L_N[N_X * N_X], q_N[N_X], theta[N_THETA];
+    double stack[PREPARED_SIZE];
+    double costates[HORIZON][N_X];
+    double w[QP_ROWS], W[QP_ROWS], constant;
+} RtiPrepared;
 
-/* What a sample found: predicted x_0 … x_N and u_0 … u_{N−1}, and the guess for the next sample. */
+/* A state, the solution of its QP, and what CasADi's `readout` and `embedding` make of them. The
+ * residual and the iterations are the solver's; `gradient` is dV/dθ or dQ/dθ where it was asked for. */
 typedef struct {
-    double x[HORIZON + 1][N_X], u[HORIZON][N_U];
-    RtiGuess next;
-    double value, residual, iterations;
-} RtiSolution;
+    double s[N_X], v[QP_N], lam[QP_ROWS], constant;
+    double read[READ_SIZE];
+    double embedded[EMBEDDED_SIZE];
+    double nu[QP_N], lower[QP_N], upper[QP_N];
+    double residual, iterations, gradient[N_THETA];
+} RtiSolved;
 
-static void rti_reset(RtiGuess *guess) {
-    memset(guess, 0, sizeof *guess);
+static void rti_start(RtiPrepared *prepared) {
     for (int k = 0; k < HORIZON; k++) {
-        memcpy(guess->x[k], REFERENCE_STATE, sizeof guess->x[k]);
-        memcpy(guess->u[k], REFERENCE_ACTION, sizeof guess->u[k]);
+        memcpy(prepared->x[k], REFERENCE_STATE, sizeof prepared->x[k]);
+        memcpy(prepared->u[k], REFERENCE_ACTION, sizeof prepared->u[k]);
     }
+    memset(prepared->costates, 0, sizeof prepared->costates);
+}
+
+/* Make the solution, its first stage dropped and its last control repeated, the next guess. */
+static void rti_shift(RtiPrepared *prepared, const RtiSolved *solved) {
+    memcpy(prepared->x, solved->read + READ_next_x, sizeof prepared->x);
+    memcpy(prepared->u, solved->read + READ_next_u, sizeof prepared->u);
+    memcpy(prepared->costates, solved->read + READ_next_chi, sizeof prepared->costates);
 }
 
 /* Whether every entry is finite: of ∞ − ∞ the sum of magnitudes says so too. */
@@ -53,74 +67,179 @@ static int well_posed(const double theta[]) {
     return 1;
 }
 
-/* V(s) and π(s) of the QP at the guess; anything but RTI_SOLVED leaves `solution` alone. */
-static int rti_sample(const RtiGuess *guess, const double theta[], const double s[],
-                      RtiSolution *solution) {
-    QP_SCRATCH double L[HORIZON * N_W * N_W], q[HORIZON * N_W], L_N[N_X * N_X], q_N[N_X];
-    QP_SCRATCH double prepared[PREPARED_SIZE], embedded[EMBEDDED_SIZE], read[READ_SIZE];
-    QP_SCRATCH double lower[QP_N], upper[QP_N], w[QP_ROWS], W[QP_ROWS];
-    const double *const x = guess->x[0], *const u = guess->u[0];
-    if (!well_posed(theta)) return RTI_ILL_POSED;
-    const double constant = stage_costs(guess->x[0], guess->u[0], guess->costates[0], theta, L, q);
-    terminal_cost(theta, L_N, q_N);
+static Qp rti_qp(const RtiPrepared *prepared, const RtiSolved *solved) {
+    const Qp qp = {prepared->stack + PREPARED_H,       solved->embedded + EMBEDDED_f,
+                   solved->lower,                      solved->upper,
+                   prepared->stack + PREPARED_Gamma,   solved->embedded + EMBEDDED_lower,
+                   solved->embedded + EMBEDDED_upper,  prepared->w,
+                   prepared->W};
+    return qp;
+}
+
+static int rti_prepare(RtiPrepared *prepared, QpWork *work) {
+    const double *const theta = prepared->theta;
+    for (int k = 0; k < HORIZON; k++)
+        for (int i = 0; i < N_X; i++) {
+            prepared->w[k * N_X + i] = SLACK_DISCOUNTS[k] * SLACK_LINEAR(theta)[i];
+            prepared->W[k * N_X + i] = SLACK_DISCOUNTS[k] * SLACK_QUADRATIC(theta)[i];
+        }
+    prepared->constant = stage_costs(prepared->x[0], prepared->u[0], prepared->costates[0], theta,
+                                     prepared->L, prepared->q);
+    terminal_cost(theta, prepared->L_N, prepared->q_N);
     {
-        const double *arguments[PREPARED_ARG] = {x, u, L, q, L_N, q_N, theta};
+        const double *arguments[PREPARED_ARG] = {prepared->x[0], prepared->u[0], prepared->L,
+                                                 prepared->q,    prepared->L_N,  prepared->q_N,
+                                                 theta};
         QP_SCRATCH double w[PREPARED_W + 1];
-        double *results[PREPARED_RES] = {prepared};
+        double *results[PREPARED_RES] = {prepared->stack};
         long long int iw[PREPARED_IW + 1];
         preparation(arguments, results, iw, w, 0);
     }
-    if (!all_finite(prepared, PREPARED_SIZE)) return QP_NOT_FINITE;
+    if (!all_finite(prepared->stack, PREPARED_SIZE)) return QP_NOT_FINITE;
+    const Qp qp = rti_qp(prepared, (const RtiSolved *)0);
+    return qp_load(&qp, work);
+}
+
+/* A guess of the working set: the limits at which the guess of states and controls is. */
+static double limit_reached(double value, double lower, double upper, int soft) {
+    const double below = 1e-9 * (1.0 + fabs(lower)), above = 1e-9 * (1.0 + fabs(upper));
+    if (value <= lower + below) return soft && value < lower - below ? -2.0 : -1.0;
+    if (value >= upper - above) return soft && value > upper + above ? 2.0 : 1.0;
+    return 0.0;
+}
+
+static void rti_guess(const RtiPrepared *prepared, double set[QP_LIMITS]) {
+    const double *const theta = prepared->theta;
+    for (int k = 0; k < HORIZON; k++) {
+        const int next = k + 1 < HORIZON ? k + 1 : k; /* the guess ends at stage N − 1 */
+        for (int i = 0; i < N_U; i++)
+            set[k * N_U + i] =
+                limit_reached(prepared->u[k][i], ACTION_LOWER[i], ACTION_UPPER[i], 0);
+        for (int i = 0; i < N_X; i++)
+            set[QP_N + k * N_X + i] = limit_reached(prepared->x[next][i], theta[THETA_x_l + i],
+                                                    theta[THETA_x_u + i], 1);
+    }
+}
+
+/* Of all multipliers of Q(s, a) at a kink, those that make dQ/da as small as they can: see
+ * `controllers.qp.problem.multipliers_at_kink`. Least squares by one-sided Jacobi rotations. */
+static void rti_kink(const RtiPrepared *prepared, RtiSolved *solved) {
+    const double *const rows = prepared->stack + PREPARED_Gamma;
+    const double *const low = solved->embedded + EMBEDDED_lower;
+    const double *const high = solved->embedded + EMBEDDED_upper;
+    double G[N_X][N_U], V[N_X][N_X], total[N_U], chosen[N_X];
+    int near[N_X], inside[N_U], count = 0;
+    for (int i = 0; i < N_X; i++) {
+        double y = 0.0;
+        for (int j = 0; j < N_U; j++) y += rows[i * QP_N + j] * solved->v[j];
+        if (qp_min(fabs(y - low[i]), fabs(y - high[i])) < 1e-8 * (1.0 + fabs(y))) near[count++] = i;
+    }
+    if (count == 0) return;
+    for (int j = 0; j < N_U; j++) {
+        const double v = solved->v[j], width = 1e-8 * (1.0 + fabs(v));
+        inside[j] = v > ACTION_LOWER[j] - REFERENCE_ACTION[j] + width &&
+                    v < ACTION_UPPER[j] - REFERENCE_ACTION[j] - width;
+        total[j] = solved->nu[j];
+        for (int c = 0; c < count; c++) {
+            G[c][j] = inside[j] ? rows[near[c] * QP_N + j] : 0.0;
+            total[j] += solved->lam[near[c]] * rows[near[c] * QP_N + j];
+        }
+    }
+    for (int c = 0; c < count; c++)
+        for (int d = 0; d < count; d++) V[c][d] = c == d;
+    for (int sweep = 0, turned = 1; turned && sweep < 30; sweep++) {
+        turned = 0;
+        for (int c = 0; c < count; c++)
+            for (int d = c + 1; d < count; d++) {
+                double cc = 0.0, dd = 0.0, cd = 0.0;
+                for (int j = 0; j < N_U; j++) {
+                    cc += G[c][j] * G[c][j];
+                    dd += G[d][j] * G[d][j];
+                    cd += G[c][j] * G[d][j];
+                }
+                if (!(fabs(cd) > 1e-16 * sqrt(cc * dd))) continue;
+                const double ratio = (dd - cc) / (2.0 * cd);
+                const double t = copysign(1.0, ratio) / (fabs(ratio) + sqrt(1.0 + ratio * ratio));
+                const double cosine = 1.0 / sqrt(1.0 + t * t), sine = cosine * t;
+                for (int j = 0; j < N_U; j++) {
+                    const double a = G[c][j], b = G[d][j];
+                    G[c][j] = cosine * a - sine * b;
+                    G[d][j] = sine * a + cosine * b;
+                }
+                for (int j = 0; j < count; j++) {
+                    const double a = V[c][j], b = V[d][j];
+                    V[c][j] = cosine * a - sine * b;
+                    V[d][j] = sine * a + cosine * b;
+                }
+                turned = 1;
+            }
+    }
+    double largest = 0.0, squares[N_X];
+    for (int c = 0; c < count; c++) {
+        squares[c] = chosen[c] = 0.0;
+        for (int j = 0; j < N_U; j++) squares[c] += G[c][j] * G[c][j];
+        largest = qp_max(largest, squares[c]);
+    }
+    for (int c = 0; c < count; c++) {
+        double along = 0.0;
+        if (!(squares[c] > 1e-30 * largest)) continue;
+        for (int j = 0; j < N_U; j++) along += G[c][j] * total[j];
+        for (int d = 0; d < count; d++) chosen[d] += V[c][d] * along / squares[c];
+    }
+    for (int c = 0; c < count; c++) {
+        const int i = near[c];
+        double y = 0.0;
+        for (int j = 0; j < N_U; j++) y += rows[i * QP_N + j] * solved->v[j];
+        const int over = fabs(y - high[i]) < fabs(y - low[i]);
+        solved->lam[i] =
+            qp_clip(chosen[c], over ? 0.0 : -prepared->w[i], over ? prepared->w[i] : 0.0);
+        for (int j = 0; j < N_U; j++) total[j] -= solved->lam[i] * rows[i * QP_N + j];
+    }
+    memcpy(solved->nu, total, sizeof total);
+}
+
+/* V(s) and π(s) of a prepared QP for the state in `solved`, or Q(s, a) where `a` is given. */
+static int rti_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved,
+                        const double a[]) {
+    const double *const stack = prepared->stack, *const theta = prepared->theta;
+    double set[QP_LIMITS];
     {
-        const double *arguments[EMBEDDED_ARG] = {s, theta, prepared + PREPARED_Phi, prepared + PREPARED_g,
-                                                 prepared + PREPARED_f, prepared + PREPARED_F};
-        double *results[EMBEDDED_RES] = {embedded}, w[EMBEDDED_W + 1];
+        const double *arguments[EMBEDDED_ARG] = {
+            solved->s,          theta,          stack + PREPARED_Phi, stack + PREPARED_g,
+            stack + PREPARED_f, stack + PREPARED_F};
+        double *results[EMBEDDED_RES] = {solved->embedded}, w[EMBEDDED_W + 1];
         long long int iw[EMBEDDED_IW + 1];
         embedding(arguments, results, iw, w, 0);
     }
-    if (!all_finite(embedded, EMBEDDED_SIZE)) return QP_NOT_FINITE;
-    for (int k = 0; k < HORIZON; k++) {
-        for (int i = 0; i < N_U; i++) {
-            lower[k * N_U + i] = ACTION_LOWER[i] - REFERENCE_ACTION[i];
-            upper[k * N_U + i] = ACTION_UPPER[i] - REFERENCE_ACTION[i];
-        }
-        for (int i = 0; i < N_X; i++) {
-            w[k * N_X + i] = SLACK_DISCOUNTS[k] * SLACK_LINEAR(theta)[i];
-            W[k * N_X + i] = SLACK_DISCOUNTS[k] * SLACK_QUADRATIC(theta)[i];
-        }
+    for (int k = 0; k < QP_N; k++) {
+        solved->lower[k] = ACTION_LOWER[k % N_U] - REFERENCE_ACTION[k % N_U];
+        solved->upper[k] = ACTION_UPPER[k % N_U] - REFERENCE_ACTION[k % N_U];
     }
-    const Qp qp = {prepared + PREPARED_H,     embedded + EMBEDDED_f, lower, upper,
-                   prepared + PREPARED_Gamma, embedded + EMBEDDED_lower,
-                   embedded + EMBEDDED_upper, w,                     W};
-    QP_SCRATCH QpWork work; /* here, so that it takes the place of CasADi's work vector */
-    QpStatus status = qp_load(&qp, &work);
-    if (status == QP_SOLVED) status = qp_solve(&qp, &work, guess->set);
+    for (int i = 0; a && i < N_U; i++) solved->lower[i] = solved->upper[i] = a[i] - REFERENCE_ACTION[i];
+    if (!all_finite(solved->embedded, EMBEDDED_SIZE) || (a && !all_finite(a, N_U)))
+        return QP_NOT_FINITE;
+    const Qp qp = rti_qp(prepared, solved);
+    rti_guess(prepared, set);
+    const QpStatus status = qp_solve(&qp, work, set);
     if (status != QP_SOLVED) return status;
+    memcpy(solved->v, work->v, sizeof solved->v);
+    memcpy(solved->lam, work->lam, sizeof solved->lam);
+    memcpy(solved->nu, work->nu, sizeof solved->nu);
+    solved->residual = qp_residual(&qp, work);
+    solved->iterations = work->iterations;
+    if (!(solved->residual <= RTI_RESIDUAL)) return RTI_INACCURATE;
+    if (a) rti_kink(prepared, solved);
+    solved->constant = prepared->constant;
     {
-        const double *arguments[READ_ARG] = {s, work.v, work.lam, prepared + PREPARED_A,
-                                             prepared + PREPARED_B, prepared + PREPARED_r, L, q, L_N,
-                                             q_N, &constant, theta};
-        double *results[READ_RES] = {read}, w[READ_W + 1];
+        const double *arguments[READ_ARG] = {
+            solved->s,     solved->v,   solved->lam, stack + PREPARED_A, stack + PREPARED_B,
+            stack + PREPARED_r, prepared->L, prepared->q, prepared->L_N, prepared->q_N,
+            &solved->constant, theta};
+        double *results[READ_RES] = {solved->read}, w[READ_W + 1];
         long long int iw[READ_IW + 1];
         readout(arguments, results, iw, w, 0);
     }
-    if (!all_finite(read, READ_SIZE)) return QP_NOT_FINITE;
-    const double residual = qp_residual(&qp, &work);
-    if (!(residual <= RTI_RESIDUAL)) return RTI_INACCURATE;
-    for (int k = 0; k <= HORIZON; k++)
-        for (int i = 0; i < N_X; i++)
-            solution->x[k][i] = read[READ_xi + k * N_X + i] + REFERENCE_STATE[i];
-    for (int k = 0; k < HORIZON; k++)
-        for (int i = 0; i < N_U; i++)
-            solution->u[k][i] = work.v[k * N_U + i] + REFERENCE_ACTION[i];
-    memcpy(solution->next.x, read + READ_next_x, sizeof solution->next.x);
-    memcpy(solution->next.u, read + READ_next_u, sizeof solution->next.u);
-    memcpy(solution->next.costates, read + READ_next_chi, sizeof solution->next.costates);
-    qp_remember(&work, solution->next.set);
-    solution->value = read[READ_value];
-    solution->residual = residual;
-    solution->iterations = work.iterations;
-    return RTI_SOLVED;
+    return all_finite(solved->read, READ_SIZE) ? RTI_SOLVED : QP_NOT_FINITE;
 }
 
 #endif

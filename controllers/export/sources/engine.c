@@ -1,0 +1,142 @@
+/* The library that runs `controllers.RtiNmpc`: the phases of a sample, and whole closed loops. */
+#define _POSIX_C_SOURCE 199309L
+#include <stddef.h>
+#include <time.h>
+
+#include "core.h"
+#include "sensitivities.h"
+
+size_t engine_sizes(int what) {
+    return what == 0 ? sizeof(RtiPrepared) : what == 1 ? sizeof(RtiSolved) : sizeof(QpWork);
+}
+
+int engine_prepare(RtiPrepared *prepared, QpWork *work) { return rti_prepare(prepared, work); }
+
+int engine_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved, const double a[]) {
+    const int status = rti_feedback(prepared, work, solved, a);
+    if (status == RTI_SOLVED) rti_gradient(prepared, solved);
+    return status;
+}
+
+int engine_policy(const RtiPrepared *prepared, const RtiSolved *solved, QpWork *work,
+                  double policy[]) {
+    return rti_policy(prepared, solved, work, policy);
+}
+
+/* An FMU instance, as `cosim.plant.fmi` hands it over: the FMI functions of its version that set and
+ * get reals and make a step; value references and values of what the scenario wires. */
+typedef struct {
+    int version;
+    void (*set)(void), (*get)(void), (*step)(void);
+    void *component;
+    const unsigned *inputs, *outputs, *states;
+    size_t n_inputs, n_outputs, n_states;
+    double *input, *output, *state;
+    double step_size;
+} Plant;
+
+enum { OK, FAILED_SET, FAILED_GET, FAILED_STEP, ENDED, NOT_FINITE };
+
+static int refused(int status) { return status != 0 && status != 1; }
+
+static int plant_get(const Plant *plant, const unsigned references[], size_t count, double values[]) {
+    typedef int (*Get2)(void *, const unsigned *, size_t, double *);
+    typedef int (*Get3)(void *, const unsigned *, size_t, double *, size_t);
+    return plant->version == 2
+               ? ((Get2)plant->get)(plant->component, references, count, values)
+               : ((Get3)plant->get)(plant->component, references, count, values, count);
+}
+
+/* Write the inputs, read the outputs, step, read the states; `status` gets FMI's own. */
+static int plant_step(const Plant *plant, double time, int *status) {
+    typedef int (*Set2)(void *, const unsigned *, size_t, const double *);
+    typedef int (*Set3)(void *, const unsigned *, size_t, const double *, size_t);
+    typedef int (*Step2)(void *, double, double, int);
+    typedef int (*Step3)(void *, double, double, _Bool, _Bool *, _Bool *, _Bool *, double *);
+    _Bool event = 0, terminate = 0, early = 0;
+    double last = 0.0;
+    *status = plant->version == 2
+                  ? ((Set2)plant->set)(plant->component, plant->inputs, plant->n_inputs, plant->input)
+                  : ((Set3)plant->set)(plant->component, plant->inputs, plant->n_inputs,
+                                       plant->input, plant->n_inputs);
+    if (refused(*status)) return FAILED_SET;
+    *status = plant_get(plant, plant->outputs, plant->n_outputs, plant->output);
+    if (refused(*status)) return FAILED_GET;
+    *status = plant->version == 2
+                  ? ((Step2)plant->step)(plant->component, time, plant->step_size, 0)
+                  : ((Step3)plant->step)(plant->component, time, plant->step_size, 0, &event,
+                                         &terminate, &early, &last);
+    if (refused(*status)) return FAILED_STEP;
+    if (terminate || early) return ENDED;
+    *status = plant_get(plant, plant->states, plant->n_states, plant->state);
+    if (refused(*status)) return FAILED_GET;
+    return all_finite(plant->state, (int)plant->n_states) && isfinite(plant->output[0]) ? OK
+                                                                                       : NOT_FINITE;
+}
+
+static double seconds(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+/* A closed loop between two calls. A row of `table` is a sample: state, action, the plant's outputs
+ * (stage cost and disturbance), value, residual, whether the controller failed, and the seconds of
+ * preparation, feedback and plant. `pending` says whether there is a solution to shift. */
+typedef struct {
+    RtiPrepared *prepared;
+    RtiSolved *solved;
+    QpWork *work;
+    double applied[N_U];
+    long long pending;
+} Loop;
+
+size_t engine_loop_size(void) { return sizeof(Loop); }
+
+void engine_begin(Loop *loop, RtiPrepared *prepared, RtiSolved *solved, QpWork *work) {
+    loop->prepared = prepared;
+    loop->solved = solved;
+    loop->work = work;
+    loop->pending = 0;
+    rti_start(prepared);
+    memcpy(loop->applied, REFERENCE_ACTION, sizeof loop->applied);
+}
+
+/* Samples `first` to `end` of a loop; returns the sample at which the plant failed, or `end`.
+ * `fault` gets what failed there and FMI's status. */
+long long engine_run(Loop *loop, const Plant *plant, long long first, long long end, double *table,
+                     int fault[2]) {
+    for (long long sample = first; sample < end; sample++) {
+        const double begin = seconds();
+        if (loop->pending) rti_shift(loop->prepared, loop->solved);
+        int status = rti_prepare(loop->prepared, loop->work);
+        const double middle = seconds();
+        memcpy(loop->solved->s, plant->state, sizeof loop->solved->s);
+        if (status == RTI_SOLVED)
+            status = rti_feedback(loop->prepared, loop->work, loop->solved, 0);
+        const double solved = seconds();
+        const int failed = status != RTI_SOLVED;
+        loop->pending = !failed;
+        if (failed) rti_start(loop->prepared);
+        for (int i = 0; !failed && i < N_U; i++)
+            loop->applied[i] =
+                qp_clip(loop->solved->v[i] + REFERENCE_ACTION[i], ACTION_LOWER[i], ACTION_UPPER[i]);
+        memcpy(table, plant->state, N_X * sizeof(double));
+        memcpy(table + N_X, loop->applied, N_U * sizeof(double));
+        table += N_W;
+        memcpy(plant->input, loop->applied, N_U * sizeof(double));
+        const double before = seconds();
+        fault[0] = plant_step(plant, (double)sample * plant->step_size, &fault[1]);
+        const double after = seconds();
+        if (fault[0] != OK) return sample;
+        memcpy(table, plant->output, plant->n_outputs * sizeof(double));
+        table += plant->n_outputs;
+        *table++ = failed ? NAN : loop->solved->read[READ_value];
+        *table++ = failed ? NAN : loop->solved->residual;
+        *table++ = failed;
+        *table++ = middle - begin;
+        *table++ = solved - middle;
+        *table++ = after - before;
+    }
+    return end;
+}

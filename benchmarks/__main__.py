@@ -14,6 +14,7 @@ STEPS = {
     "export": 2000,
     "evaluation": 2000,
     "scaling": 20,
+    "before": 500,
 }
 """The benchmarks, and how many samples each takes at a time."""
 
@@ -23,14 +24,18 @@ def main():
     parser.add_argument("name", choices=STEPS)
     parser.add_argument("--scenario", "-s", default="paper")
     parser.add_argument("--steps", "--samples", "-n", type=int, help="samples at a time")
+    parser.add_argument("--against", help="`before`: folder of another version's sources")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     steps = STEPS[chosen.name] if chosen.steps is None else chosen.steps
     if steps < 1:
         parser.error(f"--steps must be at least 1, not {steps}")
+    if chosen.name == "before" and not chosen.against:
+        parser.error("before needs --against, a checkout of the other version")
     scenario = Scenario.load(chosen.scenario)
     with output(chosen.json) as out_:
-        rows = import_module(f"benchmarks.{chosen.name}").measure(scenario, steps)
+        more = [chosen.against] if chosen.name == "before" else []
+        rows = import_module(f"benchmarks.{chosen.name}").measure(scenario, steps, *more)
         title = f"{chosen.name} on {scenario.name}, {steps} samples at a time"
         out_.table(title, HEADER, [cells(row) for row in rows])
         out_.json({"scenario": scenario.name, "steps": steps, "rows": rows})

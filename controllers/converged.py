@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.dynamics import sampled_jacobian
 from controllers.errors import QpError
-from controllers.functions import BufferedFunction, StackedFunction, stacked
+from controllers.functions import StackedFunction, stacked
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp
 from controllers.qp.problem import NOT_CONVEX
@@ -156,10 +156,6 @@ class ConvergedNmpc(RtiNmpc):
         self._tolerance, self._patience = tolerance, iterations
         self._merit = merit(problem, parameters.blocks)
         super().__init__(problem, parameters, hessian="exact", backend=backend)
-
-    def casadi_functions(self) -> list[BufferedFunction]:
-        """All CasADi functions that a sample may call."""
-        return [*super().casadi_functions(), self._merit]
 
     @property
     def _lifts(self) -> bool:

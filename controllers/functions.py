@@ -70,10 +70,6 @@ class BufferedFunction:
             for name in sizes
         }
         self.outputs = {name: self.memory[self.places[name]] for name in results}
-        self.bind(function)
-
-    def bind(self, function: ca.Function) -> None:
-        """Let another function of the same arguments and results do the work, a compiled one."""
         self._buffer, self._evaluate = function.buffer()
         for i, array in enumerate(self.inputs.values()):
             self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]
@@ -187,39 +183,14 @@ SWITCH = "COSIM_COMPILE"
 CHOICES = ("auto", "never", "now")
 INTERPRETED, COMPILED = "interpreted", "compiled"
 FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
-LOOK, LONG = 1000, 20_000
-"""Samples from which a stored library is worth looking for, and from which one is worth making."""
+LONG = 1000
+"""Samples from which a run is worth a compiled controller; what is compiled is kept."""
 PATIENCE = 120.0
 """Seconds that a compiler may take."""
 
 
-def bind_compiled(functions: Sequence[BufferedFunction], samples: int = LONG) -> str:
-    """Let compiled C compute the functions of a run of `samples`; `compiled` or `interpreted`.
-
-    A library that an earlier run has left in the user's cache is taken from `LOOK` samples on, and
-    one is made, and waited for, from `LONG` on. COSIM_COMPILE says `never`, or `now` for any
-    number. Without a compiler, and where it fails, the interpreter stays; the results are the same
-    to the bit. Raises ControllerError on another word in COSIM_COMPILE.
-    """
-    if samples < LOOK and switch() != "now":
-        return INTERPRETED
-    source = {"functions.c": c_source([function.function for function in functions])}
-    path = library(source, ["functions.c"], make=samples >= LONG or switch() == "now")
-    try:
-        libraries = [ca.external(each.function.name(), str(path)) for each in functions if path]
-    except RuntimeError:
-        return INTERPRETED
-    if path is None:
-        return INTERPRETED
-    for function, compiled in zip(functions, libraries, strict=True):
-        function.bind(compiled)
-    return COMPILED
-
-
-def library(
-    sources: Mapping[str, str | bytes], entry: Sequence[str], *, make: bool = True
-) -> Path | None:
-    """Shared library of C files in the user's cache, made where it is missing and `make` says so.
+def library(sources: Mapping[str, str | bytes], entry: Sequence[str]) -> Path | None:
+    """Shared library of C files in the user's cache, made where it is missing.
 
     `sources` are the files by name, `entry` the names of those that the compiler is given; the
     others are included by them. It is the same file for the same content, compiler and flags, it
@@ -236,8 +207,6 @@ def library(
     try:
         path = cache_folder("compiled") / f"{content.hexdigest()[:32]}.lib"
         if not path.is_file():
-            if not make:
-                return None
             _compile([compiler, *FLAGS, "-o", "library", *entry, "-lm"], files, path)
         os.utime(path)
     except (OSError, subprocess.SubprocessError, filelock.Timeout):

@@ -53,6 +53,15 @@ class Penalty:
             total += linear * v + quadratic * v * v
         return float(total)
 
+    def along(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Penalty of each of K states (K, n), to the bits of a call."""
+        total = np.zeros(len(states))
+        for v, linear, quadratic in zip(
+            self.violation(states).T, self.linear, self.quadratic, strict=True
+        ):
+            total += linear * v + quadratic * v * v
+        return total
+
     def violation(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Violation v ≥ 0 of each bound for states (…, n), same shape and units."""
         outside: NDArray[np.float64] = np.maximum(self.lower - states, states - self.upper)

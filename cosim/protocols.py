@@ -94,6 +94,15 @@ class Controller(Protocol):
         """Solve for the measured state s (n,), with the first action fixed to a (m,) if given."""
 
 
+CompiledLoop = Callable[[Any, int, Array], tuple[int, int, int]]
+"""A closed loop in compiled code, from a controller's `compiled_loop` to a plant's `drive`.
+
+It gets an FMU instance's native functions, the number of the first sample, and a table with a row
+for each sample to come: state, action, stage cost, disturbance, value, residual, whether the
+controller failed, seconds of prepare, feedback and step. It returns the sample that it came to,
+what failed there (0: nothing), and FMI's status.
+"""
+
 Exploration = Callable[[Array, np.random.Generator], Array | None]
 """Maps the policy's action (m,) and a generator to the action that explores, None to stay greedy.
 

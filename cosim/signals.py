@@ -146,6 +146,7 @@ class SignalColumns:
 
     def __init__(self, scenario: Scenario, steps: int, residuals: bool) -> None:
         unwanted = () if residuals else (RESIDUAL,)
+        self._unwanted = {kind.name for kind in SIGNALS if kind.of in unwanted}
         read = {kind: kind.of for kind in SIGNALS if isinstance(kind.of, str)}
         scalars = {k: of for k, of in read.items() if not k.vector and of not in unwanted}
         vectors = {kind: of for kind, of in read.items() if kind.vector}
@@ -171,6 +172,16 @@ class SignalColumns:
         for values in self._vectors(sample):
             row += values.tolist()
         self._rows.append(row)
+
+    def fill(self, first: int, values: Mapping[str, Array]) -> None:
+        """Store what somebody else has sampled, by name, from sample number `first` on."""
+        where = slice(first, first + len(values["time"]))
+        for name, column in self.columns.items():
+            if name in values and name not in self._unwanted:
+                column[where] = values[name]
+        stored = {name: column[where] for name, column in self.columns.items()}
+        for name, derive in self._derived.items():
+            stored[name][:] = derive(self._scenario, stored)
 
     def store(self, first: int) -> dict[str, Array]:
         """Store what was read, from sample number `first` on, and return it by name."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cosim import signals
 from cosim.errors import CosimError
 from cosim.protocols import (
+    CompiledLoop,
     Controller,
     Exploration,
     Plant,
@@ -68,7 +69,11 @@ def simulate(
         raise CosimError(f"steps must be at least 1, not {steps}")
     run = _Run(plant, controller, steps, seed, exploration, residuals)
     if recorder is None:
-        run.go(_no_record, progress)
+        loop = None if exploration is not None else _compiled_loop(plant, controller)
+        if loop is None:
+            run.go(_no_record, progress)
+        else:
+            run.go_compiled(loop, progress)
         return run.trajectory()
     recorder.start(plant.scenario, controller, seed, steps, plant.units)
     try:
@@ -80,6 +85,17 @@ def simulate(
 
 def _no_record(_: SampleBlock) -> None:
     return None
+
+
+def _compiled_loop(plant: Plant, controller: Controller) -> CompiledLoop | None:
+    """The controller's own loop with the plant, if both have one; looked for on their classes.
+
+    A wrapper that hands attributes on would otherwise lose what it adds.
+    """
+    if not hasattr(type(plant), "drive") or not hasattr(type(controller), "compiled_loop"):
+        return None
+    loop: CompiledLoop | None = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
+    return loop
 
 
 class _Run:
@@ -158,6 +174,40 @@ class _Run:
                 if progress is not None:
                     progress(k + 1)
         self._final_state = s
+
+    def go_compiled(self, loop: CompiledLoop, progress: Callable[[int], None] | None) -> None:
+        """Run with the controller's loop, to the same columns."""
+        scenario, plant, columns = self._scenario, self._plant, self._columns
+        s = plant.reset(spawn_seeds(self._seed)[0])
+        n, m = s.size, scenario.action_lower.size
+        outputs = 1 + len(scenario.plant.disturbances)
+        for first in range(0, self._steps, BLOCK):
+            end = min(first + BLOCK, self._steps)
+            table = np.empty((end - first, n + m + outputs + 6))
+            self._final_state = plant.drive(loop, table)  # type: ignore[attr-defined]
+            states, actions, output, rest = np.split(table, [n, n + m, n + m + outputs], axis=1)
+            value, residual, failed, *clock = rest.T
+            columns.fill(
+                first,
+                {
+                    "time": np.arange(first, end, dtype=np.float64) * scenario.sampling_time,
+                    "states": states,
+                    "actions": actions,
+                    "disturbances": output[:, 1:],
+                    "stage_cost": output[:, 0],
+                    "penalty": scenario.state_penalty.along(states),
+                    "value": value,
+                    "residual": residual,
+                    "explored": np.zeros(end - first),
+                    "failed": failed,
+                    **dict(
+                        zip(("prepare_time", "feedback_time", "plant_time"), clock, strict=True)
+                    ),
+                },
+            )
+            self._status += [FALLBACK if each else "solved" for each in failed]
+            if progress is not None:
+                progress(end)
 
     def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
         """Prepare and feed back, timed apart; None if the controller declares a failure."""

@@ -20,7 +20,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # pytest's own filter ends with this process; what tests start has to be as strict.
 os.environ.setdefault("PYTHONWARNINGS", "error")
-# Compiled functions give the same bits (tests/controllers/test_compilation.py turns them on); a
+# Compiled controllers have tests of their own (tests/controllers/rti/test_engine.py); a
 # cache that begins empty would have every test process compile them anew beside the others.
 os.environ.setdefault("COSIM_COMPILE", "never")
 OWN = "COSIM_CACHE" not in os.environ

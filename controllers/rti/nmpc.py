@@ -10,19 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ControllerError, ParameterError, QpError
+from controllers.export.core import STATUSES
 from controllers.functions import (
     COMPILED,
     INTERPRETED,
     LONG,
-    LOOK,
-    BufferedFunction,
-    bind_compiled,
     switch,
 )
 from controllers.problem import Problem
 from controllers.qp import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
-from controllers.rti.engine import NOT_FINITE, STATUSES, Engine
+from controllers.rti.engine import NOT_FINITE, Engine
 from controllers.rti.feedback import embedding, readout
 from controllers.rti.preparation import (
     LEAST_CONTROLS,
@@ -35,6 +33,8 @@ from controllers.rti.preparation import (
 from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 from controllers.sensitivities import sensitivities
 from controllers.theta import Parameters
+from cosim.protocols import CompiledLoop
+from cosim.scenario import Scenario
 
 Vector = NDArray[np.float64]
 
@@ -58,9 +58,8 @@ class RtiNmpc:
     prepared stays for the sample's other feedbacks, so that Q(s, π(s)) = V(s), and for replay.
 
     `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
-    or a function that makes a `QpBackend`; `functions` says whether the CasADi functions are
-    `interpreted` or `compiled`, which changes no bit (see `compile_functions`). Raises
-    ControllerError on another choice.
+    or a function that makes a `QpBackend`; `functions` says whether a sample is `interpreted` or
+    `compiled` (see `compile`). Raises ControllerError on another choice.
     """
 
     name = "rti"
@@ -125,22 +124,18 @@ class RtiNmpc:
         self.functions = INTERPRETED
         self.reset()
 
-    def casadi_functions(self) -> list[BufferedFunction]:
-        """All CasADi functions that a sample may call."""
-        f = self._functions
-        return [
-            *(f.preparation, f.embedding, f.readout, f.gradient, f.policy),
-            *self._hessian.functions,
-            *([] if self._riccati is None else [self._riccati]),
-        ]
-
     def compile(self, samples: int = LONG) -> None:
-        """Compile if a run of `samples` is worth it; to be called before the first sample."""
-        if self._compilable and (samples >= LOOK or switch() == "now"):
-            self._engine = Engine.load(self._functions, self._parameters.blocks)
-            self.functions = INTERPRETED if self._engine is None else COMPILED
-        elif not self._compilable:
-            self.functions = bind_compiled(self.casadi_functions(), samples)
+        """Compile if a run of `samples` is worth it; to be called before the first sample.
+
+        COSIM_COMPILE says `never`, or `now` for any number. Without a compiler, for the exact
+        Hessian, for backends other than `daqp` and for long horizons, whose arrays are large,
+        CasADi's interpreter stays. Both give the same to rounding and to DAQP's accuracy
+        (`tests/controllers/rti/test_engine.py` holds the bounds).
+        """
+        if not self._compilable or (samples < LONG and switch() != "now"):
+            return
+        self._engine = Engine.load(self._functions, self._parameters.blocks)
+        self.functions = INTERPRETED if self._engine is None else COMPILED
         self._prepared = None
 
     # θ ------------------------------------------------------------------------------------------
@@ -365,6 +360,25 @@ class RtiNmpc:
             qp=self._qp.copy(),
         )
 
+    def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:
+        """The closed loop in compiled code, begun anew; None where only Python can run it.
+
+        That is before `compile`, with several iterations, in a subclass that samples otherwise, and
+        where the scenario saturates otherwise than the problem.
+        """
+        own, problem = type(self), self.problem
+        changed = (own.prepare, own.feedback) != (RtiNmpc.prepare, RtiNmpc.feedback)
+        if self._engine is None or self.iterations > 1 or changed:
+            return None
+        for name in ("action_lower", "action_upper", "reference_action"):
+            if not np.array_equal(getattr(scenario, name), getattr(problem, name)):
+                return None
+        if len(scenario.plant.states) != problem.n_states:
+            return None
+        self.reset()
+        self._engine.begin()
+        return self._engine.run
+
     # read-outs that leave the guess alone -------------------------------------------------------
 
     def value(self, s: ArrayLike) -> float:
@@ -381,10 +395,7 @@ class RtiNmpc:
 
 
 def compile_functions(controller: object, samples: int = LONG) -> None:
-    """Compile an NMPC's functions if a run of `samples` is worth it; nothing on other controllers.
-
-    To be called before the first sample; see `controllers.functions.bind_compiled`.
-    """
+    """`RtiNmpc.compile` where the controller is one; nothing on other controllers."""
     if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
         controller.compile(samples)
 

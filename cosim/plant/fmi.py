@@ -10,6 +10,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
@@ -113,6 +114,23 @@ class Wiring:
     outputs: Sequence[int]
     states: Sequence[int]
     starts: Sequence[StartValue]
+
+
+class Native(ctypes.Structure):
+    """An instance for compiled code; the C struct is `Plant` of the controllers' `engine.c`."""
+
+    _fields_: ClassVar[list[tuple[str, Any]]] = [
+        ("version", ctypes.c_int),
+        *((name, ctypes.c_void_p) for name in ("set", "get", "step", "component")),
+        *((name, ctypes.c_void_p) for name in ("inputs", "outputs", "states")),
+        *((name, ctypes.c_size_t) for name in ("n_inputs", "n_outputs", "n_states")),
+        *((name, ctypes.c_void_p) for name in ("input", "output", "state")),
+        ("step_size", ctypes.c_double),
+    ]
+
+
+NOT_FINITE = 5
+"""What failed in a compiled loop: an output or state is not finite; below it a call of FMI."""
 
 
 class Instance:
@@ -252,6 +270,30 @@ class Instance:
         for name, function, arguments in self._starts:
             if (status := function(*arguments)) not in ACCEPTED:
                 self.fail(name, status)
+
+    @cached_property
+    def native(self) -> Native:
+        """The instance's functions and buffers for compiled code, which calls them directly."""
+        exchanged = (self._set_inputs, self._get_outputs, self._get_states)
+        references = [each[1] for each in exchanged]
+        values = (self.inputs, self.outputs, self.states)
+        calls = (self._set_values, self._get_values, self._do_step)
+        return Native(
+            int(self.prefix[-1]),
+            *(ctypes.cast(call, ctypes.c_void_p) for call in calls),
+            self._component,
+            *(ctypes.cast(each, ctypes.c_void_p) for each in references),
+            *(len(each) for each in values),
+            *(ctypes.cast(each, ctypes.c_void_p) for each in values),
+            self._step_size.value,
+        )
+
+    def fail_native(self, fault: int, status: int) -> None:
+        """Raise PlantError for what failed in a compiled loop."""
+        names = (f"Set{self.real}", f"Get{self.real}", "DoStep", "DoStep")
+        if fault == len(names):
+            self.messages.append("the FMU ended the step early")
+        self.fail(names[fault - 1], DISCARD if fault == len(names) else status)
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""

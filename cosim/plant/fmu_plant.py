@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from cosim.errors import CapabilityError, PlantError
 from cosim.plant.archive import unpack
-from cosim.plant.fmi import Fmi2Instance, Fmi3Instance, Instance
+from cosim.plant.fmi import NOT_FINITE, Fmi2Instance, Fmi3Instance, Instance
 from cosim.plant.wiring import Wirer, check_step, refusals, seed_words
-from cosim.protocols import Step
+from cosim.protocols import CompiledLoop, Step
 from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -199,6 +199,30 @@ class FmuPlant:
         self._k = k + 1
         self._penalty_now = self.penalty(states)
         return Step(self._copy_states(), cost, penalty, self._copy_disturbances())
+
+    def drive(self, loop: CompiledLoop, table: Array) -> Array:
+        """Let a compiled loop make the next samples, a row of `table` each; return the state (n,).
+
+        It does what as many calls of `step` do; raises PlantError, then needs a reset.
+        """
+        fmi = self._instance
+        if self._k < 0:
+            self._refuse_unstarted()
+        k, first, end = self._k, self._k, self._k + len(table)
+        self._k = _NOT_STARTED
+        while k < end:
+            if k in self._changes:
+                self._changes[k]()
+            stop = min((change for change in self._changes if change > k), default=end)
+            stop = min(stop, end)
+            k, fault, status = loop(fmi.native, k, table[k - first : stop - first])
+            if fault == NOT_FINITE:
+                self._refuse_output(k)
+            if fault:
+                fmi.fail_native(fault, status)
+        self._k = end
+        self._penalty_now = self.penalty(self._states[:])
+        return self._copy_states()
 
     def snapshot(self) -> Snapshot:
         """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""

@@ -91,6 +91,14 @@ typedef struct {
     long long pending;
 } Loop;
 
+static void rti_start(RtiPrepared *prepared) {
+    for (int k = 0; k < HORIZON; k++) {
+        memcpy(prepared->x[k], REFERENCE_STATE, sizeof prepared->x[k]);
+        memcpy(prepared->u[k], REFERENCE_ACTION, sizeof prepared->u[k]);
+    }
+    memset(prepared->costates, 0, sizeof prepared->costates);
+}
+
 size_t engine_loop_size(void) { return sizeof(Loop); }
 
 void engine_begin(Loop *loop, RtiPrepared *prepared, RtiSolved *solved, QpWork *work) {

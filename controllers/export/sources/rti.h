@@ -37,14 +37,6 @@ typedef struct {
     double residual, iterations, gradient[N_THETA];
 } RtiSolved;
 
-static void rti_start(RtiPrepared *prepared) {
-    for (int k = 0; k < HORIZON; k++) {
-        memcpy(prepared->x[k], REFERENCE_STATE, sizeof prepared->x[k]);
-        memcpy(prepared->u[k], REFERENCE_ACTION, sizeof prepared->u[k]);
-    }
-    memset(prepared->costates, 0, sizeof prepared->costates);
-}
-
 /* Make the solution, its first stage dropped and its last control repeated, the next guess. */
 static void rti_shift(RtiPrepared *prepared, const RtiSolved *solved) {
     memcpy(prepared->x, solved->read + READ_next_x, sizeof prepared->x);

@@ -7,7 +7,7 @@ import pytest
 from controllers import ThetaBlocks
 from controllers.dynamics import sampled_jacobian
 from controllers.model import discretise
-from controllers.rti.feedback import embedding
+from controllers.rti.feedback import embedding, readout
 from controllers.rti.preparation import preparation
 from controllers.theta import SymbolicTheta
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
@@ -23,7 +23,8 @@ def blocks():
 @pytest.fixture(scope="module")
 def functions(blocks):
     prepared = preparation(evaporator_problem(), blocks)
-    return prepared, embedding(evaporator_problem(), blocks, prepared)
+    read = readout(evaporator_problem(), blocks, prepared)
+    return prepared, embedding(evaporator_problem(), blocks, prepared, read)
 
 
 @pytest.fixture

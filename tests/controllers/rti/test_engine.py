@@ -1,0 +1,158 @@
+"""The compiled controller against the interpreter's, and its own loop against Python's."""
+
+import numpy as np
+import pytest
+
+from controllers import Parameters, Problem, QpError, RtiNmpc, ThetaBlocks
+from controllers.factories import tuned
+from controllers.functions import find_compiler
+from cosim import FmuPlant, Scenario, simulate
+from tests.helpers.sampling import evaporator_problem, random_parameters
+
+pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+
+BOUNDS = {
+    "action": 1e-10,
+    "predicted_states": 1e-10,
+    "value": 1e-9,
+    "value_gradient": 1e-9,
+    "policy_jacobian": 1e-8,
+    "policy_state_jacobian": 1e-9,
+    # DAQP's own duality gap where an action is enforced, found up to 2e-8; the engine's is 1e-14.
+    "action value": 1e-7,
+    "action value's gradient": 1e-8,
+}
+"""Largest differences between the compiled and the interpreted controller, relative to the largest
+entry; the actions' in their own unit."""
+
+
+def both(problem, parameters):
+    found = RtiNmpc(problem, parameters), RtiNmpc(problem, parameters)
+    found[0].compile()
+    assert [each.functions for each in found] == ["compiled", "interpreted"]
+    return found
+
+
+@pytest.fixture(autouse=True)
+def compiled(monkeypatch):
+    monkeypatch.delenv("COSIM_COMPILE", raising=False)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    problem = evaporator_problem()
+    blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2",))
+    return problem, random_parameters(problem, blocks, np.random.default_rng(7))
+
+
+def test_it_gives_what_the_interpreter_gives(learnt):
+    problem, parameters = learnt
+    ours, reference = both(problem, parameters)
+    rng, worst = np.random.default_rng(0), dict.fromkeys(BOUNDS, 0.0)
+    s = problem.reference_state
+    for k in range(200):
+        ours.prepare()
+        reference.prepare()
+        got, wanted = ours.feedback(s), reference.feedback(s)
+        a = np.clip(
+            wanted.action + rng.normal(0, 10, 2), problem.action_lower, problem.action_upper
+        )
+        enforced, expected = ours.feedback(s, a), reference.feedback(s, a)
+        assert got.residual < 1e-9 and enforced.residual < 1e-9 and enforced.duality_gap < 1e-12
+        pairs = {name: (getattr(got, name), getattr(wanted, name)) for name in list(BOUNDS)[:6]}
+        pairs["action value"] = enforced.value, expected.value
+        pairs["action value's gradient"] = enforced.value_gradient, expected.value_gradient
+        if wanted.weakly_active:
+            del pairs["policy_jacobian"], pairs["policy_state_jacobian"]
+        for name, (one, other) in pairs.items():
+            scale = 1.0 if name == "action" else np.abs(other).max()
+            worst[name] = max(worst[name], np.abs(np.subtract(one, other)).max() / scale)
+        ours.feedback(s)
+        reference.feedback(s)
+        s = wanted.predicted_states[1] + rng.normal(0, (0.3, 1.0) if k % 5 else (2.0, 3.0))
+    assert {name: value for name, value in worst.items() if value > BOUNDS[name]} == {}
+
+
+def test_a_feedback_depends_on_its_point_alone(learnt):
+    ours, _ = both(*learnt)
+    states = learnt[0].reference_state + np.random.default_rng(1).normal(0, 1, (20, 2))
+    seen = []
+    for s in states:
+        ours.prepare()
+        point = ours.linearisation_point
+        solution = ours.feedback(s)
+        seen.append((point, s, solution.memory.tobytes(), solution.policy_jacobian.tobytes()))
+    for point, s, memory, jacobian in reversed(seen):
+        ours.prepare_at(point)
+        again = ours.feedback(s)
+        assert again.memory.tobytes() == memory
+        assert again.policy_jacobian.tobytes() == jacobian
+
+
+def test_an_action_at_the_policy_leaves_no_slope(learnt):
+    ours, _ = both(*learnt)
+    s = learnt[0].state_lower + 0.01
+    policy = ours.feedback(s)
+    enforced = ours.feedback(s, policy.action)
+    assert enforced.value == pytest.approx(policy.value, rel=1e-12)
+    assert np.abs(enforced.action_gradient).max() < 1e-6 * np.abs(policy.costates).max()
+
+
+def test_a_state_that_is_not_finite_is_refused_and_the_next_one_solved(learnt):
+    ours, _ = both(*learnt)
+    with pytest.raises(QpError):
+        ours.feedback([np.nan, 50.0])
+    with pytest.raises(QpError):
+        ours.feedback(learnt[0].reference_state, [np.inf, 200.0])
+    assert ours.feedback(learnt[0].reference_state).status == "solved"
+
+
+def test_a_hessian_that_is_not_convex_is_refused(learnt):
+    problem, parameters = learnt
+    ours, _ = both(problem, parameters.replace({"B_l": -np.eye(4)}))
+    ours.prepare()
+    with pytest.raises(QpError, match="not convex"):
+        ours.feedback(problem.reference_state)
+
+
+@pytest.mark.parametrize("scenario", ["paper", "fouled"])
+def test_its_own_loop_gives_the_bytes_of_pythons(monkeypatch, scenario):
+    loaded = Scenario.load(scenario)
+    controller = tuned(loaded)
+    controller.compile()
+    runs = []
+    with FmuPlant(loaded) as plant:
+        for _ in range(2):
+            seen = []
+            run = simulate(plant, controller, 1100, 3, progress=seen.append)
+            runs.append((run.to_csv(), run.status, run.final_state.tobytes(), seen, plant.k))
+            monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
+    assert runs[0] == runs[1]
+
+
+def test_its_loop_meets_the_plants_changes(monkeypatch):
+    loaded = Scenario.load("paper").replace(
+        {"plant": {"changes": [{"time": 1800.0, "parameters": {"UA2": 5.2}}]}}
+    )
+    controller, runs = tuned(loaded), []
+    controller.compile()
+    with FmuPlant(loaded) as plant:
+        for _ in range(2):
+            runs.append(simulate(plant, controller, 60, 0).to_csv())
+            monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
+    assert runs[0] == runs[1]
+
+
+def test_a_sample_without_a_solution_keeps_the_last_action(monkeypatch):
+    loaded = Scenario.load("paper")
+    problem = Problem.from_scenario(loaded)
+    naive = Parameters.naive(problem)
+    controller, runs = RtiNmpc(problem, naive.replace({"B_l": -np.eye(4)})), []
+    controller.compile()
+    with FmuPlant(loaded) as plant:
+        for _ in range(2):
+            run = simulate(plant, controller, 5, 0)
+            assert run["failed"].all()
+            runs.append(run.to_csv())
+            monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
+    assert runs[0] == runs[1]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controllers import compile_functions
 from controllers.optimum import yardstick
 from controllers.problem import Problem
 from controllers.theta import Parameters
@@ -81,6 +82,7 @@ class Judge:
             self._controller.theta = policy
             policy = self._controller
         seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
+        compile_functions(policy, self._run.evaluation_steps * len(seeds))
         return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)
 
     @cached_property

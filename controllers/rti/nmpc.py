@@ -136,6 +136,7 @@ class RtiNmpc:
             return
         self._engine = Engine.load(self._functions, self._parameters.blocks)
         self.functions = INTERPRETED if self._engine is None else COMPILED
+        self._compilable = self._engine is not None  # where it failed once it is not tried again
         self._prepared = None
 
     # θ ------------------------------------------------------------------------------------------

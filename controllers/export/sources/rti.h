@@ -88,7 +88,9 @@ static int rti_prepare(RtiPrepared *prepared, QpWork *work) {
         preparation(arguments, results, iw, w, 0);
     }
     if (!all_finite(prepared->stack, PREPARED_SIZE)) return QP_NOT_FINITE;
-    const Qp qp = rti_qp(prepared, (const RtiSolved *)0);
+    Qp qp = {0}; /* the matrices alone */
+    qp.H = prepared->stack + PREPARED_H;
+    qp.rows = prepared->stack + PREPARED_Gamma;
     return qp_load(&qp, work);
 }
 

@@ -63,20 +63,27 @@ static void core_forget(CoreGuess *guess) {
     }
 }
 
+/* Apart, so that the solver's arrays take the place of CasADi's work vector. */
+static QP_APART int core_solve(const RtiPrepared *prepared, RtiSolved *solved) {
+    QP_SCRATCH QpWork work;
+    const int status = rti_load(prepared, &work);
+    return status == RTI_SOLVED ? rti_feedback(prepared, &work, solved, 0) : status;
+}
+
 /* V(s) and π(s) of the QP at the guess; anything but RTI_SOLVED leaves `solution` alone. */
 static int core_sample(const CoreGuess *guess, const double theta[], const double s[],
                        CoreSolution *solution) {
     QP_SCRATCH RtiPrepared prepared;
     QP_SCRATCH RtiSolved solved;
-    QP_SCRATCH QpWork work;
     if (!well_posed(theta)) return RTI_ILL_POSED;
     memcpy(prepared.x, guess->x, sizeof prepared.x);
     memcpy(prepared.u, guess->u, sizeof prepared.u);
     memcpy(prepared.costates, guess->costates, sizeof prepared.costates);
     memcpy(prepared.theta, theta, sizeof prepared.theta);
     memcpy(solved.s, s, sizeof solved.s);
-    int status = rti_prepare(&prepared, &work);
-    if (status == RTI_SOLVED) status = rti_feedback(&prepared, &work, &solved, 0);
+    int status = rti_prepare(&prepared);
+    if (status != RTI_SOLVED) return status;
+    status = core_solve(&prepared, &solved);
     if (status != RTI_SOLVED) return status;
     for (int k = 0; k <= HORIZON; k++)
         for (int i = 0; i < N_X; i++)

@@ -10,7 +10,10 @@ size_t engine_sizes(int what) {
     return what == 0 ? sizeof(RtiPrepared) : what == 1 ? sizeof(RtiSolved) : sizeof(QpWork);
 }
 
-int engine_prepare(RtiPrepared *prepared, QpWork *work) { return rti_prepare(prepared, work); }
+int engine_prepare(RtiPrepared *prepared, QpWork *work) {
+    const int status = rti_prepare(prepared);
+    return status == RTI_SOLVED ? rti_load(prepared, work) : status;
+}
 
 int engine_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved, const double a[]) {
     const int status = rti_feedback(prepared, work, solved, a);
@@ -117,7 +120,7 @@ long long engine_run(Loop *loop, const Plant *plant, long long first, long long 
     for (long long sample = first; sample < end; sample++) {
         const double begin = seconds();
         if (loop->pending) rti_shift(loop->prepared, loop->solved);
-        int status = rti_prepare(loop->prepared, loop->work);
+        int status = engine_prepare(loop->prepared, loop->work);
         const double middle = seconds();
         memcpy(loop->solved->s, plant->state, sizeof loop->solved->s);
         if (status == RTI_SOLVED)

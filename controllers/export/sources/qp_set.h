@@ -13,6 +13,13 @@ enum { QP_LIMITS = QP_N + QP_ROWS };
 #define QP_SCRATCH
 #endif
 
+/* A function whose arrays leave the stack when it returns. */
+#ifdef __GNUC__
+#define QP_APART __attribute__((noinline))
+#else
+#define QP_APART
+#endif
+
 typedef enum { QP_SOLVED, QP_NOT_CONVEX, QP_ITERATION_LIMIT, QP_NOT_FINITE } QpStatus;
 
 /* A member of the working set: inactive, at its limit, beyond it (soft rows), or an equation. */

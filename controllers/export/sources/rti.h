@@ -68,7 +68,9 @@ static Qp rti_qp(const RtiPrepared *prepared, const RtiSolved *solved) {
     return qp;
 }
 
-static int rti_prepare(RtiPrepared *prepared, QpWork *work) {
+/* Linearise and condense; `rti_load` is what its QP's solver does beforehand. Apart, so that CasADi's
+ * work vector and the solver's may share their place on a stack. */
+static QP_APART int rti_prepare(RtiPrepared *prepared) {
     const double *const theta = prepared->theta;
     for (int k = 0; k < HORIZON; k++)
         for (int i = 0; i < N_X; i++) {
@@ -87,7 +89,10 @@ static int rti_prepare(RtiPrepared *prepared, QpWork *work) {
         long long int iw[PREPARED_IW + 1];
         preparation(arguments, results, iw, w, 0);
     }
-    if (!all_finite(prepared->stack, PREPARED_SIZE)) return QP_NOT_FINITE;
+    return all_finite(prepared->stack, PREPARED_SIZE) ? RTI_SOLVED : QP_NOT_FINITE;
+}
+
+static int rti_load(const RtiPrepared *prepared, QpWork *work) {
     Qp qp = {0}; /* the matrices alone */
     qp.H = prepared->stack + PREPARED_H;
     qp.rows = prepared->stack + PREPARED_Gamma;

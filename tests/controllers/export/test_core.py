@@ -157,7 +157,7 @@ def test_no_controller_takes_more_stack_than_the_limit_that_refuses_it(
         for line in path.read_text().splitlines():
             place, size, _ = line.split("\t")
             frames[place.rpartition(":")[2].partition(".")[0]] = int(size)
-    used = frames["rti_sample"] + max(v for name, v in frames.items() if name != "rti_sample")
+    used = frames["core_sample"] + max(v for name, v in frames.items() if name != "core_sample")
     monkeypatch.setattr(sys.modules["controllers.export.core"], "STACK_LIMIT", used)
     with pytest.raises(ControllerError, match="kB of stack a sample"):
         core(problem, Parameters.naive(problem), hessian)

@@ -57,7 +57,7 @@ def test_a_failed_sensor_holds_the_last_action_and_the_iteration_cap_is_a_failur
     first, failed, after = rows(built(exported), [(25, 50), (np.nan, 50), (25, 50)])
     assert (failed[2], after[2]) == (3, 0)
     np.testing.assert_array_equal(failed[:2], first[:2])
-    capped = rows(built(exported, "-DQP_ITERATIONS=1"), [(20, 40)])
+    capped = rows(built(exported, "-DQP_ITERATIONS=1"), [(10, 30)])
     assert capped[0, 2] == 2
 
 

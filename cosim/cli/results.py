@@ -49,9 +49,14 @@ def check(
     """
     with output(json) as out_:
         from cosim.files import temporary_folder
-        from cosim.studies.check import differences, load_tolerances
         from cosim.studies.results import StudyResults
-        from cosim.studies.stored import chosen, stored_results, stored_studies
+        from cosim.studies.stored import (
+            chosen,
+            differences,
+            load_tolerances,
+            stored_results,
+            stored_studies,
+        )
 
         folder = folder or (Path("results") if Path("results").is_dir() else stored_results())
         tolerances, studies = load_tolerances(folder), stored_studies(folder)

@@ -120,16 +120,18 @@ class Look(NamedTuple):
 def palette(names: Sequence[str]) -> dict[str, Look]:
     """A look for each controller or case, in the order given.
 
-    Cases that differ in their settings only, `rule(start=naive)` and `rule(start=tuned)`, share a
-    colour and differ in their line style. Known controllers and rules have colours of their own.
+    Cases that differ in their settings only, `rule(start=naive)` and `rule(start=tuned)`, and
+    `search+rule` and `rule`, share a colour and differ in their line style. Known controllers and
+    rules have colours of their own.
     """
-    heads = dict.fromkeys(name.partition("(")[0] for name in names)
+    head_of = {name: name.partition("(")[0].removeprefix("search+") for name in names}
+    heads = dict.fromkeys(head_of.values())
     others = cycle(_OTHERS)
     color = {head: _KNOWN.get(head) or next(others) for head in heads}
     used: dict[str, int] = {}
     looks = {}
     for name in names:
-        own = color[name.partition("(")[0]]
+        own = color[head_of[name]]
         looks[name] = Look(own, _LINES[used.get(own, 0) % len(_LINES)])
         used[own] = used.get(own, 0) + 1
     return looks

@@ -173,7 +173,7 @@ def collected(runs: Sequence[Run], out: Path) -> tuple[pd.DataFrame, pd.DataFram
 
 
 class Judged(NamedTuple):
-    """Operation on one scenario: by case and samples the greedy costs (R, S), and each run's life.
+    """Operation on one scenario: by case and samples the greedy costs, and each run's life.
 
     `greedy[case][samples]` (R, S), `optimum[samples]` (S,); `lives` has a row for each run and
     mark with `regret` (greedy), `life_regret`, and `dearest` as a regret.
@@ -185,7 +185,7 @@ class Judged(NamedTuple):
 
 
 def judged(lives: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> Judged:
-    """Regrets of the rows of a scenario; NaN without an optimum."""
+    """Regrets of the rows of a scenario; without an optimum against the best case at the time."""
     costs: dict[str, dict[int, Array]] = {}
     for (case, samples), rows in greedy.groupby(["case", "samples"], sort=False):
         table = rows.assign(run=rows.training_seed.fillna(-1)).pivot(
@@ -194,8 +194,13 @@ def judged(lives: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> Judged:
         costs.setdefault(case, {})[int(samples)] = table.to_numpy(dtype=np.float64)
     best = {samples: cost[0] for samples, cost in costs.pop(optimum, {}).items()}
     where = ["training_seed", "samples"]
-    own = lives[lives.case == optimum][[*where, "J"]].rename(columns={"J": "optimal_J"})
-    found = lives[lives.case != optimum].merge(own, on=where, how="left")
+    own = lives[lives.case == optimum].set_index(where).J
+    if not best:
+        for mark in lives.samples.unique().tolist():
+            each = (cost[mark].mean(axis=0) for cost in costs.values() if mark in cost)
+            best[mark] = min(each, key=np.mean)
+        own = lives.groupby(where).J.min()
+    found = lives[lives.case != optimum].merge(own.rename("optimal_J"), on=where, how="left")
     mean = greedy.groupby([*KEYS[1:], "samples"]).J.mean().rename("greedy_J").reset_index()
     found = found.merge(mean, on=[*KEYS[1:], "samples"], how="left")
     level = found.samples.map({samples: float(cost.mean()) for samples, cost in best.items()})

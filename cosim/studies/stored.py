@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+from pydantic import Field, ValidationError
 
 from cosim.errors import ResultsError
-from cosim.files import write_atomically
-from cosim.studies.check import TOLERANCES
-from cosim.studies.document import StudyTable
+from cosim.files import read_toml, write_atomically
+from cosim.studies.document import StudyTable, Table
 from cosim.studies.document import read as read_study
-from cosim.studies.keyed import rounded_csv
-from cosim.studies.plan import RUNS
+from cosim.studies.pictures import LOGS, TRAJECTORIES
+from cosim.studies.plan import EVALUATION, RUNS
 from cosim.studies.report import TABLES
-from cosim.studies.results import ABOUT, TIMING, StudyResults
-from cosim.validation import suggestion
+from cosim.studies.results import ABOUT, CURVES, TIMING, StudyResults
+from cosim.text_tables import csv_text, parse_rows
+from cosim.validation import describe, suggestion
 
+TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"
 """Folder within the folder: what long studies have finished."""
 LARGEST = 4_000_000
@@ -114,3 +121,168 @@ def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
             f"[Report]({name}/{TABLES}) · made with {made['versions']}; code {made['code_hash']}.\n"
         )
     write_atomically(folder / "README.md", "\n".join(parts))
+
+
+class Tolerance(Table):
+    """The largest difference of a signal that counts as none, in the signal's unit."""
+
+    absolute: Annotated[float, Field(ge=0, strict=False)]
+    unit: str
+
+
+class _Tolerances(Table):
+    tolerance: dict[str, Tolerance]
+
+
+def load_tolerances(folder: Path) -> dict[str, Tolerance]:
+    """Tolerances by signal of a folder of stored studies; raises ResultsError."""
+    path = folder / TOLERANCES
+    if not path.exists():
+        raise ResultsError(
+            f"'{path}' does not exist; name the folder of the results with --results"
+        )
+    document = read_toml(path, f"'{path}'", ResultsError)
+    try:
+        return _Tolerances.model_validate(document).tolerance
+    except ValidationError as error:
+        raise ResultsError(f"'{path}': {describe(error, _Tolerances)}") from None
+
+
+def compared_tables(folder: Path) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Tables of a study's folder that a check compares: key columns, and columns left out."""
+    run = ("scenario", "case", "training_seed")
+    found: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+        EVALUATION: ((*run, "seed"), ()),
+        CURVES: ((*run, "samples"), ()),
+    }
+    for path in sorted((folder / LOGS).glob("*.csv")):
+        found[path.relative_to(folder).as_posix()] = (("samples",), ())
+    for path in sorted((folder / TRAJECTORIES).glob("**/*.csv")):
+        found[path.relative_to(folder).as_posix()] = (("time",), ("status", "residual"))
+    return found
+
+
+def differences(
+    name: str, stored: Path, now: Path, tolerances: Mapping[str, Tolerance]
+) -> list[str]:
+    """What differs between a stored study and the same computed now, in words; [] if nothing.
+
+    Trajectories come first: they name the signal in which a difference begins. Raises ResultsError
+    where a stored table is missing or damaged, or a signal has no tolerance.
+    """
+    wanted, found = compared_tables(stored), compared_tables(now)
+    extra = [table for table in found if table not in wanted]
+    lines = [f"{name}: {table} is computed but not stored" for table in extra]
+    for table, (keys, drop) in reversed(wanted.items()):
+        if not (stored / table).is_file():
+            raise ResultsError(
+                f"the stored table '{stored / table}' is missing; make it with: "
+                f"cosim results update {name}"
+            )
+        if not (now / table).is_file():
+            lines.append(f"{name}: {table} is stored but not computed any more")
+            continue
+        one, other = (_read(folder / table, list(keys), drop) for folder in (stored, now))
+        lines += _table_differences(f"{name}/{table}", one, other, tolerances)
+    return lines
+
+
+def _read(path: Path, keys: list[str], drop: tuple[str, ...]) -> pd.DataFrame:
+    """A stored CSV by its key columns; `attrs` are the units of its signals.
+
+    Raises ResultsError if a key's column is missing, two rows have the same keys, or another column
+    holds something else than numbers.
+    """
+    try:
+        frame = pd.read_csv(path, dtype=str, na_filter=False)
+    except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        raise ResultsError(f"the stored table '{path}' cannot be read: {error}") from None
+    parts = {title: title.removesuffix("]").partition(" [") for title in frame}
+    frame = frame.rename(columns={title: name for title, (name, _, _) in parts.items()})
+    try:
+        frame = frame.map(_rounded).set_index(keys).drop(columns=list(drop), errors="ignore")
+        frame = frame.replace("", "nan").astype(float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(f"the stored table '{path}' is damaged: {error}") from None
+    if not frame.index.is_unique:
+        raise ResultsError(f"'{path}' has two rows {frame.index[frame.index.duplicated()][0]}")
+    frame.attrs = {name: unit for name, _, unit in parts.values()}
+    return frame
+
+
+def _table_differences(
+    name: str, stored: pd.DataFrame, now: pd.DataFrame, tolerances: Mapping[str, Tolerance]
+) -> list[str]:
+    """What differs between two tables, in words.
+
+    The first row that differs is named by its keys, with each signal that differs there, both
+    values, unit and tolerance; rows that only one has are named too.
+    """
+    lines = []
+    for one, other, text in (
+        (stored, now, "stored but not computed any more"),
+        (now, stored, "computed but not stored"),
+    ):
+        if len(lone := one.index[~one.index.isin(other.index)]):
+            lines.append(f"{name}: row {_row(one, lone[0])} is {text}")
+    common = stored.index[stored.index.isin(now.index)]
+    firsts = {}
+    for signal in (column for column in stored if column in now):
+        allowed = _tolerance(str(signal), stored.attrs[signal], tolerances)
+        was, value = (table.loc[common, signal].to_numpy() for table in (stored, now))
+        same = (was == value) | (np.isnan(was) & np.isnan(value))
+        beyond = ~same & ~(np.abs(was - value) <= allowed.absolute)
+        if beyond.any():
+            row = int(np.argmax(beyond))
+            firsts[signal] = (row, float(was[row]), float(value[row]), allowed)
+    begin = min((row for row, *_ in firsts.values()), default=0)
+    for signal, (row, was, value, allowed) in sorted(firsts.items(), key=lambda i: i[1][0] > begin):
+        where = f"{name}: row {_row(stored, common[row])}: signal {signal}"
+        unit = "" if allowed.unit in ("", "1") else f" {allowed.unit}"
+        lines.append(
+            f"{where} differs from here on" if row > begin else
+            f"{where} is {value!r} now, {was!r} stored: {abs(value - was):.3g} apart, tolerance "
+            f"{allowed.absolute:g}{unit}"
+        )  # fmt: skip
+    for one, other, text in ((stored, now, "stored, not computed"), (now, stored, "not stored")):
+        if lost := [str(signal) for signal in one if signal not in other]:
+            lines.append(f"{name}: signal {', '.join(lost)} is {text}")
+    return lines
+
+
+def _tolerance(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
+    """The signal's own tolerance, else that of the first pattern (`theta *`) that fits it."""
+    fitting = (name for name in tolerances if fnmatchcase(signal, name))
+    name = signal if signal in tolerances else next(fitting, None)
+    if name is None:
+        raise ResultsError(f"signal '{signal}' has no tolerance; give it one in {TOLERANCES}")
+    if unit and unit != tolerances[name].unit:
+        raise ResultsError(
+            f"signal '{signal}' is in {unit}, its tolerance in {TOLERANCES} in "
+            f"'{tolerances[name].unit}'"
+        )
+    return tolerances[name]
+
+
+def _row(table: pd.DataFrame, row: object) -> str:
+    values = row if isinstance(row, tuple) else (row,)
+    pairs = zip(table.index.names, values, strict=True)
+    return ", ".join(f"{key}={value}" for key, value in pairs if value)
+
+
+def rounded_csv(text: str) -> str:
+    """A CSV with numbers of eight digits, as tables are stored: a last bit is no change."""
+    header, *rows = parse_rows(text)
+    return csv_text(header, ([_rounded(cell) for cell in row] for row in rows))
+
+
+def _rounded(cell: str) -> str:
+    """A cell's number with eight digits; whole numbers and words as they are."""
+    try:
+        int(cell)
+    except ValueError:
+        try:
+            return f"{float(cell):.{DIGITS}g}"
+        except ValueError:
+            return cell
+    return cell

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
@@ -20,7 +19,6 @@ from cosim.validation import suggestion
 if TYPE_CHECKING:
     from cosim.studies.plan import Plan, Run, Training
 
-Array = NDArray[np.float64]
 Table = tuple[str, Sequence[str], list[list[str]]]
 Where = tuple[str, str]
 """Scenario and case."""
@@ -69,32 +67,6 @@ def collected(runs: Sequence[Run], out: Path) -> pd.DataFrame:
     return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
 
 
-class Course(NamedTuple):
-    """θ of the trainings of a case, in scaled entries: `theta` (runs, shares, entries)."""
-
-    seeds: list[int]
-    theta: Array
-
-    def of(self, seeds: Sequence[int]) -> Course:
-        """The course of these seeds alone."""
-        return Course(list(seeds), self.theta[[self.seeds.index(seed) for seed in seeds]])
-
-    @property
-    def end(self) -> Array:
-        """θ at the end, (runs, entries)."""
-        return np.asarray(self.theta[:, -1])
-
-    @property
-    def way(self) -> Array:
-        """‖θ_K − θ_0‖, (runs,)."""
-        return np.asarray(np.linalg.norm(self.end - self.theta[:, 0], axis=1))
-
-    def moved(self, share: float) -> Array:
-        """‖θ_K − θ_share·K‖ as a share of the way, (runs,)."""
-        late = np.linalg.norm(self.end - self.theta[:, SHARES.index(share)], axis=1)
-        return np.asarray(late / np.maximum(self.way, np.finfo(np.float64).tiny))
-
-
 def tables(
     frame: pd.DataFrame,
     runs: pd.DataFrame,
@@ -109,53 +81,42 @@ def tables(
     StudyError for a block or a case that is not there.
     """
     entries = [name for name in frame if name.startswith(PREFIX)]
-    blocks = list(dict.fromkeys(map(_block, entries)))
+    blocks = {name: name.removeprefix(PREFIX).partition("[")[0] for name in entries}
     for name in (*settings["without"], *settings["blocks"]):
-        if name not in blocks:
+        if name not in (known := dict.fromkeys(blocks.values())):
             raise StudyError(
-                f"[theta]: no log has a block '{name}'{suggestion(name, blocks)}; there are "
-                f"{', '.join(blocks)}"
+                f"[theta]: no log has a block '{name}'{suggestion(name, known)}; there are "
+                f"{', '.join(known)}"
             )
-    counted = [name for name in entries if _block(name) not in settings["without"]]
-    own = [name for name in entries if _block(name) in settings["blocks"]]
-    courses = _courses(frame, counted, scales)
-    costs = {
-        where: dict(zip(rows.training_seed, rows.J, strict=True))
-        for where, rows in runs.groupby(["scenario", "case"], sort=False)
+    counted = [name for name in entries if blocks[name] not in settings["without"]]
+    own = [name for name in entries if blocks[name] in settings["blocks"]]
+    theta = frame.set_index(["scenario", "case", "share", "training_seed"])[entries].sort_index()
+    scaled = theta[counted] / [scales.get(name, 1.0) for name in counted]
+    names = {
+        (scenario, case): f"{case} on {scenario}" if frame.scenario.nunique() > 1 else case
+        for scenario, case in zip(frame.scenario, frame.case, strict=True)
     }
-    several = frame.scenario.nunique() > 1
-    names = {where: f"{where[1]} on {where[0]}" if several else where[1] for where in courses}
+    costs = runs.set_index(["scenario", "case", "training_seed"]).J.sort_index()
     title = "Where θ went, in scaled entries"
     title += f" without {', '.join(settings['without'])}" if settings["without"] else ""
-    pairs = _pairs(trained, settings["pairs"], list(courses))
-    unscaled = _courses(frame, own, {})
+    pairs = _pairs(trained, settings["pairs"], list(names))
     return [
-        (title, *_course_table(courses, names, settings["late"])),
+        (title, *_course_table(scaled, names, settings["late"])),
         (
             "How far θ and J of two cases are apart, training seed by training seed",
-            *_apart(pairs, courses, unscaled, costs, names, own),
+            *_apart(pairs, scaled, theta[own], costs, names),
         ),
     ]
 
 
-def _block(entry: str) -> str:
-    return entry.removeprefix(PREFIX).partition("[")[0]
-
-
-def _courses(
-    frame: pd.DataFrame, entries: Sequence[str], scales: Mapping[str, float]
-) -> dict[Where, Course]:
-    units = np.array([scales.get(name, 1.0) for name in entries])
-    found = {}
-    for where, rows in frame.groupby(["scenario", "case"], sort=False):
-        theta = rows[list(entries)].to_numpy(dtype=np.float64) / units
-        seeds = [int(seed) for seed in rows.training_seed.iloc[:: len(SHARES)]]
-        found[where] = Course(seeds, theta.reshape(len(seeds), len(SHARES), len(entries)))
-    return found
+def _way(theta: pd.DataFrame, where: Where, since: float = 0.0) -> pd.Series[float]:
+    """‖θ_K − θ_since·K‖ by training seed."""
+    moved = theta.loc[(*where, 1.0)] - theta.loc[(*where, since)]
+    return pd.Series(np.linalg.norm(moved, axis=1), moved.index)
 
 
 def _course_table(
-    courses: Mapping[Where, Course], names: Mapping[Where, str], late: bool
+    theta: pd.DataFrame, names: Mapping[Where, str], late: bool
 ) -> tuple[Sequence[str], list[list[str]]]:
     header: tuple[str, ...] = ("case", "runs", "way, median", "between seeds")
     if late:
@@ -164,18 +125,17 @@ def _course_table(
             f"converged (< {CONVERGED})",
         )  # fmt: skip
     rows = []
-    for where, course in courses.items():
-        apart = [float(np.linalg.norm(a - b)) for a, b in combinations(course.end, 2)]
-        row = [
-            names[where],
-            str(len(course.seeds)),
-            shown(float(np.median(course.way)), None, 1, 3),
-        ]
+    for where, name in names.items():
+        way, end = _way(theta, where), theta.loc[(*where, 1.0)].to_numpy()
+        apart = [float(np.linalg.norm(a - b)) for a, b in combinations(end, 2)]
+        row = [name, str(len(way)), shown(way.median(), None, 1, 3)]
         row.append(shown(float(np.median(apart)), None, 1, 3) if apart else "")
         if late:
-            half, fifth = course.moved(0.5), course.moved(0.8)
-            row += [shown(float(f(half)), None, 1, 2) for f in (np.median, np.max)]
-            row += [shown(float(f(fifth)), None, 1, 2) for f in (np.median, np.max)]
+            below = way.clip(lower=np.finfo(np.float64).tiny)
+            half, fifth = (_way(theta, where, share) / below for share in (0.5, 0.8))
+            row += [
+                shown(f, None, 1, 2) for part in (half, fifth) for f in (part.median(), part.max())
+            ]
             row.append(f"{int((fifth < CONVERGED).sum())}/{len(fifth)}")
         rows.append(row)
     return header, rows
@@ -201,41 +161,42 @@ def _pairs(
 
 def _apart(
     pairs: Sequence[tuple[Where, Where]],
-    courses: Mapping[Where, Course],
-    unscaled: Mapping[Where, Course],
-    costs: Mapping[Where, Mapping[int, float]],
+    scaled: pd.DataFrame,
+    own: pd.DataFrame,
+    costs: pd.Series[float],
     names: Mapping[Where, str],
-    entries: Sequence[str],
 ) -> tuple[Sequence[str], list[list[str]]]:
     """Differences of two cases, second less first, over the seeds that both have."""
     header = (
         "cases", "seeds", "ΔJ, mean [95 %]", "‖Δθ‖, median", "of the way", "‖mean Δθ‖",
         "by chance", "entries that differ",
-        *(f"Δ {name.removeprefix(PREFIX)}, mean [95 %]" for name in entries),
+        *(f"Δ {name.removeprefix(PREFIX)}, mean [95 %]" for name in own),
     )  # fmt: skip
     rows = []
     for first, second in pairs:
-        common = [seed for seed in courses[first].seeds if seed in courses[second].seeds]
-        if not common:
+        change, moved = (
+            (theta.loc[(*second, 1.0)] - theta.loc[(*first, 1.0)]).dropna()
+            for theta in (scaled, own)
+        )
+        if not (seeds := len(change)):
             continue
-        before, after = courses[first].of(common), courses[second].of(common)
-        change = after.end - before.end
         size = np.linalg.norm(change, axis=1)
-        moved = unscaled[second].of(common).end - unscaled[first].of(common).end
-        cost = np.array([costs[second][seed] - costs[first][seed] for seed in common])
+        ways = (_way(scaled, first) + _way(scaled, second)).loc[change.index]
+        cost = (costs.loc[second] - costs.loc[first]).loc[change.index].to_numpy(dtype=np.float64)
         # Root of E‖mean‖² of as many differences whose expectation is zero.
-        chance = np.sqrt(change.var(axis=0, ddof=1).sum() / len(change)) if len(change) > 1 else 0
+        chance = np.sqrt(change.var().sum() / seeds) if seeds > 1 else 0.0
+        columns = change.to_numpy().T
         rows.append(
             [
                 f"{names[second]} − {names[first]}",
-                str(len(common)),
+                str(seeds),
                 _shown(mean(cost)),
                 shown(float(np.median(size)), None, 1, 3),
-                shown(float(np.median(2 * size / (before.way + after.way))), None, 1, 3),
-                shown(float(np.linalg.norm(change.mean(axis=0))), None, 1, 3),
-                shown(float(chance), None, 1, 3) if len(common) > 1 else "",
-                f"{sum(_differs(mean(column)) for column in change.T)}/{change.shape[1]}",
-                *(_shown(mean(column)) for column in moved.T),
+                shown(float(np.median(2 * size / ways)), None, 1, 3),
+                shown(float(np.linalg.norm(change.mean())), None, 1, 3),
+                shown(float(chance), None, 1, 3) if seeds > 1 else "",
+                f"{sum(_differs(mean(column)) for column in columns)}/{len(columns)}",
+                *(_shown(mean(column)) for column in moved.to_numpy().T),
             ]
         )
     return header, rows

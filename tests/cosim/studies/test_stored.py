@@ -8,9 +8,8 @@ from typer.testing import CliRunner
 
 from cosim.cli.main import app
 from cosim.comparison import load_run
-from cosim.studies.check import compared_tables
 from cosim.studies.results import StudyResults
-from cosim.studies.stored import stored_studies
+from cosim.studies.stored import compared_tables, stored_studies
 from cosim.studies.tables import read_table
 
 STORED = Path(__file__).parents[3] / "results"

@@ -90,6 +90,7 @@ def document(plan: Plan) -> dict[str, Any]:
                 "marks": (marks := definition.marks(name)),
                 "columns": [m for m in definition.samples_of(table.columns, name) if m in marks]
                 or marks,
+                "drawn": table.drawn,
             }
             for name, scenario in definition.scenarios.items()
         }

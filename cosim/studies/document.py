@@ -111,6 +111,8 @@ class OperationTable(Table):
     """Times in hours of operation, for all scenarios or by a scenario's name, with `default`."""
     columns: list[Hour] = []
     """Those of them that tables show; all, if left out."""
+    drawn: list[Source] = []
+    """Cases that the figure shows; all, if left out."""
 
 
 class ThetaTable(Table):

@@ -288,10 +288,12 @@ def operation_figure(
     """Greedy regret and regret so far against the plant's samples, on log axes.
 
     Lines are medians over the training seeds, bands from the best to the worst; `baselines` are
-    dashed and have no bands. Vertical lines stand at an hour, a shift, a day, a week.
+    dashed and have no bands; `about` may name the cases that are `drawn`. Vertical lines stand at
+    an hour, a shift, a day, a week.
     """
     named = {"hour": 1, "shift": 8, "day": 24, "week": 168}
     lives, h = found.lives, about["sampling_time"]
+    lives = lives[lives.case.isin(about["drawn"] or lives.case)]
     with figure(3.4) as drawn:
         panels = drawn.subplots(1, 2, sharey=True)
         titles = ("of θ, run greedily", "of the run so far, exploration included")

@@ -587,6 +587,8 @@ def _check_names(study: Study) -> None:
         (f"trajectory '{t.name}'", c, names) for t in study.table.trajectory for c in t.cases or []
     ]
     asked += [("logs", case, trained) for case in study.table.logs]
+    if (operation := study.table.operation) is not None:
+        asked += [("operation.drawn", case, trained) for case in operation.drawn]
     for where, name, known in asked:
         if name not in known:
             raise StudyError(

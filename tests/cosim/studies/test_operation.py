@@ -20,7 +20,7 @@ def lived(tmp_path_factory):
     growing = {"name": "grow", "algorithm": GROW, "start": "tuned"}
     return run_toy(
         out,
-        operation=HOURS,
+        operation=HOURS | {"drawn": ["slow"]},
         curves={"points": 1, "seeds": 2, "steps": 20},
         case=[growing, growing | {"name": "slow", "settings": {"rate": 0.5}, "against": "grow"}],
     )

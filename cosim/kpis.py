@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from time import perf_counter
 
 import numpy as np
@@ -56,6 +57,14 @@ def measure(
     for name, quantiles in run.timing_summary().items():
         clock |= {f"{name}_{key}": value for key, value in quantiles.items()}
     return indicators(run, burn_in), clock
+
+
+def indicators_of(
+    plant: Plant, controller: Controller, seeds: Sequence[int], steps: int, burn_in: int = 0
+) -> dict[str, Array]:
+    """`indicators` of a controller on each of S seeds by name, (S,) each."""
+    found = [measure(plant, controller, seed, steps, burn_in)[0] for seed in seeds]
+    return {name: np.array([figures[name] for figures in found]) for name in found[0]}
 
 
 def input_effort(actions: Array, lower: Array, upper: Array) -> float:

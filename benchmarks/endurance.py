@@ -1,6 +1,6 @@
 """Endurance: a long learning run; memory, time, failures.
 
-    python benchmarks/endurance.py --samples 1000000 [--record] [--rule-alone]
+    python -m benchmarks.endurance --samples 1000000 [--record] [--rule-alone]
 
 Trains on one plant and looks at every tenth of the run. Exit code 1 where memory grew by more than
 --megabytes after the first tenth, the last tenth cost more than --drift times the first one's CPU

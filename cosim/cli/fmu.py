@@ -177,30 +177,3 @@ def build(
         for path in built:
             out_.note(f"built {path}")
         out_.json({"built": [str(path) for path in built]})
-
-
-@app.command()
-def reference(
-    file: FileArgument = "evaporator",
-    update: Annotated[
-        bool, typer.Option("--update", help="Developers: store the signals of FILE anew.")
-    ] = False,
-    json: JsonOption = False,
-) -> None:
-    """Compare an evaporator FMU with the stored reference signals, bit for bit.
-
-    Exit code 1 if a signal differs.
-    """
-    with output(json) as out_:
-        from fmus import crosscheck
-
-        if update:
-            files = crosscheck.update(_path(file))
-            out_.note("\n".join(f"wrote {path}" for path in files))
-            out_.json({"written": [str(path) for path in files]})
-            return
-        found = [str(deviation) for deviation in crosscheck.deviations(_path(file))]
-        out_.note("\n".join(found) or f"{len(crosscheck.CASES)} cases, identical")
-        out_.json({"identical": not found, "deviations": found})
-    if found:
-        raise typer.Exit(DIFFERENT)

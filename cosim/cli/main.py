@@ -62,7 +62,10 @@ class _Commands(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find a command; `train` gets the options that are made of TrainingRun's fields."""
         name, command, rest = super().resolve_command(ctx, args)
-        return name, train.command() if name == "train" else command, rest
+        if name == "train" and command is not None:
+            epilog, command = command.epilog, train.command()
+            command.epilog = epilog
+        return name, command, rest
 
     def invoke(self, ctx: Any) -> Any:
         """Let Ctrl-C through, which Typer would end without a word."""
@@ -81,26 +84,32 @@ app = typer.Typer(
     cls=_Commands,
     help="Co-simulate an FMU plant with learning-based MPC, and benchmark what it learns.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (
-    demo.demo,
-    simulate.simulate,
-    evaluate.evaluate,
-    train.train,
-    view.view,
-    compare.compare,
-    optimum.optimum,
-    tuning.tuning,
-    export.export,
-    reproduce.reproduce,
+RUN, LEARN, BUILD = "Run, look and compare", "Learn", "Build and hand over"
+for panel, function, example in (
+    (RUN, demo.demo, "demo --out demo"),
+    (RUN, simulate.simulate, "simulate --scenario paper --controller tuned --steps 500 --record"),
+    (RUN, evaluate.evaluate, "evaluate --scenario fouled --controllers naive,tuned --seeds 10"),
+    (LEARN, train.train, "train --algorithm q-learning --samples 20000 --out learnt"),
+    (RUN, view.view, "view cosim-run/run.rrd --png run.png"),
+    (RUN, compare.compare, "compare cosim-run other-run --relative 1e-9"),
+    (LEARN, optimum.optimum, "optimum --scenario paper"),
+    (LEARN, tuning.tuning, "tuning --scenario paper --out tuned.toml"),
+    (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
+    (RUN, reproduce.reproduce, "reproduce --budget quick --out reproduction"),
 ):
-    app.command()(command)
-for group in (scenario, study, results, fmu):
-    app.add_typer(group.app, name=group.__name__.rpartition(".")[2])
+    app.command(rich_help_panel=panel, epilog=f"Example: cosim {example}")(function)
+for panel, module, example in (
+    (BUILD, scenario, "scenario init mine.fmu --out mine.toml"),
+    (LEARN, study, "study run study.toml --out study"),
+    (LEARN, results, "results check quick"),
+    (BUILD, fmu, "fmu info mine.fmu"),
+):
+    name = module.__name__.rpartition(".")[2]
+    app.add_typer(module.app, name=name, rich_help_panel=panel, epilog=f"Example: cosim {example}")
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70

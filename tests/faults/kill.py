@@ -59,6 +59,12 @@ def _study(folder: Path) -> None:
     (folder / "study.toml").write_text(STUDY)
 
 
+def _stored(folder: Path) -> None:
+    (folder / "out").mkdir()
+    shutil.copy(ROOT / "results" / "tolerances.toml", folder / "out")
+    (folder / "out" / "runs.toml").write_text(STUDY)
+
+
 def _recording(folder: Path) -> None:
     done = run_cosim("simulate", "-n", 300, "--record", "--out", "recorded", folder=folder)
     assert done.returncode == 0, done.stderr
@@ -94,6 +100,12 @@ JOBS = (
         "simulate --steps 20000 --record --out out",
         ("out/trajectory.csv", "out/scenario.toml"),
     ),
+    Job(
+        "demo",
+        "demo --samples 1000 --steps 20 --out out",
+        ("out/demo.csv", "out/learning.csv", "out/parameters.toml"),
+    ),
+    Job("update", "results update --results out --jobs 2", ("out/runs/summary.csv",), _stored),
     Job("view", "view recorded/run.rrd --png out.png", (), _recording),
     Job("export", "export tuned --out policy.fmu", ("policy.fmu",)),
 )

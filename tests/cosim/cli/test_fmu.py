@@ -54,12 +54,6 @@ def test_build_writes_both_files_and_makes_the_folder(cosim, tmp_path):
     assert json.loads(out)["built"] == [f"new/folder/{name}" for name in names]
 
 
-def test_reference_signals_are_reproduced(cosim):
-    code, _, err = cosim("fmu", "reference")
-    assert code == 0
-    assert "4 cases, identical" in err
-
-
 BAD_INPUT = {
     "no such file": (["info", "none.fmu"], "there is no file none.fmu"),
     "no FMU": (["info", "text.fmu"], "text.fmu is not an FMU"),
@@ -69,7 +63,6 @@ BAD_INPUT = {
     "build with two": (["build", "--check", "--out", "x"], "give one of --out DIR"),
     "own plant into a folder": (["build", ".", "--out", "x"], "FOLDER --out FILE.fmu"),
     "own plant without a description": (["build", ".", "--out", "x.fmu"], "No such file"),
-    "reference of no FMU": (["reference", "text.fmu"], "text.fmu is not an FMU"),
     "build into a file": (["build", "--out", "text.fmu"], "text.fmu"),
 }
 

@@ -14,6 +14,7 @@ import sys
 import uuid
 import zipfile
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -341,7 +342,9 @@ def binaries(
     FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both are
     built, lies a universal binary.
     """
-    libraries = {c.platform: c.library(sources, identifier, warnings) for c in compilers}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        built = pool.map(lambda each: each.library(sources, identifier, warnings), compilers)
+        libraries = dict(zip((each.platform for each in compilers), built, strict=True))
     macos = [library for p, library in libraries.items() if p.suffix == ".dylib"]
     found = {}
     for platform, library in libraries.items():

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, isfinite, log10
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 
 from cosim.errors import PlantError
@@ -44,7 +44,7 @@ def draft_scenario(
     state: Sequence[float] = (),
     action: Sequence[float] = (),
 ) -> str:
-    """Text of a commented scenario file for an FMU, as it will stand at `target`.
+    """Text of a scenario file for an FMU, as it will stand at `target`, remarks first.
 
     What is not given is guessed; `state` and `action` are where the search for the steady state
     begins. Raises PlantError, which says what to give, where nothing can be guessed.
@@ -73,8 +73,8 @@ def draft_scenario(
         document["controller"]["model"] = "controllers.evaporator:model"
     else:
         document["plant"]["fmu"] = _relative(archive.path, target)
-    lines = _lines(document, _comments(document, roles, units))
-    return "\n".join([HEAD, *lines]) + "\n"
+    notes = [f"# {field}: {note}" for field, note in _comments(document, roles, units).items()]
+    return "\n".join([HEAD, *notes, "", tomli_w.dumps(document)])
 
 
 def _start(variables: Sequence[Any], given: Sequence[float], kind: str) -> Array:
@@ -165,7 +165,7 @@ def _relative(path: Path, target: Path) -> str:
 
 
 def _comments(document: dict[str, Any], roles: Roles, units: dict[str, str]) -> dict[str, str]:
-    """Comment of each field and table by its dotted name."""
+    """Remark on each field and table by its dotted name."""
 
     def named(names: Sequence[str]) -> str:
         return ", ".join(f"{n} [{units[n]}]" if units.get(n) else n for n in names)
@@ -192,30 +192,6 @@ def _comments(document: dict[str, Any], roles: Roles, units: dict[str, str]) -> 
     if "model" not in document["controller"]:
         comments["controller"] += '; add model = "my_plant:model", a model in CasADi'
     return comments
-
-
-def _lines(table: dict[str, Any], comments: dict[str, str], path: str = "") -> Iterator[str]:
-    """The lines of a TOML table, its tables last."""
-
-    def comment(name: str) -> str:
-        return f"  # {comments[name]}" if name in comments else ""
-
-    for key, value in table.items():
-        if not isinstance(value, dict):
-            yield f"{key} = {_value(value)}{comment(path + key)}"
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from ("", f"[{path}{key}]{comment(path + key)}")
-            yield from _lines(value, comments, f"{path}{key}.")
-
-
-def _value(value: Any) -> str:
-    """A value as TOML writes it."""
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
-    if isinstance(value, float):
-        return repr(value) if isfinite(value) else ("inf" if value > 0 else "-inf")
-    return json.dumps(value, ensure_ascii=False)
 
 
 REALS = ("Real", "Float64", "Float32")

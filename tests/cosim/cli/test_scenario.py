@@ -120,7 +120,7 @@ def test_a_plant_without_noise_is_said_to_have_none(cosim, tank, tmp_path):
     code, _, err = cosim("scenario", "init", tank, "--sampling-time", 0.5, "--out", "quiet.toml")
     assert code == 0
     assert "no noise was found" in err
-    assert "# CHECK: no noise was found" in (tmp_path / "quiet.toml").read_text()
+    assert "# disturbance: CHECK: no noise was found" in (tmp_path / "quiet.toml").read_text()
 
 
 def test_a_sampling_time_called_ts_is_found(cosim, tank, tmp_path):

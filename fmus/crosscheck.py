@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmus import FmuError
+from fmus.check import description_of
 from fmus.evaporator import BY_NAME, DISTURBANCES
-from fmus.information import description_of
 
 FOLDER = Path(__file__).parent / "reference"
 CASES: dict[str, dict[str, str]] = {

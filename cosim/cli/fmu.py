@@ -56,7 +56,7 @@ def _as_plant(fmu: Path) -> tuple[Any, list[str]]:
 def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
     with output(json) as out_:
-        from fmus.information import information
+        from fmus.check import information
 
         description, refused = _as_plant(_path(file))
         found = information(_path(file), description)

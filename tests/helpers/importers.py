@@ -22,8 +22,7 @@ from fmpy.model_description import ModelDescription, ModelVariable
 from numpy.typing import NDArray
 
 from fmus import CheckError, FmuError
-from fmus.check import NotOfferedError, declared_variables, initialised, validate
-from fmus.information import information
+from fmus.check import NotOfferedError, declared_variables, information, initialised, validate
 
 TIMEOUT = 300.0  # s for one importer
 JUDGES = ("fmpy", "fmutool")

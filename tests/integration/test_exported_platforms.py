@@ -10,7 +10,7 @@ import fmpy
 import pytest
 
 from fmus.build import PLATFORMS
-from fmus.information import information
+from fmus.check import information
 from tests.helpers.platforms import (
     MARKS,
     NATIVE,

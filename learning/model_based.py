@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import chi2
+from scipy.stats import f as fisher
 
 from controllers.economic import tune
 from controllers.errors import TuningError
@@ -55,6 +55,8 @@ WINDOWS = (15, 60, 240)
 """Latest samples of which that mean is taken, every `WINDOWS[0]` samples."""
 POOL = 480
 """Number of residuals up to which those from before a change are kept."""
+CAUTION = 120
+"""Samples of the present plant below which back-offs only grow; errors below which none tells."""
 RECENT = 1440
 """Latest samples by which the size of the errors is measured."""
 THINNED = 10
@@ -122,13 +124,15 @@ class ModelBased:
         self._controller, self._configuration, self._rng = controller, configuration, rng
         self._problem = problem = Problem.from_scenario(scenario)
         start, n = controller.parameters, problem.n_states
-        self._base = _tuned(problem, start)
+        self._base = base = _tuned(problem, start)
         self._features = Features(problem)
         self._rollout = Rollout(problem, start, self._features)
         self._model: EmpiricalModel | None = None
         self._progress = Progress(
             rows=np.zeros((configuration.memory, self._features.inputs + n + 1)),
-            back_off=np.zeros(2 * n),
+            back_off=np.maximum(
+                np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]]), 0.0
+            ),
             pool=np.zeros((0, n + 1)),
             due=configuration.first_update,
         )
@@ -165,13 +169,16 @@ class ModelBased:
 
     def _changed(self, model: EmpiricalModel) -> int:
         """Number of latest samples that speak of another plant than the model's, or 0."""
-        noise = np.cov(model.residuals.T)
+        (M, K), noise = model.residuals.shape, np.cov(model.residuals.T)
+        if M < CAUTION:
+            return 0
         for window in WINDOWS:
             if window > self._progress.count - self._progress.updated:
                 return 0
             mean, design = model.mean_error(*self._latest(window))
             covariance = noise / window + design @ model.covariance @ design.T
-            if chi2.sf(mean @ np.linalg.solve(covariance, mean), mean.size) < ALARM:
+            statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
+            if fisher.sf(statistic, K, M - K) < ALARM:
                 return window
         return 0
 
@@ -188,7 +195,8 @@ class ModelBased:
         search = BackOffs(
             self._problem, self._rollout, self._base, self._model, inputs[-RECENT:], self._rng
         )
-        found, present = search.best(now.back_off), self._controller.parameters
+        least = now.back_off if age < CAUTION else np.zeros_like(now.back_off)
+        found, present = search.best(now.back_off, least), self._controller.parameters
         new = search.theta(found)
         search.draw(FINE)
         better = search.excess(search.promise(new), search.promise(present.theta)) <= 0
@@ -285,18 +293,18 @@ class BackOffs:
         deviation = float(row @ self._model.covariance @ row) ** 0.5
         return float((one.cost - other.cost) / max(deviation, PLATEAU * abs(one.cost)))
 
-    def best(self, delta: Array) -> Array:
-        """The smallest δ whose cost the model cannot tell from the least one.
+    def best(self, delta: Array, least: Array) -> Array:
+        """The smallest δ, not below `least`, whose cost the model cannot tell from the least one.
 
         First a grid, at once over the bounds whose penalty shows anywhere, up to two, and one by
         one over what others there are; then each about the best point, on longer rollouts.
         """
         grids = [
-            self._rounded(i, [level * unit for level in LEVELS])
+            self._rounded(i, [max(level * unit, least[i]) for level in LEVELS])
             for i, unit in enumerate(self._unit)
         ]
         active: list[int] = []
-        points = [delta, np.zeros_like(delta)]
+        points = [delta, least]
         while True:
             delta = self._least(points)
             worth = np.where(delta > 0, np.inf, self._worth)
@@ -311,7 +319,7 @@ class BackOffs:
         for factors in FACTORS:
             for i in active:
                 wanted = [delta[i] * factor for factor in factors] if delta[i] else [self._unit[i]]
-                values = self._rounded(i, wanted)
+                values = self._rounded(i, [max(value, least[i]) for value in wanted])
                 delta = self._least([delta, *(_with(delta, [i], [value]) for value in values)])
         return delta
 

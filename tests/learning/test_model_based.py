@@ -106,7 +106,7 @@ def test_the_back_off_of_a_known_loop_is_found(problem, base, features, rng):
     visited = np.tile([27.0, 60.0, 220.0, 230.0], (10, 1))
     slope = 10_000.0
     loop = riding(problem, base, 2, slope)
-    found = BackOffs(problem, loop, base, model, visited, rng).best(np.zeros(4))
+    found = BackOffs(problem, loop, base, model, visited, rng).best(np.zeros(4), np.zeros(4))
     # slope = 1e5 · P(noise < −δ) at the optimum; the tails are widened by a per cent.
     assert found[0] == pytest.approx(0.8, abs=0.06)
     assert (found[1:] == 0).all()
@@ -126,8 +126,9 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, featu
 
 
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch):
-    for name, samples in (("BURN", 20), ("COARSE", 60), ("FINE", 80)):
-        monkeypatch.setattr(model_based, name, samples)
+    smaller = {"BURN": 5, "COARSE": 25, "FINE": 30, "LEVELS": (0.0, 3.0), "FACTORS": ((1.2,),)}
+    for name, value in smaller.items():
+        monkeypatch.setattr(model_based, name, value)
     settings = {"first_update": 15}
     every = {"samples": 80, "log_every": 20, "evaluate_every": 80, "checkpoint_every": 20}
     run = make_run("model-based", scenario, settings, start="tuned", **every)

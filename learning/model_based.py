@@ -182,6 +182,20 @@ class ModelBased:
                 return window
         return 0
 
+    def _least(self, inputs: Array) -> Array:
+        """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
+
+        No present one shrinks beyond the state that came closest to its bound: what lies behind it
+        the model only extrapolates. Of few samples none shrinks.
+        """
+        present, problem = self._progress.back_off, self._problem
+        if len(inputs) < CAUTION:
+            return present
+        states = inputs[:, : problem.n_states]
+        rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
+        least: Array = np.clip(rooms.min(axis=0), 0.0, present)
+        return least
+
     def _update(self) -> Update:
         now = self._progress
         age = now.count - now.era
@@ -195,8 +209,8 @@ class ModelBased:
         search = BackOffs(
             self._problem, self._rollout, self._base, self._model, inputs[-RECENT:], self._rng
         )
-        least = now.back_off if age < CAUTION else np.zeros_like(now.back_off)
-        found, present = search.best(now.back_off, least), self._controller.parameters
+        found = search.best(now.back_off, self._least(inputs))
+        present = self._controller.parameters
         new = search.theta(found)
         search.draw(FINE)
         better = search.excess(search.promise(new), search.promise(present.theta)) <= 0

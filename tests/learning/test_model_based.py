@@ -55,7 +55,7 @@ def test_the_fit_predicts_a_plant_with_another_parameter(features, rng):
 def test_the_deviation_of_the_mean_cost_is_what_the_fits_scatter(features, rng):
     at = plant_data(features, rng, 50, np.zeros(features.count))[0]
     costs, deviations = [], []
-    for _ in range(30):
+    for _ in range(12):
         error = rng.normal(scale=0.15, size=features.count)
         model = EmpiricalModel.fit(features, *plant_data(features, rng, 200, error))
         row = model.cost_row(at)
@@ -65,6 +65,7 @@ def test_the_deviation_of_the_mean_cost_is_what_the_fits_scatter(features, rng):
     assert 0.4 < np.std(costs) / np.mean(deviations) < 1.6
 
 
+@pytest.mark.slow  # compiles the controller
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_the_compiled_rollout_is_the_interpreted_one(
     problem, base, features, fitted, rng, monkeypatch
@@ -110,6 +111,16 @@ def test_the_back_off_of_a_known_loop_is_found(problem, base, features, rng):
     # slope = 1e5 · P(noise < −δ) at the optimum; the tails are widened by a per cent.
     assert found[0] == pytest.approx(0.8, abs=0.06)
     assert (found[1:] == 0).all()
+
+
+def test_back_offs_shrink_no_further_than_the_plant_has_been(scenario, base, rng):
+    run = make_run("model-based", scenario)
+    controller = SimpleNamespace(parameters=base, theta=base.theta)
+    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+    rule._progress.back_off = np.array([2.0, 0.0, 0.0, 5.0])
+    inputs = np.tile([26.0, 77.0, 220.0, 230.0], (200, 1))
+    assert rule._least(inputs) == pytest.approx([1.0, 0.0, 0.0, 3.0])
+    assert rule._least(inputs[:50]) == pytest.approx([2.0, 0.0, 0.0, 5.0])
 
 
 def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, features, fitted, rng):

@@ -16,7 +16,7 @@ from controllers.rti import LinearisationPoint
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, LearnableSolution, Transition, Update
 from learning.checkpoint import group, prefixed
-from learning.configuration import Configuration, Count, ExplorationProbability, ExplorationShare
+from learning.configuration import Configuration, Count, ExplorationProbability
 from learning.errors import DivergenceError
 from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel, PredictionErrors
@@ -43,20 +43,24 @@ class BatchQLearningConfiguration(Configuration):
     """Hyperparameters of batch Q-learning."""
 
     exploration_probability: ExplorationProbability = 0.3
-    exploration_share: ExplorationShare = 1 / 30
     discount: Discount = None
-    prior_width: PriorWidth = 0.3
-    batch_size: Count = Field(500, description="samples between two updates")
+    prior_width: PriorWidth = 0.1
+    batch_size: Count = Field(100, description="samples between two updates")
     first_batch: Count | None = Field(
-        None,
+        500,
         description="samples of the first batch, which gives noise and widths; as the others if "
         "not given",
     )
-    measure_offset: MeasureOffset = True
+    measure_offset: MeasureOffset = False
     relinearisations: Count = Field(2, description="replays and steps of θ per batch")
     innovation_clip: InnovationClip = 3.0
     variance_memory: VarianceMemory = 2000.0
     prediction_errors: ErrorsKept = 1000
+
+    @property
+    def criterion(self) -> float:
+        """Discount of the TD error."""
+        return 1.0 if self.discount is None else self.discount
 
     def narrowed(self, width: float) -> Self:
         """Copy whose prior is `width` times as wide."""
@@ -193,7 +197,7 @@ class BatchQLearning:
         """Work in coordinates of this scale, (n_θ,)."""
         settings = self._configuration
         self._step = ConstrainedStep(self._controller, settings, scale=scale)
-        self._average_cost = AverageCost.of(settings.discount, self._scenario, self._step)
+        self._average_cost = AverageCost.of(settings.criterion, self._scenario, self._step)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Filter, errors and the open batch."""

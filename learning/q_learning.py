@@ -17,7 +17,6 @@ from learning.configuration import (
     Configuration,
     Count,
     ExplorationProbability,
-    ExplorationShare,
     NonNegative,
     Positive,
 )
@@ -46,7 +45,12 @@ AS_PRINTED: dict[str, Any] = {
 # The Kalman forms, online and in batches, share these.
 Discount = Annotated[
     float | None,
-    Field(gt=0, le=1, description="of the TD error: the scenario's if not given; 1 is mean cost"),
+    Field(
+        gt=0,
+        le=1,
+        description="of the TD error; if not given 1, that is the mean cost, which no sampling "
+        "time alters, and for the rules td and fit the scenario's",
+    ),
 ]
 PriorWidth = Annotated[
     Positive,
@@ -74,17 +78,16 @@ class QLearningConfiguration(Configuration):
     """Hyperparameters of online Q-learning; `AS_PRINTED` has those of the paper's rule."""
 
     exploration_probability: ExplorationProbability = 0.3
-    exploration_share: ExplorationShare = 1 / 30
     rule: Literal["kalman", "td", "fit"] = Field(
         "kalman",
         description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
     )
     discount: Discount = None
-    prior_width: PriorWidth = 0.3
+    prior_width: PriorWidth = 0.1
     prior_samples: Count = Field(
         500, description="first samples, at which θ rests: they give noise and widths"
     )
-    measure_offset: MeasureOffset = True
+    measure_offset: MeasureOffset = False
     step_every: Count = Field(50, description="samples per step of θ")
     innovation_clip: InnovationClip = 3.0
     variance_memory: VarianceMemory = 2000.0
@@ -98,6 +101,11 @@ class QLearningConfiguration(Configuration):
     scaled: bool = Field(
         True, description="rules td and fit: step in coordinates θ/scale, else in θ itself"
     )
+
+    @property
+    def criterion(self) -> float | None:
+        """Discount of the TD error, None for the scenario's."""
+        return 1.0 if self.discount is None and self.rule == "kalman" else self.discount
 
     def narrowed(self, width: float) -> Self:
         """Copy whose prior is `width` times as wide."""
@@ -229,7 +237,7 @@ class KalmanFilter:
         """Work in coordinates of this scale, (n_θ,)."""
         settings = self._configuration
         self._step = ConstrainedStep(self._controller, settings, scale=scale)
-        self._average_cost = AverageCost.of(settings.discount, self._scenario, self._step)
+        self._average_cost = AverageCost.of(settings.criterion, self._scenario, self._step)
 
     def _filter(self, variance: float) -> KalmanRegression:
         settings = self._configuration

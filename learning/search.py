@@ -41,6 +41,16 @@ RULES: dict[str, Any] = {
     "batch-q-learning": BatchQLearning,
     "actor-critic": ActorCritic,
 }
+BOLD = {"exploration_share": 1 / 30, "prior_width": 0.3, "measure_offset": True}
+IN_SEARCH: dict[str, dict[str, Any]] = {
+    "q-learning": BOLD,
+    "batch-q-learning": {**BOLD, "batch_size": 500, "first_batch": None},
+    "actor-critic": {},
+}
+"""The rules' defaults in a search, bolder than alone: a comparison stops what goes wrong.
+
+Their TD error has the scenario's discount there.
+"""
 CANDIDATES = 3
 """θ of a phase of learning that are compared, at equal distances in samples."""
 SENSITIVITIES = 100
@@ -74,7 +84,7 @@ class SearchConfiguration(Configuration):
         """Settings of a rule in the search: those that they share, and the rule's own."""
         shared = {field: getattr(self, field) for field in Configuration.model_fields}
         own = self.rule_settings if name == self.rule else {}
-        return RULES[name].Configuration.from_dict(shared | own)
+        return RULES[name].Configuration.from_dict(IN_SEARCH[name] | shared | own)
 
     def without_part(self) -> Mapping[str, str]:
         """The settings that only a search with a rule has."""
@@ -90,12 +100,12 @@ class SearchConfiguration(Configuration):
         """Explore as the rule would, unless told otherwise; refuse settings that it lacks."""
         if shared := sorted(self.rule_settings.keys() & Configuration.model_fields.keys()):
             raise ValueError(f"rule_settings: {shared[0]} is a setting of the search itself")
-        rule = RULES["q-learning" if self.rule == "none" else self.rule]
-        fields = rule.Configuration.model_fields
+        rule = "q-learning" if self.rule == "none" else self.rule
+        fields = RULES[rule].Configuration.model_fields
         for name in ("exploration_probability", "exploration_share"):
             if name not in self.model_fields_set:
                 # Not by `setattr`: it is still a default, which a scenario may replace.
-                self.__dict__[name] = fields[name].default
+                self.__dict__[name] = IN_SEARCH[rule].get(name, fields[name].default)
         if self.rule != "none":
             try:
                 self.rule_configuration(self.rule)
@@ -253,10 +263,13 @@ class Search:
         first = settings.q_learning_first and self._rules_made % 2 == 0
         name = "q-learning" if first else settings.rule
         self._rules_made += 1
+        chosen = settings.rule_configuration(name).narrowed(width)
+        if getattr(chosen, "discount", 1.0) is None:
+            chosen = chosen.model_copy(update={"discount": self._scenario.discount})
         made: Rule = RULES[name](
             self._controller,
             self._scenario,
-            settings.rule_configuration(name).narrowed(width),
+            chosen,
             samples,
             self._strategy,
             self._rng,

@@ -8,6 +8,7 @@ from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
 from learning.exploration import build_strategy
 from learning.loop import TrainingLoop
+from tests.helpers.linear_quadratic import DISCOUNT
 
 
 def learn(*arguments, **settings):
@@ -68,8 +69,9 @@ def test_wrong_parameters_do_not(linear_quadratic):
 
 
 EXPLORATION = {"exploration_probability": 0.5, "exploration_deviation": (1.0,)}
-ONLINE = {"prior_width": 1.0, "prior_samples": 50, "step_every": 10, **EXPLORATION}
-BATCH = {"prior_width": 3.0, "batch_size": 50, "variance_memory": 50.0, **EXPLORATION}
+LQ = {"measure_offset": True, "discount": DISCOUNT, **EXPLORATION}
+ONLINE = {"prior_width": 1.0, "prior_samples": 50, "step_every": 10, **LQ}
+BATCH = {"prior_width": 3.0, "batch_size": 50, "first_batch": None, "variance_memory": 50.0, **LQ}
 
 
 def test_online_q_learning_finds_the_riccati_solution(linear_quadratic):
@@ -95,14 +97,14 @@ def test_batch_q_learning_finds_the_riccati_solution(linear_quadratic):
 def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, rule, settings):
     exact = linear_quadratic.riccati(1.0)[1]
     assert np.abs(exact - linear_quadratic.K).max() > 0.04
-    controller = learn(linear_quadratic, rule, 6000, 0.0, discount=1.0, **settings)
+    controller = learn(linear_quadratic, rule, 6000, 0.0, **settings | {"discount": 1.0})
     assert gain(controller) == pytest.approx(exact, abs=0.01)
 
 
 def test_the_mean_cost_is_found_beside_theta(linear_quadratic):
     noise = 0.1
     exact = noise**2 * np.trace(linear_quadratic.riccati(1.0)[0])
-    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, discount=1.0, **BATCH)
+    _, algorithm = train(linear_quadratic, BatchQLearning, 3000, noise, **BATCH | {"discount": 1.0})
     assert algorithm._average_cost.mean_cost == pytest.approx(exact, rel=0.2)
 
 

@@ -84,6 +84,16 @@ class Engine:
         """Feedback phase for the memory's state, with `action` enforced or not."""
         return self._feedback(*(self._action_value if enforced else self._value))
 
+    def batch(self, states: Vector) -> tuple[Vector, Vector]:
+        """π (K, m) and V (K,) of the memory's QP for states (K, n), NaN where there is none."""
+        actions, values = np.empty((len(states), self.action.size)), np.empty(len(states))
+        self._library.engine_batch(
+            *self._value[:3],
+            ctypes.c_longlong(len(states)),
+            *(ctypes.c_void_p(array.ctypes.data) for array in (states, actions, values)),
+        )
+        return actions, values
+
     def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
         """dπ/dθ (m, n_θ) and dπ/ds (m, n) of copies of the memory; None where LICQ fails."""
         # In another workspace: the next feedback needs what the preparation factorised.

@@ -386,6 +386,35 @@ class RtiNmpc:
         """V(s) of the prepared QP."""
         return self._solve(s, None).value
 
+    def feedback_batch(self, states: ArrayLike) -> tuple[Vector, Vector]:
+        """π (K, m) and V (K,) of the prepared QP at states (K, n); NaN where it is not solved.
+
+        Compiled controllers solve them in one call. Raises ControllerError on a wrong shape.
+        """
+        rows = np.ascontiguousarray(states, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] != self.problem.n_states:
+            raise ControllerError(
+                f"the states must have shape (K, {self.problem.n_states}), not {rows.shape}"
+            )
+        if self._prepared is None:
+            self.prepare()
+        if self._engine is not None and self.iterations == 1 and not self._status:
+            return self._engine.batch(rows)
+        actions, values = np.full((len(rows), self.problem.n_actions), np.nan), []
+        for action, s in zip(actions, rows, strict=True):
+            try:
+                solution = self._solve(s, None)
+            except QpError:
+                values.append(np.nan)
+                continue
+            action[:] = solution.action
+            values.append(solution.value)
+        return actions, np.array(values)
+
+    def value_batch(self, states: ArrayLike) -> Vector:
+        """V (K,) of the prepared QP at states (K, n); see `feedback_batch`."""
+        return self.feedback_batch(states)[1]
+
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q(s, a) of the prepared QP."""
         return self._solve(s, a).value

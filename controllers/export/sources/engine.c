@@ -21,6 +21,18 @@ int engine_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved
     return status;
 }
 
+/* π and V of a prepared QP for `count` states, a row each; NAN where there is no solution. */
+void engine_batch(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved, long long count,
+                  const double states[], double actions[], double values[]) {
+    for (; count > 0; count--, states += N_X, actions += N_U, values++) {
+        memcpy(solved->s, states, sizeof solved->s);
+        const int failed = rti_feedback(prepared, work, solved, 0) != RTI_SOLVED;
+        for (int i = 0; i < N_U; i++)
+            actions[i] = failed ? NAN : solved->v[i] + REFERENCE_ACTION[i];
+        *values = failed ? NAN : solved->read[READ_value];
+    }
+}
+
 int engine_policy(const RtiPrepared *prepared, const RtiSolved *solved, QpWork *work,
                   double policy[]) {
     return rti_policy(prepared, solved, work, policy);

@@ -89,6 +89,22 @@ def test_a_feedback_depends_on_its_point_alone(learnt):
         assert again.policy_jacobian.tobytes() == jacobian
 
 
+def test_a_batch_is_the_feedback_of_each_state_and_moves_no_guess(learnt):
+    ours, reference = both(*learnt)
+    states = learnt[0].reference_state + np.random.default_rng(1).normal(0, 1, (20, 2))
+    states[7, 0] = np.nan
+    known = np.delete(np.arange(20), 7)
+    for controller in (ours, reference):
+        controller.feedback(states[0])
+        controller.prepare()
+        actions, values = controller.feedback_batch(states)
+        assert np.isnan(values[7]) and np.isnan(actions[7]).all()
+        np.testing.assert_array_equal(controller.value_batch(states), values)
+        for k in known:
+            assert np.array_equal(controller.policy(states[k]), actions[k])
+            assert controller.value(states[k]) == values[k]
+
+
 def test_an_action_at_the_policy_leaves_no_slope(learnt):
     ours, _ = both(*learnt)
     s = learnt[0].state_lower + 0.01

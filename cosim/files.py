@@ -7,13 +7,11 @@ import errno
 import hashlib
 import json
 import os
-import re
 import secrets
 import shutil
 import socket
 import stat
 import tempfile
-import time
 import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -103,15 +101,6 @@ def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Pat
 
 
 CACHE_VARIABLE = "COSIM_CACHE"
-UNUSED_DAYS = 30
-TAG = "CACHEDIR.TAG"
-TAGGED = """\
-Signature: 8a477f597d28d172789f06886806bc55
-# A cache of rti-cosim, by which backups know what they may leave out. What nobody has used for
-# some weeks is deleted here, and nothing where this file is missing or another.
-"""
-"""The mark of a folder that this cache made; see https://bford.info/cachedir/."""
-_ENTRY = re.compile(r"[0-9a-f]{16,64}(\..*)?|\.partial-.*")
 _caches: dict[Path, Path] = {}
 
 
@@ -129,7 +118,7 @@ def cache_folder(kind: str) -> Path:
     """The folder for cached files of a `kind`: the user's, made if need be, or a temporary one.
 
     Temporary, until this process ends, where the user's cannot be written or others could write it:
-    native code is loaded from here. Entries unused for `UNUSED_DAYS` are deleted once per process.
+    native code is loaded from here.
     """
     folder = user_cache(kind)
     if folder in _caches and _caches[folder].is_dir():
@@ -139,12 +128,9 @@ def cache_folder(kind: str) -> Path:
         for level in (folder.parent, folder):
             level.mkdir(mode=0o700, exist_ok=True)
         usable = is_trusted(folder) and os.access(folder, os.W_OK | os.X_OK)
-        if usable and not any(folder.iterdir()):
-            (folder / TAG).write_text(TAGGED, "utf-8")
     except OSError:
         usable = False
     if usable:
-        _sweep(folder)
         _caches[folder] = folder
     else:
         _caches[folder] = _make_temporary(f"cosim-{kind}-", None)
@@ -170,20 +156,6 @@ def is_trusted(path: Path) -> bool:
         and not stat.S_ISLNK(status.st_mode)
         for status in found
     )
-
-
-def _sweep(folder: Path) -> None:
-    """Delete unused entries of a folder that carries this cache's mark, by their kind of name."""
-    try:
-        if (folder / TAG).read_text("utf-8", "replace") != TAGGED:
-            return
-        entries = [entry for entry in folder.iterdir() if _ENTRY.fullmatch(entry.name)]
-    except OSError:
-        return
-    for entry in entries:
-        with suppress(OSError):
-            if entry.lstat().st_mtime < time.time() - UNUSED_DAYS * 86400:
-                _delete(entry)
 
 
 def _delete(entry: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 import re
 import shutil
 import stat
@@ -190,8 +189,6 @@ def _holds(folder: Path, archive: zipfile.ZipFile) -> bool:
     # Of entries with one name the last is what unpacking leaves.
     entries = {entry.filename: entry for entry in archive.infolist() if not entry.is_dir()}
     try:
-        # Counts as use before the look, so that nobody sweeps what is being looked at.
-        os.utime(folder)
         return all(_same(archive, entry, folder / name) for name, entry in entries.items())
     except OSError:
         return False

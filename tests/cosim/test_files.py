@@ -12,8 +12,6 @@ from cosim import files
 from cosim.files import (
     DEEPEST,
     LARGEST,
-    TAG,
-    UNUSED_DAYS,
     cache_folder,
     is_trusted,
     protect,
@@ -164,33 +162,6 @@ def test_a_cached_file_that_others_can_write_is_not_trusted(own_cache):
     assert is_trusted(path)
     path.chmod(0o620)
     assert not is_trusted(path)
-
-
-HASH = "0123456789abcdef" * 4
-
-
-@posix
-@pytest.mark.parametrize("marked", [True, False])
-def test_only_unused_entries_of_our_own_kind_are_swept(own_cache, tmp_path, monkeypatch, marked):
-    folder = cache_folder("fmus")
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "kept").touch()
-    old = [HASH, HASH[:16] + ".npz", HASH[:32] + "." + HASH, ".partial-old"]
-    foreign = ["plant.fmu", ".git", "0123", HASH + "0", HASH.upper()]
-    for name in (*old, *foreign, HASH.replace("0", "1")):
-        (folder / name).mkdir()
-    (folder / HASH[:20]).symlink_to(tmp_path / "elsewhere")
-    for name in (*old, *foreign, HASH[:20]):
-        then = (folder / name).lstat().st_mtime - (UNUSED_DAYS + 1) * 86400
-        os.utime(folder / name, (then, then), follow_symlinks=False)
-    if not marked:
-        (folder / TAG).write_text("another")
-    monkeypatch.setattr(files, "_caches", {})
-    cache_folder("fmus")
-    left = {path.name for path in folder.iterdir()}
-    kept = {TAG, *foreign, HASH.replace("0", "1")}
-    assert left == kept if marked else left == kept | {*old, HASH[:20]}
-    assert (tmp_path / "elsewhere" / "kept").exists()
 
 
 def test_a_temporary_folder_is_deleted_with_what_is_in_it_whatever_is_raised(tmp_path):

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 import fmus
-from cosim.files import TAG
 from cosim.plant.archive import place
 from tests.helpers.command import run_cosim
 
@@ -31,7 +30,7 @@ def contents(folder):
 
 
 def entries(cache):
-    return [path for path in cache.iterdir() if path.name != TAG]
+    return list(cache.iterdir())
 
 
 def packed(archive):

@@ -16,7 +16,7 @@ ROWS = {0: 0.0, 200: 3.0, 500: 6.0, 700: 7.0, 800: 9.0, 1000: 10.0}
 """How far θ has come, by samples."""
 
 
-def wander(training, folder):
+def wander(training, folder, marks):
     """g goes from 0 to 10, faster with `rate`, and further with the seed; h moves from 1 to 2."""
     factor = training.settings["rate"] * (1 + training.options["seed"])
     log = "samples,J,greedy_J,td_error,theta g,theta h[0]\n"

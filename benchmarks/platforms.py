@@ -9,10 +9,10 @@ import sys
 import tempfile
 from pathlib import Path
 
+from benchmarks.importers import check
 from cosim.text_tables import markdown_table
 from fmus.build import PLATFORMS
 from fmus.model import FmiVersion
-from tests.helpers.importers import check
 from tests.helpers.platforms import (
     LAWS,
     NATIVE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
@@ -184,7 +185,38 @@ def differences(
             continue
         one, other = (_read(folder / table, list(keys), drop) for folder in (stored, now))
         lines += _table_differences(f"{name}/{table}", one, other, tolerances)
+    if lines and EVALUATION in wanted and (now / EVALUATION).is_file():
+        lines[:0] = [f"{name}: {words}" for words in _cause(stored, now, tolerances)]
     return lines
+
+
+def _cause(stored: Path, now: Path, tolerances: Mapping[str, Tolerance]) -> list[str]:
+    """Where to look, by the cases whose evaluation differs; [] where none does.
+
+    The optimum is a stored table, so that it differs with the plant and the cost alone; controllers
+    that learn nothing differ with their model and problem too, and the others with their algorithm.
+    """
+    keys, drop = compared_tables(stored)[EVALUATION]
+    both = [_read(folder / EVALUATION, list(keys), drop) for folder in (stored, now)]
+    about = json.loads((stored / ABOUT).read_text("utf-8"))
+    cases = {case["name"]: case for case in about["cases"]}
+    differing = []
+    for case in cases:
+        was, value = (frame[frame.index.get_level_values("case") == case] for frame in both)
+        if _table_differences("", was, value, tolerances):
+            differing.append(case)
+    if not differing:
+        return []
+    same = ", ".join(case for case in cases if case not in differing) or "none"
+    if any(cases[case]["target"] == "optimal" for case in differing):
+        place = "the plant, its noise and its cost"
+    elif all(cases[case]["trained"] for case in differing):
+        place = "the algorithm of " + ", ".join(cases[case]["target"] for case in differing)
+    elif "tuned" in cases and "tuned" not in differing:
+        place = "the problem's discount, for which a tuned cost makes up"
+    else:
+        place = "the controller's model, its problem (horizon, bounds) and its QP"
+    return [f"evaluations that differ: {', '.join(differing)}; the same: {same}; look at {place}"]
 
 
 def _read(path: Path, keys: list[str], drop: tuple[str, ...]) -> pd.DataFrame:

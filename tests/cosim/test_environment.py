@@ -31,12 +31,6 @@ def test_an_action_of_another_shape_is_refused(env, wrong):
         env.unwrapped.step(np.array(wrong))
 
 
-def test_the_scenario_is_an_argument():
-    env = gymnasium.make("cosim/Evaporator-v0", scenario="fast-sampling")
-    assert env.unwrapped.scenario.sampling_time == 6.0
-    env.close()
-
-
 def test_an_episode_is_rendered_from_its_first_state_on():
     env = gymnasium.make("cosim/Evaporator-v0", render_mode="rgb_array")
     env.reset(seed=0)
@@ -75,13 +69,6 @@ def test_later_episodes_of_a_seed_differ_and_repeat(env):
     first = episodes()
     assert len({tuple(row) for row in first}) == 3
     assert episodes() == first
-
-
-def test_actions_are_saturated(env):
-    env.reset(seed=0)
-    one = env.step(np.array([1e6, -1e6]))[0]
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.step(np.array([400.0, 100.0]))[0], one)
 
 
 def test_an_episode_is_truncated_by_the_time_limit():

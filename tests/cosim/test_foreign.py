@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
-import fmus
 from cosim import FmuPlant, simulate
 from cosim.errors import CapabilityError, PlantError
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Hold
-from tests.helpers.tank import build_tank, edited, without_attribute, write_scenario
+from tests.helpers.tank import build_tank, write_scenario
 
 
 @pytest.fixture(scope="module")
@@ -54,23 +53,6 @@ def test_a_missing_capability_is_an_error_only_when_asked_for(tanks, tmp_path):
             plant.reset(0, [2.0])
         plant.reset(0)
         plant.step([3.0])
-
-
-@pytest.mark.parametrize("name", ["evaporator", "evaporator_fmi3"])
-def test_an_fmu_that_declares_no_state_saving_still_steps(tmp_path, paper, name):
-    drop = without_attribute(
-        "canGetAndSetFMUstate",
-        "canSerializeFMUstate",
-        "canGetAndSetFMUState",
-        "canSerializeFMUState",
-    )
-    path = edited(fmus.path(name), tmp_path / "plain.fmu", drop)
-    with FmuPlant(paper, path) as plain, FmuPlant(paper, name) as ours:
-        np.testing.assert_array_equal(plain.reset(3), ours.reset(3))
-        a = paper.reference_action
-        np.testing.assert_array_equal(plain.step(a).s, ours.step(a).s)
-        with pytest.raises(CapabilityError, match="save and restore"):
-            plain.snapshot()
 
 
 def test_returned_nan_is_an_error_that_names_variable_and_step(tanks, tmp_path):

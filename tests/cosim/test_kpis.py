@@ -31,14 +31,6 @@ def test_a_first_order_lag_settles_into_five_per_cent_after_three_time_constants
     )
 
 
-def test_the_slowest_state_decides_the_settling_time(paper):
-    time = np.arange(4000) * 1.0
-    states = np.stack([np.exp(-time / 10.0), np.exp(-time / 200.0)], axis=1)
-    assert settling_time(run_with_states(paper, time, states)) == pytest.approx(
-        200.0 * np.log(20.0), abs=1.0
-    )
-
-
 def test_a_state_that_still_drifts_has_not_settled(paper):
     time = np.arange(100) * 1.0
     states = np.stack([np.exp(-time / 5.0), 1.0 - time / 100.0], axis=1)

@@ -41,13 +41,3 @@ def test_a_step_is_the_plants_own_in_other_units(env, paper):
         seen, scaled, *_ = env.step(np.array([0.3, -0.2]))
     np.testing.assert_array_equal(seen, normalisation.observation(s))
     assert scaled == normalisation.reward(-reward)
-
-
-def test_a_state_whose_operating_point_is_zero_counts_in_its_bounds_width(paper):
-    moved = paper.replace(
-        {
-            "controller": {"reference_state": [0.0, 50.0]},
-            "bounds": {"state_lower": [-3.0, 40.0], "state_upper": [1.0, 80.0]},
-        }
-    )
-    np.testing.assert_allclose(Normalisation(moved).state_scale, [0.4, 5.0], rtol=1e-15)

@@ -36,6 +36,7 @@ WORKERS = (
 
 
 @linux
+@SLOW
 def test_workers_end_with_the_parent(tmp_path):
     program = WORKERS.format(folder=str(tmp_path))
     with subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL) as parent:
@@ -43,12 +44,6 @@ def test_workers_end_with_the_parent(tmp_path):
         workers = [int(path.name) for path in tmp_path.iterdir()]
         parent.kill()
     assert eventually(lambda: not any(map(alive, workers)))
-
-
-def test_a_worker_whose_parent_ended_before_it_asked_ends():
-    program = "import time; from cosim.processes import follow_parent; follow_parent(1 << 30); "
-    with subprocess.Popen([sys.executable, "-c", f"{program}time.sleep(600)"]) as worker:
-        assert worker.wait(60) == 1
 
 
 CHILD = (
@@ -107,46 +102,6 @@ def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
     assert process.returncode == 143
     assert words == "terminated\n"
     assert list((tmp_path / "out").iterdir()) == []
-
-
-LOST = """
-import sys, time
-from cosim.processes import Terminated, unwinding_on_signals, unwound
-
-class Slow:
-    def __del__(self):  # what is raised in here is lost
-        print("ready", flush=True)
-        time.sleep(60)
-
-sys.unraisablehook = lambda _: print("lost", flush=True)
-with unwinding_on_signals():
-    try:
-        slow = Slow()
-        del slow
-        time.sleep(60)
-    except (KeyboardInterrupt, Terminated) as error:
-        try:
-            time.sleep(1.5)  # the signal comes again, and is not raised again
-            {}["unwinding"]
-        except KeyError:
-            time.sleep(0.5)
-        unwound()
-        print(type(error).__name__)
-time.sleep(0.5)
-"""
-
-
-@linux
-@pytest.mark.parametrize(
-    ("number", "word"), [(signal.SIGINT, "KeyboardInterrupt"), (signal.SIGTERM, "Terminated")]
-)
-def test_a_signal_whose_exception_was_lost_comes_again_and_unwinds_once(number, word):
-    with subprocess.Popen(
-        [sys.executable, "-c", LOST], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == "ready\n"
-        process.send_signal(number)
-        assert process.communicate(timeout=30) == (f"lost\n{word}\n", "")
 
 
 HOLD = (

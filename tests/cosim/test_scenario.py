@@ -1,9 +1,5 @@
-import tomllib
-
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from cosim.errors import ScenarioError
 from cosim.scenario import Scenario, presets
@@ -211,44 +207,6 @@ def test_bad_documents_are_refused_in_one_clear_line(case, tmp_path, monkeypatch
     assert "\n" not in message
     for part in expected:
         assert part in message
-
-
-def _leaves(table, path=()):
-    for key, value in table.items():
-        if isinstance(value, dict) and value:
-            yield from _leaves(value, (*path, key))
-        else:
-            yield (*path, key)
-
-
-JUNK = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(-3, 3),
-    st.floats(),
-    st.text(max_size=3),
-    st.lists(st.one_of(st.floats(), st.text(max_size=2)), max_size=3),
-    st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
-)
-
-
-@given(data=st.data())
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-def test_any_junk_in_any_field_is_accepted_or_refused_by_name(data):
-    document = tomllib.loads(Scenario.load("paper").to_toml())
-    path = data.draw(st.sampled_from(list(_leaves(document))))
-    table = document
-    for key in path[:-1]:
-        table = table[key]
-    table[path[-1]] = data.draw(JUNK)
-    try:
-        scenario = Scenario.from_dict(document)
-    except ScenarioError as error:
-        message = str(error)
-        assert "\n" not in message
-        assert path[0] in message
-    else:
-        assert Scenario.from_dict(tomllib.loads(scenario.to_toml())) == scenario
 
 
 def test_a_seed_draws_the_same_random_plant_for_ever():

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import CosimError
 from cosim.simulation import BLOCK, spawn_seeds
 from cosim.trajectory import FALLBACK
 from tests.helpers.loop import Failing, Hold, Proportional
@@ -121,11 +120,6 @@ def test_residuals_that_nobody_wants_are_not_computed(evaporator, paper):
     assert np.isnan(spared["residual"]).all()
     for name in whole.signals.keys() - {"residual"}:
         assert whole[name].tobytes() == spared[name].tobytes()
-
-
-def test_an_action_of_wrong_length_ends_the_run_by_name(evaporator):
-    with pytest.raises(CosimError, match=r"Hold gave an action of shape \(3,\), not \(2,\)"):
-        simulate(evaporator, Hold([200.0, 200.0, 200.0]), 5, seed=0)
 
 
 class Recorder:

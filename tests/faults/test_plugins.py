@@ -60,15 +60,6 @@ def test_a_target_of_no_form_is_refused(loader, target):
         load(target)
 
 
-@pytest.mark.parametrize(
-    "body", ["1 / 0", "raise RuntimeError('a\\nb')", "return 3", "return None"]
-)
-def test_a_factory_that_fails_is_named(module, body):
-    name = module(f"def make(scenario):\n    {body}\n")
-    with pytest.raises(ControllerLookupError, match=f"{name}:make"):
-        build_controller(f"{name}:make", PAPER)
-
-
 def test_a_controller_that_fails_in_the_loop_leaves_a_report(tmp_path):
     (tmp_path / "broken.py").write_text(
         "class Broken:\n"

@@ -15,7 +15,7 @@ import pytest
 
 import fmus
 from fmus import build, crosscheck, evaporator
-from fmus.build import compilers, present
+from fmus.build import compilers
 from fmus.evaporator import EVAPORATOR
 
 HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
@@ -72,20 +72,6 @@ def test_local_build_gives_the_shipped_results(tmp_path: Path, version: int) -> 
     evaporator.build(tmp_path)
     own = tmp_path / f"{fmus.NAMES[version - 2]}.fmu"
     assert [str(d) for d in crosscheck.deviations(own)] == []
-
-
-@needs_compiler
-def test_library_exports_the_fmi_functions_only(folders: dict[int, Path]) -> None:
-    if shutil.which("nm") is None:
-        pytest.skip("there is no nm")
-    for version, folder in folders.items():
-        library = folder / "binaries" / present().folder(f"{version}.0") / "evaporator.so"
-        listing = subprocess.run(
-            ["nm", "-D", "--defined-only", str(library)], capture_output=True, text=True, check=True
-        ).stdout
-        names = [line.split()[-1] for line in listing.splitlines()]
-        assert names
-        assert all(name.startswith(f"fmi{version}") for name in names)
 
 
 @needs_compiler

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 import fmus
+from benchmarks import importers
 from fmus import check
-from tests.helpers import importers
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fmus
+from benchmarks.importers import relative_difference
 from fmus import crosscheck
-from tests.helpers.importers import relative_difference
 
 
 @pytest.mark.parametrize("name", fmus.NAMES)

@@ -73,21 +73,7 @@ class LinearQuadratic:
             }
         )
         scenario = self.scenario
-        self.problem = Problem(
-            model=model(),
-            sampling_time=scenario.sampling_time,
-            horizon=3,
-            discount=DISCOUNT,
-            state_lower=scenario.state_lower,
-            state_upper=scenario.state_upper,
-            action_lower=scenario.action_lower,
-            action_upper=scenario.action_upper,
-            penalty_linear=scenario.penalty_linear,
-            penalty_quadratic=scenario.penalty_quadratic,
-            reference_state=scenario.reference_state,
-            reference_action=scenario.reference_action,
-            reference_cost=0.0,
-        )
+        self.problem = Problem.from_scenario(scenario)
         step = discretise(model(), scenario.sampling_time, 2)
         none = np.zeros(0)
         columns = [np.array(step(e, [0.0], none, none)).ravel() for e in np.eye(2)]

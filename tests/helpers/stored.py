@@ -1,6 +1,6 @@
 """The stored set of QPs from real closed-loop runs: θ, state, action, linearisation point.
 
-`python -m tests.integration.record_qps` regenerates it.
+`python -m benchmarks.record_qps` regenerates it.
 """
 
 from __future__ import annotations

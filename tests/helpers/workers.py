@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,15 +25,6 @@ class Noting(Proportional):
 
 def noting(scenario):
     return Noting(scenario)
-
-
-class Slow(Noting):
-    def prepare(self):
-        time.sleep(1e-3)
-
-
-def slow(scenario):
-    return Slow(scenario)
 
 
 class Mortal(Noting):

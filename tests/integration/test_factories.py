@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from controllers import ConvergedNmpc, Parameters, Problem
-from controllers.errors import ParameterError
-from controllers.factories import converged, from_file, naive
+from controllers import Parameters, Problem
+from controllers.factories import from_file, naive
 from cosim import Scenario
 
 
@@ -39,21 +38,10 @@ def test_backend_and_hessian_are_the_scenarios(paper):
     assert first.feedback(s).prepared.spectrum is not None
 
 
-def test_converged_is_solved_to_convergence(paper):
-    controller = converged(paper)
-    assert isinstance(controller, ConvergedNmpc)
-    assert controller.feedback([27.0, 52.0]).residual < 1e-8
-
-
 def test_a_file_gives_the_same_controller(paper, tmp_path):
     parameters = Parameters.naive(Problem.from_scenario(paper)).replace({"x_l": [26, 40]})
     controller = from_file(paper, parameters.save(tmp_path / "theta.toml"))
     assert controller.parameters.hash == parameters.hash
-
-
-def test_a_missing_file_is_named(paper):
-    with pytest.raises(ParameterError, match=r"nowhere\.toml' does not exist"):
-        from_file(paper, "nowhere.toml")
 
 
 def test_the_scenario_says_how_many_qps_a_sample_has(paper):

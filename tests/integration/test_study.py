@@ -140,33 +140,3 @@ def test_a_run_that_was_killed_twice_ends_in_the_same_bytes(folder, undisturbed,
     assert list(tmp_path.glob(UNDER_WAY)), "a training was under way"
     finish(start(folder, tmp_path, "--jobs", "2"))
     assert contents(tmp_path) == undisturbed
-
-
-def test_a_cluster_of_two_ends_in_the_same_bytes(folder, undisturbed, tmp_path):
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as cluster:
-        finish(start(folder, tmp_path, "--scheduler", cluster.scheduler_address))
-    assert contents(tmp_path) == undisturbed
-
-
-def test_a_worker_that_is_killed_loses_only_its_piece(folder, undisturbed, tmp_path):
-    process = start(folder, tmp_path, "--jobs", "2")
-    while trained(tmp_path) < 600:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.05)
-    os.kill(worker_of(process.pid), signal.SIGKILL)
-    finish(process)
-    assert contents(tmp_path) == undisturbed
-
-
-def worker_of(parent):
-    """The process id of one of the workers, children that are not the resource tracker."""
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        fields = stat.read_text().rpartition(")")[2].split()
-        command = (stat.parent / "cmdline").read_text()
-        if int(fields[1]) == parent and "popen_loky" in command and "tracker" not in command:
-            return int(stat.parent.name)
-    raise AssertionError("no worker was found")

@@ -128,14 +128,6 @@ def test_replay_at_the_same_theta_gives_the_values_of_the_run(scenario, collecte
     assert replayed.failures == 0
 
 
-def test_transitions_that_do_not_follow_each_other_share_nothing(scenario, collected):
-    controller, samples = collected
-    whole, gaps = filled(controller, samples), filled(controller, samples[::3])
-    expected = whole.replay(average_cost(scenario))
-    found = gaps.replay(average_cost(scenario))
-    assert found.td_error == pytest.approx(expected.td_error[::3], rel=1e-9, abs=1e-6)
-
-
 def test_replay_sees_the_present_theta(scenario, collected):
     controller, samples = collected
     buffer = filled(controller, samples)

@@ -108,6 +108,7 @@ def test_the_mean_cost_is_found_beside_theta(linear_quadratic):
     assert algorithm._average_cost.mean_cost == pytest.approx(exact, rel=0.2)
 
 
+@pytest.mark.slow
 def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
     settings = {"parameter_drift": 1e-6, **ONLINE}
     controller = learn(linear_quadratic, QLearning, 20_000, 0.1, **settings)
@@ -141,6 +142,7 @@ def test_actor_critic_finds_the_riccati_gain_of_the_mean_cost(linear_quadratic):
     assert gain(controller) == pytest.approx(exact, abs=0.02)
 
 
+@pytest.mark.slow
 def test_converged_nmpc_learns_the_same_on_a_linear_plant(linear_quadratic):
     converged = ConvergedNmpc(linear_quadratic.problem, linear_quadratic.wrong())
     controller = learn(linear_quadratic, BatchQLearning, 2000, 0.0, converged, **BATCH)

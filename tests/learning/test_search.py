@@ -61,7 +61,7 @@ def test_a_search_explores_as_its_rule_does_and_takes_its_settings():
 
 
 @pytest.mark.parametrize("rule", SETTINGS)
-@pytest.mark.parametrize("at", [90, 400])
+@pytest.mark.parametrize("at", [400])
 def test_a_restored_search_goes_on_as_the_first_one(scenario, rule, at):
     """At 90 samples a phase of learning is open, at 400 a comparison."""
     with FmuPlant(scenario) as first, FmuPlant(scenario) as second:

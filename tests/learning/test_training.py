@@ -1,5 +1,4 @@
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -15,8 +14,6 @@ from learning.evaluation import HELD_OUT
 from learning.log import LogRow, late_movement, to_csv
 from learning.q_learning import QLearning
 from tests.helpers import training
-from tests.helpers.command import run_cosim, start_cosim
-from tests.helpers.processes import eventually
 from tests.helpers.training import killed_and_resumed, train
 
 SETTINGS = {
@@ -203,31 +200,6 @@ def test_scenarios_that_differ_in_open_points_train_differently(scenario):
         other = dataclasses.replace(run, scenario=scenario.replace(stated))
         theta.add(train(other).parameters.hash)
     assert len(theta) == 3
-
-
-def written(path):
-    """When a file was written, 0 where there is none."""
-    return path.stat().st_mtime_ns if path.exists() else 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SETTINGS)
-def test_kill_minus_nine_at_any_moment_then_resume_gives_the_same_files(name, tmp_path):
-    settings = [f"--set={key}={value}" for key, value in SETTINGS[name].items()]
-    counts = ["--log-every=50", "--evaluate-every=500", "--checkpoint-every=250"]
-    words = ["train", "-a", name, "-n", "4000", "--json", *settings, *counts]
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    run_cosim(*words, "--out", whole, check=True)
-    rng, path, seen = np.random.default_rng(1), killed / "checkpoint.npz", 0
-    for resume in ([], ["--resume"], ["--resume"]):
-        with start_cosim(*words, "--out", killed, *resume) as process:
-            eventually(lambda: process.poll() is not None or written(path) != seen, 120)  # noqa: B023
-            time.sleep(rng.uniform(0.0, 0.3))
-            process.kill()
-        seen = written(path)
-    run_cosim(*words, "--out", killed, "--resume", check=True)
-    for file in ("learning.csv", "parameters.toml"):
-        assert (whole / file).read_bytes() == (killed / file).read_bytes()
 
 
 def test_the_late_movement_is_that_of_the_last_fifth(problem):

@@ -1,7 +1,6 @@
 import itertools
 
 import numpy as np
-import pytest
 
 from controllers.dynamic_programming.grid import Grid
 from controllers.dynamic_programming.policy_iteration import Feature, graded_axis
@@ -64,24 +63,6 @@ def test_cubics_are_interpolated_exactly_within_the_smooth_intervals():
     np.testing.assert_allclose(
         SMOOTH.interpolate(function(SMOOTH.points), list(x.T)), function(x), rtol=1e-10, atol=1e-8
     )
-
-
-def test_interpolation_is_linear_outside_the_smooth_intervals_and_continuous():
-    values = np.random.default_rng(6).normal(size=SMOOTH.size)
-    edge = np.array([2.0, 2.5, 3.0])
-    found = SMOOTH.interpolate(values, [edge, np.full(3, SMOOTH.axes[1][2])])
-    assert found[1] == pytest.approx(0.5 * (found[0] + found[2]), rel=1e-12)
-    for place in (1.1, 2.0):
-        sides = np.array([place - 1e-9, place + 1e-9])
-        left, right = SMOOTH.interpolate(values, [sides, np.zeros(2)])
-        assert left == pytest.approx(right, abs=1e-6)
-
-
-def test_a_kink_beyond_the_smooth_interval_does_not_reach_into_it():
-    values = SMOOTH.points[:, 0].copy()
-    values[SMOOTH.points[:, 0] > 2.0] = 1e6
-    x = np.linspace(0.0, 2.0, 50)
-    np.testing.assert_allclose(SMOOTH.interpolate(values, [x, np.zeros(50)]), x, atol=1e-12)
 
 
 def test_cubic_weights_are_what_interpolation_multiplies_with_and_sum_to_one():

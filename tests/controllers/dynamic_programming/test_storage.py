@@ -55,16 +55,6 @@ def test_a_damaged_or_foreign_file_is_refused(stored):
         store.read_optimum(stored, "abc")
 
 
-def test_the_packages_own_is_preferred_to_the_users(optimum, tmp_path, monkeypatch):
-    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    kept = store.keep("abc", optimum)
-    assert store.stored_file("abc") == kept
-    (tmp_path / "shipped").mkdir()
-    monkeypatch.setattr(store, "SHIPPED", tmp_path / "shipped")
-    own = store.write_optimum(tmp_path / "shipped" / "abc.npz", optimum, "abc")
-    assert store.stored_file("abc") == own
-
-
 def changed_key(problem=PROBLEM, law=LAW, parameters=P, settings=None):
     return store.optimum_key(PlantProblem(problem, law, parameters), settings or Settings())
 
@@ -91,10 +81,3 @@ def test_key_changes_with_the_equations():
     model = PROBLEM.model
     other = replace(model, economic_cost=lambda x, u, d, p: model.economic_cost(x, u, d, p) + u[0])
     assert changed_key(problem=replace(PROBLEM, model=other)) != changed_key()
-
-
-def test_key_forgets_what_only_the_nmpc_reads():
-    other = replace(PROBLEM, horizon=20, substeps=7, discount=0.5, reference_cost=1.0)
-    assert changed_key(problem=other) == changed_key()
-    discounted = Settings(criterion="discounted")
-    assert changed_key(problem=other, settings=discounted) != changed_key(settings=discounted)

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from fmpy import fmi2
 
+from benchmarks import importers
 from controllers.factories import naive, tuned
 from cosim import FmuPlant, Scenario, simulate
-from tests.helpers import importers
 from tests.helpers.command import run_cosim
 
 pytestmark = pytest.mark.skipif(
@@ -78,22 +78,6 @@ def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
         expected = simulate(plant, tuned(scenario), SAMPLES, 5)
     for column, name in enumerate(("X2", "P2", "P100", "F200"), start=1):
         np.testing.assert_allclose(rows[:, column], expected[name], rtol=0, atol=ACTION)
-
-
-def test_fmpys_own_master_runs_the_loop_with_an_error_of_first_order_in_its_step(exported):
-    """The error is largest at time zero, which the first step, on zeros, leads to."""
-    scenario = Scenario.load("paper")
-    with FmuPlant(scenario) as plant:
-        expected = simulate(plant, tuned(scenario), 20, 5)
-    errors = []
-    for parts in ("64", "128"):
-        result = subprocess.run(
-            [sys.executable, EXAMPLES / "fmpy_simulate_ssp.py", exported[1], "20", parts],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        errors.append(np.abs(_rows(result.stdout)[:20, 1] - expected["X2"]).max())
-    assert errors[0] < 0.1
-    assert errors[1] < 0.6 * errors[0]
 
 
 def _rows(printed):

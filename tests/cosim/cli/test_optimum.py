@@ -1,14 +1,10 @@
 """`cosim optimum`: J*, bounds, files and errors."""
 
 import json
-from dataclasses import replace
 
 import pytest
 
 from controllers import optimum as store
-from controllers.dynamic_programming.bellman import PlantProblem
-from controllers.dynamic_programming.policy_iteration import Certificate, Figure, Settings
-from cosim import Scenario
 
 
 def test_stored_optimum_as_json(cosim):
@@ -28,36 +24,6 @@ def test_stored_optimum_as_json(cosim):
 @pytest.fixture(autouse=True)
 def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-
-
-def test_without_a_certificate_it_is_a_reference(cosim, tmp_path, monkeypatch):
-    plant = PlantProblem.from_scenario(Scenario.load("paper"))
-    key = store.optimum_key(plant, Settings())
-    known = store.read_optimum(store.SHIPPED / f"{key}.npz", key)
-    monkeypatch.setattr(store, "SHIPPED", tmp_path / "none")
-    store.keep(key, replace(known, certificate=None))
-    code, out, err = cosim("optimum", "--scenario", "paper")
-    assert code == 0
-    assert "reference of paper" in out
-    assert "not called J*: no certificate; make one with --refine" in out + err
-    figures = known.certificate.figures
-    apart = (Figure("solution", 6300.0, 6300.0, 6300.0), *figures[1:])
-    apart = replace(known, certificate=Certificate(apart))
-    store.keep(key, apart)
-    code, out, _ = cosim("optimum", "--scenario", "paper", "--json")
-    document = json.loads(out)
-    assert document["kind"] == "reference"
-    assert "apart, more than 0.05 %" in document["objection"]
-
-
-def test_a_drifting_plant_has_the_quasi_static_reference(cosim):
-    code, out, _ = cosim("optimum", "--scenario", "drifting", "--json")
-    document = json.loads(out)
-    assert code == 0
-    assert document["kind"] == "reference"
-    gains = [row["J"] for row in document["table"]]
-    assert gains == sorted(gains, reverse=True)
-    assert gains[-1] < document["J"] < gains[0]
 
 
 def test_damaged_cache_is_named_with_the_cure(cosim, tmp_path, monkeypatch):

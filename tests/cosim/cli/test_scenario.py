@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario
-from cosim.plant.archive import unpack
-from cosim.plant.draft import guess_roles
 from tests.helpers.tank import build_tank, edited
 
 
@@ -90,17 +88,6 @@ def test_what_cannot_be_guessed_is_asked_for(cosim, tank, tmp_path):
         assert "Traceback" not in err
 
 
-def test_wrong_names_and_numbers_are_named(cosim, tank):
-    for words, said in (
-        (("--states", "y"), "has no variable 'y'"),
-        (("--state", "1,2"), "--state takes 1 numbers"),
-        (("--action", "much"), "--action takes numbers"),
-    ):
-        code, _, err = cosim("scenario", "init", tank, "--sampling-time", 0.5, *words)
-        assert code == 2
-        assert said in err
-
-
 def test_a_plant_that_starts_where_it_likes_is_left_to_settle(cosim, tank, tmp_path):
     other = edited(tank, tmp_path / "o.fmu", lambda text: text.replace('"x_start"', '"level0"'))
     words = ("--states", "x", "--sampling-time", 0.5, "--action", 2)
@@ -114,20 +101,3 @@ def test_a_plant_that_starts_where_it_likes_is_left_to_settle(cosim, tank, tmp_p
         for _ in range(400):
             s = plant.step([2.0]).s
     assert drafted["controller"]["reference_state"] == pytest.approx(s, rel=1e-6)
-
-
-def test_a_plant_without_noise_is_said_to_have_none(cosim, tank, tmp_path):
-    code, _, err = cosim("scenario", "init", tank, "--sampling-time", 0.5, "--out", "quiet.toml")
-    assert code == 0
-    assert "no noise was found" in err
-    assert "# disturbance: CHECK: no noise was found" in (tmp_path / "quiet.toml").read_text()
-
-
-def test_a_sampling_time_called_ts_is_found(cosim, tank, tmp_path):
-    parameter = '<ScalarVariable name="Ts" valueReference="77" causality="parameter" variability='
-    parameter += '"fixed"><Real start="0.5"/></ScalarVariable></ModelVariables>'
-    other = edited(
-        tank, tmp_path / "o.fmu", lambda text: text.replace("</ModelVariables>", parameter)
-    )
-    roles = guess_roles(unpack(other))
-    assert roles.mapping["sampling_time"] == "Ts"

@@ -43,14 +43,6 @@ def test_a_recording_is_drawn_without_a_screen(recording, tmp_path):
 
 
 @slow
-def test_names_that_the_viewers_font_lacks_do_not_stop_it(tmp_path, foreign, rng):
-    path = tmp_path / "run.rrd"
-    units = {"tank[1].level": "∇水"}
-    recorded(path, foreign, [random_block(foreign, rng, status="∇ failed")], units, 10)
-    drawn(path, tmp_path / "a.png")
-
-
-@slow
 def test_the_viewer_listens_on_loopback_only_and_ends(recording, tmp_path):
     seen = set()
     stop = threading.Event()
@@ -135,26 +127,3 @@ def test_the_window_binds_loopback(recording, monkeypatch):
     command = commands[0]
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert command[-1] == str(recording)
-
-
-@pytest.mark.parametrize("call", ["connect", "take_screenshot"])
-def test_a_viewer_that_does_not_answer_is_one_error(recording, tmp_path, monkeypatch, call):
-    def late(*_):
-        raise TimeoutError("Deadline expired before operation could complete")
-
-    client = SimpleNamespace(
-        open=lambda _: None,
-        get_state=lambda: SimpleNamespace(loading=False, recordings=[], views=[]),
-        set_time=lambda *_, **__: None,
-        take_screenshot=lambda: b"",
-    )
-    connect = late if call == "connect" else lambda _: client
-    setattr(client, call, late)
-    monkeypatch.setattr(viewer, "ViewerClient", SimpleNamespace(connect=connect))
-    monkeypatch.setattr(viewer, "child_process", no_process)
-    wait = viewer._wait
-    skipped = ("starting the viewer",)
-    monkeypatch.setattr(viewer, "_wait", lambda d, t, what: what in skipped or wait(d, t, what))
-    with pytest.raises(RecordingError, match="did not answer"):
-        render(recording, tmp_path / "a.png", at=1.0)
-    assert list(tmp_path.glob("*.png")) == []

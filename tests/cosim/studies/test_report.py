@@ -13,7 +13,6 @@ from cosim.text_tables import markdown_table
 from tests.helpers.toy_study import GROW, run_toy
 
 ROOT = Path(__file__).parents[3]
-LOST = {"rate": -10.0}
 CASES = [
     {"name": "grow", "algorithm": GROW, "samples": 2000, "settings": {"rate": [1.0, 9.0]}},
     {

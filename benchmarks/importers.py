@@ -1,4 +1,4 @@
-"""Independent FMI importers run an FMU: python -m tests.helpers.importers TOOL SUBJECT FILE.
+"""Independent FMI importers run an FMU: python -m benchmarks.importers TOOL SUBJECT FILE.
 
 Native importers write to the console and may crash: each check is a process of its own, whose
 last line is its finding as JSON.
@@ -314,7 +314,7 @@ def check(fmu: Path) -> list[Finding]:
 
 def _in_own_process(tool: str, subject: str, fmu: Path) -> Finding:
     blame = FAILED if tool in JUDGES else CANNOT
-    command = [sys.executable, "-m", "tests.helpers.importers", tool, subject, str(fmu.resolve())]
+    command = [sys.executable, "-m", "benchmarks.importers", tool, subject, str(fmu.resolve())]
     try:
         result = subprocess.run(
             command, capture_output=True, text=True, timeout=TIMEOUT, check=False

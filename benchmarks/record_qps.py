@@ -1,6 +1,6 @@
 """Regenerate tests/controllers/data/qps.npz: QPs from closed-loop runs of scenario `paper`.
 
-Run `python -m tests.integration.record_qps`. Naive, tuned-like, greedy and learned-like
+Run `python -m benchmarks.record_qps`. Naive, tuned-like, greedy and learned-like
 θ, explored and with either Hessian, start on the constraint, far above it and far below it; every
 third sample is kept, as V and as Q in turns.
 """

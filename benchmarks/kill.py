@@ -1,6 +1,6 @@
 """Signals at random moments of every long command: nothing is lost, nothing survives.
 
-    python -m tests.faults.kill --trials 70 [--seed 0] [--only training]
+    python -m benchmarks.kill --trials 70 [--seed 0] [--only training]
 
 Every trial: start the command in a folder of its own, and after a random share of the time that it
 takes kill its whole group, kill its first process alone, or send that SIGTERM or Ctrl-C, in turn.
@@ -33,7 +33,7 @@ from cosim.recording import read_recording
 from tests.helpers.command import run_cosim, start_cosim
 from tests.helpers.processes import alive, eventually
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 MARK = "COSIM_KILL"
 STUDY = """\
 schema = 1

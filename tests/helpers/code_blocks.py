@@ -20,6 +20,7 @@ TITLE = re.compile(r'title="([^"]+)"')
 # Not typed by a test of its page, because another check does it or a person has to be there.
 COVERED = {
     "make demo": "the Makefile's target; `make check` runs its command on a small budget",
+    "cosim demo --out demo": "minutes; `make check` runs it on a small budget",
     "make test": "the target is run by .ci/run",
     "python3 -m venv .venv": "tests/packaging installs into an empty environment",
     ". .venv/bin/activate": "tests/packaging installs into an empty environment",

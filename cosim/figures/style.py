@@ -73,11 +73,20 @@ _STYLE: Any = {
 }
 
 
+class Picture(Figure):
+    """A figure that a notebook shows without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        content = io.BytesIO()
+        self.savefig(content, format="png", dpi=100)
+        return content.getvalue()
+
+
 @contextmanager
 def figure(height: float, width: float = WIDTH) -> Iterator[Figure]:
     """A figure of the house style, in inches, without touching the user's own settings."""
     with _styled():
-        yield Figure(figsize=(width, height), layout="constrained")
+        yield Picture(figsize=(width, height), layout="constrained")
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from controllers.rti import LinearisationPoint
 from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, LearnableSolution, Transition, Update
 from learning.checkpoint import group, prefixed
-from learning.configuration import Configuration, Count, ExplorationProbability
+from learning.configuration import Configuration, Count, ExplorationProbability, ExplorationShare
 from learning.errors import DivergenceError
 from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel, PredictionErrors
@@ -43,15 +43,16 @@ class BatchQLearningConfiguration(Configuration):
     """Hyperparameters of batch Q-learning."""
 
     exploration_probability: ExplorationProbability = 0.3
+    exploration_share: ExplorationShare = 1 / 30
     discount: Discount = None
-    prior_width: PriorWidth = 0.1
-    batch_size: Count = Field(100, description="samples between two updates")
+    prior_width: PriorWidth = 0.3
+    batch_size: Count = Field(500, description="samples between two updates")
     first_batch: Count | None = Field(
-        500,
+        None,
         description="samples of the first batch, which gives noise and widths; as the others if "
         "not given",
     )
-    measure_offset: MeasureOffset = False
+    measure_offset: MeasureOffset = True
     relinearisations: Count = Field(2, description="replays and steps of θ per batch")
     innovation_clip: InnovationClip = 3.0
     variance_memory: VarianceMemory = 2000.0

@@ -17,6 +17,7 @@ from learning.configuration import (
     Configuration,
     Count,
     ExplorationProbability,
+    ExplorationShare,
     NonNegative,
     Positive,
 )
@@ -78,16 +79,17 @@ class QLearningConfiguration(Configuration):
     """Hyperparameters of online Q-learning; `AS_PRINTED` has those of the paper's rule."""
 
     exploration_probability: ExplorationProbability = 0.3
+    exploration_share: ExplorationShare = 1 / 30
     rule: Literal["kalman", "td", "fit"] = Field(
         "kalman",
         description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
     )
     discount: Discount = None
-    prior_width: PriorWidth = 0.1
+    prior_width: PriorWidth = 0.3
     prior_samples: Count = Field(
         500, description="first samples, at which θ rests: they give noise and widths"
     )
-    measure_offset: MeasureOffset = False
+    measure_offset: MeasureOffset = True
     step_every: Count = Field(50, description="samples per step of θ")
     innovation_clip: InnovationClip = 3.0
     variance_memory: VarianceMemory = 2000.0

@@ -41,16 +41,6 @@ RULES: dict[str, Any] = {
     "batch-q-learning": BatchQLearning,
     "actor-critic": ActorCritic,
 }
-BOLD = {"exploration_share": 1 / 30, "prior_width": 0.3, "measure_offset": True}
-IN_SEARCH: dict[str, dict[str, Any]] = {
-    "q-learning": BOLD,
-    "batch-q-learning": {**BOLD, "batch_size": 500, "first_batch": None},
-    "actor-critic": {},
-}
-"""The rules' defaults in a search, bolder than alone: a comparison stops what goes wrong.
-
-Their TD error has the scenario's discount there.
-"""
 CANDIDATES = 3
 """θ of a phase of learning that are compared, at equal distances in samples."""
 SENSITIVITIES = 100
@@ -84,7 +74,7 @@ class SearchConfiguration(Configuration):
         """Settings of a rule in the search: those that they share, and the rule's own."""
         shared = {field: getattr(self, field) for field in Configuration.model_fields}
         own = self.rule_settings if name == self.rule else {}
-        return RULES[name].Configuration.from_dict(IN_SEARCH[name] | shared | own)
+        return RULES[name].Configuration.from_dict(shared | own)
 
     def without_part(self) -> Mapping[str, str]:
         """The settings that only a search with a rule has."""
@@ -105,7 +95,7 @@ class SearchConfiguration(Configuration):
         for name in ("exploration_probability", "exploration_share"):
             if name not in self.model_fields_set:
                 # Not by `setattr`: it is still a default, which a scenario may replace.
-                self.__dict__[name] = IN_SEARCH[rule].get(name, fields[name].default)
+                self.__dict__[name] = fields[name].default
         if self.rule != "none":
             try:
                 self.rule_configuration(self.rule)
@@ -264,6 +254,7 @@ class Search:
         name = "q-learning" if first else settings.rule
         self._rules_made += 1
         chosen = settings.rule_configuration(name).narrowed(width)
+        # Comparisons decide on the mean cost; the rule inside has the scenario's discount.
         if getattr(chosen, "discount", 1.0) is None:
             chosen = chosen.model_copy(update={"discount": self._scenario.discount})
         made: Rule = RULES[name](

@@ -181,7 +181,7 @@ def starting_parameters(
 
 def _value_offset(problem: Problem, configuration: Configuration) -> float | None:
     """c_lambda at the start, None for ℓ_s; the level of V is that of the TD error's discount."""
-    chosen: float | None = getattr(configuration, "criterion", None)
+    chosen: float | None = getattr(configuration, "discount", None)
     return problem.value_level(chosen) if configuration.value_offset == "discounted" else None
 
 

@@ -157,7 +157,11 @@ def numeric_options():
             for bad in BAD.get(parameter.type_descriptor.annotation, ()):
                 if parameter.param_type_name != "option":
                     continue
-                is_seed = bad.isdigit() and parameter.opts[0] in ("--seed", "--first-seed")
+                is_seed = bad.isdigit() and parameter.opts[0] in (
+                    "--seed",
+                    "--first-seed",
+                    "--seed-values",
+                )
                 # These two are numbers to a parser; what they mean is tested with a file.
                 odd = bad in ("nan", "inf") and parameter.opts[0] in ("--relative", "--at")
                 if is_seed or odd or (bad == "-1" and parameter.min is None):

@@ -131,7 +131,7 @@ def test_in_operation_it_goes_on_and_backs_off_by_its_own_errors(name, scenario)
                 bounds.append([loop.parameters["x_l"][0], loop.parameters["x_u"][1]])
     lower, upper = np.array(bounds).T
     assert moved[-1] >= 950 and len(moved) >= 2
-    assert (lower > 25.5).sum() > len(lower) / 2 and (upper < 79.9).any()
+    assert (lower > 25.5).sum() > len(lower) / 2 and (upper < 80.0).any()
     assert (lower >= 25.0).all() and (upper <= 80.0).all()
 
 

@@ -110,10 +110,11 @@ def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dic
             if k + 1 not in marks:
                 continue
             clock[k + 1] = process_time() - start
+            since = violating[first : k + 1]
             figures = {
                 "samples": k + 1,
                 "J": float(cost[: k + 1].mean()),
-                "violating": float(violating[first : k + 1].mean()),
+                "violating": float(since.mean()) if len(since) else np.nan,
                 "dearest": dearest(cost[first : k + 1]),
                 "first_change": first or np.nan,
                 "updates": updates,

@@ -6,7 +6,7 @@ import nbformat
 import pytest
 
 NOTEBOOKS = Path(__file__).parents[2] / "examples" / "notebooks"
-SMALLER = {"4000": "500", "2000": "500", "=1000": "=500", "steps=300": "steps=20"}
+SMALLER = {"4000": "1000", "2000": "1000", "steps=300": "steps=20"}
 NAMES = ("evaluate", "study", "train")
 
 

@@ -66,9 +66,10 @@ def test_a_signal_loses_nothing_and_leaves_nothing(job):
 
 @pytest.mark.slow
 def test_a_short_endurance_run_fails_nowhere_and_does_not_grow():
-    script = Path(__file__).parents[2] / "benchmarks" / "endurance.py"
-    words = [sys.executable, str(script), "--samples", "5000"]
-    seen = json.loads(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
+    words = [sys.executable, "-m", "benchmarks.endurance", "--samples", "5000"]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=True)
+    seen = json.loads(done.stdout)
     assert seen["status"] == "finished"
     assert seen["failures"] == 0
     assert len(seen["J"]) == 10

@@ -236,7 +236,7 @@ def jacobian(fmu: Path) -> str:
     casadi.GlobalOptions.setNumpyMode(-1)
     if fmpy.read_model_description(str(fmu)).modelExchange is None:
         raise NotOfferedError("the FMU has no model-exchange interface")
-    flags = information(fmu).flags["model exchange"]
+    flags = information(fmu)["flags"]["model exchange"]
     if "true" not in {v for k, v in flags.items() if k.startswith("providesDirectional")}:
         raise NotOfferedError("the FMU provides no directional derivatives")
     folder = fmpy.extract(str(fmu))

@@ -6,7 +6,6 @@ import hashlib
 import importlib.util
 import os
 import platform as host
-import re
 import shutil
 import struct
 import subprocess
@@ -16,7 +15,6 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,7 +22,7 @@ import fmpy
 
 from cosim.files import replacing, temporary_folder
 from fmus import BuildError
-from fmus.description import build_description, c_header, model_description
+from fmus.description import build_description, c_header, model_description, render
 from fmus.model import C_IDENTIFIER, FmiVersion, Model, Variable
 
 PACKAGE = Path(__file__).parent
@@ -104,7 +102,6 @@ def platforms_of(library: bytes) -> tuple[str, ...]:
     return ()
 
 
-_MAGIC = 0xCAFEBABE
 _ALIGNMENT = 14  # binary digits: pages of 16 KiB on Apple silicon
 
 
@@ -114,7 +111,7 @@ def universal_binary(libraries: Sequence[bytes]) -> bytes:
     The layout is that of ``fat_header`` and ``fat_arch`` in macOS' mach-o/fat.h.
     """
     page = 1 << _ALIGNMENT
-    table = struct.pack(">II", _MAGIC, len(libraries))
+    table = struct.pack(">II", _UNIVERSAL, len(libraries))
     body = b""
     for library in libraries:
         architecture = struct.unpack_from("<II", library, 4)  # cputype, cpusubtype
@@ -233,47 +230,6 @@ def cross_compiler(platform: Platform) -> Compiler:
     return Compiler(platform, command, _CROSS_FLAGS[platform.suffix])
 
 
-PROCESSORS = {
-    "Cortex-M7, double FPU": ("-target", "thumb-linux-musleabihf", "-mcpu=cortex_m7+fp_armv8d16"),
-    "Cortex-M4, no double FPU": ("-target", "thumb-linux-musleabihf", "-mcpu=cortex_m4"),
-    "RISC-V RV32GC": ("-target", "riscv32-linux-musl"),
-}
-"""Zig's flags for micro-controllers."""
-_FRAME = re.compile(r"stack frame size \((\d+)\)")
-_ALLOCATED, _NO_BITS, _WRITABLE = 2, 8, 1
-
-
-def footprint(sources: Mapping[str, bytes], target: Sequence[str]) -> dict[str, int]:
-    """Bytes that C takes on a processor of `PROCESSORS`, by clang -Os: flash, static, stack.
-
-    `flash` is code and constants without libm and what is called for arithmetic, `static` memory
-    of its own, `stack` the sum of all frames, a bound without recursion. Raises BuildError.
-    """
-    with temporary_folder("cosim-") as folder:
-        for name, data in sources.items():
-            (folder / name).write_bytes(data)
-        units = [name for name in sources if name.endswith(".c")]
-        command = [
-            sys.executable, "-m", "ziglang", "cc", *target, "-std=c99", "-Os", "-ffp-contract=off",
-            "-Wframe-larger-than=0", "-c", *units, "-o", "object.o",
-        ]  # fmt: skip
-        result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if result.returncode != 0:
-            raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
-        elf = (folder / "object.o").read_bytes()
-    sizes = {"flash": 0, "static": 0}
-    (start,) = struct.unpack_from("<I", elf, 0x20)
-    size, count = struct.unpack_from("<HH", elf, 0x2E)
-    for k in range(count):
-        kind, flags, _, _, length = struct.unpack_from("<5I", elf, start + k * size + 4)
-        if flags & _ALLOCATED:
-            sizes["static" if kind == _NO_BITS or flags & _WRITABLE else "flash"] += length
-    return sizes | {"stack": sum(map(int, _FRAME.findall(result.stderr)))}
-
-
-_QUIET = ("-w",)
-
-
 def compilers(every_platform: bool) -> list[Compiler]:
     """The local compiler alone, or the cross-compiler for each of `PLATFORMS`.
 
@@ -289,16 +245,17 @@ def build_fmu(
     *,
     every_platform: bool = False,
     files: Mapping[str, bytes] | None = None,
+    warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
     """Compile C sources and write them with their model description as the FMU `target`.
 
     `sources` are the files of the folder ``sources/`` by name; every ``*.c`` is compiled, as C99,
     against fmpy's FMI headers. `description` is the text of modelDescription.xml, FMI 2.0 or 3.0;
     its interfaces must name one modelIdentifier. The binary is for the platform at hand, made by
-    the local compiler, or, with `every_platform`, one for each of `fmus.platforms.PLATFORMS`, made
-    by the extra ``cross``. `files` are further members by their path in the archive. With the same
-    compiler the bytes repeat. Raises BuildError where there is no compiler, it complains, or the
-    description names no model.
+    the local compiler, or, with `every_platform`, one for each of `PLATFORMS`, made by the extra
+    ``cross``. `files` are further members by their path in the archive, `warnings` what the
+    compiler warns of, by its options. With the same compiler the bytes repeat. Raises BuildError
+    where there is no compiler, it complains, or the description names no model.
     """
     path = Path(target)
     text = description.encode() if isinstance(description, str) else description
@@ -306,11 +263,12 @@ def build_fmu(
     if not any(name.endswith(".c") for name in sources):
         raise BuildError(f"{path}: there is no C source (*.c) to build it from")
     members = {
+        **(files or {}),
         "modelDescription.xml": text,
-        **binaries(sources, identifier, version, compilers(every_platform), _QUIET),
+        **_binaries(sources, identifier, version, compilers(every_platform), warnings),
         **{f"sources/{name}": data for name, data in sources.items()},
     }
-    return write_archive({**(files or {}), **members}, path)
+    return write_archive(members, path)
 
 
 def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
@@ -318,19 +276,16 @@ def build_folder(folder: str | Path, target: str | Path, every_platform: bool = 
 
     As `build_fmu`; raises BuildError also where a file is missing.
     """
-    folder = Path(folder)
-    description = folder / "modelDescription.xml"
+    description = Path(folder) / "modelDescription.xml"
     try:
         text = description.read_bytes()
     except OSError as error:
         raise BuildError(f"{description}: {error.strerror}") from None
-    sources = {path.name: path.read_bytes() for path in sorted(folder.glob("*.[ch]"))}
-    if not any(name.endswith(".c") for name in sources):
-        raise BuildError(f"{folder}: there is no C source (*.c)")
+    sources = {path.name: path.read_bytes() for path in Path(folder).glob("*.[ch]")}
     return build_fmu(target, sources, text, every_platform=every_platform)
 
 
-def binaries(
+def _binaries(
     sources: Mapping[str, bytes],
     identifier: str,
     version: str,
@@ -345,7 +300,7 @@ def binaries(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         built = pool.map(lambda each: each.library(sources, identifier, warnings), compilers)
         libraries = dict(zip((each.platform for each in compilers), built, strict=True))
-    macos = [library for p, library in libraries.items() if p.suffix == ".dylib"]
+    macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]
     found = {}
     for platform, library in libraries.items():
         folder = platform.folder(version)
@@ -379,10 +334,15 @@ def _model(description: bytes) -> tuple[str, str]:
     return version, identifier
 
 
-PLANT_SOURCES = PACKAGE / "plant_sources"
 # Of the evaporator's sources what serves any model: FMI's faces, and what they are made of.
-FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
-WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
+_FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
+_WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
+_GENERATED = ("variables.h", "buildDescription.xml")
+
+
+def files_of(folder: str) -> dict[str, bytes]:
+    """File name → bytes of the C headers in a folder of this package."""
+    return {path.name: path.read_bytes() for path in (PACKAGE / folder).glob("*.h")}
 
 
 def sources_of(
@@ -395,8 +355,8 @@ def sources_of(
 
     `own` is the model's own C; `rows` is its table as the C shall check it, where that differs.
     """
-    paths = [SOURCES / name for name in (*FACES, f"fmi{version}.c")]
-    paths += [PLANT_SOURCES / name for name in WITHOUT_DERIVATIVES]
+    paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
+    paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
     files = {path.name: path.read_bytes() for path in paths} | dict(own)
     variables = model.variables if rows is None else rows
     token = _token(model, version, files)
@@ -418,13 +378,13 @@ def assemble(
 ) -> Path:
     """Build the FMU `target` of what `sources_of` found, with a page that shows its table.
 
-    `remarks` are sentences on that page, `files` further members of the archive. As
-    `fmus.own.build_fmu`, whose BuildError it raises; with the same compiler the bytes repeat.
+    `remarks` are sentences on that page, `files` further members of the archive. As `build_fmu`,
+    whose BuildError it raises; with the same compiler the bytes repeat.
     """
-    generated = ("variables.h", "buildDescription.xml")
-    written = {name: data for name, data in sources.items() if name not in generated}
+    written = {name: data for name, data in sources.items() if name not in _GENERATED}
+    page = render("model.html", model=model, version=version, remarks=remarks)
     members = {
-        "documentation/index.html": _page(model, version, remarks).encode(),
+        "documentation/index.html": page.encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
         **(files or {}),
     }
@@ -433,30 +393,12 @@ def assemble(
 
 
 def _token(model: Model, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
-    """GUID or instantiation token: a digest of all that makes the model."""
-    digest = hashlib.sha256(model_description(version, "", model).encode())
+    return token_of([model_description(version, "", model)], sources)
+
+
+def token_of(texts: Sequence[str], sources: Mapping[str, bytes]) -> str:
+    """GUID or instantiation token: a digest of all that makes a model."""
+    digest = hashlib.sha256("".join(texts).encode())
     for name in sorted(sources):
         digest.update(name.encode() + b"\0" + sources[name])
     return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
-
-
-def _page(model: Model, version: FmiVersion, remarks: str) -> str:
-    rows = "\n".join(
-        f"<tr><td>{escape(v.name)}</td><td>{v.kind}</td><td>{escape(v.unit)}</td>"
-        f"<td>{escape(v.description)}</td></tr>"
-        for v in model.exported(version)
-    )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head><meta charset="utf-8"><title>{escape(model.name)}</title></head>
-<body>
-<h1>{escape(model.name)}</h1>
-<p>{escape(model.description)}</p>
-<p>{escape(remarks)} The model can be restored, serialised and instantiated many times.</p>
-<table>
-<tr><th>variable</th><th>kind</th><th>unit</th><th>meaning</th></tr>
-{rows}
-</table>
-</body>
-</html>
-"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -24,47 +25,10 @@ _INTERFACES = {
     "ModelExchange": "model exchange",
     "ScheduledExecution": "scheduled execution",
 }
-_LIBRARIES = (".so", ".dll", ".dylib")
-VARIABLE = (
+_VARIABLE = (
     "name", "valueReference", "type", "causality", "variability", "unit", "start", "min", "max",
     "description",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Information:
-    """An FMU file: its path, SHA-256 and fmpy's `description` of the model.
-
-    `flags` are the capability flags that each interface states, by its name in words; `platforms`
-    are the folders under ``binaries/`` with what their libraries are made for by their own first
-    bytes, and ``c-code`` for sources.
-    """
-
-    path: str
-    sha256: str
-    description: ModelDescription
-    flags: dict[str, dict[str, str]]
-    platforms: dict[str, tuple[str, ...]]
-
-    def to_dict(self) -> dict[str, Any]:
-        """All of it as plain data; of each variable the attributes in `VARIABLE`."""
-        about, experiment = self.description, self.description.defaultExperiment
-        times = [getattr(experiment, n, None) for n in ("startTime", "stopTime", "stepSize")]
-        start, stop, step = (None if t is None else float(t) for t in times)
-        return {
-            "path": self.path,
-            "sha256": self.sha256,
-            "fmi_version": about.fmiVersion,
-            "name": about.modelName,
-            "description": about.description or "",
-            "interfaces": list(self.flags),
-            "platforms": self.platforms,
-            "flags": self.flags,
-            "start_time": start,
-            "stop_time": stop,
-            "step_size": step,
-            "variables": [{n: getattr(v, n) for n in VARIABLE} for v in about.modelVariables],
-        }
 
 
 def description_of(fmu: Path) -> ModelDescription:
@@ -77,38 +41,43 @@ def description_of(fmu: Path) -> ModelDescription:
         raise FmuError(f"{fmu} is not an FMU: {error}") from error
 
 
-def information(fmu: Path, description: ModelDescription | None = None) -> Information:
-    """Read the FMU file `fmu`; raises FmuError when it is missing or is no FMU.
+def information(fmu: Path, description: ModelDescription | None = None) -> dict[str, Any]:
+    """What the FMU file `fmu` says of itself; raises FmuError when it is missing or is no FMU.
 
-    `description` is that of the file where it has been read already: a large one takes seconds.
+    ``flags`` are the capability flags that each interface states, by its name in words;
+    ``platforms`` are the folders under ``binaries/`` with what their libraries are made for by
+    their own first bytes, and ``c-code`` for sources. `description` is that of the file where it
+    has been read already: a large one takes seconds.
     """
-    description = description or description_of(fmu)
+    about = description or description_of(fmu)
     with zipfile.ZipFile(fmu) as container:
         names = {entry.filename.replace("\\", "/"): entry for entry in container.infolist()}
-        text = container.read(names["modelDescription.xml"])
+        root = etree.fromstring(container.read(names["modelDescription.xml"]))
         platforms = {
             name.split("/")[1]: platforms_of(container.read(entry)) or ("not a library",)
             for name, entry in sorted(names.items())
-            if name.startswith("binaries/") and name.count("/") == 2 and name.endswith(_LIBRARIES)
+            if re.fullmatch(r"binaries/[^/]+/[^/]+\.(so|dll|dylib)", name)
         }
     if any(name.startswith("sources/") and name.endswith(".c") for name in names):
         platforms["c-code"] = ()
-    return Information(
-        path=str(fmu),
-        sha256=hashlib.sha256(fmu.read_bytes()).hexdigest(),
-        description=description,
-        flags=_flags(text),
-        platforms=platforms,
-    )
-
-
-def _flags(text: bytes) -> dict[str, dict[str, str]]:
-    root = etree.fromstring(text)
-    found = {name: root.find(tag) for tag, name in _INTERFACES.items()}
+    flags = {
+        words: {key: value for key, value in face.attrib.items() if key != "modelIdentifier"}
+        for tag, words in _INTERFACES.items()
+        if (face := root.find(tag)) is not None
+    }
+    times = {"start_time": "startTime", "stop_time": "stopTime", "step_size": "stepSize"}
+    stated = {key: getattr(about.defaultExperiment, name, None) for key, name in times.items()}
     return {
-        name: {key: value for key, value in element.attrib.items() if key != "modelIdentifier"}
-        for name, element in found.items()
-        if element is not None
+        "path": str(fmu),
+        "sha256": hashlib.sha256(fmu.read_bytes()).hexdigest(),
+        "fmi_version": about.fmiVersion,
+        "name": about.modelName,
+        "description": about.description or "",
+        "interfaces": list(flags),
+        "platforms": platforms,
+        "flags": flags,
+        **{key: None if value is None else float(value) for key, value in stated.items()},
+        "variables": [{n: getattr(v, n) for n in _VARIABLE} for v in about.modelVariables],
     }
 
 
@@ -163,7 +132,7 @@ def validate(fmu: Path) -> str:
 
 def declared_variables(fmu: Path) -> str:
     """Every variable that the description declares can be read once the FMU is initialised."""
-    description = fmpy.read_model_description(str(fmu), validate=False)
+    description = description_of(fmu)
     if description.coSimulation is None and description.modelExchange is None:
         raise NotOfferedError("the FMU has neither co-simulation nor model exchange")
     folder = fmpy.extract(str(fmu))
@@ -201,8 +170,7 @@ def _read(instance: Any, variable: ModelVariable, version2: bool) -> None:
 
 def co_simulation(fmu: Path) -> str:
     """The default experiment runs by `simulate_fmu`, every output is finite."""
-    description = fmpy.read_model_description(str(fmu), validate=False)
-    if description.coSimulation is None:
+    if description_of(fmu).coSimulation is None:
         raise NotOfferedError("the FMU has no co-simulation interface")
     result = fmpy.simulate_fmu(str(fmu), fmi_type="CoSimulation")
     names = result.dtype.names[1:]

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import re
-import uuid
-from html import escape
 from pathlib import Path
-from string import Template
 
 from cosim.files import temporary_folder
 from fmus import BuildError, plants
@@ -19,13 +15,18 @@ from fmus.build import (
     RESOURCES,
     SOURCES,
     WARNINGS,
-    Compiler,
-    binaries,
+    build_fmu,
     compilers,
     read_archive,
-    write_archive,
+    token_of,
 )
-from fmus.description import LICENSE, build_description, c_header, model_description
+from fmus.description import (
+    LICENSE,
+    build_description,
+    c_header,
+    model_description,
+    render,
+)
 from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable
 
 _EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
@@ -83,40 +84,12 @@ EVAPORATOR = Model(
 BY_NAME = EVAPORATOR.by_name
 
 
-def documentation_page(version: FmiVersion, build_file: str) -> str:
-    """The text of documentation/index.html; `build_file` names the record of the build."""
-    template = Template((RESOURCES / "documentation.html").read_text(encoding="utf-8"))
-    return template.substitute(
-        description=escape(EVAPORATOR.description),
-        fmi_version=f"{version}.0",
-        model_version=EVAPORATOR.version,
-        license=LICENSE,
-        diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
-        rows="\n".join(_row(variable) for variable in EVAPORATOR.exported(version)),
-        source=f"fmi{version}.c",
-        build_file=build_file,
-    )
-
-
-def _row(variable: Variable) -> str:
-    numbers = "".join(
-        f'<td class="n">{"" if value is None else f"{value:.10g}"}</td>'
-        for value in (variable.start, variable.min, variable.max)
-    )
-    reference = EVAPORATOR.value_reference(variable.name)
-    return (
-        f'<tr><td>{variable.name}</td><td class="n">{reference}</td>'
-        f"<td>{variable.kind}</td><td>{escape(variable.unit)}</td>{numbers}"
-        f"<td>{escape(variable.description)}</td></tr>"
-    )
-
-
 FILE_NAMES: dict[FmiVersion, str] = {2: "evaporator.fmu", 3: "evaporator_fmi3.fmu"}
 HEADER = "variables.h"
 BUILD_FILE = "extra/org.rti-cosim/build.json"
 
 
-def hand_written_sources() -> dict[str, bytes]:
+def _hand_written() -> dict[str, bytes]:
     """File name → bytes of every C source but the generated header."""
     files = sorted(SOURCES.glob("*.[ch]"))
     return {path.name: path.read_bytes() for path in files if path.name != HEADER}
@@ -130,25 +103,32 @@ def header(token: str) -> str:
 
 def model_token() -> str:
     """GUID of FMI 2.0 and instantiation token of FMI 3.0: a digest of all that makes the model."""
-    digest = hashlib.sha256()
     descriptions = (model_description(version, "", EVAPORATOR) for version in FILE_NAMES)
-    for text in (header(""), *descriptions):
-        digest.update(text.encode())
-    for name, content in hand_written_sources().items():
-        digest.update(name.encode() + b"\0" + content)
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
+    return token_of([header(""), *descriptions], _hand_written())
 
 
 def sources(version: FmiVersion) -> dict[str, bytes]:
     """File name → bytes of the folder `sources/` of the FMU, generated files included."""
-    other = "fmi3.c" if version == 2 else "fmi2.c"
-    files = {name: data for name, data in hand_written_sources().items() if name != other}
+    files = _hand_written()
+    del files["fmi3.c" if version == 2 else "fmi2.c"]
     files[HEADER] = header(model_token()).encode()
     files["buildDescription.xml"] = build_description(version, EVAPORATOR).encode()
     return files
 
 
-def build_record(with_compilers: list[Compiler]) -> bytes:
+def documentation_page(version: FmiVersion) -> str:
+    """The text of documentation/index.html."""
+    return render(
+        "evaporator.html",
+        model=EVAPORATOR,
+        version=version,
+        license=LICENSE,
+        diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
+        build_file=BUILD_FILE,
+    )
+
+
+def _build_record(every_platform: bool) -> bytes:
     """How the binaries were made (JSON): for each platform the compiler and its flags."""
     record = {
         "compiler_flags": [*COMPILER_FLAGS, *WARNINGS],
@@ -158,33 +138,11 @@ def build_record(with_compilers: list[Compiler]) -> bytes:
                 "target": compiler.platform.target,
                 "linker_flags": list(compiler.linker_flags),
             }
-            for compiler in with_compilers
+            for compiler in compilers(every_platform)
         },
         "model_token": model_token(),
     }
     return (json.dumps(record, indent=2) + "\n").encode()
-
-
-def contents(version: FmiVersion, every_platform: bool) -> dict[str, bytes]:
-    """Every file of the FMU by its path in the archive."""
-    icon = (RESOURCES / "icon.png").read_bytes()
-    code = sources(version)
-    used = compilers(every_platform)
-    files = {
-        "modelDescription.xml": model_description(version, model_token(), EVAPORATOR).encode(),
-        "documentation/index.html": documentation_page(version, BUILD_FILE).encode(),
-        "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
-        BUILD_FILE: build_record(used),
-        **binaries(code, EVAPORATOR.identifier, f"{version}.0", used, WARNINGS),
-        **{f"sources/{name}": data for name, data in code.items()},
-    }
-    if version == 2:
-        return files | {"model.png": icon}
-    name = "terminalsAndIcons.xml"
-    return files | {
-        "terminalsAndIcons/icon.png": icon,
-        f"terminalsAndIcons/{name}": (RESOURCES / name).read_bytes(),
-    }
 
 
 def build(folder: Path, every_platform: bool = False) -> list[Path]:
@@ -192,9 +150,32 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
 
     For the platform at hand by the local compiler, or for every one by the extra ``cross``.
     """
-    files = {name: contents(v, every_platform) for v, name in FILE_NAMES.items()}
     folder.mkdir(parents=True, exist_ok=True)
-    return [write_archive(members, folder / name) for name, members in files.items()]
+    token, record = model_token(), _build_record(every_platform)
+    icons = {
+        2: {"model.png": "icon.png"},
+        3: {
+            "terminalsAndIcons/icon.png": "icon.png",
+            "terminalsAndIcons/terminalsAndIcons.xml": "terminalsAndIcons.xml",
+        },
+    }
+    built = []
+    for version, name in FILE_NAMES.items():
+        resources = icons[version] | {"documentation/licenses/license.txt": "license.txt"}
+        files = {member: (RESOURCES / path).read_bytes() for member, path in resources.items()}
+        files["documentation/index.html"] = documentation_page(version).encode()
+        files[BUILD_FILE] = record
+        built.append(
+            build_fmu(
+                folder / name,
+                sources(version),
+                model_description(version, token, EVAPORATOR),
+                every_platform=every_platform,
+                files=files,
+                warnings=WARNINGS,
+            )
+        )
+    return built
 
 
 def differences(built: Path, shipped: Path) -> list[str]:

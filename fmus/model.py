@@ -45,13 +45,13 @@ class Variable:
 
     name: str
     kind: Kind
-    type: Type
-    unit: str
-    start: float | None
-    min: float | None
-    max: float | None
-    nominal: float | None
-    description: str
+    type: Type = Type.REAL
+    unit: str = ""
+    start: float | None = None
+    min: float | None = None
+    max: float | None = None
+    nominal: float | None = None
+    description: str = ""
     uses: tuple[str, ...] = ()
 
     @property
@@ -74,15 +74,11 @@ class Unit:
     offset: float = 0.0
     exponents: tuple[tuple[str, int], ...] = ()
 
-
-LAWS = (
-    ("uniform", 1, "nominal + range (2 U - 1), U uniform on [0, 1)"),
-    ("normal", 2, "nominal + range Z, Z standard normal"),
-)
-
-
-LAW_NUMBER = "law of the disturbances as an integer; 0: as the enumeration law says"
-SATURATE = "an input beyond its range acts at the bound, as an actuator at its stop; false: refused"
+    def si(self) -> dict[str, object]:
+        """The attributes of FMI's BaseUnit."""
+        factor = self.factor if self.factor != 1.0 else None
+        offset = self.offset if self.offset != 0.0 else None
+        return {**dict(self.exponents), "factor": factor, "offset": offset}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,16 +126,13 @@ class Model:
         return [v for v in self.variables if v.type not in (Type.SEED_HIGH, Type.LAW_NUMBER)]
 
 
-_CALCULATED = (Kind.OUTPUT, Kind.DERIVATIVE)
-
-
 @cache
 def closure(name: str, model: Model) -> frozenset[str]:
     """All variables that calculated variable `name` depends on, states not resolved further."""
     found: set[str] = set()
     for used in model.by_name[name].uses:
         found.add(used)
-        if model.by_name[used].kind in _CALCULATED:
+        if model.by_name[used].kind in (Kind.OUTPUT, Kind.DERIVATIVE):
             found |= closure(used, model)
     return frozenset(found)
 

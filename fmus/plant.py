@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
-from fmus.build import PLANT_SOURCES, SOURCES, assemble, sources_of
-from fmus.model import LAW_NUMBER, SATURATE, FmiVersion, Kind, Model, Type, Unit, Variable
+from fmus.build import SOURCES, assemble, files_of, sources_of
+from fmus.description import render
+from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (
@@ -26,11 +28,26 @@ class Signal:
 
     name: str
     unit: str
-    start: float
-    min: float
-    max: float
-    description: str
+    start: float = 0.0
+    min: float = -inf
+    max: float = inf
+    description: str = ""
     range: float = 0.0
+
+    def variable(
+        self,
+        kind: Kind,
+        uses: tuple[str, ...] = (),
+        *,
+        name: str | None = None,
+        description: str | None = None,
+    ) -> Variable:
+        """The signal as a row of a table; a state or an output `uses` others and has no start."""
+        start = None if kind in (Kind.STATE, Kind.OUTPUT) else self.start
+        return Variable(
+            name or self.name, kind, Type.REAL, self.unit, start, self.min, self.max,
+            _nominal(self.start), description or self.description, uses,
+        )  # fmt: skip
 
 
 def plant_model(
@@ -53,30 +70,40 @@ def plant_model(
     disturbances are drawn anew, and ``saturate``, with which an input beyond its range acts at the
     bound.
     """
-    drawn = ["stochastic", "law", "law_number", "seed", "seedHigh", "sampling_time", "time"]
+    switches = _switches(sampling_time)
+    drawn = (*(each.name for each in switches if each.name != "saturate"), "time")
     known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
-    table = [Variable("time", Kind.INDEPENDENT, Type.REAL, "s", None, None, None, None, "time")]
-    table += [_row(s, Kind.STATE, start=None, uses=(f"{s.name}_start",)) for s in states] + [
-        _derivative(s, known) for s in states
-    ]
-    table += [_row(s, Kind.INPUT) for s in inputs]
+    table = [
+        Variable("time", Kind.INDEPENDENT, unit="s", description="time"),
+        *(s.variable(Kind.STATE, (f"{s.name}_start",)) for s in states),
+        *(
+            Variable(
+                f"der({s.name})", Kind.DERIVATIVE, Type.REAL, f"{s.unit}/s", None, -1e6, 1e6,
+                _nominal(s.start), f"time derivative of {s.name}", known,
+            )
+            for s in states
+        ),
+        *(s.variable(Kind.INPUT) for s in inputs),
+        *(
+            d.variable(Kind.OUTPUT, (f"{d.name}_nominal", f"{d.name}_range", *drawn))
+            for d in disturbances
+        ),
+        *(s.variable(Kind.OUTPUT, known) for s in outputs),
+        *switches,
+    ]  # fmt: skip
     for d in disturbances:
-        uses = (f"{d.name}_nominal", f"{d.name}_range", *drawn)
-        table.append(_row(d, Kind.OUTPUT, start=None, uses=uses))
-    table += [_row(s, Kind.OUTPUT, start=None, uses=known) for s in outputs]
-    table += _switches(sampling_time)
-    for d in disturbances:
-        table.append(_row(d, Kind.TUNABLE, name=f"{d.name}_nominal", text=f"mean {d.description}"))
+        mean = f"mean {d.description}"
+        table.append(d.variable(Kind.TUNABLE, name=f"{d.name}_nominal", description=mean))
         table.append(
             Variable(
                 f"{d.name}_range", Kind.TUNABLE, Type.REAL, d.unit, d.range, 0.0, d.max - d.min,
                 _nominal(d.range), "half width (uniform) or standard deviation (normal)",
             )
         )  # fmt: skip
-    table += [
-        _row(s, Kind.FIXED, name=f"{s.name}_start", text=f"{s.name} at the start") for s in states
-    ]
-    table += [_row(s, Kind.TUNABLE) for s in parameters]
+    for s in states:
+        start = f"{s.name} at the start"
+        table.append(s.variable(Kind.FIXED, name=f"{s.name}_start", description=start))
+    table += [s.variable(Kind.TUNABLE) for s in parameters]
     units = dict.fromkeys(v.unit for v in table if v.unit)
     return Model(
         name=name,
@@ -107,10 +134,14 @@ def build_plant(
     draws that are a function of seed and sample; fourth-order Runge–Kutta steps of at most 1 s.
     Raises BuildError where there is no compiler or it complains.
     """
-    own = {name: (SOURCES / name).read_bytes() for name in _SHARED}
-    own |= {path.name: path.read_bytes() for path in sorted(PLANT_SOURCES.glob("*.h"))}
+    own = {name: (SOURCES / name).read_bytes() for name in _SHARED} | files_of("plant_sources")
     own["equations.h"] = equations.encode() if isinstance(equations, str) else equations
-    own["states.h"] = _states_header(model).encode()
+    own["states.h"] = render(
+        "states.h",
+        model=model,
+        states=[model.by_name[name].identifier for name in model.names(Kind.STATE)],
+        drawn=[n.removesuffix("_nominal") for n in model.by_name if n.endswith("_nominal")],
+    ).encode()
     return assemble(
         model,
         version,
@@ -125,73 +156,21 @@ def _nominal(value: float) -> float:
     return abs(value) or 1.0
 
 
-def _row(
-    signal: Signal,
-    kind: Kind,
-    *,
-    name: str | None = None,
-    start: float | bool | None = True,
-    uses: tuple[str, ...] = (),
-    text: str | None = None,
-) -> Variable:
-    return Variable(
-        name or signal.name, kind, Type.REAL, signal.unit,
-        signal.start if start is True else None, signal.min, signal.max,
-        _nominal(signal.start), signal.description if text is None else text, uses,
-    )  # fmt: skip
-
-
-def _derivative(state: Signal, uses: tuple[str, ...]) -> Variable:
-    return Variable(
-        f"der({state.name})", Kind.DERIVATIVE, Type.REAL, f"{state.unit}/s", None, -1e6, 1e6,
-        _nominal(state.start), f"time derivative of {state.name}", uses,
-    )  # fmt: skip
-
-
 def _switches(sampling_time: float) -> list[Variable]:
     fixed = Kind.FIXED
     return [
-        Variable("stochastic", Kind.TUNABLE, Type.BOOLEAN, "", 1.0, 0.0, 1.0, None,
-                 "draw the disturbances; false: their means"),
-        Variable("law", fixed, Type.LAW, "", 1.0, 1.0, 2.0, None, "law of the disturbances"),
-        Variable("seed", fixed, Type.SEED, "", 0.0, None, None, None, "seed of the disturbances"),
-        Variable("seedHigh", fixed, Type.SEED_HIGH, "", 0.0, None, None, None,
-                 "upper 32 bits of the seed (FMI 2.0 Integers have 32)"),
+        Variable("stochastic", Kind.TUNABLE, Type.BOOLEAN, "", 1.0, 0.0, 1.0,
+                 description="draw the disturbances; false: their means"),
+        Variable("law", fixed, Type.LAW, "", 1.0, 1.0, 2.0, description="law of the disturbances"),
+        Variable("seed", fixed, Type.SEED, "", 0.0, description="seed of the disturbances"),
+        Variable("seedHigh", fixed, Type.SEED_HIGH, "", 0.0,
+                 description="upper 32 bits of the seed (FMI 2.0 Integers have 32)"),
         Variable("sampling_time", fixed, Type.REAL, "s", sampling_time, 0.01, 86400.0,
                  sampling_time, "the disturbances are redrawn at its multiples and held between"),
-        Variable("saturate", fixed, Type.BOOLEAN, "", 0.0, 0.0, 1.0, None, SATURATE),
-        Variable("law_number", fixed, Type.LAW_NUMBER, "", 0.0, 0.0, 2.0, None, LAW_NUMBER),
+        Variable("saturate", fixed, Type.BOOLEAN, "", 0.0, 0.0, 1.0,
+                 description="an input beyond its range acts at the bound, as an actuator at its "
+                 "stop; false: refused"),
+        Variable("law_number", fixed, Type.LAW_NUMBER, "", 0.0, 0.0, 2.0,
+                 description="law of the disturbances as an integer; 0: as the enumeration law "
+                 "says"),
     ]  # fmt: skip
-
-
-def _states_header(model: Model) -> str:
-    """The value references that the shared sources go through."""
-    states = [model.by_name[name].identifier for name in model.names(Kind.STATE)]
-    drawn = [n.removesuffix("_nominal") for n in model.by_name if n.endswith("_nominal")]
-    rows = "".join(f"    {{VR_{d}, VR_{d}_nominal, VR_{d}_range}},\n" for d in drawn)
-
-    def references(pattern: str) -> str:
-        return ", ".join(pattern.format(state) for state in states)
-
-    return f"""\
-/* Generated from the table of {model.name}; do not edit. */
-#ifndef STATES_H
-#define STATES_H
-
-#include "variables.h"
-
-enum {{ N_STATES = {len(states)}, N_DISTURBANCES = {len(drawn)} }};
-
-static const unsigned STATE_REFERENCES[N_STATES] = {{{references("VR_{}")}}};
-static const unsigned DERIVATIVE_REFERENCES[N_STATES] = {{{references("VR_der_{}")}}};
-static const unsigned START_REFERENCES[N_STATES] = {{{references("VR_{}_start")}}};
-
-/* The last row is none: C has no empty array. */
-static const struct {{
-    int realised, nominal, range;
-}} DISTURBANCES[N_DISTURBANCES + 1] = {{
-{rows}    {{0, 0, 0}},
-}};
-
-#endif
-"""

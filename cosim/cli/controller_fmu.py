@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,8 @@ from cosim.plant.wiring import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
-from fmus.build import PROCESSORS, footprint
-from fmus.model import FmiVersion
-from fmus.sampled import SampledSystem, Signal, build_sampled
+from fmus.model import FmiVersion, Kind, Variable
+from fmus.sampled import SampledSystem, build_sampled
 from fmus.ssp import Component, Connection, write_ssp
 
 SAMPLES = 100
@@ -57,6 +55,36 @@ def sampled_controller(
     predicted += [(actions, k) for k in range(problem.horizon)]
     bounds = zip(problem.action_lower.tolist(), problem.action_upper.tolist(), strict=True)
     codes = ", ".join(f"{code} {text}" for code, text in enumerate(STATUSES))
+    signals = [
+        Variable(name, Kind.INPUT, unit=unit, start=start, description="measured state")
+        for (name, unit), start in zip(states, problem.reference_state.tolist(), strict=True)
+    ]
+    about = "action, within its bounds"
+    signals += [
+        Variable(name, Kind.OUTPUT, unit=unit, min=low, max=high, description=about)
+        for (name, unit), (low, high) in zip(actions, bounds, strict=True)
+    ]
+    reports = {
+        "value": "value V(s) of the state",
+        "qp_status": f"of the present sample: {codes}",
+        "kkt_residual": "largest KKT residual of the last QP that was solved",
+        "qp_iterations": "steps of the QP solver in the last QP that was solved",
+        "failures": "samples without a solution so far; they repeat the last action",
+    }
+    signals += [Variable(name, Kind.OUTPUT, description=text) for name, text in reports.items()]
+    for quantities, k in predicted:
+        for name, unit in quantities:
+            about = f"predicted {name}, {k} samples ahead"
+            signals.append(
+                Variable(f"predicted.{name}[{k}]", Kind.OUTPUT, unit=unit, description=about)
+            )
+    meanings = [block.meaning for block in blocks for _ in range(block.size)]
+    signals += [
+        Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
+        for label, about, value in zip(
+            blocks.labels, meanings, parameters.theta.tolist(), strict=True
+        )
+    ]
     return SampledSystem(
         name=f"RTI-NMPC {scenario.name}",
         identifier=f"rti_nmpc_{hashlib.sha256(origin.encode()).hexdigest()[:12]}",
@@ -65,59 +93,20 @@ def sampled_controller(
             f"{hessian} Hessian, θ {parameters.hash}"
         ),
         sampling_time=scenario.sampling_time,
-        inputs=tuple(
-            Signal(name, unit, "measured state", start)
-            for (name, unit), start in zip(states, problem.reference_state.tolist(), strict=True)
-        ),
-        outputs=(
-            *(
-                Signal(name, unit, "action, within its bounds", None, low, high)
-                for (name, unit), (low, high) in zip(actions, bounds, strict=True)
-            ),
-            Signal("value", "", "value V(s) of the state"),
-            Signal("qp_status", "", f"of the present sample: {codes}"),
-            Signal("kkt_residual", "", "largest KKT residual of the last QP that was solved"),
-            Signal("qp_iterations", "", "steps of the QP solver in the last QP that was solved"),
-            Signal(
-                "failures", "", "samples without a solution so far; they repeat the last action"
-            ),
-            *(
-                Signal(f"predicted.{name}[{k}]", unit, f"predicted {name}, {k} samples ahead")
-                for quantities, k in predicted
-                for name, unit in quantities
-            ),
-        ),
-        parameters=tuple(
-            Signal(f"theta.{_structured(label)}", "", meaning, value)
-            for label, meaning, value in zip(
-                blocks.labels,
-                (block.meaning for block in blocks for _ in range(block.size)),
-                parameters.theta.tolist(),
-                strict=True,
-            )
-        ),
+        signals=tuple(signals),
         sources=exported.sources,
     )
 
 
 def write_c(controller: RtiNmpc, scenario: Scenario, folder: Path) -> dict[str, Any]:
-    """Write the controller as C into `folder`, whose name its functions begin with.
-
-    Returns a summary with the bytes that it takes on `PROCESSORS`, none without a cross-compiler.
-    """
+    """Write the controller as C into `folder`, whose name its functions begin with."""
     exported = core(controller.problem, controller.parameters, scenario.controller.hessian)
     name = re.sub(r"\W", "_", folder.absolute().name)
     files = plain_c(exported, name, scenario)
     folder.mkdir(exist_ok=True)
     for file, text in files.items():
         write_atomically(folder / file, text)
-    measured = {}
-    if find_spec("ziglang") is not None:
-        code = {file: files[file].encode() for file in (f"{name}.c", f"{name}.h")}
-        memory = sum(map(int, re.findall(r"_(?:MEMORY|THETA) = (\d+)", files[f"{name}.h"])))
-        for processor, target in PROCESSORS.items():
-            measured[processor] = footprint(code, target) | {"instance": 8 * memory}
-    return {"folder": str(folder), "files": list(files), "name": name, "bytes": measured}
+    return {"folder": str(folder), "files": list(files), "name": name}
 
 
 def _structured(label: str) -> str:

@@ -71,9 +71,6 @@ def export(
 
             summary = write_c(rti, loaded, out)
             out_.note(f"wrote {', '.join(summary['files'])} to {out}")
-            header = ("processor", "flash", "static", "stack", "instance")
-            rows = [(name, *map(str, sizes.values())) for name, sizes in summary["bytes"].items()]
-            out_.table("bytes, by clang -Os", header, rows)
             out_.json(summary)
             return
         out_.announce(loaded)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -35,50 +35,45 @@ def _short(number: object) -> str:
         return str(number)
 
 
-def _binary(folder: str, made_for: tuple[str, ...]) -> str:
-    return f"{folder} ({', '.join(made_for)})" if made_for else folder
-
-
-def _as_plant(fmu: Path) -> tuple[Any, list[str]]:
-    """Model description, None where it is not to be had, and why the FMU can be no plant."""
-    from cosim.errors import PlantError
-    from cosim.plant.archive import unpack
-    from cosim.plant.wiring import refusals
-
-    try:
-        unpacked = unpack(fmu)
-    except PlantError as error:
-        return None, [str(error)]
-    return unpacked.description, list(refusals(unpacked))
-
-
 @app.command()
 def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
     with output(json) as out_:
+        from cosim.errors import PlantError
+        from cosim.plant.archive import unpack
+        from cosim.plant.wiring import refusals
         from fmus.check import information
 
-        description, refused = _as_plant(_path(file))
+        try:
+            unpacked = unpack(_path(file))
+            description, refused = unpacked.description, list(refusals(unpacked))
+        except PlantError as error:
+            description, refused = None, [str(error)]
         found = information(_path(file), description)
-        about = found.description
-        out_.note(f"{found.path}\nsha256 {found.sha256}\n{about.modelName}: {about.description}")
-        out_.note(f"FMI {about.fmiVersion}: {', '.join(found.flags)}")
-        out_.note(f"binaries: {', '.join(_binary(*item) for item in found.platforms.items())}")
+        binaries = ", ".join(
+            f"{folder} ({', '.join(made_for)})" if made_for else folder
+            for folder, made_for in found["platforms"].items()
+        )
+        out_.note(
+            f"{found['path']}\nsha256 {found['sha256']}\n{found['name']}: {found['description']}\n"
+            f"FMI {found['fmi_version']}: {', '.join(found['flags'])}\nbinaries: {binaries}"
+        )
         out_.note("\n".join(f"no plant: {reason}" for reason in refused) or "the plant accepts it")
-        names = list(dict.fromkeys(name for flags in found.flags.values() for name in flags))
-        flags = [(name, *(f.get(name, "–") for f in found.flags.values())) for name in names]
-        out_.table("capability flags", ("flag", *found.flags), flags)
+        faces = found["flags"].values()
+        names = dict.fromkeys(name for face in faces for name in face)
+        flags = [(name, *(face.get(name, "–") for face in faces)) for name in names]
+        out_.table("capability flags", ("flag", *found["flags"]), flags)
         header = ("variable", "causality", "unit", "start", "min", "max")
         rows = [
-            (v.name, v.causality, v.unit or "", *(_short(x) for x in (v.start, v.min, v.max)))
-            for v in about.modelVariables[:SHOWN]
-        ]
-        count = len(about.modelVariables)
+            (v["name"], v["causality"], v["unit"] or "",
+             *(_short(v[key]) for key in ("start", "min", "max")))
+            for v in found["variables"][:SHOWN]
+        ]  # fmt: skip
+        count = len(found["variables"])
         out_.table(f"{count} variables", header, rows)
         if count > SHOWN:
             out_.note(f"the first {SHOWN} variables are shown; --json has all of them")
-        if json:
-            out_.json(found.to_dict() | {"refusals": refused})
+        out_.json(found | {"refusals": refused})
 
 
 @app.command()

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 import fmus
-from fmus import build, crosscheck, evaporator
+from fmus import build, evaporator
 from fmus.build import compilers
 from fmus.evaporator import EVAPORATOR
+from tests.helpers import crosscheck
 
 HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
 needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="there is no C compiler")
@@ -32,9 +33,10 @@ def shipped_record(name: str = "evaporator") -> dict:
 
 def build_elsewhere(root: Path, every_platform: bool) -> Path:
     """Both FMUs, built by a copy of the packages in another folder."""
-    ignored = shutil.ignore_patterns("__pycache__", "*.fmu", "*.npz", "variables.h")
+    ignored = shutil.ignore_patterns("__pycache__", "*.fmu", "*.npz")
     for name in ("fmus", "cosim", "controllers", "learning"):  # none may hide another
         shutil.copytree(evaporator.PACKAGE.parent / name, root / name, ignore=ignored)
+    (root / "fmus" / "sources" / "variables.h").unlink()
     code = (
         "import pathlib, sys, fmus.evaporator as e; e.build(pathlib.Path('out'), len(sys.argv) > 1)"
     )
@@ -71,7 +73,7 @@ def test_local_build_gives_the_shipped_results(tmp_path: Path, version: int) -> 
     """Another compiler, the same bits: the seeded normal law with fouling among them."""
     evaporator.build(tmp_path)
     own = tmp_path / f"{fmus.NAMES[version - 2]}.fmu"
-    assert [str(d) for d in crosscheck.deviations(own)] == []
+    crosscheck.hold(own)
 
 
 @needs_compiler
@@ -114,7 +116,7 @@ def test_every_member_but_the_binary_is_up_to_date(version: int) -> None:
             version, evaporator.model_token(), EVAPORATOR
         ).encode()
         assert container.read("modelDescription.xml") == description
-        page = evaporator.documentation_page(version, evaporator.BUILD_FILE).encode()
+        page = evaporator.documentation_page(version).encode()
         assert container.read("documentation/index.html") == page
 
 

@@ -10,12 +10,12 @@ from scipy.integrate import solve_ivp
 
 import fmus
 from benchmarks.importers import relative_difference
-from fmus import crosscheck
+from tests.helpers import crosscheck
 
 
 @pytest.mark.parametrize("name", fmus.NAMES)
 def test_stored_signals_are_reproduced_bit_for_bit(name: str) -> None:
-    assert [str(d) for d in crosscheck.deviations(fmus.path(name))] == []
+    crosscheck.hold(fmus.path(name))
 
 
 @pytest.mark.parametrize("case", crosscheck.CASES)

@@ -37,7 +37,7 @@ def test_it_holds_a_library_for_each_platform(exported) -> None:
     version, identifier = exported.version, exported.identifier
     expected = {library(Path(), p, version, identifier).as_posix() for p in PLATFORMS}
     assert held == expected
-    found = information(exported.fmu).platforms
+    found = information(exported.fmu)["platforms"]
     assert found.pop("c-code") == ()
     assert found.keys() == {p.folder(f"{version}.0") for p in PLATFORMS}
     assert all(p.tuple in found[p.folder(f"{version}.0")] for p in PLATFORMS)

@@ -11,7 +11,8 @@ import pytest
 from fmpy import fmi2, fmi3
 
 from fmus import BuildError
-from fmus.sampled import SampledSystem, Signal, build_sampled
+from fmus.model import Kind, Variable
+from fmus.sampled import SampledSystem, build_sampled
 
 CORE = b"""
 #ifndef CORE_H
@@ -43,9 +44,11 @@ def adder() -> SampledSystem:
         identifier="adder",
         description="adds its inputs",
         sampling_time=STEP,
-        inputs=(Signal("u", "kPa", "summand", 1.0, -10.0, 10.0),),
-        outputs=(Signal("y", "kPa", "sum"),),
-        parameters=(Signal("theta.gain[0]", "", "gain", 1.0),),
+        signals=(
+            Variable("u", Kind.INPUT, unit="kPa", start=1.0, min=-10.0, max=10.0),
+            Variable("y", Kind.OUTPUT, unit="kPa"),
+            Variable("theta.gain[0]", Kind.TUNABLE, start=1.0),
+        ),
         sources={"core.h": CORE},
     )
 

@@ -22,8 +22,7 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from learning import empirical_model, model_based
-from learning.loop import begin
-from learning.training_run import prepare
+from learning.training_run import begin, prepare
 
 PARTS = {
     "parameters": (empirical_model, "PARAMETER_DEVIATION", 1e-6),  # W alone is fitted

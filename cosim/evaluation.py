@@ -31,7 +31,7 @@ from cosim.studies.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, chec
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING
 from cosim.text_tables import cell, csv_pieces
-from learning.evaluation import stored_optimum
+from learning.training import stored_optimum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

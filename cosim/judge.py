@@ -16,7 +16,7 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
-from learning.evaluation import stored_optimum
+from learning.training import stored_optimum
 
 TOLERANCE = 1e-6
 """Largest difference of a state from the one played back, relative to 1 + its magnitude."""

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from learning.checkpoint import arrays_of as arrays_of
     from learning.checkpoint import take_up as take_up
     from learning.configuration import Configuration as Configuration
+    from learning.configuration import Strategy as Strategy
     from learning.errors import AlgorithmLookupError as AlgorithmLookupError
     from learning.errors import CheckpointError as CheckpointError
     from learning.errors import ConfigurationError as ConfigurationError
     from learning.errors import DivergenceError as DivergenceError
     from learning.errors import LearningError as LearningError
     from learning.errors import PrivilegeError as PrivilegeError
-    from learning.exploration import Strategy as Strategy
     from learning.q_learning import QLearning as QLearning
     from learning.search import Search as Search
     from learning.step import ConstrainedStep as ConstrainedStep
@@ -35,7 +35,7 @@ _HOMES = {
     "algorithm": ("Algorithm", "LearnableController", "Transition", "Update", "algorithms"),
     "batch_q_learning": ("BatchQLearning",),
     "checkpoint": ("arrays_of", "take_up"),
-    "configuration": ("Configuration",),
+    "configuration": ("Configuration", "Strategy"),
     "errors": (
         "AlgorithmLookupError",
         "CheckpointError",
@@ -44,7 +44,6 @@ _HOMES = {
         "LearningError",
         "PrivilegeError",
     ),
-    "exploration": ("Strategy",),
     "q_learning": ("QLearning",),
     "search": ("Search",),
     "step": ("ConstrainedStep", "td_step"),

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
-from cosim.scenario import Scenario
-from learning.algorithm import LearnableController, Transition, Update
+from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import Configuration, Count, Positive
-from learning.exploration import Strategy
 from learning.step import ConstrainedStep, policy_gradient_fit
 
 Vector = NDArray[np.float64]
@@ -50,7 +48,7 @@ class ActorCriticConfiguration(Configuration):
         )
 
 
-class ActorCritic:
+class ActorCritic(Algorithm):
     """Descends J along ∇J = E[∇π ∇πᵀ] w (paper.tex, eq. pg_update and pg_solution).
 
     Each batch at one θ: LSTDV fits the smooth part W of V = penalty + W, LSTDQ the weights w of
@@ -60,37 +58,28 @@ class ActorCritic:
     the mean cost, the benchmark's yardstick.
     """
 
-    Configuration: ClassVar[type[Configuration]] = ActorCriticConfiguration
-    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
-    needs_action_value = False
-    needs_points = False
+    Configuration = ActorCriticConfiguration
+    KEPT = ("_batch", "_advantage", "_filled")
+    configuration: ActorCriticConfiguration
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: ActorCriticConfiguration,
-        samples: int,
-        strategy: Strategy,
-        rng: np.random.Generator,
-    ) -> None:
-        self._configuration, self._strategy = configuration, strategy
-        self._samples = samples
-        self._step = ConstrainedStep(controller, configuration)
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        settings, scenario = self.configuration, self.scenario
+        self._step = ConstrainedStep(self.controller, settings)
         # Actions count in the exploration's standard deviations.
-        self._unit = np.broadcast_to(configuration.deviation(scenario), scenario.action_lower.shape)
+        self._unit = np.broadcast_to(settings.deviation(scenario), scenario.action_lower.shape)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
-        rows = configuration.batch_size
+        rows = settings.batch_size
         self._batch: dict[str, NDArray[Any]] = {
-            "states": np.empty((rows, n)),
-            "next_states": np.empty((rows, n)),
-            "reward": np.empty(rows),
-            "policy": np.empty((rows, m)),
-            "deviation": np.empty((rows, m)),
-            "explored": np.empty(rows, dtype=bool),
-            "jacobian": np.empty((rows, m, size)),
+            "states": np.zeros((rows, n)),
+            "next_states": np.zeros((rows, n)),
+            "reward": np.zeros(rows),
+            "policy": np.zeros((rows, m)),
+            "deviation": np.zeros((rows, m)),
+            "explored": np.zeros(rows, dtype=bool),
+            "jacobian": np.zeros((rows, m, size)),
         }
-        self._advantage = AdvantageRegression(size, configuration.forgetting, configuration.ridge)
+        self._advantage = AdvantageRegression(size, settings.forgetting, settings.ridge)
         self._filled = 0
 
     def observe(self, transition: Transition) -> Update | None:
@@ -103,7 +92,7 @@ class ActorCritic:
         batch["explored"][row] = transition.explored
         batch["jacobian"][row] = transition.policy.policy_jacobian
         self._filled += 1
-        if self._filled < self._configuration.batch_size:
+        if self._filled < self.configuration.batch_size:
             return None
         self._filled = 0
         return self._update(transition.number)
@@ -112,13 +101,13 @@ class ActorCritic:
         """a − π(s) of the batch, (K, m), less its mean under saturation; zero in greedy samples."""
         batch = self._batch
         explored = batch["explored"]
-        bias = self._strategy.bias(batch["policy"][explored])
-        deviation = np.zeros_like(batch["deviation"])
+        bias = self.strategy.bias(batch["policy"][explored])
+        deviation: Matrix = np.zeros_like(batch["deviation"])
         deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
         return deviation / self._unit
 
     def _update(self, number: int) -> Update:
-        settings, batch = self._configuration, self._batch
+        settings, batch = self.configuration, self._batch
         errors = lstdv(batch["states"], batch["next_states"], batch["reward"])
         jacobian = batch["jacobian"] * self._step.scale / self._unit[:, None]
         advantage = np.einsum("kmi,km->ki", jacobian, self._deviation())
@@ -133,26 +122,10 @@ class ActorCritic:
         if not fit.minimiser @ fisher @ fit.minimiser > 0:
             fit = fit.shrunk(0.0)
         # From the one radius to the other by equal ratios.
-        share = min(number / self._samples, 1.0)
+        share = min(number / self.samples, 1.0)
         radius = settings.radius * (settings.radius_end / settings.radius) ** share
         fit = fit.within(radius, lambda d: float(max(d @ fisher @ d, 0.0)) ** 0.5)
         return self._step.take(fit, float(np.sqrt(np.mean(errors * errors))))
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The advantage's sums and the part of the batch that is filled."""
-        return {
-            "information": self._advantage.information,
-            "moment": self._advantage.moment,
-            **{name: values[: self._filled] for name, values in self._batch.items()},
-        }
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._advantage.information = state["information"]
-        self._advantage.moment = state["moment"]
-        self._filled = len(state["reward"])
-        for name, values in self._batch.items():
-            values[: self._filled] = state[name]
 
 
 def quadratic_features(states: Matrix, centre: Vector, spread: Vector) -> Matrix:
@@ -186,6 +159,8 @@ class AdvantageRegression:
     moves little from batch to batch, and the gradient's noise is what limits learning. `ridge` is
     relative to the mean of the information's diagonal.
     """
+
+    KEPT = ("information", "moment")
 
     def __init__(self, size: int, forgetting: float, ridge: float) -> None:
         self._forgetting, self._ridge = forgetting, ridge

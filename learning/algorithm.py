@@ -1,7 +1,6 @@
 """What a training asks of an algorithm and of a learnable controller; algorithms by name.
 
-An own rule needs of this file `Transition`, which it is given, `Update`, which it returns, and the
-protocol `Algorithm`, which says what else it has.
+An own rule inherits `Algorithm`, is given a `Transition` and returns an `Update`.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from cosim.plugins import ALGORITHMS, load_plugin
 from cosim.protocols import Controller, Solution
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
-from learning.configuration import Configuration
+from learning.checkpoint import arrays_of, take_up
+from learning.configuration import Configuration, Strategy
 from learning.errors import AlgorithmLookupError
-from learning.exploration import Strategy
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -122,36 +121,19 @@ class Update(NamedTuple):
     rewind: bool = False
 
 
-class Rule(Protocol):
-    """What learns from transitions: an algorithm, or the rule that a search has inside."""
+class Algorithm:
+    """A learning rule. Register its class in the entry-point group `cosim.algorithms`.
 
-    @property
-    def needs_action_value(self) -> bool:
-        """Whether `Transition.action_value` must be solved for where the sample explored."""
-
-    @property
-    def needs_points(self) -> bool:
-        """Whether `Transition.point` and `Transition.next_point` must be kept."""
-
-    def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; move θ and say so, or return None."""
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """All that must survive a checkpoint but θ (`learning.checkpoint.arrays_of` helps)."""
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-
-
-class Algorithm(Rule, Protocol):
-    """A learning algorithm. Register its class in the entry-point group `cosim.algorithms`.
+    The loop constructs it with a controller that it may move (`controller.theta`), calls `observe`
+    once per sample, and evaluates the policy anew whenever that returned an `Update`. `strategy` is
+    the exploration; `rng` is a generator of its own, spawned from the run's seed, whose state the
+    loop keeps in checkpoints. A class that has all this need not inherit it.
 
     `Configuration` is the class of its hyperparameters. `asks_for` states what it needs of a plant:
     `operation`, one trajectory as it comes, or `simulator`, a plant that can be reset, put back and
-    given the same noise twice. The loop constructs it with a controller that it may move
-    (`controller.theta`), calls `observe` once per sample, and evaluates the policy anew whenever
-    `observe` returned an Update. `rng` is a generator of its own, spawned from the run's seed; the
-    loop keeps its state in checkpoints.
+    given the same noise twice. `needs_action_value` says whether `Transition.action_value` must be
+    solved for where the sample explored, `needs_points` whether the linearisation points are kept.
+    `KEPT` names the attributes that a checkpoint has (`learning.checkpoint.arrays_of`).
 
     Optional, looked up by name:
 
@@ -164,8 +146,11 @@ class Algorithm(Rule, Protocol):
       controller failed, with the sample's share of J.
     """
 
-    Configuration: ClassVar[type[Configuration]]
-    asks_for: ClassVar[Privilege]
+    Configuration: ClassVar[type[Configuration]] = Configuration
+    asks_for: ClassVar[Privilege] = "operation"
+    KEPT: ClassVar[tuple[str, ...]] = ()
+    needs_action_value = False
+    needs_points = False
 
     def __init__(
         self,
@@ -175,7 +160,21 @@ class Algorithm(Rule, Protocol):
         samples: int,
         strategy: Strategy,
         rng: np.random.Generator,
-    ) -> None: ...
+    ) -> None:
+        self.controller, self.scenario, self.configuration = controller, scenario, configuration
+        self.samples, self.strategy, self.rng = samples, strategy, rng
+
+    def observe(self, transition: Transition) -> Update | None:
+        """Take one sample; move θ and say so, or return None."""
+        return None
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that must survive a checkpoint but θ."""
+        return arrays_of(self)
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take back what `state` gave."""
+        take_up(self, state)
 
 
 def algorithms() -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,11 @@ class BackOffSearch:
 
     Raises ConfigurationError on a budget that is too small to see anything.
     """
+
+    KEPT = (
+        *("origin", "stretches", "kappa", "_unit", "_schedule", "_segment", "_step", "_binding"),
+        *("_share", "_seeds", "_first", "_rows"),
+    )
 
     def __init__(
         self,
@@ -237,27 +242,22 @@ class BackOffSearch:
         slopes: Vector = above / below if below > 0 else above
         return slopes
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """All that the search remembers, as arrays."""
-        n = self._n
-        return {
-            "progress": np.array([self._segment, self._step]),
-            "kappa": self.kappa,
-            "unit": self._unit,
-            "schedule": np.array(self._schedule, dtype=np.int64).reshape(-1, 2),
-            "binding": np.array([self._binding, self._share]),
-            "plan": np.array([np.append(s.kappa, [s.round, s.steps]) for s in self._plan]),
-            "seeds": np.array(self._seeds, dtype=np.int64),
-            "first": np.array(self._first).reshape(len(self._first), 2 * n + self._actions),
-            "rows": np.array(self._rows).reshape(len(self._rows), 2 + 3 * n),
-        }
+    # for checkpoints
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._segment, self._step = (int(value) for value in state["progress"])
-        self.kappa, self._unit = state["kappa"], state["unit"]
-        self._binding, self._share = state["binding"]
-        self._schedule = [(int(bound), int(phase)) for bound, phase in state["schedule"]]
-        self._seeds = state["seeds"].tolist()
-        self._plan = [Segment(int(row[-2]), int(row[-1]), row[:-2]) for row in state["plan"]]
-        self._first, self._rows = list(state["first"]), list(state["rows"])
+    @property
+    def origin(self) -> Vector:
+        """θ of the start."""
+        return self.start.theta
+
+    @origin.setter
+    def origin(self, theta: Vector) -> None:
+        self.start = self.start.with_theta(theta)
+
+    @property
+    def stretches(self) -> list[Vector]:
+        """The plan as rows: κ, the round, the samples."""
+        return [np.append(segment.kappa, segment[:2]) for segment in self._plan]
+
+    @stretches.setter
+    def stretches(self, rows: list[Vector]) -> None:
+        self._plan = [Segment(int(row[-2]), int(row[-1]), row[:-2]) for row in rows]

@@ -23,14 +23,12 @@ from controllers.model import Model
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.scenario import Scenario
-from learning.algorithm import LearnableController, Transition, Update
+from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off_search import BackOffSearch
-from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration, Count, Share
 from learning.errors import DivergenceError
-from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel
-from learning.step import certificate
+from learning.step import moved
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -107,85 +105,46 @@ class IdentifiedSimulatorConfiguration(IdentifiedConfiguration, BackOffConfigura
     estimation_share: EstimationShare = 0.25
 
 
-class Baseline:
-    """An estimate from the samples, all of them in operation; on a simulator a search comes after.
+class BackOff(Algorithm):
+    """One number κ a bound that binds, found by a line search: the engineer's first remedy.
 
-    A subclass says how it `learn`s from a transition and how it `conclude`s. It reports θ as
-    estimated, or with the best back-off found so far, whatever it is trying.
+    From any start (`--start`), all else of θ stays; see `BackOffSearch`. A subclass has an estimate
+    instead in operation, and before the search on a simulator: it says how it `learn`s from a
+    transition and how it `conclude`s. `theta` is that of the estimate, or has the best back-off
+    found so far, whatever is being tried.
     """
 
-    Configuration: ClassVar[type[Configuration]]
-    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
+    Configuration: ClassVar[type[Configuration]] = BackOffConfiguration
+    KEPT: ClassVar[tuple[str, ...]] = ("_count", "theta", "_search")
     budget: ClassVar[int] = 8000
-    """Samples of a run where the user says nothing."""
-    needs_action_value = False
-    needs_points = False
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: Any,
-        samples: int,
-        strategy: Strategy,
-        rng: np.random.Generator,
-    ) -> None:
-        self._controller, self._scenario, self._configuration = controller, scenario, configuration
-        self._problem = Problem.from_scenario(scenario)
-        self._rng, self._samples = rng, samples
-        self._estimation = self.estimation_samples()
-        self._count = 0
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._problem = Problem.from_scenario(self.scenario)
+        self._start = self.controller.parameters
+        self.theta = self._start.theta
+        self._count, self._estimation = 0, self._estimation_samples()
         self._search: BackOffSearch | None = None
-        self._reported: Parameters = controller.parameters
-        if not self._estimation:
-            self._begin_search(self._reported)
+        self.first_episode: int | None = None
+        if (left := self.samples - self._estimation) > 0:
+            self._search = BackOffSearch(self._start, self._problem, self.scenario, left, self.rng)
+            self.first_episode = None if self._estimation else self._episode(self._search)
 
-    @property
-    def _searches(self) -> bool:
-        """Whether a search of the back-off follows the estimate."""
-        return self.asks_for == "simulator" and bool(self._configuration.back_off)
-
-    def estimation_samples(self) -> int:
+    def _estimation_samples(self) -> int:
         """Samples before the search begins."""
-        if not self._searches:
-            return self._samples
-        share: float = self._configuration.estimation_share
-        return max(round(share * self._samples), 1)
-
-    def backed_off(self, parameters: Parameters, errors: Matrix) -> Parameters:
-        """θ in operation, its bounds set back by the greatest of its prediction errors (K, n).
-
-        None of these would have led from within the bounds of θ to beyond the scenario's. Bounds
-        that would cross stay as they are.
-        """
-        if self._searches or not self._configuration.back_off:
-            return parameters
-        lower = self._scenario.state_lower + np.maximum(-errors.min(axis=0), 0.0)
-        upper = self._scenario.state_upper - np.maximum(errors.max(axis=0), 0.0)
-        crossed = lower >= upper
-        lower, upper = (
-            np.where(crossed, parameters[name], bound)
-            for name, bound in (("x_l", lower), ("x_u", upper))
-        )
-        return parameters.replace({"x_l": lower, "x_u": upper})
+        return 0
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Take a sample of the estimation; the θ to go on with, or None."""
-        raise NotImplementedError
+        return None
 
     def conclude(self) -> Parameters:
         """θ at the end of the estimation."""
-        raise NotImplementedError
+        return self._reported
 
     @property
-    def theta(self) -> Vector:
-        """The θ found so far, (n_θ,)."""
-        return self._reported.theta
-
-    @property
-    def first_episode(self) -> int | None:
-        """Seed of the search's first round, where it begins at once on a simulator."""
-        return None if self._search is None or self._count else self._episode(self._search)
+    def _reported(self) -> Parameters:
+        return self._start.with_theta(self.theta)
 
     def _episode(self, search: BackOffSearch) -> int | None:
         """Seed of the noise of a stretch's episode; None in operation, which simply goes on."""
@@ -201,82 +160,29 @@ class Baseline:
 
     def _advance(self, transition: Transition | None) -> Update | None:
         self._count += 1
-        if self._search is not None:
-            return self._searched(self._search, transition)
-        moved = None if transition is None else self.learn(transition)
+        search = self._search
+        if search is not None and self._count > self._estimation:
+            if search.done:
+                return None
+            begins = search.observe(transition)
+            if not (begins or search.done):
+                return None
+            self.theta = search.theta.theta
+            return self._move(search.candidate, self._episode(search) if begins else None)
+        found = None if transition is None else self.learn(transition)
         if self._count == self._estimation and self.asks_for == "simulator":
-            moved = self._reported = self.conclude()
-            if self._searches:
-                search = self._begin_search(moved)
-                return self._move(search.candidate, self._episode(search))
-        if moved is None:
+            found = self.conclude()
+        if found is None:
             return None
-        self._reported = moved
-        return self._move(moved)
-
-    def _begin_search(self, start: Parameters) -> BackOffSearch:
-        budget = self._samples - self._count
-        self._search = BackOffSearch(start, self._problem, self._scenario, budget, self._rng)
-        return self._search
-
-    def _searched(self, search: BackOffSearch, transition: Transition | None) -> Update | None:
-        was_done, begins = search.done, search.observe(transition)
-        if begins:
-            self._reported = search.theta
+        self.theta = found.theta
+        if search is not None and self._count == self._estimation:
+            search.start = found
             return self._move(search.candidate, self._episode(search))
-        if search.done and not was_done:
-            self._reported = search.theta
-            return self._move(search.theta)
-        return None
+        return self._move(found)
 
     def _move(self, parameters: Parameters, episode: int | None = None) -> Update:
-        step = parameters.theta - self._controller.theta
-        self._controller.theta = parameters.theta
-        return Update(
-            td_error=float("nan"),
-            step=float(np.linalg.norm(step / parameters.blocks.scale)),
-            smallest_eigenvalue=certificate(parameters.blocks, parameters.theta).smallest,
-            episode=episode,
-        )
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The count, θ as reported, and the search."""
-        kept: dict[str, NDArray[Any]] = {
-            "count": np.array(self._count),
-            "reported": self._reported.theta,
-        }
-        if self._search is not None:
-            kept |= prefixed("search_", self._search.state())
-            kept["search_start"] = self._search.start.theta
-        return kept
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._count = int(state["count"])
-        self._reported = self._reported.with_theta(state["reported"])
-        if "search_start" in state:
-            rng = np.random.default_rng(0)  # its seeds are restored too
-            start = self._reported.with_theta(state["search_start"])
-            budget = self._samples - (self._estimation if self._estimation else 0)
-            self._search = BackOffSearch(start, self._problem, self._scenario, budget, rng)
-            self._search.restore(group(state, "search_"))
-
-
-class BackOff(Baseline):
-    """One number κ a bound that binds, found by a line search: the engineer's first remedy.
-
-    From any start (`--start`), all else of θ stays; see `BackOffSearch`.
-    """
-
-    Configuration = BackOffConfiguration
-
-    @property
-    def _searches(self) -> bool:
-        return True
-
-    def estimation_samples(self) -> int:
-        """None: the search begins at once."""
-        return 0
+        old, self.controller.theta = self.controller.theta, parameters.theta
+        return moved(parameters.blocks, old, parameters.theta, episode=episode)
 
 
 class BackOffSimulator(BackOff):
@@ -285,7 +191,34 @@ class BackOffSimulator(BackOff):
     asks_for = "simulator"
 
 
-class OffsetFree(Baseline):
+class Estimate(BackOff):
+    """An estimate from the samples, with back-offs by its own errors of prediction."""
+
+    def _estimation_samples(self) -> int:
+        if self.asks_for == "operation" or not self.configuration.back_off:
+            return self.samples
+        share: float = self.configuration.estimation_share
+        return max(round(share * self.samples), 1)
+
+    def backed_off(self, parameters: Parameters, errors: Matrix) -> Parameters:
+        """θ in operation, its bounds set back by the greatest of its prediction errors (K, n).
+
+        None of these would have led from within the bounds of θ to beyond the scenario's. Bounds
+        that would cross stay as they are.
+        """
+        if self.asks_for == "simulator" or not self.configuration.back_off:
+            return parameters
+        lower = self.scenario.state_lower + np.maximum(-errors.min(axis=0), 0.0)
+        upper = self.scenario.state_upper - np.maximum(errors.max(axis=0), 0.0)
+        crossed = lower >= upper
+        lower, upper = (
+            np.where(crossed, parameters[name], bound)
+            for name, bound in (("x_l", lower), ("x_u", upper))
+        )
+        return parameters.replace({"x_l": lower, "x_u": upper})
+
+
+class OffsetFree(Estimate):
     """c_f ← mean of s₊ − f(s, a), the integrating disturbance model of offset-free MPC.
 
     With `back_off` the bounds stand back by the greatest of the last `memory` errors about that
@@ -293,15 +226,14 @@ class OffsetFree(Baseline):
     """
 
     Configuration = OffsetFreeConfiguration
-    _configuration: OffsetFreeConfiguration
+    KEPT = (*Estimate.KEPT, "_offset", "_seen", "_errors")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._model = OneStepModel(self._scenario)
-        self._start = self._reported
+        self._model = OneStepModel(self.scenario)
         self._parameters = self._model.parameters(self._start)
         self._offset = self._start["c_f"]
-        self._errors = np.zeros((self._configuration.memory, len(self._offset)))
+        self._errors = np.zeros((self.configuration.memory, len(self._offset)))
         self._seen = 0
 
     def learn(self, transition: Transition) -> Parameters | None:
@@ -312,7 +244,7 @@ class OffsetFree(Baseline):
         self._seen += 1
         weight = 1.0 / min(self._seen, len(self._errors))
         self._offset = self._offset + weight * (error - self._offset)
-        return None if self._seen % self._configuration.update_every else self.conclude()
+        return None if self._seen % self.configuration.update_every else self.conclude()
 
     def conclude(self) -> Parameters:
         """θ with the offset and the back-off as they are."""
@@ -320,22 +252,11 @@ class OffsetFree(Baseline):
         if not len(errors):
             return self._reported
         found = self.backed_off(self._reported.replace({"c_f": self._offset}), errors)
-        if self._seen >= len(self._errors) or not self._configuration.back_off:
+        if self._seen >= len(self._errors) or not self.configuration.back_off:
             return found
         lower = np.maximum(found["x_l"], start["x_l"])
         upper = np.minimum(found["x_u"], start["x_u"])
         return found.replace({"x_l": lower, "x_u": upper}) if (lower < upper).all() else found
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The filter too."""
-        offset = np.append(self._offset, self._seen)
-        return super().state() | {"offset": offset, "errors": self._errors}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        super().restore(state)
-        self._offset, self._seen = state["offset"][:-1], int(state["offset"][-1])
-        self._errors = state["errors"].copy()
 
 
 class OffsetFreeSimulator(OffsetFree):
@@ -345,7 +266,7 @@ class OffsetFreeSimulator(OffsetFree):
     asks_for = "simulator"
 
 
-class Identified(Baseline):
+class Identified(Estimate):
     """p̂ = argmin Σ ‖(s₊ − f(s, a; p))/σ‖², the prediction-error method, carried in θ's block p.
 
     σ is the standard deviation of the errors at the start's parameters. Then the cost is tuned at
@@ -355,15 +276,15 @@ class Identified(Baseline):
     """
 
     Configuration = IdentifiedConfiguration
-    _configuration: IdentifiedConfiguration
+    KEPT = (*Estimate.KEPT, "_rows")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._model = OneStepModel(self._scenario)
+        self._model = OneStepModel(self.scenario)
         self._rows: list[Vector] = []
-        self._every = self._configuration.every
+        self._every = self.configuration.every
         if self._every is None and self.asks_for == "operation":
-            self._every = max(round(SHIFT / self._scenario.sampling_time), 1)
+            self._every = max(round(SHIFT / self.scenario.sampling_time), 1)
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Keep a transition; the last of every `every` gives a new fit."""
@@ -422,15 +343,6 @@ class Identified(Baseline):
         found: Vector = least_squares(residuals, start["p"] / unit).x * unit
         return found
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The transitions too."""
-        return super().state() | {"rows": np.array(self._rows)}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        super().restore(state)
-        self._rows = list(state["rows"])
-
 
 class IdentifiedSimulator(Identified):
     """`Identified`, then a search of the back-off with the plant put back."""
@@ -439,24 +351,8 @@ class IdentifiedSimulator(Identified):
     asks_for = "simulator"
 
 
-class Held:
+class Held(Algorithm):
     """θ as it starts, all the time: what learning in operation is compared with."""
 
-    Configuration: ClassVar = GreedyConfiguration
-    asks_for: ClassVar = "operation"
-    needs_action_value: ClassVar = False
-    needs_points: ClassVar = False
-    explores: ClassVar = False
-
-    def __init__(self, *_: Any) -> None: ...
-
-    def observe(self, transition: Transition) -> Update | None:
-        """Learn nothing."""
-        return None
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Nothing to keep."""
-        return {}
-
-    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Nothing to take back."""
+    Configuration = GreedyConfiguration
+    explores = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isnan
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from controllers.errors import QpError
 from controllers.rti import LinearisationPoint
-from cosim.scenario import Scenario
 from learning.algorithm import LearnableController, LearnableSolution, Transition, Update
-from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration, Count, ExplorationProbability, ExplorationShare
 from learning.errors import DivergenceError
-from learning.exploration import Strategy
-from learning.prediction_errors import OneStepModel, PredictionErrors
 from learning.q_learning import (
     OUTLIER,
     AverageCost,
@@ -28,9 +24,10 @@ from learning.q_learning import (
     InnovationClip,
     MeasureOffset,
     PriorWidth,
+    ValueRule,
     VarianceMemory,
 )
-from learning.step import ConstrainedStep, Fit, measured_prior
+from learning.step import Fit
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -68,7 +65,7 @@ class BatchQLearningConfiguration(Configuration):
         return self.model_copy(update={"prior_width": width * self.prior_width})
 
 
-class BatchQLearning:
+class BatchQLearning(ValueRule):
     """The measurements and the prior of online Q-learning, replayed at the present θ.
 
     Each batch of `batch_size` transitions is a measurement of d = (θ−θ₀)/σ with the information
@@ -81,35 +78,27 @@ class BatchQLearning:
     cut at ±`innovation_clip`·√r. The first batch gives noise, widths and c_f as well.
     """
 
-    Configuration: ClassVar[type[Configuration]] = BatchQLearningConfiguration
-    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
-    needs_action_value = False
+    Configuration = BatchQLearningConfiguration
+    KEPT = (
+        *ValueRule.KEPT,
+        *("_batch", "_buffer", "_anchor", "_information", "_mean", "_variance"),
+    )
     needs_points = True
+    configuration: BatchQLearningConfiguration
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: BatchQLearningConfiguration,
-        samples: int,
-        strategy: Strategy,
-        rng: np.random.Generator,
-    ) -> None:
-        self._controller, self._scenario, self._configuration = controller, scenario, configuration
-        self._model = OneStepModel(scenario)
-        self._errors = PredictionErrors(scenario, configuration.prediction_errors)
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         self._variance = 0.0
-        rows, n = max(self._length, configuration.batch_size), scenario.state_lower.size
-        self._buffer = ReplayBuffer(controller, rows)
+        rows, n = max(self._length, self.configuration.batch_size), self.scenario.state_lower.size
+        self._buffer = ReplayBuffer(self.controller, rows)
         self._batch = {
             "states": np.zeros((rows, n)),
             "prediction_errors": np.zeros((rows, n)),
             "corrections": np.zeros(rows),
         }
-        self._anchor = controller.theta.copy()
-        self._adopt(np.ones(controller.theta.size))
-        self._information: Matrix = np.eye(controller.theta.size)
-        self._mean: Vector = np.zeros(controller.theta.size)
+        self._anchor = self.controller.theta.copy()
+        self._information: Matrix = np.eye(self._anchor.size)
+        self._mean: Vector = np.zeros(self._anchor.size)
 
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
@@ -130,12 +119,12 @@ class BatchQLearning:
     @property
     def _length(self) -> int:
         """Samples of the open batch."""
-        settings = self._configuration
+        settings = self.configuration
         first = settings.first_batch if self._variance == 0.0 else None
         return settings.batch_size if first is None else first
 
     def _update(self) -> Update:
-        settings, update, failures = self._configuration, None, 0
+        settings, update, failures = self.configuration, None, 0
         information = self._information
         for _ in range(settings.relinearisations):
             replayed = self._buffer.replay(self._average_cost)
@@ -144,7 +133,7 @@ class BatchQLearning:
                 break
             td_error = self._td_error(replayed)
             if self._variance == 0.0:
-                self._begin(td_error)
+                self._begin_filter(td_error)
                 information = self._information
             gradient = replayed.gradient * self._step.scale
             limit = settings.innovation_clip * self._variance**0.5
@@ -174,55 +163,16 @@ class BatchQLearning:
     @property
     def _present(self) -> Vector:
         """d of the controller's θ."""
-        present: Vector = (self._controller.theta - self._anchor) / self._step.scale
+        present: Vector = (self.controller.theta - self._anchor) / self._step.scale
         return present
 
-    def _begin(self, td_error: Vector) -> None:
+    def _begin_filter(self, td_error: Vector) -> None:
         """Take the noise, the widths and c_f from the samples of the first batch."""
         batch = {name: values[: len(self._buffer)] for name, values in self._batch.items()}
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
-        start, scale = measured_prior(
-            self._controller.parameters,
-            batch["states"],
-            batch["prediction_errors"],
-            self._configuration.deviation(self._scenario),
-            self._variance**0.5,
-            self._configuration.prior_width,
-            measure_offset=self._configuration.measure_offset,
-        )
-        self._controller.theta = start.theta
+        start = self._begin(batch["states"], batch["prediction_errors"], self._variance**0.5)
+        self.controller.theta = start.theta
         self._anchor = start.theta.copy()
-        self._adopt(scale)
-
-    def _adopt(self, scale: Vector) -> None:
-        """Work in coordinates of this scale, (n_θ,)."""
-        settings = self._configuration
-        self._step = ConstrainedStep(self._controller, settings, scale=scale)
-        self._average_cost = AverageCost.of(settings.criterion, self._scenario, self._step)
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Filter, errors and the open batch."""
-        sums = [self._variance, self._average_cost.mean_cost]
-        return {
-            **{name: values.copy() for name, values in self._batch.items()},
-            **self._errors.state(),
-            "scale": self._step.scale.copy(),
-            "anchor": self._anchor.copy(),
-            "information": self._information.copy(),
-            "mean": self._mean.copy(),
-            "sums": np.array(sums),
-            **prefixed("buffer_", self._buffer.state()),
-        }
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._batch = {name: state[name].copy() for name in self._batch}
-        self._errors.restore(state)
-        self._adopt(state["scale"].copy())
-        self._anchor, self._mean = state["anchor"].copy(), state["mean"].copy()
-        self._information = state["information"].copy()
-        self._variance, self._average_cost.mean_cost = map(float, state["sums"])
-        self._buffer.restore(group(state, "buffer_"))
 
 
 def _newton(information: Matrix, slope: Vector) -> Fit:
@@ -258,6 +208,8 @@ class ReplayBuffer:
     What the loop or a replay has solved at this very θ is not solved again where the controller is
     `memoryless`: values are NaN where nothing is known.
     """
+
+    KEPT = ("_count", "_columns", "_theta", "_action_value", "_next_value", "_gradient")
 
     def __init__(self, controller: LearnableController, capacity: int) -> None:
         self._controller, self._capacity, self._count = controller, capacity, 0
@@ -353,16 +305,3 @@ class ReplayBuffer:
                     self._next_value[row] = value.value
             except QpError:
                 at = None
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Everything kept, as arrays."""
-        known = {"action_value": self._action_value, "next_value": self._next_value}
-        known |= {"gradient": self._gradient, "theta": self._theta}
-        known |= {f"column {name}": values for name, values in self._columns.items()}
-        return {"count": np.array(self._count), **{k: v.copy() for k, v in known.items()}}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._count, self._theta = int(state["count"]), state["theta"]
-        self._action_value, self._next_value = state["action_value"], state["next_value"]
-        self._gradient, self._columns = state["gradient"], group(state, "column ")

@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cosim.files import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
-SCHEMA = 7
+SCHEMA = 8
 Array = NDArray[Any]
 
 
@@ -54,7 +54,14 @@ def load(
 
     Raises CheckpointError where the file is missing, damaged, of another schema or another run.
     """
-    entries = _entries(path)
+    try:
+        entries = read_arrays(path)
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{path}: there is no checkpoint to resume from; run without --resume"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
     digest = entries.pop("digest", None)
     if digest is None or "about" not in entries or digest.tobytes() != _digest(entries):
         raise CheckpointError(f"{path}: the checkpoint is damaged (checksum); start the run anew")
@@ -99,30 +106,49 @@ def group(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
 
 
 def arrays_of(state: Any) -> dict[str, Array]:
-    """The fields of a dataclass, each an array or a number, as arrays by name."""
-    return {item.name: np.asarray(getattr(state, item.name)) for item in fields(state)}
+    """What an object must keep, as arrays by name.
+
+    These are the attributes that its class names in `KEPT`, or a dataclass's fields: arrays,
+    numbers and lists of arrays; tables of arrays and objects of this kind, whose names stand after
+    the attribute's; None is left out.
+    """
+    found: dict[str, Array] = {}
+    for name in _kept(state):
+        value = getattr(state, name)
+        if isinstance(value, dict) or _has_parts(value):
+            inner = value if isinstance(value, dict) else arrays_of(value)
+            found |= prefixed(f"{name} ", {key: np.array(part) for key, part in inner.items()})
+        elif value is not None:
+            found[name] = np.array(value)
+    return found
 
 
 def take_up(state: Any, arrays: Mapping[str, Array]) -> None:
-    """Set a dataclass's fields to what `arrays_of` gave; a number keeps its present type.
+    """Set what an object keeps to what `arrays_of` gave; a number keeps its present type.
 
-    Raises KeyError where one is missing, TypeError or ValueError where it has another form.
+    What is None now stays so. Raises KeyError where one is missing, TypeError or ValueError where
+    it has another form.
     """
-    for item in fields(state):
-        values, present = arrays[item.name], getattr(state, item.name)
-        is_array = isinstance(present, np.ndarray)
-        setattr(state, item.name, values if is_array else type(present)(values.item()))
+    for name in _kept(state):
+        present = getattr(state, name)
+        if _has_parts(present):
+            take_up(present, group(arrays, f"{name} "))
+        elif isinstance(present, dict):
+            setattr(state, name, group(arrays, f"{name} "))
+        elif isinstance(present, np.ndarray | list):
+            values = arrays[name].copy()
+            setattr(state, name, values if isinstance(present, np.ndarray) else list(values))
+        elif present is not None:
+            setattr(state, name, type(present)(arrays[name].item()))
 
 
-def _entries(path: Path) -> dict[str, Array]:
-    try:
-        return read_arrays(path)
-    except FileNotFoundError as error:
-        raise CheckpointError(
-            f"{path}: there is no checkpoint to resume from; run without --resume"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
+def _kept(state: Any) -> Iterable[str]:
+    names: Iterable[str] | None = getattr(state, "KEPT", None)
+    return [item.name for item in fields(state)] if names is None else names
+
+
+def _has_parts(value: Any) -> bool:
+    return hasattr(value, "KEPT") or is_dataclass(value)
 
 
 def _digest(entries: Mapping[str, Array]) -> bytes:
@@ -132,17 +158,3 @@ def _digest(entries: Mapping[str, Array]) -> bytes:
         digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
         digest.update(array.tobytes())
     return digest.digest()
-
-
-def generator_state(rng: np.random.Generator) -> dict[str, Any]:
-    """State of a generator as JSON-ready numbers."""
-    state: dict[str, Any] = dict(rng.bit_generator.state)
-    return state
-
-
-def restore_generator(rng: np.random.Generator, state: dict[str, Any]) -> None:
-    """Put a generator back; raises CheckpointError where the state is of another kind."""
-    try:
-        rng.bit_generator.state = state
-    except (TypeError, ValueError, KeyError) as error:
-        raise CheckpointError(f"the generator's state cannot be restored ({error})") from error

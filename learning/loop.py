@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from math import inf
 from typing import Any
 
@@ -14,7 +14,6 @@ from controllers.rti import LinearisationPoint
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
 from cosim.protocols import Step, recover
-from cosim.simulation import spawn_seeds
 from learning.algorithm import (
     Algorithm,
     LearnableController,
@@ -22,10 +21,9 @@ from learning.algorithm import (
     Transition,
     Update,
 )
-from learning.checkpoint import generator_state, group, prefixed, restore_generator
+from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.configuration import Strategy
 from learning.errors import PrivilegeError
-from learning.exploration import Strategy, build_strategy
-from learning.training_run import TrainingRun, build_controller
 
 Vector = NDArray[np.float64]
 CHECKED_EVERY = 10
@@ -94,7 +92,10 @@ class TrainingLoop:
         self._simulator = plant if simulator else None
         self._plant = plant if simulator else PlantInOperation(plant)
         self.controller, self.algorithm, self.rng = controller, algorithm, rng
-        self._strategy, self._algorithm_rng = strategy, algorithm_rng
+        self._strategy = strategy
+        self._generators = {"exploration": rng}
+        if algorithm_rng is not None:
+            self._generators["algorithm"] = algorithm_rng
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
@@ -273,10 +274,9 @@ class TrainingLoop:
             content = self._asked("mark").serialise(self._marked[0])
             arrays |= {"marked_s": self._marked[1], "marked": np.frombuffer(content, np.uint8)}
             arrays |= _stored("marked_point", self._marked[2])
-        values = {"counts": asdict(self.counts), "generator": generator_state(self.rng)}
-        if self._algorithm_rng is not None:
-            values["algorithm_generator"] = generator_state(self._algorithm_rng)
+        values = {name: rng.bit_generator.state for name, rng in self._generators.items()}
         stored = {"theta": self.controller.theta, **prefixed("loop ", arrays)}
+        stored |= prefixed("counts ", arrays_of(self.counts))
         return values, stored | prefixed("algorithm ", self.algorithm.state())
 
     def restore(self, values: dict[str, Any], stored: dict[str, NDArray[Any]]) -> None:
@@ -284,12 +284,11 @@ class TrainingLoop:
 
         Raises KeyError, TypeError, ValueError or another error where it is not that.
         """
-        restore_generator(self.rng, values["generator"])
-        if self._algorithm_rng is not None:
-            restore_generator(self._algorithm_rng, values["algorithm_generator"])
+        for name, rng in self._generators.items():
+            rng.bit_generator.state = values[name]
         self.controller.theta = stored["theta"]
         self.algorithm.restore(group(stored, "algorithm "))
-        self.counts = Counts(**{name: int(values["counts"][name]) for name in asdict(Counts())})
+        take_up(self.counts, group(stored, "counts "))
         arrays = group(stored, "loop ")
         self.s, self._applied = arrays["s"], arrays["applied"]
         self._marked = None
@@ -298,27 +297,6 @@ class TrainingLoop:
             self._marked = (snapshot, arrays["marked_s"], _point("marked_point", arrays))
         self._point = _point("point", arrays)
         self.restart()
-
-
-def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> TrainingLoop:
-    """The loop of a run at its start: the plant is reset, once, and the first state is solved for.
-
-    All random numbers come from the run's seed.
-    """
-    controller = build_controller(run.controller, run.scenario, run.starting_parameters())
-    strategy = build_strategy(run.configuration, run.scenario)
-    plant_seed, rng = spawn_seeds(run.seed)
-    own = run.algorithm_rng()
-    rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
-    loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
-    first: int | None = getattr(rule, "first_episode", None)
-    if first is not None and rule.asks_for != "simulator":
-        raise PrivilegeError(
-            f"{algorithm.__name__} asks for a plant in operation and states 'first_episode', which "
-            "only a simulator has"
-        )
-    loop.start(plant.reset(plant_seed if first is None else first))
-    return loop
 
 
 def _stored(name: str, point: LinearisationPoint | None) -> dict[str, Vector]:

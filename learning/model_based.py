@@ -22,14 +22,12 @@ from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.scenario import Scenario
-from learning.algorithm import LearnableController, Transition, Update
-from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.algorithm import Algorithm, Transition, Update
+from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration, Count
 from learning.empirical_model import EmpiricalModel, Features, Rollout, bound_costs
-from learning.exploration import Strategy
 from learning.prediction_errors import SortedErrors
-from learning.step import certificate
+from learning.step import moved
 
 Array = NDArray[np.float64]
 
@@ -99,7 +97,7 @@ class Progress:
     model_samples: int = 0
 
 
-class ModelBased:
+class ModelBased(Algorithm):
     """Operates with θ, fits the empirical model, searches on it, and operates on.
 
     An update is due whenever the model's data have doubled or `longest_interval` has passed, and as
@@ -109,41 +107,33 @@ class ModelBased:
     """
 
     Configuration = ModelBasedConfiguration
-    asks_for: ClassVar[Literal["operation"]] = "operation"
+    KEPT = ("_progress",)
+    configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
-    needs_action_value = False
-    needs_points = False
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: ModelBasedConfiguration,
-        samples: int,
-        strategy: Strategy,
-        rng: np.random.Generator,
-    ) -> None:
-        self._controller, self._configuration, self._rng = controller, configuration, rng
-        self._problem = problem = Problem.from_scenario(scenario)
-        start, n = controller.parameters, problem.n_states
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        settings, start = self.configuration, self.controller.parameters
+        self._problem = problem = Problem.from_scenario(self.scenario)
         self._base = base = _tuned(problem, start)
         self._features = Features(problem)
         self._rollout = Rollout(problem, start, self._features)
         self._model: EmpiricalModel | None = None
+        n = problem.n_states
         self._progress = Progress(
-            rows=np.zeros((configuration.memory, self._features.inputs + n + 1)),
+            rows=np.zeros((settings.memory, self._features.inputs + n + 1)),
             back_off=np.maximum(
                 np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]]), 0.0
             ),
             pool=np.zeros((0, n + 1)),
-            due=configuration.first_update,
+            due=settings.first_update,
         )
 
     @property
     def explores(self) -> bool:
         """Whether the samples explore now."""
         now = self._progress
-        return now.count - now.era < self._configuration.exploration_samples
+        return now.count - now.era < self.configuration.exploration_samples
 
     @property
     def model_samples(self) -> int:
@@ -206,37 +196,32 @@ class ModelBased:
             self._features, inputs, outputs, now.pool[: max(POOL - age, 0)]
         )
         now.updated = now.count
-        interval = max(age, self._configuration.first_update)
-        now.due = now.count + min(interval, self._configuration.longest_interval)
+        interval = max(age, self.configuration.first_update)
+        now.due = now.count + min(interval, self.configuration.longest_interval)
         search = BackOffs(
-            self._problem, self._rollout, self._base, self._model, inputs[-RECENT:], self._rng
+            self._problem, self._rollout, self._base, self._model, inputs[-RECENT:], self.rng
         )
         found = search.best(now.back_off, self._least(inputs))
-        present = self._controller.parameters
+        present = self.controller.parameters
         new = search.theta(found)
         search.draw(FINE)
         better = search.excess(search.promise(new), search.promise(present.theta)) <= 0
         if better:
             now.back_off = found
-            self._controller.theta = new
+            self.controller.theta = new
         now.model_samples += search.samples
-        step = self._controller.theta - present.theta
-        return Update(
-            td_error=float("nan"),
-            step=float(np.linalg.norm(step / present.blocks.scale)),
-            smallest_eigenvalue=certificate(present.blocks, self._controller.theta).smallest,
-            refused=not better,
-        )
+        end = self.controller.theta
+        return moved(present.blocks, present.theta, end, refused=not better)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """The data, the model and how far the run is."""
         model = {} if self._model is None else self._model.arrays()
-        return arrays_of(self._progress) | prefixed("model ", model)
+        return super().state() | prefixed("model ", model)
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
-        take_up(self._progress, state)
-        if model := group({k: v for k, v in state.items() if k.startswith("model ")}, "model "):
+        super().restore(state)
+        if model := group(state, "model "):
             self._model = EmpiricalModel(self._features, **model)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from cmaes import CMA
@@ -12,11 +12,10 @@ from scipy.linalg import expm
 
 from controllers.theta import Parameters
 from cosim.scenario import Scenario
-from learning.algorithm import LearnableController, Transition, Update
+from learning.algorithm import Algorithm, Transition, Update
 from learning.baselines import GreedyConfiguration
-from learning.configuration import Configuration, Count, Positive
-from learning.exploration import Strategy
-from learning.step import HESSIANS, certificate
+from learning.configuration import Count, Positive
+from learning.step import HESSIANS, certificate, moved
 
 Vector = NDArray[np.float64]
 
@@ -77,7 +76,7 @@ class Coordinates:
         return start.replace(values)
 
 
-class PolicySearch:
+class PolicySearch(Algorithm):
     """CMA-ES (Hansen) on the mean cost of stretches of operation, one for each candidate.
 
     A stretch begins where the last one ended; its first samples, as many as the horizon has, settle
@@ -85,33 +84,23 @@ class PolicySearch:
     generation that the budget leaves over changes nothing.
     """
 
-    Configuration: ClassVar[type[Configuration]] = PolicySearchConfiguration
-    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
-    needs_action_value = False
-    needs_points = False
+    Configuration = PolicySearchConfiguration
+    KEPT = ("_told", "_costs", "_noise", "_sum", "_step")
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: PolicySearchConfiguration,
-        samples: int,
-        strategy: Strategy,
-        rng: np.random.Generator,
-    ) -> None:
-        self._controller, self._configuration, self._rng = controller, configuration, rng
-        self._coordinates = Coordinates(controller.parameters, scenario, configuration.width)
-        self._seed = int(rng.integers(2**31))
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        settings, start = self.configuration, self.controller.parameters
+        self._coordinates = Coordinates(start, self.scenario, settings.width)
+        self._seed = int(self.rng.integers(2**31))
         self._search = self._new_search()
         self._told: list[Vector] = []
-        self._population: list[Vector] = []
         self._costs: list[float] = []
         self._sum, self._step = 0.0, 0
-        horizon = scenario.controller.horizon
-        self._settling = 0 if self._simulated else min(horizon, configuration.episode - 1)
-        seed = self._begin_generation()
-        self.first_episode = seed if self._simulated else None
-        controller.theta = self._coordinates.theta(self._population[0]).theta
+        horizon = self.scenario.controller.horizon
+        self._settling = 0 if self._simulated else min(horizon, settings.episode - 1)
+        self._begin_generation()
+        self.first_episode = self._noise if self._simulated else None
+        self.controller.theta = self._coordinates.theta(self._population[0]).theta
 
     @property
     def _simulated(self) -> bool:
@@ -120,20 +109,18 @@ class PolicySearch:
     def _new_search(self) -> CMA:
         return CMA(
             mean=np.zeros(self._coordinates.size),
-            sigma=self._configuration.spread,
-            population_size=self._configuration.population,
+            sigma=self.configuration.spread,
+            population_size=self.configuration.population,
             seed=self._seed,
         )
 
-    def _begin_generation(self) -> int:
-        """Ask for a population; the seed of its noise."""
-        self._population = self._ask()
-        self._costs = []
-        self._noise = int(self._rng.integers(2**63))
-        return self._noise
+    def _begin_generation(self) -> None:
+        """Ask for a population, and for its noise."""
+        self._population, self._costs = self._ask(), []
+        self._noise = int(self.rng.integers(2**63))
 
     def _ask(self) -> list[Vector]:
-        return [self._search.ask() for _ in range(self._configuration.population)]
+        return [self._search.ask() for _ in range(self.configuration.population)]
 
     @property
     def theta(self) -> Vector:
@@ -151,7 +138,7 @@ class PolicySearch:
     def _take(self, cost: float) -> Update | None:
         self._sum += cost if self._step >= self._settling else 0.0
         self._step += 1
-        if self._step < self._configuration.episode:
+        if self._step < self.configuration.episode:
             return None
         self._costs.append(self._sum / (self._step - self._settling))
         self._sum, self._step = 0.0, 0
@@ -160,39 +147,24 @@ class PolicySearch:
             self._tell(np.array(self._population), self._costs)
             self._begin_generation()
         candidate = self._coordinates.theta(self._population[len(self._costs)])
-        self._controller.theta = candidate.theta
-        blocks = candidate.blocks
-        return Update(
-            td_error=float("nan"),
-            step=float(np.linalg.norm((self.theta - before) / blocks.scale)),
-            smallest_eigenvalue=certificate(blocks, candidate.theta).smallest,
-            episode=self._noise if self._simulated else None,
+        self.controller.theta = candidate.theta
+        blocks, episode = candidate.blocks, self._noise if self._simulated else None
+        return moved(blocks, before, self.theta, episode=episode)._replace(
+            smallest_eigenvalue=certificate(blocks, candidate.theta).smallest
         )
 
     def _tell(self, population: NDArray[np.float64], costs: list[float]) -> None:
         self._search.tell(list(zip(population, costs, strict=True)))
         self._told.append(np.column_stack([population, costs]))
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """What was told, from which the search is made again, and the present generation."""
-        size, population = self._coordinates.size, self._configuration.population
-        return {
-            "told": np.array(self._told).reshape(len(self._told), population, size + 1),
-            "costs": np.array(self._costs),
-            "noise": np.array([self._noise], dtype=np.uint64),
-            "episode": np.array([self._sum, self._step]),
-        }
-
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave, by asking and telling all of it again."""
-        self._search, self._told = self._new_search(), []
-        for generation in state["told"]:
+        """Take back what `state` gave, and ask and tell all of it again."""
+        super().restore(state)
+        self._search, told, self._told = self._new_search(), self._told, []
+        for generation in told:
             self._ask()
             self._tell(generation[:, :-1], generation[:, -1].tolist())
         self._population = self._ask()
-        self._costs = state["costs"].tolist()
-        self._noise = int(state["noise"][0])
-        self._sum, self._step = float(state["episode"][0]), int(state["episode"][1])
 
 
 class PolicySearchSimulator(PolicySearch):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +25,7 @@ class OneStepModel:
 
     def __init__(self, scenario: Scenario) -> None:
         problem = Problem.from_scenario(scenario)
+        self.states = problem.n_states
         model = problem.model
         step = discretise(model, problem.sampling_time, problem.substeps)
         x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
@@ -126,6 +125,8 @@ class PredictionErrors:
     and is right under a wrong model too, since the errors carry what the model lacks.
     """
 
+    KEPT = ("_errors", "_count")
+
     def __init__(self, scenario: Scenario, capacity: int) -> None:
         self._penalty = KnownPenalty(scenario)
         self._errors = np.zeros((capacity, scenario.state_lower.size))
@@ -145,11 +146,3 @@ class PredictionErrors:
         """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""
         values = self.values
         return float(self._penalty(prediction + values).mean()) if len(values) else float("nan")
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """All that is kept, as arrays."""
-        return {"errors": self._errors.copy(), "error_count": np.array(self._count)}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._errors, self._count = state["errors"].copy(), int(state["error_count"])

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
-from learning.algorithm import LearnableController, Transition, Update
-from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import (
     Configuration,
     Count,
@@ -22,9 +22,8 @@ from learning.configuration import (
     Positive,
 )
 from learning.errors import DivergenceError
-from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel, PredictionErrors
-from learning.step import ConstrainedStep, Fit, measured_prior, td_fit, td_step
+from learning.step import ConstrainedStep, Fit, prior_deviation, td_fit, td_step
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -123,44 +122,56 @@ class QLearningConfiguration(Configuration):
         return dict.fromkeys(names, f"the rule {self.rule}")
 
 
-class QLearning:
-    """Online Q-learning by the configuration's rule: `KalmanFilter` or `SampleSteps`."""
+class ValueRule(Algorithm):
+    """What Q-learning has online and in batches: prediction errors, a mean cost, coordinates."""
 
-    Configuration: ClassVar[type[Configuration]] = QLearningConfiguration
-    asks_for: ClassVar[Literal["operation", "simulator"]] = "operation"
-    needs_action_value = True
-    needs_points = False
+    KEPT: ClassVar[tuple[str, ...]] = ("scale", "_average_cost", "_errors")
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: QLearningConfiguration,
-        samples: int,
-        strategy: Strategy,
-        rng: np.random.Generator,
-    ) -> None:
-        form = KalmanFilter if configuration.rule == "kalman" else SampleSteps
-        self._form: KalmanFilter | SampleSteps = form(controller, scenario, configuration)
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._model = OneStepModel(self.scenario)
+        self._errors = PredictionErrors(self.scenario, self.configuration.prediction_errors)
+        self.scale = np.ones(self.controller.theta.size)
 
-    def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; move θ and say so, or return None."""
-        return self._form.observe(transition)
+    @property
+    def scale(self) -> Vector:
+        """The coordinates of the steps, (n_θ,)."""
+        return self._step.scale
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """All that the rule remembers, as arrays."""
-        return self._form.state()
+    @scale.setter
+    def scale(self, scale: Vector) -> None:
+        settings = self.configuration
+        self._step = ConstrainedStep(self.controller, settings, scale)
+        self._average_cost = AverageCost.of(settings.criterion, self.scenario, self._step)
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._form.restore(state)
+    def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
+        """The prior's mean; its deviations become the coordinates.
+
+        `states` and `errors` e (K, n) are those of the first samples, `noise` is the standard
+        deviation of the TD errors, which c_lambda's level is not below.
+        """
+        settings, start = self.configuration, self.controller.parameters
+        if settings.measure_offset:
+            start = start.replace({"c_f": errors.mean(axis=0)})
+        self.scale = prior_deviation(
+            start,
+            states.std(axis=0),
+            errors.std(axis=0),
+            settings.deviation(self.scenario),
+            max(abs(float(start["c_lambda"])), noise),
+            settings.prior_width,
+        )
+        return start
 
 
-class KalmanFilter:
-    """Extended Kalman filter for Q with the target held, and the next penalty by its expectation.
+class QLearning(ValueRule):
+    """Online Q-learning by the configuration's rule.
 
-    θ ~ N(θ₀, diag(σ²)) with the widths of `learning.step`. One TD error measures ∇Qᵀd with
-    variance r (`KalmanRegression`):
+    `td` and `fit` step on each sample's δ = ℓ + γV_θ(s₊) − Q_θ(s, a) (paper.tex, eq. Qlearning).
+
+    `kalman` is an extended Kalman filter for Q with the target held, and the next penalty by its
+    expectation: θ ~ N(θ₀, diag(σ²)) with the widths of `learning.step`. One TD error measures ∇Qᵀd
+    with variance r (`KalmanRegression`):
 
         δ = ℓ + p(s) + γ[V_θ(s₊) − p(s₊) + mean_i p(f(s, a) + e_i)] − Q_θ(s, a)
 
@@ -170,28 +181,29 @@ class KalmanFilter:
     Geist and Pietquin (2010), linearised and with the target held.
     """
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: QLearningConfiguration,
-    ) -> None:
-        self._controller, self._scenario, self._configuration = controller, scenario, configuration
-        self._model = OneStepModel(scenario)
-        self._errors = PredictionErrors(scenario, configuration.prediction_errors)
-        self._adopt(np.ones(controller.theta.size))
-        self._regression: KalmanRegression | None = None
-        rows, n = configuration.prior_samples, scenario.state_lower.size
+    Configuration = QLearningConfiguration
+    KEPT = (*ValueRule.KEPT, "_first", "_regression", "_count", "_squares")
+    needs_action_value = True
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        settings, n = self.configuration, self.scenario.state_lower.size
+        if settings.rule != "kalman" and settings.scaled:
+            self.scale = self.controller.parameters.blocks.scale
+        rows = settings.prior_samples
         self._first = {
             "states": np.zeros((rows, n)),
             "prediction_errors": np.zeros((rows, n)),
             "td_errors": np.zeros(rows),
         }
+        self._regression = self._filter(1.0)
         self._count = 0
         self._squares = 0.0
 
     def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; one in `step_every` moves θ."""
+        """Take one sample; one in `step_every` moves θ, with `td` and `fit` each."""
+        if self.configuration.rule != "kalman":
+            return self._sample_step(transition)
         prediction = self._model(transition.s, transition.a)
         error = transition.next_s - prediction
         self._errors.add(error)
@@ -199,16 +211,15 @@ class KalmanFilter:
         value = transition.next_policy.value - transition.next_penalty + expected
         solution = transition.action_value
         td_error = self._average_cost.target(transition.cost, value) - solution.value
-        count, self._count = self._count, self._count + 1
-        if self._regression is None:
-            first = self._first
+        first, count, self._count = self._first, self._count, self._count + 1
+        if count < len(first["states"]):
             first["states"][count], first["prediction_errors"][count] = transition.s, error
             first["td_errors"][count] = td_error
-            return self._begin() if self._count == len(first["states"]) else None
+            return self._begin_filter() if self._count == len(first["states"]) else None
         gradient = solution.value_gradient * self._step.scale
         innovation = self._regression.update(td_error, gradient)
         self._squares += innovation * innovation
-        every = self._configuration.step_every
+        every = self.configuration.step_every
         if self._count % every:
             return None
         error_size, self._squares = (self._squares / every) ** 0.5, 0.0
@@ -216,34 +227,18 @@ class KalmanFilter:
         self._regression.taken()
         return update
 
-    def _begin(self) -> Update:
+    def _begin_filter(self) -> Update:
         """Take the noise, the widths and c_f from the first samples."""
-        first, settings = self._first, self._configuration
+        first = self._first
         variance = float(np.mean(first["td_errors"] ** 2))
         if not np.isfinite(variance):
             raise DivergenceError("TD errors are not finite")
-        start, scale = measured_prior(
-            self._controller.parameters,
-            first["states"],
-            first["prediction_errors"],
-            settings.deviation(self._scenario),
-            variance**0.5,
-            settings.prior_width,
-            measure_offset=settings.measure_offset,
-        )
-        self._adopt(scale)
+        start = self._begin(first["states"], first["prediction_errors"], variance**0.5)
         self._regression = self._filter(max(variance, np.finfo(np.float64).tiny))
         return self._step.move(start.theta, variance**0.5)
 
-    def _adopt(self, scale: Vector) -> None:
-        """Work in coordinates of this scale, (n_θ,)."""
-        settings = self._configuration
-        self._step = ConstrainedStep(self._controller, settings, scale=scale)
-        self._average_cost = AverageCost.of(settings.criterion, self._scenario, self._step)
-
     def _filter(self, variance: float) -> KalmanRegression:
-        settings = self._configuration
-        size = self._step.scale.size
+        settings, size = self.configuration, self.scale.size
         return KalmanRegression(
             np.zeros(size),
             np.eye(size),
@@ -253,28 +248,14 @@ class KalmanFilter:
             settings.parameter_drift,
         )
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Filter, errors and first samples."""
-        state = {
-            **self._first,
-            **self._errors.state(),
-            "scale": self._step.scale,
-            "sums": np.array([self._count, self._squares, self._average_cost.mean_cost]),
-        }
-        if self._regression is not None:
-            state |= prefixed("filter ", arrays_of(self._regression))
-        return {name: np.array(values) for name, values in state.items()}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._first = {name: state[name] for name in self._first}
-        self._errors.restore(state)
-        self._adopt(state["scale"])
-        count, self._squares, self._average_cost.mean_cost = (float(v) for v in state["sums"])
-        self._count = int(count)
-        if kept := group(state, "filter "):
-            self._regression = self._filter(1.0)
-            take_up(self._regression, kept)
+    def _sample_step(self, transition: Transition) -> Update:
+        settings = self.configuration
+        target = self._average_cost.target(transition.cost, transition.next_policy.value)
+        td_error = target - transition.action_value.value
+        gradient = transition.action_value.value_gradient * self._step.scale
+        rule = td_fit if settings.rule == "fit" else td_step
+        fit = self._average_cost.take(rule(td_error, gradient, settings.step_size))
+        return self._step.take(fit, abs(td_error))
 
 
 @dataclass
@@ -321,37 +302,6 @@ class KalmanRegression:
         self.mean[:] = 0.0
 
 
-class SampleSteps:
-    """Steps on each sample's δ = ℓ + γV_θ(s₊) − Q_θ(s, a) (paper.tex, eq. Qlearning)."""
-
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: QLearningConfiguration,
-    ) -> None:
-        self._configuration = configuration
-        self._step = ConstrainedStep(controller, configuration, scaled=configuration.scaled)
-        self._average_cost = AverageCost.of(configuration.discount, scenario, self._step)
-        self._fit = td_fit if configuration.rule == "fit" else td_step
-
-    def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; each moves θ."""
-        target = self._average_cost.target(transition.cost, transition.next_policy.value)
-        td_error = target - transition.action_value.value
-        gradient = transition.action_value.value_gradient * self._step.scale
-        fit = self._fit(td_error, gradient, self._configuration.step_size)
-        return self._step.take(self._average_cost.take(fit), abs(td_error))
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The mean cost."""
-        return {"mean_cost": np.array(self._average_cost.mean_cost)}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._average_cost.mean_cost = float(state["mean_cost"])
-
-
 class AverageCost:
     """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
 
@@ -362,6 +312,8 @@ class AverageCost:
 
     `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
     """
+
+    KEPT = ("mean_cost",)
 
     def __init__(self, discount: float, position: int, scale: float, start: float) -> None:
         self.discount = discount

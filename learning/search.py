@@ -6,20 +6,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from cosim.scenario import Scenario
 from learning.actor_critic import ActorCritic
-from learning.algorithm import LearnableController, Rule, Transition, Update
+from learning.algorithm import Algorithm, Transition, Update
 from learning.batch_q_learning import BatchQLearning
-from learning.checkpoint import group, prefixed
+from learning.checkpoint import group
 from learning.configuration import Configuration, Count
 from learning.errors import ConfigurationError, DivergenceError
-from learning.exploration import Strategy
 from learning.prediction_errors import OneStepModel
 from learning.q_learning import QLearning
 from learning.search_plan import (
@@ -32,7 +30,7 @@ from learning.search_plan import (
     Settle,
     Trial,
 )
-from learning.step import certificate
+from learning.step import moved
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -47,7 +45,6 @@ SENSITIVITIES = 100
 """Policy Jacobians, at most, that the metric of a block is the mean of."""
 LATEST = 1000
 """Samples of a phase of learning whose prediction errors are kept."""
-ROW = ("s", "a", "after")
 
 
 class SearchConfiguration(Configuration):
@@ -105,20 +102,20 @@ class SearchConfiguration(Configuration):
 
 
 class EpisodeData:
-    """The `done` of `length` samples of a request's episode.
+    """The `done` of `length` samples of a request; `deviation` (m,) is the exploration's σ."""
 
-    `deviation` (m,) is the exploration's σ; `size` is n_θ and `states` n.
-    """
+    KEPT = (
+        *("done", "length", "_stage_cost", "_penalty", "_rows", "_candidates", "_metric"),
+        "_jacobians",
+    )
 
-    def __init__(
-        self, request: Request | None, length: int, deviation: Vector, size: int, states: int
-    ) -> None:
+    def __init__(self, request: Request | None, length: int, deviation: Vector, size: int) -> None:
         self._learns = isinstance(request, Learn)
         self._sensitive = isinstance(request, Trial) and request.sensitive
-        self._deviation, self._states = deviation, states
+        self._deviation = deviation
         self.done, self.length = 0, length
         self._stage_cost, self._penalty = 0.0, 0.0
-        self._rows: list[tuple[Vector, ...]] = []
+        self._rows: list[Vector] = []
         self._candidates: list[Vector] = []
         self._metric: Matrix = np.zeros((size, size))
         self._jacobians = 0
@@ -134,7 +131,7 @@ class EpisodeData:
 
     def take(self, transition: Transition, theta: Vector | None = None) -> None:
         """Take a sample, and θ (n_θ,) after it, where that may be a candidate."""
-        self._rows.append((transition.s, transition.a, transition.next_s))
+        self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
         if not self._learns:
             self._judge(transition)
         elif theta is not None and (self.done + 1) % max(self.length // CANDIDATES, 1) == 0:
@@ -157,44 +154,24 @@ class EpisodeData:
 
     def result(self, model: OneStepModel) -> Result:
         """What came of the episode, its predictions by the controller's own `model`."""
-        n, rows = self._states, self._rows[-LATEST:] if self._learns else self._rows
-        predictions = np.array([model(s, a) for s, a, _ in rows]).reshape(-1, n)
-        errors = np.array([after for _, _, after in rows]).reshape(-1, n) - predictions
+        n, width = model.states, model.states + len(self._deviation)
+        rows = np.array(self._rows[-LATEST:] if self._learns else self._rows).reshape(-1, width + n)
+        states = rows[:, :n]
+        predictions = np.array([model(row[:n], row[n:width]) for row in rows]).reshape(-1, n)
+        errors = rows[:, width:] - predictions
         if not self._learns:
             metric = self._metric / max(self._jacobians, 1) if self._sensitive else None
             count = self.length
             return Block(
                 self._stage_cost / count, self._penalty / count, predictions, errors, metric
             )
-        states = np.array([s for s, _, _ in rows]).reshape(-1, n)
         candidates = np.array(self._candidates).reshape(-1, len(self._metric))
         if not len(errors):
             errors, states = np.zeros((1, n)), np.zeros((1, n))
         return Learned(candidates, errors, states.std(axis=0), errors.std(axis=0))
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """All that was taken, as arrays."""
-        counts = [self.done, self.length, self._stage_cost, self._penalty, self._jacobians]
-        state: dict[str, NDArray[Any]] = {
-            "counts": np.array(counts),
-            "metric": self._metric.copy(),
-            "candidates": np.array(self._candidates).reshape(-1, len(self._metric)),
-        }
-        for name, part in zip(ROW, zip(*self._rows, strict=True), strict=False):
-            state[f"rows {name}"] = np.array(part)
-        return state
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        done, length, self._stage_cost, self._penalty, jacobians = map(float, state["counts"])
-        self.done, self.length, self._jacobians = int(done), int(length), int(jacobians)
-        self._metric = state["metric"].copy()
-        self._candidates = [row.copy() for row in state["candidates"]]
-        if "rows s" in state:
-            self._rows = list(zip(*(state[f"rows {name}"] for name in ROW), strict=True))
-
-
-class Search:
+class Search(Algorithm):
     """An algorithm that carries a `SearchPlan` out; a rule learns in its phases, or none does.
 
     `theta` is the incumbent: what the run hands over, while the controller carries the θ that is
@@ -203,51 +180,41 @@ class Search:
     `restore` gives them once more: the plan is deterministic, so it comes back to where it was.
     """
 
-    Configuration: ClassVar[type[Configuration]] = SearchConfiguration
-    asks_for: ClassVar[Literal["operation", "simulator"]] = "simulator"
+    Configuration = SearchConfiguration
+    KEPT = ("_comparison", "_episode", "_learnt", "_rule")
+    asks_for = "simulator"
+    configuration: SearchConfiguration
 
-    def __init__(
-        self,
-        controller: LearnableController,
-        scenario: Scenario,
-        configuration: SearchConfiguration,
-        samples: int,
-        strategy: Strategy,
-        rng: np.random.Generator,
-    ) -> None:
-        self._controller, self._scenario, self._configuration = controller, scenario, configuration
-        self._strategy, self._rng = strategy, rng
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        settings, scenario = self.configuration, self.scenario
         self._learnt, self._rules_made = 0, 0
-        self.explores = True
-        """Whether the samples explore now."""
-        seed = int(rng.integers(2**63))
-        self._rule = self._make_rule(samples, 1.0)
-        self._deviation = np.broadcast_to(
-            configuration.deviation(scenario), scenario.action_lower.shape
-        )
-        self._model, self._states = OneStepModel(scenario), scenario.state_lower.size
-        block, blocks = configuration.block, configuration.blocks
-        self._search = SearchPlan(
+        seed = int(self.rng.integers(2**63))
+        self._rule = self._make_rule(self.samples, 1.0)
+        self._deviation = np.broadcast_to(settings.deviation(scenario), scenario.action_lower.shape)
+        self._model = OneStepModel(scenario)
+        block, blocks = settings.block, settings.blocks
+        search = SearchPlan(
             scenario,
-            controller.parameters,
+            self.controller.parameters,
             self._deviation,
-            samples,
+            self.samples,
             seed,
-            phase=blocks * block if self._rule is None else configuration.phase,
+            phase=blocks * block if self._rule is None else settings.phase,
             block=block,
             blocks=blocks,
         )
-        self._plan = self._search.plan()
+        self._comparison, self._plan = search.comparison, search.plan()
         self._results: list[Result] = []
         self._request: Request | None = next(self._plan, None)
         self._open()
 
-    def _make_rule(self, samples: int, width: float) -> Rule | None:
+    def _make_rule(self, samples: int, width: float) -> Algorithm | None:
         """The rule for a phase of `samples` samples from the controller's present θ.
 
         Its prior or trust region is `width` times as wide as in the first phase.
         """
-        settings = self._configuration
+        settings = self.configuration
         if settings.rule == "none":
             return None
         first = settings.q_learning_first and self._rules_made % 2 == 0
@@ -256,36 +223,16 @@ class Search:
         chosen = settings.rule_configuration(name).narrowed(width)
         # Comparisons decide on the mean cost; the rule inside has the scenario's discount.
         if getattr(chosen, "discount", 1.0) is None:
-            chosen = chosen.model_copy(update={"discount": self._scenario.discount})
-        made: Rule = RULES[name](
-            self._controller,
-            self._scenario,
-            chosen,
-            samples,
-            self._strategy,
-            self._rng,
+            chosen = chosen.model_copy(update={"discount": self.scenario.discount})
+        made: Algorithm = RULES[name](
+            self.controller, self.scenario, chosen, samples, self.strategy, self.rng
         )
         return made
 
     @property
-    def needs_action_value(self) -> bool:
-        """Whether Q of explored samples is asked for."""
-        return self.explores and self._rule is not None and self._rule.needs_action_value
-
-    @property
-    def needs_points(self) -> bool:
-        """Whether linearisation points are asked for."""
-        return self.explores and self._rule is not None and self._rule.needs_points
-
-    @property
     def theta(self) -> Vector:
         """The incumbent, (n_θ,): it has won a comparison, or it is the start."""
-        return self._search.comparison.incumbent.theta
-
-    @property
-    def accepted(self) -> int:
-        """How often the incumbent changed."""
-        return self._search.comparison.accepted
+        return self._comparison.incumbent.theta
 
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of an episode begins the next one."""
@@ -307,17 +254,18 @@ class Search:
 
     def _open(self) -> None:
         """Make ready for the request that the plan has put."""
-        request, controller = self._request, self._controller
+        request, controller = self._request, self.controller
         controller.theta = self.theta if request is None else request.theta
         learns = isinstance(request, Learn)
-        self.explores = learns and self._rule is not None
-        length = request.samples if isinstance(request, Learn) else self._search.comparison.block
-        self._episode = EpisodeData(
-            request, length, self._deviation, controller.theta.size, self._states
-        )
+        length = request.samples if isinstance(request, Learn) else self._comparison.block
+        self._episode = EpisodeData(request, length, self._deviation, controller.theta.size)
         if isinstance(request, Learn) and not request.goes_on:
             self._rule = self._make_rule(request.samples, request.width)
             self._learnt = 0
+        rule = self._rule if learns else None
+        self.explores = rule is not None
+        self.needs_action_value = rule is not None and rule.needs_action_value
+        self.needs_points = rule is not None and rule.needs_points
 
     def _learn(self, transition: Transition) -> Update | None:
         """Let the rule have a sample."""
@@ -333,18 +281,18 @@ class Search:
             self._episode.take(transition)
             return None
         self._learnt += 1
-        self._episode.take(transition, self._controller.theta)
+        self._episode.take(transition, self.controller.theta)
         return update
 
     def _next(self) -> Update:
         """Give the plan what came of its request; begin the episode of the next one."""
-        old, answered = self._controller.theta, self._request
+        old, answered = self.controller.theta, self._request
         self._advance(self._episode.result(self._model))
-        theta, blocks = self._controller.theta, self._controller.parameters.blocks
-        return Update(
-            td_error=float("nan"),
-            step=float(np.linalg.norm((theta - old) / blocks.scale)),
-            smallest_eigenvalue=certificate(blocks, theta).smallest,
+        theta, blocks = self.controller.theta, self.controller.parameters.blocks
+        return moved(
+            blocks,
+            old,
+            theta,
             episode=self._request.episode if isinstance(self._request, Settle) else None,
             mark=isinstance(answered, Settle),
             rewind=isinstance(self._request, Trial) and self._request.begins,
@@ -355,33 +303,28 @@ class Search:
             self._request = self._plan.send(result)
         except StopIteration:
             self._request = None
-        none = np.zeros((0, self._states))
+        none = np.zeros((0, self._model.states))
         if isinstance(result, Block):
-            expected = self._search.comparison.expected
+            expected = self._comparison.expected
             result = result._replace(predictions=none, expected=expected)
         self._results.append(result._replace(errors=none))
         self._open()
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Every result so far, the errors that count, the open episode's data, the rule's state."""
-        state = self._episode.state() | self._search.comparison.state()
-        state |= {"learnt": np.array(self._learnt), "results": np.array(len(self._results))}
+        state = super().state() | {"results": np.array(len(self._results))}
         for k, result in enumerate(self._results):
             kept = {name: part for name, part in result._asdict().items() if part is not None}
             state |= {f"result {k} {name}": np.asarray(part) for name, part in kept.items()}
-        return state | ({} if self._rule is None else prefixed("rule ", self._rule.state()))
+        return state
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
-        theta = self._controller.theta
+        theta = self.controller.theta
         for k in range(int(state["results"])):
             kept: dict[str, Any] = group(state, f"result {k} ")
             for name in kept.keys() & {"stage_cost", "penalty", "expected"}:
                 kept[name] = float(kept[name])
             self._advance(Learned(**kept) if "candidates" in kept else Block(**kept))
-        self._search.comparison.restore(state)
-        self._controller.theta = theta
-        self._episode.restore(state)
-        self._learnt = int(state["learnt"])
-        if self._rule is not None:
-            self._rule.restore(group(state, "rule "))
+        self.controller.theta = theta
+        super().restore(state)

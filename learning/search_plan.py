@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,6 +130,7 @@ class PairedComparison:
     to `blocks` blocks of `block` samples.
     """
 
+    KEPT = ("_errors", "pooled")
     MEMORY = 6000
     """Prediction errors over which a penalty is expected: the tail is what counts."""
 
@@ -145,7 +146,7 @@ class PairedComparison:
         self.expected = float("nan")
         """Penalty expected of the latest block."""
         self._errors: Matrix = np.zeros((0, scenario.state_lower.size))
-        self._pooled, self._pool = self._errors, SortedErrors(self._errors)
+        self.pooled = self._errors
         self.incumbent = Candidate(start.theta)
         self.base = self.incumbent
         self.accepted = 0
@@ -166,14 +167,14 @@ class PairedComparison:
             self.accepted += 1
         self.base = self.incumbent = candidate
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The prediction errors that later comparisons count, as arrays."""
-        return {"latest errors": self._errors, "pooled errors": self._pooled}
+    @property
+    def pooled(self) -> Matrix:
+        """The prediction errors that the penalties of this round's blocks are expected with."""
+        return self._pooled
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        self._errors, self._pooled = state["latest errors"], state["pooled errors"]
-        self._pool = SortedErrors(self._pooled)
+    @pooled.setter
+    def pooled(self, errors: Matrix) -> None:
+        self._pooled, self._pool = errors, SortedErrors(errors)
 
     def spend(self, samples: int) -> None:
         """Count samples that are asked for; raises Spent where the limit leaves fewer."""
@@ -208,7 +209,7 @@ class PairedComparison:
         self.spend(self.block)
         yield Settle(self.incumbent.theta, episode)
         # One pool for the whole round, or two θ would not be judged alike.
-        self._pooled, self._pool = self._errors, SortedErrors(self._errors)
+        self.pooled = self._errors
         self.base = self.incumbent = Candidate(self.incumbent.theta)
         for _ in range(blocks):
             yield from self.run(self.incumbent)

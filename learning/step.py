@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,26 +210,20 @@ def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vec
 class ConstrainedStep:
     """Moves a controller's θ by a fit under every constraint on θ.
 
-    `scale` (n_θ,) are the coordinates of the fits: the layout's, or ones where the configuration
-    says `scaled = false`, or `scale` where it is given. The least eigenvalue that the Hessians may
-    have is the configuration's, or half of the start's where that is less: an economically tuned
-    cost is flat. Raises DivergenceError on a step that is not finite.
+    `scale` (n_θ,) are the coordinates of the fits, the layout's if not given. The least eigenvalue
+    that the Hessians may have is the configuration's, or half of the start's where that is less: an
+    economically tuned cost is flat. Raises DivergenceError on a step that is not finite.
     """
 
     def __init__(
         self,
         controller: LearnableController,
         configuration: Configuration,
-        *,
-        scaled: bool = True,
         scale: Vector | None = None,
     ) -> None:
         self._controller = controller
         blocks = controller.parameters.blocks
-        if scale is not None:
-            self.blocks = rescaled(blocks, scale)
-        else:
-            self.blocks = blocks if scaled else rescaled(blocks, np.ones(blocks.size))
+        self.blocks = blocks if scale is None else rescaled(blocks, scale)
         self.scale: Vector = self.blocks.scale
         least = least_eigenvalue(configuration, controller.parameters)
         self._enforce = LinearMatrixInequality(self.blocks, least)
@@ -284,6 +279,16 @@ class ConstrainedStep:
             where = self.blocks.slices[name]
             theta[where] = np.maximum(theta[where], minimum)
         return theta
+
+
+def moved(blocks: ThetaBlocks, old: Vector, new: Vector, **said: Any) -> Update:
+    """What an algorithm says of a move of θ that no fit led to; `said` are further fields."""
+    return Update(
+        td_error=float("nan"),
+        step=float(np.linalg.norm((new - old) / blocks.scale)),
+        smallest_eigenvalue=certificate(blocks, new).smallest,
+        **said,
+    )
 
 
 def least_eigenvalue(configuration: Configuration, start: Parameters) -> float:
@@ -344,35 +349,6 @@ def prior_deviation(
     floor = np.finfo(np.float64).tiny ** 0.25
     deviation: Vector = np.concatenate([widths[block.name] for block in start.blocks])
     return np.maximum(deviation, floor)
-
-
-def measured_prior(
-    start: Parameters,
-    states: NDArray[np.float64],
-    errors: NDArray[np.float64],
-    action_deviation: Vector,
-    noise: float,
-    width: float,
-    *,
-    measure_offset: bool,
-) -> tuple[Parameters, Vector]:
-    """Mean and deviation (n_θ,) of the prior by the first samples' states and errors e, (K, n).
-
-    The mean is the start, with `measure_offset` c_f at the mean of e.
-    `noise` is the standard deviation of the TD errors, which c_lambda's level is not below.
-    """
-    if measure_offset:
-        start = start.replace({"c_f": errors.mean(axis=0)})
-    level = max(abs(float(start["c_lambda"])), noise)
-    deviation = prior_deviation(
-        start,
-        states.std(axis=0),
-        errors.std(axis=0),
-        action_deviation,
-        level,
-        width,
-    )
-    return start, deviation
 
 
 def _root_diagonal(matrix: NDArray[np.float64]) -> Vector:

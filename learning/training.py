@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from importlib.metadata import version
 from itertools import islice
-from math import isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -15,27 +16,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers import compile_functions
+from controllers.optimum import QuasiStaticPolicy, change_of, yardstick
+from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
+from cosim.kpis import indicators_of
 from cosim.plant import FmuPlant
+from cosim.plant.archive import SHIPPED
 from cosim.plugins import build_controller
-from cosim.protocols import functions_of
+from cosim.protocols import Controller, Plant, functions_of
 from cosim.scenario import Scenario
 from cosim.shown import Shown
-from cosim.statistics import shown
+from cosim.statistics import gap_closed, regret, shown
+from cosim.text_tables import csv_text
 from learning import checkpoint
-from learning.algorithm import Algorithm, LearnableController, Privilege, load_algorithm
-from learning.checkpoint import Checkpoint
+from learning.algorithm import Algorithm, LearnableController, Privilege, Update, load_algorithm
+from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up
 from learning.configuration import Configuration
-from learning.drift import Drift
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
-from learning.evaluation import FIGURES, Judge, stored_optimum
-from learning.log import COLUMNS, LogRow, Totals, late_movement, to_csv
-from learning.loop import TrainingLoop, begin
 from learning.step import certificate
-from learning.training_run import Options, TrainingRun, prepare
-from learning.training_run import build_controller as build_learnt
+from learning.training_run import Options, TrainingRun, begin, learnable, prepare
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,6 +44,210 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
+HELD_OUT = 1_000_000
+"""First of the held-out seeds; training seeds stay below."""
+FIGURES = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
+COLUMNS = (
+    "samples",
+    "updates",
+    "J",
+    "td_error",
+    "step",
+    "smallest_eigenvalue",
+    "corrected",
+    "refused",
+    "failures",
+    "explored",
+    "saturated",
+    "weakly_active",
+    "licq_failed",
+    "plant_samples",
+    "greedy_J",
+    "greedy_economic_cost",
+    "greedy_mean_violation",
+    "greedy_violating_share",
+    "greedy_failures",
+    "regret",
+    "gap_closed",
+)
+
+
+class LogRow(dict[str, float]):
+    """A line of the log: figures by column, NaN where not measured, and the `parameters` then.
+
+    The entries of θ have names in the CSV alone.
+    """
+
+    __slots__ = ("parameters",)
+
+    def __init__(self, figures: Mapping[str, float], parameters: Parameters) -> None:
+        super().__init__(figures)
+        self.parameters = parameters
+
+
+@dataclass
+class Totals:
+    """Sums since the last line of the log.
+
+    `cost` over the `samples`; `updates`, and over these `squares` of the TD error, norms of the
+    `step`, flags `corrected` and `refused`; `smallest_eigenvalue` is the least of all.
+    """
+
+    cost: float = 0.0
+    samples: int = 0
+    updates: int = 0
+    squares: float = 0.0
+    step: float = 0.0
+    corrected: int = 0
+    refused: int = 0
+    smallest_eigenvalue: float = inf
+
+    def add(self, cost: float, update: Update | None) -> None:
+        """Take a sample's cost and its update, if there was one."""
+        self.cost += cost
+        self.samples += 1
+        if update is None:
+            return
+        self.updates += 1
+        self.squares += update.td_error**2
+        self.step += update.step
+        self.corrected += update.corrected
+        self.refused += update.refused
+        self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
+
+    def means(self) -> dict[str, float]:
+        """Means over the samples and their updates, NaN where there was none."""
+        count = self.updates or float("nan")
+        return {
+            "J": self.cost / (self.samples or float("nan")),
+            "updates": self.updates,
+            "td_error": (self.squares / count) ** 0.5,
+            "step": self.step / count,
+            "corrected": self.corrected,
+            "refused": self.refused,
+        }
+
+
+def to_csv(rows: Sequence[LogRow]) -> str:
+    """The log as CSV with exact decimals: its figures, then a column `theta NAME` for each entry.
+
+    What was not measured is left empty.
+    """
+    if not rows:
+        return ""
+    labels = [f"theta {label}" for label in rows[0].parameters.blocks.labels]
+    return csv_text(
+        [*rows[0], *labels],
+        (map(_cell, [*row.values(), *row.parameters.theta.tolist()]) for row in rows),
+    )
+
+
+def _cell(value: float) -> str:
+    return "" if isnan(value) else repr(int(value) if value == int(value) else value)
+
+
+def late_movement(start: Parameters, rows: Sequence[LogRow]) -> float:
+    """‖θ_K − θ_0.8K‖/‖θ_K − θ_0‖ in scaled entries: the criterion of convergence, below 0.05.
+
+    θ_0.8K is that of the last row within the first four fifths of the samples. NaN where θ never
+    moved or the log has no such row.
+    """
+    early = [row for row in rows if row["samples"] <= 0.8 * rows[-1]["samples"]]
+    if not early:
+        return float("nan")
+    last, scale = rows[-1].parameters.theta, start.blocks.scale
+    way = float(np.linalg.norm((last - start.theta) / scale))
+    moved = float(np.linalg.norm((last - early[-1].parameters.theta) / scale))
+    return moved / way if way > 0 else float("nan")
+
+
+def drift(scenario: Scenario) -> Callable[[float], dict[str, float]] | None:
+    """The parameters that change in a scenario's plant, and J*, by column, at a time in s.
+
+    For the log: the learner is not told. J* is NaN where none is stored; None of another plant.
+    """
+    law = change_of(scenario)
+    if law is None:
+        return None
+    known = QuasiStaticPolicy.stored(scenario)
+
+    def row(time: float) -> dict[str, float]:
+        reference = float("nan") if known is None else float(known.gain_at(time))
+        return law.present(time) | {"reference_J": reference}
+
+    return row
+
+
+class Judge:
+    """Judges a run's θ by its greedy policy on the held-out seeds.
+
+    `start` is a θ of the run's blocks. `optimum` is a controller whose J on the same seeds is J*,
+    for the regret and the gap closed; without it they are NaN.
+    """
+
+    def __init__(
+        self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
+    ) -> None:
+        self._run, self._plant, self._start, self._optimum = run, plant, start, optimum
+        self._controller = learnable(run.controller, run.scenario, start)
+
+    def verdict(self, theta: Array) -> dict[str, Any]:
+        """The greedy policy at θ (n_θ,): means of `FIGURES`, `regret`, `gap_closed`.
+
+        `regret_interval` is its 95 % interval over the runs; `failures` is a sum; None is unknown.
+        """
+        costs = self._costs(theta)
+        means: dict[str, Any] = {name: float(costs[name].mean()) for name in FIGURES}
+        beyond = regret(costs["J"], self._optimal_cost)
+        gap = gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value
+        known = isfinite(beyond.value)
+        return means | {
+            "failures": int(costs["failures"].sum()),
+            "regret": beyond.value if known else None,
+            "regret_interval": beyond.t,
+            "gap_closed": gap if known else None,
+        }
+
+    @property
+    def baselines(self) -> dict[str, float]:
+        """J on the held-out runs of naive and, where it is known, optimal."""
+        found = {"naive": float(self._naive_cost.mean())}
+        if self._optimum is not None:
+            found["optimal"] = float(self._optimal_cost.mean())
+        return found
+
+    @cached_property
+    def start_J(self) -> float:
+        """J on the held-out runs of θ where the run starts."""
+        return float(self._costs(self._start.theta)["J"].mean())
+
+    @property
+    def limit(self) -> float:
+        """Greedy J above which a run has diverged."""
+        # A cost may be negative, a profit say: the margin counts in its magnitude.
+        worst = max(float(self._naive_cost.mean()), self.start_J)
+        return worst + (self._run.divergence - 1) * abs(worst)
+
+    def _costs(self, policy: Array | Controller) -> dict[str, Array]:
+        """Indicators on the held-out seeds of the greedy policy at θ, or of a controller."""
+        if isinstance(policy, np.ndarray):
+            self._controller.theta = policy
+            policy = self._controller
+        seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
+        compile_functions(policy, self._run.evaluation_steps * len(seeds))
+        return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)
+
+    @cached_property
+    def _naive_cost(self) -> Array:
+        run = self._run
+        naive = Parameters.naive(Problem.from_scenario(run.scenario))
+        return self._costs(learnable(run.controller, run.scenario, naive))["J"]
+
+    @cached_property
+    def _optimal_cost(self) -> Array:
+        if self._optimum is None:
+            return np.full(self._run.evaluation_seeds, np.nan)
+        return self._costs(self._optimum)["J"]
 
 
 @dataclass(frozen=True, repr=False)
@@ -106,7 +311,7 @@ class Training(Shown):
 
     def controller(self) -> LearnableController:
         """A fresh controller that has this θ."""
-        return build_learnt(self.run.controller, self.run.scenario, self.parameters)
+        return learnable(self.run.controller, self.run.scenario, self.parameters)
 
     def log(self) -> dict[str, Array]:
         """The columns of the training's log, (K,) each, NaN where not measured."""
@@ -226,6 +431,17 @@ def train(
     return run_training(run, out, resume=resume, optimum=optimum, progress=progress)
 
 
+def stored_optimum(scenario: Scenario) -> str | None:
+    """`optimal` where it is the scenario's yardstick and can be had without solving anything.
+
+    A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
+    scenario names the plant's own model.
+    """
+    if scenario.plant.fmu not in SHIPPED and scenario.plant.model is None:
+        return None
+    return None if yardstick(scenario) is None else "optimal"
+
+
 def run_training(
     run: TrainingRun,
     out: str | Path | None = None,
@@ -289,11 +505,11 @@ class _Session:
     ) -> None:
         self.run, self.plant, self.out = run, plant, out
         self.identity = run.identity()
-        self.loop: TrainingLoop = begin(run, algorithm, plant)
+        self.loop = begin(run, algorithm, plant)
         self.start = self.loop.start_parameters
         self.rows: list[LogRow] = []
         self.totals = Totals()
-        self.drift = Drift.of(run.scenario)
+        self.drift = drift(run.scenario)
         self.without_checkpoint: str | None = None
 
     def run_to_the_end(self, judge: Judge, progress: Callable[[int, LogRow], None] | None) -> str:
@@ -334,7 +550,7 @@ class _Session:
             "plant_samples": counts["number"],
         }
         if self.drift is not None:
-            figures |= self.drift.row(self.plant.time)
+            figures |= self.drift(self.plant.time)
         if judge is not None:
             verdict = judge.verdict(answer.theta)
             figures |= {f"greedy_{name}": verdict[name] for name in FIGURES}
@@ -371,10 +587,8 @@ class _Session:
         except CapabilityError as error:
             self.without_checkpoint = str(error)
             return
-        values |= {
-            "totals": asdict(self.totals),
-            "columns": list(self.rows[0]) if self.rows else [],
-        }
+        values["columns"] = list(self.rows[0]) if self.rows else []
+        arrays |= prefixed("totals ", arrays_of(self.totals))
         arrays |= {
             "plant": np.frombuffer(plant, dtype=np.uint8),
             "rows": np.array([list(row.values()) for row in self.rows]),
@@ -391,16 +605,12 @@ class _Session:
         try:
             self._require_same_beginning(path, int(found.run["samples"]))
             columns, arrays = found.state["columns"], found.arrays
+            rows = zip(arrays["rows"].tolist(), arrays["row_thetas"], strict=True)
             self.rows = [
-                LogRow(
-                    dict(zip(columns, map(float, figures), strict=True)),
-                    self.start.with_theta(theta),
-                )
-                for figures, theta in zip(
-                    arrays["rows"].tolist(), arrays["row_thetas"], strict=True
-                )
+                LogRow(dict(zip(columns, figures, strict=True)), self.start.with_theta(theta))
+                for figures, theta in rows
             ]
-            self.totals = Totals(**found.state["totals"])
+            take_up(self.totals, group(arrays, "totals "))
             self.plant.restore(self.plant.deserialise(arrays["plant"].tobytes()))
             self.loop.restore(found.state, arrays)
         except (

@@ -1,4 +1,4 @@
-"""A training run: its settings, checked, and the θ and controller that it starts with."""
+"""A training run: its settings, checked, and the θ, controller and loop that it starts with."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from controllers.economic import tune
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
+from cosim.plant import FmuPlant
 from cosim.plugins import OURS, depends_on
 from cosim.scenario import Scenario
+from cosim.simulation import spawn_seeds
 from cosim.validation import suggestion
-from learning.algorithm import LearnableController, load_algorithm
+from learning.algorithm import Algorithm, LearnableController, load_algorithm
 from learning.commissioning import back_off
 from learning.configuration import Configuration
-from learning.errors import ConfigurationError
+from learning.errors import ConfigurationError, PrivilegeError
+from learning.loop import TrainingLoop
 
 Vector = NDArray[np.float64]
 CONTROLLERS = ("rti", "converged")
@@ -107,11 +110,6 @@ class TrainingRun:
             return starting_parameters(problem, self.configuration, self.start)
         return back_off(starting_parameters(problem, self.configuration, "tuned"), self.scenario)
 
-    def algorithm_rng(self) -> np.random.Generator:
-        """The algorithm's own generator, apart from those of noise and exploration."""
-        # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
-        return np.random.default_rng(np.random.SeedSequence(self.seed).spawn(3)[2])
-
 
 class Options(TypedDict, total=False):
     """The fields of `TrainingRun` that `train` takes as further keywords."""
@@ -151,6 +149,28 @@ def prepare(
         configuration=settings,
         **options,
     )
+
+
+def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> TrainingLoop:
+    """The loop of a run at its start: the plant is reset, once, and the first state is solved for.
+
+    All random numbers come from the run's seed.
+    """
+    controller = learnable(run.controller, run.scenario, run.starting_parameters())
+    strategy = run.configuration.strategy(run.scenario)
+    plant_seed, rng = spawn_seeds(run.seed)
+    # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
+    own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])
+    rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
+    loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
+    first: int | None = getattr(rule, "first_episode", None)
+    if first is not None and rule.asks_for != "simulator":
+        raise PrivilegeError(
+            f"{algorithm.__name__} asks for a plant in operation and states 'first_episode', which "
+            "only a simulator has"
+        )
+    loop.start(plant.reset(plant_seed if first is None else first))
+    return loop
 
 
 def starting_parameters(
@@ -219,7 +239,7 @@ def _extended(problem: Problem, configuration: Configuration, path: str) -> Para
     return Parameters.naive(problem, blocks).replace(values)
 
 
-def build_controller(kind: str, scenario: Scenario, parameters: Parameters) -> LearnableController:
+def learnable(kind: str, scenario: Scenario, parameters: Parameters) -> LearnableController:
     """`rti` or `converged`; raises ConfigurationError on another kind."""
     if kind not in CONTROLLERS:
         raise ConfigurationError(

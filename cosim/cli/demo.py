@@ -47,7 +47,7 @@ def demo(
         from cosim.scenario import Scenario
         from cosim.simulation import simulate
         from cosim.text_tables import markdown_table
-        from learning.evaluation import HELD_OUT
+        from learning.training import HELD_OUT
 
         scenario = Scenario.load(SCENARIO)
         folder = open_folder(out).absolute()

@@ -16,8 +16,7 @@ from cosim.cli.output import Output, dump, load_scenario, open_folder, output, r
 from cosim.errors import CosimError
 
 if TYPE_CHECKING:
-    from learning.log import LogRow
-    from learning.training import Training
+    from learning.training import LogRow, Training
 
 FILES = (
     "checkpoint.npz",
@@ -82,8 +81,7 @@ def train(
     with output(json) as out_:
         from cosim.files import write_atomically
         from learning.algorithm import load_algorithm
-        from learning.evaluation import stored_optimum
-        from learning.training import CHECKPOINT, run_training
+        from learning.training import CHECKPOINT, run_training, stored_optimum
         from learning.training_run import prepare
 
         found = load_algorithm(algorithm)

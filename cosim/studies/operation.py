@@ -37,9 +37,8 @@ from cosim.studies.store import LOG, ONLINE
 from cosim.studies.tables import KEYS, read_table
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
-from learning.log import LogRow
-from learning.loop import begin
-from learning.training_run import TrainingRun
+from learning.training import LogRow
+from learning.training_run import TrainingRun, begin
 
 Array = NDArray[np.float64]
 Table = tuple[str, Sequence[str], list[list[str]]]

@@ -19,8 +19,7 @@ from controllers.theta import Parameters
 from cosim.errors import StudyError
 from cosim.files import temporary_folder
 from cosim.plant import FmuPlant
-from cosim.plugins import OURS, code_hash, depends_on, import_from, versions
-from cosim.plugins import build_controller as build_named
+from cosim.plugins import OURS, build_controller, code_hash, depends_on, import_from, versions
 from cosim.protocols import Controller
 from cosim.scenario import Scenario, resolved
 from cosim.studies.document import (
@@ -34,8 +33,8 @@ from cosim.studies.document import (
 from cosim.validation import suggestion
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.evaluation import stored_optimum
-from learning.training_run import TrainingRun, build_controller, prepare
+from learning.training import stored_optimum
+from learning.training_run import TrainingRun, learnable, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
 EVALUATION, GREEDY = "evaluation.csv", "greedy.csv"
@@ -99,7 +98,7 @@ class Training:
             path.write_text(parameters, "utf-8")
             found = Parameters.load(path, problem)
         found = found.with_theta(np.array(theta)) if theta else found
-        return build_controller(self.options["controller"], self.scenario, found)
+        return learnable(self.options["controller"], self.scenario, found)
 
 
 @dataclass(frozen=True)
@@ -489,7 +488,7 @@ def plan(study: Study) -> Plan:
         training = None if seed is None else study.training(case, scenario, seed)
         if (case.name, scenario) not in depends:
             if ":" in (case.controller or ""):
-                build_named(case.target, study.scenarios[scenario])  # a mistake shows here
+                build_controller(case.target, study.scenarios[scenario])  # a mistake shows here
             parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
             depends[case.name, scenario] = depends_on(
                 study.scenarios[scenario], *parts, packages=OURS

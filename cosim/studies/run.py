@@ -33,8 +33,7 @@ from cosim.studies.document import TrajectoryTable
 from cosim.studies.plan import EVALUATION, Plan, Run, Study, Training, greedy_file, plan
 from cosim.studies.results import StudyResults
 from cosim.studies.store import CHECKPOINT, INDICATORS, Figures, RunStore, Trained
-from learning.log import COLUMNS, LogRow, to_csv
-from learning.training import run_training
+from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 BLOCK = 20_000
 """Samples of an item of evaluation, about: a few seconds of work."""

@@ -10,8 +10,7 @@ import pytest
 
 from cosim import Scenario
 from learning.algorithm import Algorithm, load_algorithm
-from learning.log import LogRow
-from learning.training import Training, run_training
+from learning.training import LogRow, Training, run_training
 from learning.training_run import TrainingRun
 
 

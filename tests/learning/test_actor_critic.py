@@ -7,7 +7,6 @@ from controllers.theta import Parameters
 from learning import ActorCritic
 from learning.actor_critic import AdvantageRegression, lstdv
 from learning.algorithm import Transition
-from learning.exploration import build_strategy
 from tests.helpers.carrier import Carrier
 
 
@@ -24,7 +23,7 @@ def algorithm(problem, scenario, **settings):
         **settings,
     )
     carrier = Carrier(Parameters.naive(problem))
-    strategy = build_strategy(configuration, scenario)
+    strategy = configuration.strategy(scenario)
     return carrier, ActorCritic(
         carrier, scenario, configuration, 4000, strategy, np.random.default_rng(0)
     )

@@ -12,10 +12,10 @@ from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim import FmuPlant, Scenario, simulate
 from learning.algorithm import load_algorithm
-from learning.log import to_csv
-from learning.loop import begin
 from learning.policy_search import Coordinates
 from learning.prediction_errors import OneStepModel
+from learning.training import to_csv
+from learning.training_run import begin
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed, train
 

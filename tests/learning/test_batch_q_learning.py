@@ -8,10 +8,10 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import BatchQLearning, QLearning
 from learning.batch_q_learning import ReplayBuffer
-from learning.exploration import build_strategy
-from learning.loop import TrainingLoop, begin
+from learning.checkpoint import arrays_of, take_up
+from learning.loop import TrainingLoop
 from learning.q_learning import AverageCost
-from learning.training_run import TrainingRun, starting_parameters
+from learning.training_run import TrainingRun, begin, starting_parameters
 
 
 class Bench:
@@ -28,7 +28,7 @@ class Bench:
             }
         )
         self.controller = controller or RtiNmpc(task.problem, task.wrong())
-        strategy = build_strategy(configuration, task.scenario)
+        strategy = configuration.strategy(task.scenario)
         self.algorithm = BatchQLearning(
             self.controller, task.scenario, configuration, 1000, strategy, np.random.default_rng(0)
         )
@@ -88,7 +88,7 @@ def collected(scenario, problem):
     """Samples of a run at one θ, with their points, and the controller."""
     configuration = QLearning.Configuration(rule="fit", exploration_probability=0.4)
     controller = RtiNmpc(problem, starting_parameters(problem, configuration))
-    strategy = build_strategy(configuration, scenario)
+    strategy = configuration.strategy(scenario)
     algorithm = QLearning(
         controller, scenario, configuration, 100, strategy, np.random.default_rng(0)
     )
@@ -212,6 +212,6 @@ def test_a_restored_buffer_remembers_what_was_solved(scenario, collected):
     first = buffer.replay(average_cost(scenario))
     counting = Counting(controller)
     other = ReplayBuffer(counting, 100)
-    other.restore(buffer.state())
+    take_up(other, arrays_of(buffer))
     assert_same(other.replay(average_cost(scenario)), first)
     assert counting.feedbacks == 0

@@ -6,9 +6,7 @@ import pytest
 from learning.checkpoint import (
     Checkpoint,
     arrays_of,
-    generator_state,
     load,
-    restore_generator,
     save,
     take_up,
 )
@@ -35,16 +33,6 @@ def test_another_runs_checkpoint_is_refused_by_the_field_that_differs(stored):
         load(stored, {**RUN, "seed": 4})
 
 
-def test_a_generator_goes_on_where_it_was():
-    rng = np.random.default_rng(1)
-    rng.random(10)
-    other = np.random.default_rng(2)
-    restore_generator(other, generator_state(rng))
-    assert np.array_equal(rng.random(5), other.random(5))
-    with pytest.raises(CheckpointError):
-        restore_generator(rng, {"bit_generator": "MT19937"})
-
-
 @dataclass
 class Memory:
     number: int = 0
@@ -53,12 +41,25 @@ class Memory:
     weights: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
-def test_a_dataclass_goes_through_arrays_with_the_types_that_it_had():
-    arrays = arrays_of(Memory(3, 0.1, True, np.arange(4.0)))
-    found = Memory()
-    take_up(found, arrays)
-    assert (found.number, found.mean, found.began) == (3, 0.1, True)
-    assert (type(found.number), type(found.began)) == (int, bool)
-    assert found.weights.tolist() == [0.0, 1.0, 2.0, 3.0]
+class Kept:
+    KEPT = ("memory", "table", "rows", "nothing")
+
+    def __init__(self):
+        self.memory, self.table, self.rows, self.nothing = Memory(), {}, [], None
+
+
+def test_what_is_kept_goes_through_arrays_with_the_types_that_it_had():
+    first, found = Kept(), Kept()
+    first.memory = Memory(3, 0.1, True, np.arange(4.0))
+    first.table, first.rows = {"a b": np.ones(2)}, [np.zeros(2), np.ones(2)]
+    take_up(found, arrays_of(first))
+    memory = found.memory
+    assert (memory.number, memory.mean, memory.began) == (3, 0.1, True)
+    assert (type(memory.number), type(memory.began)) == (int, bool)
+    assert memory.weights.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert found.table["a b"].tolist() == [1.0, 1.0] and found.nothing is None
+    assert [row.tolist() for row in found.rows] == [[0.0, 0.0], [1.0, 1.0]]
+    take_up(found, arrays_of(Kept()))
+    assert found.rows == [] and found.table == {}
     with pytest.raises(KeyError):
         take_up(found, {})

@@ -6,7 +6,6 @@ import pytest
 from controllers.converged import ConvergedNmpc
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
-from learning.exploration import build_strategy
 from learning.loop import TrainingLoop
 from tests.helpers.linear_quadratic import DISCOUNT
 
@@ -22,7 +21,7 @@ def train(task, cls, samples, noise, controller=None, **settings):
         {"parametrisation": "paper", "value_offset": "stage-cost", **settings}
     )
     controller = controller or RtiNmpc(task.problem, task.wrong())
-    strategy = build_strategy(configuration, task.scenario)
+    strategy = configuration.strategy(task.scenario)
     algorithm = cls(
         controller, task.scenario, configuration, samples, strategy, np.random.default_rng(0)
     )

@@ -13,11 +13,9 @@ from cosim.simulation import spawn_seeds
 from learning import QLearning
 from learning.algorithm import Update
 from learning.errors import PrivilegeError
-from learning.evaluation import HELD_OUT
-from learning.exploration import build_strategy
-from learning.loop import PlantInOperation, TrainingLoop, begin
-from learning.training import run_training
-from learning.training_run import TrainingRun, starting_parameters
+from learning.loop import PlantInOperation, TrainingLoop
+from learning.training import HELD_OUT, run_training
+from learning.training_run import TrainingRun, begin, starting_parameters
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +41,7 @@ class Idle:
 def interaction(plant, problem, controller=None, **settings):
     configuration = QLearning.Configuration.from_dict(settings)
     controller = controller or RtiNmpc(problem, starting_parameters(problem, configuration))
-    strategy = build_strategy(configuration, plant.scenario)
+    strategy = configuration.strategy(plant.scenario)
     plant_seed, rng = spawn_seeds(4)
     made = TrainingLoop(plant, controller, Idle(), strategy, rng)
     made.start(plant.reset(plant_seed))

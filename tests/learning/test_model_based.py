@@ -9,8 +9,8 @@ from controllers.factories import tuned
 from controllers.functions import find_compiler
 from learning import model_based
 from learning.empirical_model import EmpiricalModel, Features, Rollout
-from learning.log import to_csv
 from learning.model_based import BackOffs, ModelBased
+from learning.training import to_csv
 from tests.helpers.training import killed_and_resumed, make_run, train
 
 

@@ -4,6 +4,7 @@ import pytest
 from controllers.model import discretise
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.penalty import Penalty
+from learning.checkpoint import arrays_of, take_up
 from learning.prediction_errors import (
     KnownPenalty,
     OneStepModel,
@@ -52,7 +53,7 @@ def test_the_oldest_errors_are_forgotten(scenario):
         errors.add(np.array([float(k), 0.0]))
     assert sorted(errors.values[:, 0]) == [2.0, 3.0, 4.0]
     other = PredictionErrors(scenario, 3)
-    other.restore(errors.state())
+    take_up(other, arrays_of(errors))
     assert np.array_equal(other.values, errors.values)
 
 

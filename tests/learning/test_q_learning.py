@@ -6,7 +6,6 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import QLearning
-from learning.exploration import build_strategy
 from learning.loop import TrainingLoop
 from learning.q_learning import AS_PRINTED, AverageCost, KalmanRegression
 from learning.step import Fit
@@ -20,7 +19,7 @@ class Bench:
         self.scenario = plant.scenario
         configuration = QLearning.Configuration.from_dict(settings)
         self.controller = RtiNmpc(problem, starting_parameters(problem, configuration))
-        strategy = build_strategy(configuration, self.scenario)
+        strategy = configuration.strategy(self.scenario)
         self.algorithm = QLearning(
             self.controller, self.scenario, configuration, 1000, strategy, np.random.default_rng(0)
         )

@@ -5,9 +5,8 @@ import pytest
 
 from cosim import FmuPlant
 from learning.errors import ConfigurationError
-from learning.loop import begin
 from learning.search import Search
-from learning.training_run import TrainingRun
+from learning.training_run import TrainingRun, begin
 
 SETTINGS = {
     "none": {},

@@ -10,9 +10,8 @@ from cosim import FmuPlant
 from cosim.kpis import indicators_of
 from learning.algorithm import Update, load_algorithm
 from learning.errors import CheckpointError
-from learning.evaluation import HELD_OUT
-from learning.log import LogRow, late_movement, to_csv
 from learning.q_learning import QLearning
+from learning.training import HELD_OUT, LogRow, late_movement, to_csv
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed, train
 

@@ -6,7 +6,6 @@ from controllers.theta import Parameters, ThetaBlocks
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.exploration import build_strategy
 from learning.training_run import starting_parameters
 
 
@@ -34,7 +33,7 @@ STATED = {
 
 def test_what_the_scenario_states_takes_the_place_of_defaults(scenario):
     configuration = QLearning.Configuration().for_scenario(scenario.replace(STATED))
-    strategy = build_strategy(configuration, scenario)
+    strategy = configuration.strategy(scenario)
     assert strategy.kind == "literal"
     assert (strategy.probability, strategy.deviation.tolist()) == (0.2, [3.0, 4.0])
     assert configuration.value_offset == "stage-cost"

@@ -7,7 +7,6 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
 from learning.configuration import Configuration
-from learning.exploration import build_strategy
 from learning.loop import TrainingLoop
 from learning.step import ConstrainedStep, Fit, least_eigenvalue
 from learning.training_run import starting_parameters
@@ -48,7 +47,7 @@ def learnt(scenario, cls, start, units):
     """θ and actions of a run of the rule alone."""
     configuration = cls.Configuration.from_dict(SETTINGS[cls])
     controller = RtiNmpc(Problem.from_scenario(scenario), start)
-    strategy = build_strategy(configuration, scenario)
+    strategy = configuration.strategy(scenario)
     rule = cls(controller, scenario, configuration, SAMPLES, strategy, np.random.default_rng(0))
     plant = NoisyModel(scenario, *units)
     loop = TrainingLoop(plant, controller, rule, strategy, np.random.default_rng(1))

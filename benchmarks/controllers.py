@@ -1,8 +1,8 @@
 """The phases of an RTI-NMPC's sample along a closed loop, beside what else could do the same.
 
-References: the same functions interpreted, ProxQP in place of DAQP; on every tenth sample ProxQP
-called cold through qpsolvers on the same QP, IPOPT on the nonlinear programme, and a Q-learning
-sample of mpcrl on the same transition where that is installed (extra `outsiders`).
+References: the same functions interpreted; on every tenth sample ProxQP called cold through
+qpsolvers on the same QP, IPOPT on the nonlinear programme, and a Q-learning sample of mpcrl on the
+same transition where that is installed (extra `outsiders`).
 """
 
 import warnings
@@ -15,42 +15,31 @@ from benchmarks.ipopt import IpoptNmpc
 from benchmarks.measuring import clock, figure
 from controllers import Problem, RtiNmpc, compile_functions
 from controllers.factories import naive_parameters
-from controllers.qp.daqp_backend import DaqpBackend
-from controllers.qp.explicit_slack import qpsolvers_problem
+from controllers.qp.backends import DaqpBackend, qpsolvers_problem
 from cosim import FmuPlant
 from cosim.simulation import spawn_seeds
 
 SAMPLE, Q_SAMPLE = "prepare + feedback + dV/dθ", "V(s₊), Q(s, a) and dQ/dθ"
 INTERPRETER = "interpreter"
-AT_MOST = {"DAQP": 60.0, "ProxQP": 250.0}
-"""Bounds of a sample in µs."""
+AT_MOST = 60.0
+"""Bound of a sample in µs."""
 EXPLORATION, WARM_UP, BLOCK, EVERY = 3.0, 20, 50, 10
 IPOPT = {"ipopt.tol": 1e-8, "ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-6}
 
 
 def measure(scenario, steps):
     """Time each phase of a sample in one closed loop; the others follow block by block."""
-    controllers = {
-        "DAQP": rti_controller(scenario, "daqp"),
-        INTERPRETER: rti_controller(scenario, "daqp"),
-        "ProxQP": rti_controller(scenario, "proxqp"),
-    }
-    for name, controller in controllers.items():
-        if name != INTERPRETER:
-            compile_functions(controller)
+    controllers = {name: rti_controller(scenario, "daqp") for name in ("DAQP", INTERPRETER)}
+    compile_functions(controllers["DAQP"])
     seconds, visits = run(scenario, controllers, steps)
     ours = seconds["DAQP"]
     rows = [
         figure(
             f"DAQP: {phase}", times, INTERPRETER, seconds[INTERPRETER][phase],
-            at_most=AT_MOST["DAQP"] if phase == SAMPLE else None,
+            at_most=AT_MOST if phase == SAMPLE else None,
         )
         for phase, times in ours.items()
     ]  # fmt: skip
-    for phase in ("prepare", "feedback"):
-        rows.append(figure(f"DAQP: {phase}", ours[phase], "ProxQP", seconds["ProxQP"][phase]))
-    sample = seconds["ProxQP"][SAMPLE]
-    rows.append(figure(f"ProxQP: {SAMPLE}", sample, at_most=AT_MOST["ProxQP"]))
     references = [
         ("feedback", "qpsolvers, ProxQP, cold", cold_qp),
         (SAMPLE, "IPOPT, warm started", ipopt),

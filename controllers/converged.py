@@ -14,8 +14,8 @@ from controllers.dynamics import sampled_jacobian
 from controllers.errors import QpError
 from controllers.functions import StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.qp import QpBackend, QpSolution, SoftQp
-from controllers.qp.problem import NOT_CONVEX
+from controllers.qp.backends import QpBackend
+from controllers.qp.problem import NOT_CONVEX, QpSolution, SoftQp
 from controllers.rti import RtiNmpc
 from controllers.rti.preparation import Exact
 from controllers.rti.solution import LinearisationPoint, RtiSolution

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError
 from controllers.model import Model
-from controllers.qp.daqp_backend import FIXED, MEANING, SETTINGS
+from controllers.qp.backends import FIXED, MEANING, SETTINGS
 from cosim.penalty import Penalty
 from cosim.plugins import blamed, load_plugin
 from cosim.scenario import Scenario

@@ -17,8 +17,14 @@ from numpy.typing import NDArray
 from controllers.dynamics import stage_parameter_gradient
 from controllers.functions import StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.qp.active_set import LEAST_CONTROLS, StageMatrices, kkt_solve, kkt_solve_by_stages
-from controllers.qp.problem import QpSolution, SoftQp
+from controllers.qp.problem import (
+    LEAST_CONTROLS,
+    QpSolution,
+    SoftQp,
+    StageMatrices,
+    kkt_solve,
+    kkt_solve_by_stages,
+)
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Matrix = NDArray[np.float64]

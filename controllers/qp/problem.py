@@ -1,9 +1,10 @@
-"""The QP of one sample as mathematics, and the measures of a solution."""
+"""The QP of one sample as mathematics, the measures of a solution, and its active set."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ from controllers.errors import QpError
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Index = NDArray[np.intp]
 
 
 NOT_CONVEX = "not convex"
@@ -156,7 +159,7 @@ class QpSolution(NamedTuple):
         moved = np.abs(qp.rows[:, free]).max(axis=1, initial=0.0) > 0
         return bool((at_limit & (undecided | ~moved)).any())
 
-    def active(self, qp: SoftQp) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    def active(self, qp: SoftQp) -> tuple[Mask, Mask, Mask]:
         """Masks: variables held by a bound, rows held at a limit, rows violated.
 
         They are the branches of the proximal operators in `residuals`: of a distance and a
@@ -230,3 +233,184 @@ def multipliers_at_kink(
     lam[:n][near] = np.clip(chosen, np.where(over, 0, -w), np.where(over, w, 0))
     nu[:m] = total - lam[:n][near] @ rows
     return QpSolution(v, nu, lam)
+
+
+STEPS = 10
+
+
+def kkt_solve(
+    qp: SoftQp, active: tuple[Mask, Mask, Mask], seeds: Matrix, limits: Matrix
+) -> tuple[Matrix, Matrix]:
+    """Solve the KKT system of an active set for several right-hand sides, one a row.
+
+    `active` is what `QpSolution.active` returns. Held variables stay at zero, rows at their limit
+    take the values `limits` (k, rows), and a violated row adds its quadratic weight to the Hessian.
+    `seeds` (k, variables) are the right-hand sides of stationarity. Returns the variables
+    (k, variables) and the multipliers of the rows at their limit (k, rows), zero elsewhere. Where
+    the system is singular (LICQ fails) it is solved by least squares.
+    """
+    held, at_limit, violated = active
+    free, equal, outside = ~held, qp.rows[at_limit], qp.rows[violated]
+    bound = held.any()
+    H = qp.H
+    if bound:
+        H, equal, outside = H[free][:, free], equal[:, free], outside[:, free]
+    size, count = len(H), len(equal)
+    # Column-major, as LAPACK wants it.
+    kkt = np.zeros((size + count, size + count), order="F")
+    right = np.empty((size + count, len(seeds)), order="F")
+    kkt[:size, :size] = H
+    if len(outside):
+        kkt[:size, :size] += 2 * (outside.T * qp.W[violated]) @ outside
+    kkt[:size, size:], kkt[size:, :size] = equal.T, equal
+    right[:size] = (seeds[:, free] if bound else seeds).T
+    right[size:] = limits[:, at_limit].T
+    answer, singular = right, False
+    if len(kkt):  # every variable may be held
+        # SciPy is imported where it is needed: it is a quarter of a short run.
+        from scipy.linalg.lapack import dgesv  # noqa: PLC0415
+
+        _, _, answer, status = dgesv(kkt, right)
+        singular = status != 0
+    if singular:
+        answer = np.asarray(np.linalg.lstsq(kkt, right)[0], dtype=np.float64)
+    v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)
+    v[:, free], lam[:, at_limit] = answer[:size].T, answer[size:].T
+    return v, lam
+
+
+def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-10) -> QpSolution:
+    """Bring an approximate solution to a residual below `accuracy` by a few Newton steps.
+
+    A step takes the active set that the present iterate shows and solves for it exactly; near the
+    solution this primal-dual active-set method (semismooth Newton on the proximal residuals) ends
+    after one or two. Returns the best iterate, `solution` itself if none is better.
+    """
+    best, least = solution, solution.residuals(qp).largest
+    for _ in range(STEPS):
+        if least < accuracy:
+            break
+        solution = _newton_step(qp, solution)
+        residual = solution.residuals(qp).largest
+        if residual < least:
+            best, least = solution, residual
+    return best
+
+
+def _newton_step(qp: SoftQp, solution: QpSolution) -> QpSolution:
+    held, _, violated = active = solution.active(qp)
+    upwards = solution.lam > 0
+    limit = np.where(upwards, qp.row_upper, qp.row_lower)
+    base = np.where(held, np.where(solution.nu > 0, qp.upper, qp.lower), 0.0)
+    push = np.where(violated, np.where(upwards, qp.w, -qp.w), 0.0)
+    weight = np.where(violated, 2 * qp.W, 0.0)
+    fixed = qp.rows @ base - limit
+    seed = -(qp.H @ base + qp.f + (push + weight * fixed) @ qp.rows)
+    moved, lam = kkt_solve(qp, active, seed[None], -fixed[None])
+    v = base + moved[0]
+    multipliers = lam[0] + push + weight * (qp.rows @ v - limit)
+    nu = np.where(held, -(qp.H @ v + qp.f + multipliers @ qp.rows), 0.0)
+    return QpSolution(v, nu, multipliers)
+
+
+LEAST_CONTROLS = 150
+"""Number of controls N·m from which the banded system is solved faster than the dense one."""
+
+
+class StageMatrices(NamedTuple):
+    """What a QP's KKT matrix is made of: A (N, n, n), B (N, n, m), L (N, n+m, n+m), L_N (n, n)."""
+
+    A: Matrix
+    B: Matrix
+    L: Matrix
+    L_N: Matrix
+
+
+@cache
+def _places(n: int, m: int, horizon: int) -> dict[str, Index]:
+    """Where each block of every stage stands in LAPACK's band storage, by equation and unknown.
+
+    Unknowns of stage k are v_k, χ_{k+1}, ξ_{k+1} and λ_{k+1}; its equations stationarity in v_k,
+    the dynamics, stationarity in ξ_{k+1} and what the active set says of each row. They reach ξ_k
+    to the left and v_{k+1}, χ_{k+2} to the right, so the band is one stage wide on either side.
+    """
+    width = m + 3 * n
+    reach = width - 1
+    v, chi, xi, lam = np.split(np.arange(width), (m, m + n, m + 2 * n))
+
+    def at(rows: Index, columns: Index) -> Index:
+        # The storage's columns are 3·reach + 1 long.
+        place: Index = 2 * reach + rows - columns + columns * (3 * reach + 1)
+        return place
+
+    def block(rows: Index, columns: Index, on: int = 0) -> Index:
+        """Places of a block that reaches `on` stages to the right, (stages, rows, columns)."""
+        stages = np.arange(max(0, -on), horizon - max(0, on))[:, None, None] * width
+        return at(stages + rows[:, None], stages + on * width + columns)
+
+    def diagonal(rows: Index, columns: Index) -> Index:
+        stages = np.arange(horizon)[:, None] * width
+        return at(stages + rows, stages + columns)
+
+    return {
+        "v, v": block(v, v),
+        "v, xi": block(v, xi, -1),
+        "v, chi": block(v, chi),
+        "chi, v": block(chi, v),
+        "chi, xi": block(chi, xi, -1),
+        "chi, next xi": diagonal(chi, xi),
+        "xi, xi": block(xi, xi),
+        "xi, v": block(xi, v, 1),
+        "xi, next chi": block(xi, chi, 1),
+        "xi, chi": diagonal(xi, chi),
+        "xi, lam": diagonal(xi, lam),
+        "lam, xi": diagonal(lam, xi),
+        "lam, lam": diagonal(lam, lam),
+    }
+
+
+def kkt_solve_by_stages(
+    stages: StageMatrices, W: Vector, active: tuple[Mask, Mask, Mask], seeds: Matrix
+) -> tuple[Matrix, Matrix] | None:
+    """What `kkt_solve` gives for limits of zero, at O(N); None where the system is singular.
+
+    W (Nn,) are the quadratic weights of the rows; `seeds` (k, Nm) the right-hand sides. Returns
+    variables (k, Nm) and multipliers of the rows at their limit (k, Nn), zero elsewhere.
+    """
+    from scipy.linalg.lapack import dgbsv  # noqa: PLC0415
+
+    A, B, L, L_N = stages
+    horizon, n, m = B.shape
+    held, limit, violated = (mask.reshape(horizon, -1) for mask in active)
+    free = ~held[:, :, None]
+    weight = np.where(violated, 2 * W.reshape(horizon, n), 0.0)
+    blocks: dict[str, Matrix | float] = {
+        "v, v": L[:, n:, n:] * free + held[:, :, None] * np.eye(m),
+        "v, xi": (L[:, n:, :n] * free)[1:],
+        "v, chi": B.transpose(0, 2, 1) * free,
+        "chi, v": B,
+        "chi, xi": A[1:],
+        "chi, next xi": -1.0,
+        "xi, xi": np.concatenate([L[1:, :n, :n], L_N[None]]),
+        "xi, v": L[1:, :n, n:],
+        "xi, next chi": A[1:].transpose(0, 2, 1),
+        "xi, chi": -1.0,
+        "xi, lam": 1.0,
+        "lam, xi": np.where(limit, 1.0, -weight),
+        "lam, lam": np.where(limit, 0.0, 1.0),
+    }
+    width = m + 3 * n
+    reach, size = width - 1, horizon * width
+    flat = np.zeros((3 * reach + 1) * size)
+    places = _places(n, m, horizon)
+    for name, values in blocks.items():
+        flat[places[name]] = values
+    band = flat.reshape(3 * reach + 1, size, order="F")
+    right = np.zeros((len(seeds), horizon, width))
+    right[:, :, :m] = np.where(active[0], 0.0, seeds).reshape(-1, horizon, m)
+    _, _, answer, status = dgbsv(reach, reach, band, right.reshape(-1, size).T, 1, 1)
+    if status != 0:
+        return None
+    found = answer.T.reshape(-1, horizon, width)
+    v, lam = (part.reshape(len(seeds), -1) for part in (found[:, :, :m], found[:, :, m + 2 * n :]))
+    return v, np.where(active[1], lam, 0.0)

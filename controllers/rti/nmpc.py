@@ -18,7 +18,7 @@ from controllers.functions import (
     switch,
 )
 from controllers.problem import Problem
-from controllers.qp import QpBackend, make_backend
+from controllers.qp.backends import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
 from controllers.rti.engine import NOT_FINITE, Engine
 from controllers.rti.feedback import embedding, readout

@@ -13,7 +13,7 @@ from controllers.dynamics import stage_curvature, stage_function, stage_linearis
 from controllers.errors import ControllerError
 from controllers.functions import BufferedFunction, StackedFunction, stacked
 from controllers.problem import Problem
-from controllers.qp import SoftQp
+from controllers.qp.problem import SoftQp
 from controllers.theta import Parameters, ThetaBlocks
 
 Vector = NDArray[np.float64]

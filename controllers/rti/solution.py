@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from controllers.errors import ControllerError
 from controllers.functions import StackedFunction
 from controllers.problem import Problem
-from controllers.qp.active_set import StageMatrices
-from controllers.qp.problem import QpSolution, Residuals, SoftQp
+from controllers.qp.problem import QpSolution, Residuals, SoftQp, StageMatrices
 from controllers.rti.preparation import Lift, qp_of
 from controllers.sensitivities import SOLUTION, adjoint_directions, curvature_directions
 from controllers.theta import Parameters

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from controllers.errors import QpError
-from controllers.qp import SoftQp
-from controllers.qp.active_set import polish
-from controllers.qp.daqp_backend import DaqpBackend
-from controllers.qp.explicit_slack import ProxQpBackend
+from controllers.qp.backends import make_backend
+from controllers.qp.problem import SoftQp, polish
 from tests.helpers.compiled import FAMILIES, CompiledQpSolver, random_qps
 
 RESIDUAL = 1e-9
@@ -20,6 +18,7 @@ RESIDUAL = 1e-9
 REFERENCE = 1e-12
 AGREEMENT = 1e-6
 NOT_CONVEX, NOT_FINITE = 1, 3
+PEERS = ("daqp", "proxqp")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +33,7 @@ def _guesses(last: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray
     return {"none": np.zeros(last.size), "last": last.copy(), "wild": wild}
 
 
-def _check(solver: CompiledQpSolver, count: int, peers: tuple[type, ...], seed: int) -> Counter:
+def _check(solver: CompiledQpSolver, count: int, peers: tuple[str, ...], seed: int) -> Counter:
     """Solve `count` QPs; the residual is that of `QpSolution`, written independently."""
     solved: Counter = Counter()
     rng, last = np.random.default_rng(seed), np.zeros(40)
@@ -53,7 +52,7 @@ def _check(solver: CompiledQpSolver, count: int, peers: tuple[type, ...], seed: 
             assert difference.max() < RESIDUAL, (k, family, name)
         for peer in peers:
             try:
-                backend = peer()
+                backend = make_backend(peer)
                 backend.load(qp)
                 with np.errstate(invalid="ignore"):  # of rows without a limit
                     other = polish(qp, backend.solve(qp), 1e-13)
@@ -61,7 +60,7 @@ def _check(solver: CompiledQpSolver, count: int, peers: tuple[type, ...], seed: 
                 continue
             if not other.residuals(qp).largest < REFERENCE:
                 continue
-            solved[peer.__name__, family] += 1
+            solved[peer, family] += 1
             difference = np.abs(solution.v - other.v) / (1 + np.abs(other.v))
             assert difference.max() < AGREEMENT, (k, family, peer)
     return solved
@@ -72,15 +71,15 @@ def test_the_optimality_conditions_hold_on_every_family(solver: CompiledQpSolver
 
 
 def test_daqp_and_proxqp_find_the_same_solution(solver: CompiledQpSolver) -> None:
-    solved = _check(solver, 100, (DaqpBackend, ProxQpBackend), seed=2)
+    solved = _check(solver, 100, PEERS, seed=2)
     for family in FAMILIES:
-        assert solved["DaqpBackend", family] + solved["ProxQpBackend", family] > 0
+        assert solved["daqp", family] + solved["proxqp", family] > 0
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("part", range(10))
 def test_a_hundred_thousand_qps_against_daqp_and_proxqp(solver: CompiledQpSolver, part) -> None:
-    solved = _check(solver, 10_000, (DaqpBackend, ProxQpBackend), seed=100 + part)
+    solved = _check(solver, 10_000, PEERS, seed=100 + part)
     print(f"solved by peers: {dict(solved)}")
 
 

@@ -1,7 +1,6 @@
 import numpy as np
 
-from controllers.qp import QpSolution
-from controllers.qp.active_set import kkt_solve, polish
+from controllers.qp.problem import QpSolution, kkt_solve, polish
 from tests.helpers.scalar import scalar_qp, solution
 from tests.helpers.stored import solve
 

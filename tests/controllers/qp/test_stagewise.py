@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from controllers import Parameters, RtiNmpc, sensitivities
-from controllers.qp.active_set import StageMatrices, kkt_solve, kkt_solve_by_stages
+from controllers.qp.problem import StageMatrices, kkt_solve, kkt_solve_by_stages
 from tests.helpers.sampling import evaporator_problem
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controllers import Parameters, QpError, RtiNmpc, ThetaBlocks
-from controllers.qp.daqp_backend import DaqpBackend
+from controllers.qp.backends import DaqpBackend
 from controllers.rti.preparation import LEAST_CONTROLS, limits_of, preparation, riccati
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 

@@ -58,7 +58,7 @@ def optimum_key(plant: PlantProblem, settings: Settings) -> str:
     """First 16 hexadecimal digits of the SHA-256 of all that the solution depends on.
 
     That is: the model's equations, physical parameters, sampling, bounds, penalty, reference,
-    the disturbance's law, the solver's settings and, for the discounted criterion, γ.
+    the disturbance's law and the solver's settings.
     """
     problem, law, parameters = plant.problem, plant.law, plant.parameters
     symbols = problem.model.symbols()
@@ -68,15 +68,15 @@ def optimum_key(plant: PlantProblem, settings: Settings) -> str:
         "cost": _operations(problem.model.economic_cost(*symbols), symbols),
         "time_unit": problem.model.time_unit,
         "sampling_time": problem.sampling_time,
-        "discount": 1.0 if settings.criterion == "average" else problem.discount,
+        "discount": 1.0,
         "parameters": parameters.tolist(),
         "law": [law.kind, law.nominal.tolist(), law.ranges.tolist()],
-        "settings": asdict(settings),
+        "settings": asdict(settings) | {"criterion": "average"},
     }
-    for kind in ("state", "action"):
-        for name in (f"{kind}_lower", f"{kind}_upper", f"reference_{kind}"):
-            content[name] = getattr(problem, name).tolist()
-    for name in ("penalty_linear", "penalty_quadratic"):
+    for name in (
+        *("state_lower", "state_upper", "action_lower", "action_upper"),
+        *("penalty_linear", "penalty_quadratic", "reference_state", "reference_action"),
+    ):
         content[name] = getattr(problem, name).tolist()
     text = json.dumps(content, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -97,10 +97,8 @@ def _operations(expression: ca.SX, symbols: tuple[ca.SX, ...]) -> list[str]:
 
 def stored_file(key: str) -> Path | None:
     """File of a solved problem by its key: the package's own, else the user's, else None."""
-    for path in (SHIPPED / f"{key}.npz", cache_folder("optima") / f"{key}.npz"):
-        if path.is_file():
-            return path
-    return None
+    paths = (folder / f"{key}.npz" for folder in (SHIPPED, cache_folder("optima")))
+    return next((path for path in paths if path.is_file()), None)
 
 
 def keep(key: str, optimum: Optimum) -> Path:
@@ -116,7 +114,6 @@ def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
         "gain": optimum.gain,
         "lower": optimum.lower,
         "upper": optimum.upper,
-        "discount": optimum.discount,
         "accuracy": asdict(optimum.accuracy),
         "smooth": optimum.grid.smooth,
         "certificate": None if certificate is None else certificate.to_list(),
@@ -146,7 +143,6 @@ def read_optimum(path: Path, key: str) -> Optimum:
             float(document["lower"]),
             float(document["upper"]),
             arrays["distribution"],
-            float(document["discount"]),
             Accuracy(
                 int(accuracy["substeps"]),
                 tuple(accuracy["nodes"]),
@@ -179,9 +175,9 @@ class OptimalSolution:
 class OptimalPolicy:
     """π* and V* = penalty + W of a problem under a disturbance law, from a solved grid.
 
-    For the average-cost criterion V* is the differential value: the cost in excess of J* that a
-    start in s brings, up to a constant. Between grid states π* and W are interpolated
-    multilinearly; a state outside the grid's box is served by the nearest one inside.
+    V* is the differential value: the cost in excess of J* that a start in s brings, up to a
+    constant. Between grid states π* and W are interpolated multilinearly; a state outside the
+    grid's box is served by the nearest one inside.
     Interpolating π* costs nothing that can be measured, since π* is smooth where the plant lives
     and Q* is flat at its minimum, while minimising Q* anew in each sample costs milliseconds.
     """
@@ -189,15 +185,8 @@ class OptimalPolicy:
     name = "optimal"
 
     def __init__(self, plant: PlantProblem, optimum: Optimum) -> None:
-        problem = plant.problem
-        self.problem, self.optimum = problem, optimum
+        self.problem, self.optimum = plant.problem, optimum
         self._plant = plant
-        m = problem.n_actions
-        if optimum.actions.shape[1] != m or len(optimum.grid.axes) != problem.n_states:
-            raise OptimumError(
-                f"the policy has {len(optimum.grid.axes)} states and {optimum.actions.shape[1]} "
-                f"actions, the problem {problem.n_states} and {m}"
-            )
         self._axes = [axis.tolist() for axis in optimum.grid.axes]
         self._strides = [int(np.prod(optimum.grid.shape[i + 1 :])) for i in range(len(self._axes))]
         self._table = np.column_stack([optimum.actions, optimum.W]).tolist()
@@ -210,7 +199,6 @@ class OptimalPolicy:
     def from_scenario(
         cls,
         scenario: Scenario,
-        settings: Settings | None = None,
         *,
         overrides: Mapping[str, float | None] | None = None,
         progress: Callable[[Progress], None] | None = None,
@@ -222,14 +210,12 @@ class OptimalPolicy:
         they are not the model's, or a stored file is damaged.
         """
         plant = PlantProblem.from_scenario(scenario, overrides)
-        settings = settings or Settings()
-        key = optimum_key(plant, settings)
+        key = optimum_key(plant, Settings())
         path = stored_file(key)
-        if path is None:
-            optimum = solve(plant, settings, progress=progress)
-            keep(key, optimum)
-        else:
-            optimum = read_optimum(path, key)
+        if path is not None:
+            return cls(plant, read_optimum(path, key))
+        optimum = solve(plant, progress=progress)
+        keep(key, optimum)
         return cls(plant, optimum)
 
     @classmethod
@@ -288,7 +274,7 @@ class OptimalPolicy:
         return self.feedback(s).value
 
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
-        """Q*(s, a) = penalty(s) + E[ℓ − J* + γ V*(s₊)], with J* for the average criterion only."""
+        """Q*(s, a) = penalty(s) + E[ℓ − J* + V*(s₊)]."""
         state = np.array(s, dtype=np.float64).reshape(1, -1)
         action = np.array(a, dtype=np.float64).reshape(1, -1)
         if action.shape[1] != self.problem.n_actions or not np.isfinite(action).all():
@@ -298,13 +284,11 @@ class OptimalPolicy:
             )
         optimum = self.optimum
         smooth = self._operator.values(state, action, optimum.grid, optimum.W)[0]
-        baseline = optimum.gain if optimum.discount == 1.0 else 0.0
-        return float(smooth) - baseline + self.problem.penalty(state[0].tolist())
+        return float(smooth) - optimum.gain + self.problem.penalty(state[0].tolist())
 
     @cached_property
     def _operator(self) -> BellmanOperator:
-        optimum = self.optimum
-        return BellmanOperator(self._plant, optimum.accuracy, discount=optimum.discount)
+        return BellmanOperator(self._plant, self.optimum.accuracy)
 
     def _lookup(self, state: list[float]) -> tuple[list[float], bool]:
         """Row (action…, W) interpolated at a state in plain Python: a tenth of NumPy's time."""
@@ -465,13 +449,11 @@ class QuasiStaticPolicy:
 
     @classmethod
     def from_scenario(
-        cls,
-        scenario: Scenario,
-        *,
-        progress: Callable[[Progress], None] | None = None,
+        cls, scenario: Scenario, *, progress: Callable[[Progress], None] | None = None
     ) -> QuasiStaticPolicy:
         """The policy of a scenario that changes; solves what is not stored. Raises OptimumError."""
-        law = _law(scenario)
+        law = change_of(scenario)
+        assert law is not None
         policies = [
             OptimalPolicy.from_scenario(scenario, overrides=plant, progress=progress)
             for plant in law.plants
@@ -481,14 +463,11 @@ class QuasiStaticPolicy:
     @classmethod
     def stored(cls, scenario: Scenario) -> QuasiStaticPolicy | None:
         """The policy of a scenario that changes where all of its optima are stored, else None."""
-        law = _law(scenario)
-        policies = []
-        for plant in law.plants:
-            policy = OptimalPolicy.stored(scenario, overrides=plant)
-            if policy is None:
-                return None
-            policies.append(policy)
-        return cls(law, policies, scenario.sampling_time)
+        law = change_of(scenario)
+        assert law is not None
+        found = [OptimalPolicy.stored(scenario, overrides=plant) for plant in law.plants]
+        policies = [policy for policy in found if policy is not None]
+        return cls(law, policies, scenario.sampling_time) if len(policies) == len(found) else None
 
     @property
     def gains(self) -> list[tuple[Mapping[str, float | None], float]]:
@@ -528,13 +507,6 @@ class QuasiStaticPolicy:
             (1.0 - share) * first.value + share * second.value,
             "clamped" if "clamped" in (first.status, second.status) else "solved",
         )
-
-
-def _law(scenario: Scenario) -> Fouling | Jumps:
-    law = change_of(scenario)
-    if law is None:
-        raise OptimumError("the scenario's plant does not change: its optimum is OptimalPolicy's")
-    return law
 
 
 @dataclass(frozen=True)

@@ -30,29 +30,12 @@ class DisturbanceLaw:
     """Independent disturbances, drawn anew each sample and held over it.
 
     `uniform`: `nominal` ± `ranges`; `normal`: mean `nominal`, standard deviations `ranges`; `none`:
-    always nominal. Both arrays have shape (n_d,). Raises OptimumError where they do not fit.
+    always nominal. Both arrays have shape (n_d,).
     """
 
     kind: Literal["uniform", "normal", "none"]
     nominal: Array
     ranges: Array
-
-    def __post_init__(self) -> None:
-        """Freeze the arrays and check them."""
-        for name in ("nominal", "ranges"):
-            array = np.array(getattr(self, name), dtype=np.float64).reshape(-1)
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
-        if self.kind not in {"uniform", "normal", "none"}:
-            raise OptimumError(
-                f"disturbance law '{self.kind}' is not known; use uniform, normal or none"
-            )
-        finite = np.isfinite(self.nominal).all() and np.isfinite(self.ranges).all()
-        if self.nominal.shape != self.ranges.shape or not finite or (self.ranges < 0).any():
-            raise OptimumError(
-                f"disturbance law: nominal {self.nominal} and ranges {self.ranges} must be finite, "
-                "of one length, and no range negative"
-            )
 
     @property
     def deterministic(self) -> bool:
@@ -74,11 +57,6 @@ class DisturbanceLaw:
         Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one; a disturbance that
         does not vary takes one node. Exact for polynomials of degree 2·count−1 in each.
         """
-        if len(counts) != len(self.nominal) or any(count < 1 for count in counts):
-            raise OptimumError(
-                f"quadrature: {len(self.nominal)} disturbances need as many positive numbers of "
-                f"nodes, not {counts}"
-            )
         points, weights = [], []
         for count, nominal, spread in zip(counts, self.nominal, self.ranges, strict=True):
             if self.kind == "none" or spread == 0:
@@ -101,11 +79,6 @@ class ProductRule:
 
     axis_nodes: tuple[Array, ...]
     axis_weights: tuple[Array, ...]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of nodes per disturbance."""
-        return tuple(len(nodes) for nodes in self.axis_nodes)
 
     @cached_property
     def nodes(self) -> Array:
@@ -178,20 +151,6 @@ class PlantProblem:
     problem: Problem
     law: DisturbanceLaw
     parameters: Vector
-
-    def __post_init__(self) -> None:
-        """Raise OptimumError where the law has not the model's disturbances."""
-        model = self.problem.model
-        if len(self.law.nominal) != len(model.disturbances):
-            raise OptimumError(
-                f"the law has {len(self.law.nominal)} disturbances, model '{model.name}' "
-                f"{len(model.disturbances)}"
-            )
-
-    @classmethod
-    def nominal(cls, problem: Problem, law: DisturbanceLaw) -> PlantProblem:
-        """A plant that has the model's nominal parameters."""
-        return cls(problem, law, problem.model.nominal_parameters)
 
     @classmethod
     def from_scenario(
@@ -371,24 +330,15 @@ class Accuracy:
 
 
 class BellmanOperator:
-    """Q(s, a) = E[ℓ(s, a, d) + γ penalty(s₊) + γ W(s₊)] with V = penalty + W.
+    """Q(s, a) = E[ℓ(s, a, d) + penalty(s₊) + W(s₊)] with V = penalty + W.
 
-    The penalty's kink is known in closed form, so only the smooth W is interpolated. γ = 1
-    for the average-cost criterion. `workers` threads share the blocks of states, whose results do
-    not depend on their number.
+    The penalty's kink is known in closed form, so only the smooth W is interpolated. `workers`
+    threads share the blocks of states, whose results do not depend on their number.
     """
 
-    def __init__(
-        self,
-        plant: PlantProblem,
-        accuracy: Accuracy,
-        *,
-        discount: float = 1.0,
-        workers: int = 1,
-    ) -> None:
+    def __init__(self, plant: PlantProblem, accuracy: Accuracy, *, workers: int = 1) -> None:
         problem, law = plant.problem, plant.law
         self.problem, self.deterministic = problem, law.deterministic
-        self.discount = discount
         self._step = Elementwise(
             discretise(problem.model, problem.sampling_time, accuracy.substeps)
         )
@@ -415,14 +365,14 @@ class BellmanOperator:
 
         def block(part: slice) -> Array:
             cost, x_next = self._expected_cost(states[part], actions[part])
-            return cost + self.discount * _mean(smooth(x_next), self._weights)
+            return cost + _mean(smooth(x_next), self._weights)
 
         return np.concatenate(list(self._map(block, len(states))))
 
     def chain(self, actions: Array, grid: Grid) -> tuple[sparse.csr_array, Array]:
         """Markov chain of a policy (G, m) on the grid: transition matrix (G, G), cost (G,).
 
-        The cost is E[ℓ + γ penalty(s₊)].
+        The cost is E[ℓ + penalty(s₊)].
         """
 
         def block(part: slice) -> tuple[sparse.csr_array, Array]:
@@ -442,7 +392,7 @@ class BellmanOperator:
         return matrix, np.concatenate([cost for _, cost in blocks])
 
     def _expected_cost(self, states: Array, actions: Array) -> tuple[Array, list[Array]]:
-        """E[ℓ + γ penalty(s₊)], shape (B,), and s₊ at the nodes, n arrays (B, q)."""
+        """E[ℓ + penalty(s₊)], shape (B,), and s₊ at the nodes, n arrays (B, q)."""
         arguments = (
             [column[:, None] for column in states.T],
             [column[:, None] for column in actions.T],
@@ -452,7 +402,7 @@ class BellmanOperator:
         shape = (len(states), len(self._weights))
         x_next = [np.broadcast_to(entry, shape) for entry in self._step(*arguments)]
         cost = _mean(np.broadcast_to(self._cost(*arguments)[0], shape), self._weights)
-        return cost + self.discount * self._expected_penalty(x_next), x_next
+        return cost + self._expected_penalty(x_next), x_next
 
     def _expected_penalty(self, x_next: Sequence[Array]) -> Array:
         total = np.zeros(len(x_next[0]))

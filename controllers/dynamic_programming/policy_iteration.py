@@ -1,12 +1,12 @@
-"""The stochastic control problem solved by policy iteration, from a coarse grid to a fine one."""
+"""The stochastic control problem solved by policy iteration, and what certifies the solution."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from controllers.dynamic_programming.bellman import (
 )
 from controllers.dynamic_programming.grid import Grid
 from controllers.errors import OptimumError
-from controllers.model import discretise
+from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
 
 Array = NDArray[np.float64]
@@ -31,16 +31,14 @@ Array = NDArray[np.float64]
 class Settings:
     """How the problem is solved.
 
-    `criterion`: mean cost per sample, or cost discounted by the problem's γ. `level` 0 is a first
-    grid over all states, each further level resolves the closed loop's support (all but `tail` of
-    the samples at each end) with `cells`·2^level cells a state; cells beyond it grow by `growth`
-    each. `nodes` and `penalty_nodes` per disturbance, the influential ones first; empty: 7 and
-    20 for the first two, 2 and 4 for the third, 2 and 2 for the others. `integration_tolerance` on
-    the sampled model, relative; `tolerance` on the distance of the gain's bounds, relative, to
-    be met within `rounds` policy iterations a grid.
+    `level` 0 is a first grid over all states, each further level resolves the closed loop's support
+    (all but `tail` of the samples at each end) with `cells`·2^level cells a state; cells beyond it
+    grow by `growth` each. `nodes` and `penalty_nodes` per disturbance, the influential ones first;
+    empty: 7 and 20 for the first two, 2 and 4 for the third, 2 and 2 for the others.
+    `integration_tolerance` on the sampled model, relative; `tolerance` on the distance of the
+    gain's bounds, relative, to be met within `rounds` policy iterations a grid.
     """
 
-    criterion: Literal["average", "discounted"] = "average"
     level: int = 1
     cells: int = 12
     growth: float = 1.35
@@ -50,21 +48,6 @@ class Settings:
     integration_tolerance: float = 1e-6
     tolerance: float = 1e-4
     rounds: int = 40
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        positive = (self.tail, self.integration_tolerance, self.tolerance)
-        if (
-            self.criterion not in {"average", "discounted"}
-            or not 0 <= self.level <= 6
-            or min(self.cells, self.rounds) < 1
-            or not self.growth > 1
-            or min(positive) <= 0
-        ):
-            raise OptimumError(
-                f"{self}: criterion must be average or discounted, level 0 to 6, growth above 1 "
-                "and the other numbers positive"
-            )
 
     def accuracy(self, plant: PlantProblem) -> Accuracy:
         """Integrator and quadrature for a problem."""
@@ -314,11 +297,10 @@ _RESTART = 1e-9
 class Iterate:
     """A policy on a grid with its value, and what one more improvement found.
 
-    `actions` (G, m); `W` (G,) smooth part of the value, V = penalty + W, zero at the grid's anchor
-    for γ = 1; `gain` mean cost per sample of the policy; `lower` and `upper` are min and
-    max over the grid of TW − W. For γ = 1 they enclose the optimal gain (Odoni, 1969); for γ < 1
-    they enclose (1−γ)(V* − V) (MacQueen, 1966). `distribution` (G,) is the stationary one, `step`
-    (G, m) the last change of the actions.
+    `actions` (G, m); `W` (G,) smooth part of the value, V = penalty + W, zero at the grid's anchor;
+    `gain` mean cost per sample of the policy; `lower` and `upper`, min and max over the grid of
+    TW − W, enclose the optimal gain (Odoni, 1969). `distribution` (G,) is the stationary one,
+    `step` (G, m) the last change of the actions.
     """
 
     grid: Grid
@@ -336,9 +318,8 @@ def evaluate(
 ) -> tuple[Array, float, Array]:
     """Value W (G,), gain and stationary distribution (G,) of a policy (G, m).
 
-    For γ = 1: W + g = c + P W with W[anchor] = 0; for γ < 1: W = c + γ P W, and the gain from the
-    stationary distribution. One sparse factorisation each. Raises OptimumError where the chain
-    cannot be evaluated.
+    W + g = c + P W with W[anchor] = 0, by one sparse factorisation. Raises OptimumError where the
+    chain cannot be evaluated.
     """
     matrix, cost = operator.chain(actions, grid)
     size = grid.size
@@ -352,11 +333,8 @@ def evaluate(
     stationary = factors.solve(np.append(np.zeros(size), 1.0), trans="T")
     # The transposed system's last row makes the multipliers a distribution: they sum to 1.
     distribution = stationary[:size]
-    if operator.discount == 1.0:
-        solution = factors.solve(np.append(cost, 0.0))
-        return solution[:size], float(solution[size]), distribution
-    W = splu((sparse.eye_array(size) - operator.discount * matrix).tocsc()).solve(cost)
-    return W, float(distribution @ cost), distribution
+    solution = factors.solve(np.append(cost, 0.0))
+    return solution[:size], float(solution[size]), distribution
 
 
 def begin(operator: BellmanOperator, grid: Grid, actions: Array) -> Iterate:
@@ -499,7 +477,6 @@ class Optimum:
     lower: float
     upper: float
     distribution: Array
-    discount: float
     accuracy: Accuracy
     certificate: Certificate | None = None
 
@@ -523,10 +500,8 @@ def solve(
     """
     problem, settings = plant.problem, settings or Settings()
     accuracy = settings.accuracy(plant)
-    discount = 1.0 if settings.criterion == "average" else problem.discount
     draft, operator = (
-        BellmanOperator(plant, how, discount=discount, workers=workers)
-        for how in (accuracy.draft(), accuracy)
+        BellmanOperator(plant, how, workers=workers) for how in (accuracy.draft(), accuracy)
     )
     grid = first_grid(problem, draft, settings)
     iterate = begin(draft, grid, np.tile(problem.reference_action, (grid.size, 1)))
@@ -541,7 +516,7 @@ def solve(
             howard.level = level
     # One round that looks for better actions in the whole action box.
     iterate = howard(draft, howard.approach(draft, iterate), 9, enough=lambda *_: True, rounds=1)
-    return _optimum(howard.converge(operator, iterate), operator, accuracy)
+    return _optimum(howard.converge(operator, iterate), accuracy)
 
 
 def refine(
@@ -559,13 +534,13 @@ def refine(
     Raises OptimumError as `solve` does.
     """
     accuracy = accuracy or optimum.accuracy
-    operator = BellmanOperator(plant, accuracy, discount=optimum.discount, workers=workers)
+    operator = BellmanOperator(plant, accuracy, workers=workers)
     start = begin(operator, optimum.grid, optimum.actions)
     howard = _Howard(settings, progress)
     howard.level = settings.level if level is None else level
     grid = optimum.grid if level is None else finer_grid(operator, start, settings, level)
     iterate = howard.converge(operator, _transfer(operator, start, grid))
-    return _optimum(iterate, operator, accuracy)
+    return _optimum(iterate, accuracy)
 
 
 class _Howard:
@@ -611,20 +586,16 @@ class _Howard:
         )
 
 
-def _optimum(iterate: Iterate, operator: BellmanOperator, accuracy: Accuracy) -> Optimum:
-    average, gain = operator.discount == 1.0, iterate.gain
-    lower = min(iterate.lower, gain) if average else iterate.lower
-    upper = max(iterate.upper, gain) if average else iterate.upper
-    distribution = np.maximum(iterate.distribution, 0.0)
+def _optimum(iterate: Iterate, accuracy: Accuracy) -> Optimum:
+    gain = iterate.gain
     optimum = Optimum(
         iterate.grid,
         iterate.actions,
         iterate.W,
         gain,
-        lower,
-        upper,
-        distribution,
-        operator.discount,
+        min(iterate.lower, gain),
+        max(iterate.upper, gain),
+        np.maximum(iterate.distribution, 0.0),
         accuracy,
     )
     if iterate.upper - iterate.lower > 0.01 * abs(gain):
@@ -643,3 +614,126 @@ def _optimum(iterate: Iterate, operator: BellmanOperator, accuracy: Accuracy) ->
 def _transfer(operator: BellmanOperator, iterate: Iterate, grid: Grid) -> Iterate:
     start = begin(operator, grid, iterate.grid.resample(iterate.actions, grid))
     return replace(start, step=0.1 * start.step)
+
+
+def simulate_policy(
+    plant: PlantProblem,
+    optimum: Optimum,
+    *,
+    paths: int = 2000,
+    steps: int = 5000,
+    burn_in: int = 300,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """Mean cost per sample of a solution's policy on the plant's model, and half its 95 % interval.
+
+    The policy is interpolated as the controller does it. Each path starts in a state drawn from the
+    solution's stationary distribution, and its first `burn_in` samples are left out. The interval
+    is that of the mean of independent paths.
+    """
+    generator = np.random.default_rng(seed)
+    problem = plant.problem
+    step = Elementwise(discretise(problem.model, problem.sampling_time, optimum.accuracy.substeps))
+    cost = Elementwise(economic_cost(problem.model))
+    table = Grid(optimum.grid.axes)
+    policy = [table.interpolant(column) for column in optimum.actions.T]
+    share = optimum.distribution / optimum.distribution.sum()
+    x = list(table.points[generator.choice(table.size, paths, p=share)].T)
+    total = np.zeros(paths)
+    for k in range(burn_in + steps):
+        u = [entry(x) for entry in policy]
+        d = list(plant.law.draw(generator, paths).T)
+        if k >= burn_in:
+            total += cost(x, u, d, plant.parameters)[0]
+            violations = problem.penalty.violation(np.stack(x, axis=1)).T
+            for v, linear, quadratic in zip(
+                violations, problem.penalty_linear, problem.penalty_quadratic, strict=True
+            ):
+                total += (linear + quadratic * v) * v
+        x = [np.broadcast_to(entry, paths) for entry in step(x, u, d, plant.parameters)]
+    means = total / steps
+    half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)
+    return float(means.mean()), float(half_width)
+
+
+STABLE = 1e-3
+_MOST_GRIDS = 3
+
+
+@dataclass(frozen=True)
+class Row:
+    """A solution of the study; `change` is that of J* against what it refines, relative."""
+
+    name: str
+    optimum: Optimum
+    change: float | None = None
+
+    @property
+    def sizes(self) -> tuple[tuple[int, ...], ...]:
+        """Grid points a state, quadrature nodes and those of the penalty a disturbance."""
+        accuracy = self.optimum.accuracy
+        return self.optimum.grid.shape, accuracy.nodes, accuracy.penalty_nodes
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row as JSON has it."""
+        found = self.optimum
+        return {
+            "name": self.name,
+            "J": found.gain,
+            "lower": found.lower,
+            "upper": found.upper,
+            "states": found.grid.shape,
+            "accuracy": asdict(found.accuracy),
+            "change": self.change,
+        }
+
+    @property
+    def stable(self) -> bool:
+        """Whether refining changed J* by no more than 0.1 %."""
+        return self.change is None or self.change <= STABLE
+
+
+def study(
+    plant: PlantProblem,
+    settings: Settings,
+    optimum: Optimum,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> list[Row]:
+    """Refine a solution of `settings` until J* is stable to 0.1 %, then its quadrature once.
+
+    The grid is halved at least once and at most three times; the last row has the finer
+    quadrature and integrator on the first grid. `stable` of the last two rows is the verdict.
+    """
+    rows = [Row("solution", optimum)]
+    for level in range(settings.level + 1, settings.level + 1 + _MOST_GRIDS):
+        before = rows[-1].optimum
+        after = refine(plant, settings, before, level=level, progress=progress)
+        rows.append(Row("grid twice as fine", after, _change(before, after)))
+        if rows[-1].stable:
+            break
+    finer = optimum.accuracy.finer()
+    after = refine(plant, settings, optimum, accuracy=finer, progress=progress)
+    return [*rows, Row("quadrature finer", after, _change(optimum, after))]
+
+
+def certify(
+    plant: PlantProblem, rows: Sequence[Row], *, paths: int = 2000, steps: int = 5000
+) -> Optimum:
+    """The first refinement of a study, with its certificate.
+
+    It is what is kept, since it is nearer to J* than the solution that the study began with. The
+    simulation is that of its policy, by `simulate_policy`.
+    """
+    solution, refinement = rows[0].optimum, rows[1].optimum
+    mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
+    figures = (
+        Figure("solution", solution.gain, solution.lower, solution.upper),
+        Figure("refinement", refinement.gain, refinement.lower, refinement.upper),
+        Figure("simulation", mean, mean - half_width, mean + half_width),
+    )
+    return replace(refinement, certificate=Certificate(figures))
+
+
+def _change(before: Optimum, after: Optimum) -> float:
+    return abs(after.gain - before.gain) / abs(after.gain)

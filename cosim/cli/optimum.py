@@ -85,8 +85,14 @@ def _solve(
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
     from controllers.dynamic_programming.bellman import PlantProblem
-    from controllers.dynamic_programming.certificate import Row, certify, study
-    from controllers.dynamic_programming.policy_iteration import Certificate, Settings, solve
+    from controllers.dynamic_programming.policy_iteration import (
+        Certificate,
+        Row,
+        Settings,
+        certify,
+        solve,
+        study,
+    )
 
     plant, settings = PlantProblem.from_scenario(task), Settings()
     key = store.optimum_key(plant, settings)

@@ -8,9 +8,8 @@ import scipy.stats
 
 from controllers import OptimalPolicy, Quantity, evaporator, factories
 from controllers.dynamic_programming.bellman import PlantProblem
-from controllers.dynamic_programming.certificate import study
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import Settings, solve
+from controllers.dynamic_programming.policy_iteration import Settings, solve, study
 from controllers.errors import OptimumError
 from controllers.optimum import SHIPPED, optimum_key, read_optimum
 from controllers.problem import Problem

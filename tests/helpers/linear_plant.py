@@ -50,7 +50,7 @@ class LinearPlant:
             reference_cost=0.0,
         )
         law = DisturbanceLaw("normal", np.zeros(p), np.array(sigma, dtype=float))
-        self.plant = PlantProblem.nominal(self.problem, law)
+        self.plant = PlantProblem(self.problem, law, np.ones(1))
 
     def riccati(self, discount=1.0):
         """Value matrix P and gain K of u = Kx for a discount."""

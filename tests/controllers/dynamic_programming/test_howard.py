@@ -13,12 +13,11 @@ STATES = 12
 class RandomChain:
     """Stands in for the Bellman operator: a fixed stochastic matrix and cost."""
 
-    def __init__(self, discount=1.0):
+    def __init__(self):
         generator = np.random.default_rng(8)
         self.matrix = generator.uniform(size=(STATES, STATES)) ** 6
         self.matrix /= self.matrix.sum(axis=1, keepdims=True)
         self.cost = generator.normal(size=STATES)
-        self.discount = discount
         self.problem = SimpleNamespace()
 
     def chain(self, actions, grid):
@@ -36,16 +35,6 @@ def test_gain_and_distribution_are_those_of_the_chains_powers():
     assert gain == pytest.approx(limit @ chain.cost, abs=1e-7)
     assert W[3] == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_allclose(W + gain, chain.cost + chain.matrix @ W, atol=1e-7)
-
-
-def test_discounted_value_is_the_discounted_sum():
-    chain = RandomChain(discount=0.8)
-    W, gain, distribution = evaluate(chain, GRID, np.zeros((STATES, 1)), 0)
-    total, term = np.zeros(STATES), chain.cost.copy()
-    for _ in range(300):
-        total, term = total + term, 0.8 * chain.matrix @ term
-    np.testing.assert_allclose(W, total, rtol=1e-10)
-    assert gain == pytest.approx(distribution @ chain.cost, abs=1e-12)
 
 
 def test_a_chain_that_rests_in_two_places_has_the_gain_of_the_anchor():

@@ -38,7 +38,7 @@ def test_what_is_written_is_read_back_bit_by_bit(stored, optimum, tmp_path):
     found = store.read_optimum(stored, "abc")
     for name in ("actions", "W", "distribution"):
         np.testing.assert_array_equal(getattr(found, name), getattr(optimum, name))
-    for name in ("gain", "lower", "upper", "discount", "accuracy", "certificate"):
+    for name in ("gain", "lower", "upper", "accuracy", "certificate"):
         assert getattr(found, name) == getattr(optimum, name)
     again = store.write_optimum(tmp_path / "again.npz", optimum, "abc")
     assert again.read_bytes() == stored.read_bytes()
@@ -68,7 +68,6 @@ CHANGES = {
     "range": {"law": replace(LAW, ranges=2 * np.ones(4))},
     "plant parameter": {"parameters": P * 1.01},
     "solver": {"settings": Settings(cells=13)},
-    "criterion": {"settings": Settings(criterion="discounted")},
 }
 
 

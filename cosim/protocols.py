@@ -103,12 +103,6 @@ controller failed, seconds of prepare, feedback and step. It returns the sample 
 what failed there (0: nothing), and FMI's status.
 """
 
-Exploration = Callable[[Array, np.random.Generator], Array | None]
-"""Maps the policy's action (m,) and a generator to the action that explores, None to stay greedy.
-
-The loop saturates the result.
-"""
-
 
 @dataclass(frozen=True)
 class SampleBlock:

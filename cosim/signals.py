@@ -39,8 +39,8 @@ class Sample:
     """What the loop knows of a sample once the plant has stepped.
 
     `time` in s, the measured state `s` (n,), the applied `action` (m,), the plant's `step`, the
-    controller's `solution`, whether the controller `failed` and whether the sample `explored`, and
-    what the clock said: `prepare_time`, `feedback_time`, `plant_time` in s.
+    controller's `solution`, whether the controller `failed`, and what the clock said:
+    `prepare_time`, `feedback_time`, `plant_time` in s.
     """
 
     time: float
@@ -49,7 +49,6 @@ class Sample:
     step: Step
     solution: Solution | NoSolution
     failed: bool
-    explored: bool
     prepare_time: float
     feedback_time: float
     plant_time: float
@@ -101,7 +100,7 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("violation", _violation),
     SignalKind("value", "solution.value", COST),
     SignalKind("residual", RESIDUAL),
-    SignalKind("explored", "explored", whole=True),
+    SignalKind("explored", lambda scenario, columns: np.zeros_like(columns["time"]), whole=True),
     SignalKind("failed", "failed", whole=True),
     SignalKind("prepare_time", "prepare_time", "s", "step_time", clock=True),
     SignalKind("feedback_time", "feedback_time", "s", "step_time", clock=True),

@@ -13,7 +13,6 @@ from cosim.errors import CosimError
 from cosim.protocols import (
     CompiledLoop,
     Controller,
-    Exploration,
     Plant,
     Recorder,
     SampleBlock,
@@ -48,7 +47,6 @@ def simulate(
     steps: int,
     seed: int,
     *,
-    exploration: Exploration | None = None,
     recorder: Recorder | None = None,
     progress: Callable[[int], None] | None = None,
     residuals: bool = True,
@@ -56,10 +54,9 @@ def simulate(
     """Run a controller on a plant for `steps` samples from the scenario's initial state.
 
     Each sample: `prepare`, then `feedback(s)`, then the plant steps under the action, which the
-    actuators saturate to the scenario's action bounds. `exploration` may change the action;
-    `recorder` gets the run block by block; `progress` the number of samples done. `residuals` says
-    whether the controller's KKT residuals are wanted, which some compute only when asked: NaN
-    without.
+    actuators saturate to the scenario's action bounds. `recorder` gets the run block by block;
+    `progress` the number of samples done. `residuals` says whether the controller's KKT residuals
+    are wanted, which some compute only when asked: NaN without.
 
     If the controller fails to solve (an exception whose class has `is_solver_failure`), the last
     applied action is applied again (at the first sample the scenario's reference action), the
@@ -67,9 +64,9 @@ def simulate(
     """
     if steps < 1:
         raise CosimError(f"steps must be at least 1, not {steps}")
-    run = _Run(plant, controller, steps, seed, exploration, residuals)
+    run = _Run(plant, controller, steps, seed, residuals)
     if recorder is None:
-        loop = None if exploration is not None else _compiled_loop(plant, controller)
+        loop = _compiled_loop(plant, controller)
         if loop is None:
             run.go(_no_record, progress)
         else:
@@ -107,12 +104,10 @@ class _Run:
         controller: Controller,
         steps: int,
         seed: int,
-        exploration: Exploration | None,
         residuals: bool,
     ) -> None:
         self._plant, self._controller = plant, controller
         self._scenario: Scenario = plant.scenario
-        self._exploration = exploration
         self._seed, self._steps = seed, steps
         self._columns = SignalColumns(self._scenario, steps, residuals)
         self._status: list[str] = []
@@ -125,21 +120,15 @@ class _Run:
     ) -> None:
         keeps_predictions = record is not _no_record
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
-        sampling_time, exploration = self._scenario.sampling_time, self._exploration
+        sampling_time = self._scenario.sampling_time
         plant, read, solve = self._plant, self._columns.read, self._solve
-        plant_seed, rng = spawn_seeds(self._seed)
-        s = plant.reset(plant_seed)
+        s = plant.reset(spawn_seeds(self._seed)[0])
         self._controller.reset()
         applied = self._scenario.reference_action
         for k in range(self._steps):
             s.flags.writeable = False  # a controller reads the state, and changes nothing
             solution, prepare_time, feedback_time = solve(s)
-            action, explores = applied if solution is None else solution.action, False
-            if exploration is not None:
-                explored = exploration(action, rng)
-                # A failed sample draws its noise too, so that paired runs stay in step.
-                if solution is not None and explored is not None:
-                    action, explores = explored, True
+            action = applied if solution is None else solution.action
             if (
                 not isinstance(action, np.ndarray)
                 or action.shape != shape
@@ -160,7 +149,6 @@ class _Run:
                     step,
                     signals.NO_SOLUTION if solution is None else solution,
                     solution is None,
-                    explores,
                     prepare_time,
                     feedback_time,
                     plant_time,
@@ -198,7 +186,6 @@ class _Run:
                     "penalty": scenario.state_penalty.along(states),
                     "value": value,
                     "residual": residual,
-                    "explored": np.zeros(end - first),
                     "failed": failed,
                     **dict(
                         zip(("prepare_time", "feedback_time", "plant_time"), clock, strict=True)

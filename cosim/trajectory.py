@@ -51,9 +51,9 @@ class Trajectory(Shown):
     Signals, each (K,): `time` [s]; the scenario's states, actions and disturbances under their
     FMU names; `stage_cost` ℓ(x_k, u_k, d_k) without penalty; `penalty` and `violation` Σᵢ vᵢ of
     x_k at the true bounds; the controller's `value` and `residual` (NaN if it has none);
-    `explored` and `failed` (0 or 1). `status` has one word per sample, `fallback` where the
-    controller failed. `timing` holds wall-clock times [s] by name, (K,); `final_state` is x_K;
-    `seed` is the noise's. `signals` maps names to signals.
+    `explored` (0: a run is greedy) and `failed` (0 or 1). `status` has one word per sample,
+    `fallback` where the controller failed. `timing` holds wall-clock times [s] by name, (K,);
+    `final_state` is x_K; `seed` is the noise's. `signals` maps names to signals.
     """
 
     scenario: Scenario
@@ -138,7 +138,7 @@ class Trajectory(Shown):
 
         `economic_cost` mean of ℓ; `mean_violation` mean of Σᵢ vᵢ; `violating_share` share of
         samples with Σᵢ vᵢ > `VIOLATING`; `J` mean of ℓ + penalty; `failures` samples under the
-        fallback action; `explored` samples that the exploration changed; `statuses` samples by
+        fallback action; `explored` 0; `statuses` samples by
         status.
         """
         return {

@@ -43,15 +43,9 @@ def test_the_same_seed_repeats_and_another_differs(evaporator, paper):
 
 
 def test_controllers_with_one_seed_meet_the_same_noise(evaporator, paper):
-    def explore(action, rng):
-        return action + rng.normal(size=2)
-
-    one = simulate(evaporator, Proportional(paper), 40, seed=1, exploration=explore)
-    two = simulate(evaporator, Hold(paper.reference_action), 40, seed=1, exploration=explore)
+    one = simulate(evaporator, Proportional(paper), 40, seed=1)
+    two = simulate(evaporator, Hold(paper.reference_action), 40, seed=1)
     np.testing.assert_array_equal(one.disturbances, two.disturbances)
-    noise = two.actions - paper.reference_action
-    rng = spawn_seeds(1)[1]
-    np.testing.assert_allclose(noise, [rng.normal(size=2) for _ in range(40)], atol=1e-12)
 
 
 def test_sampling_instants_are_multiples_of_the_sampling_time():
@@ -60,19 +54,9 @@ def test_sampling_instants_are_multiples_of_the_sampling_time():
     np.testing.assert_array_equal(trajectory.time, np.arange(1000) * 0.1)
 
 
-def test_actuators_saturate_what_controller_and_exploration_ask_for(evaporator, paper):
+def test_actuators_saturate_what_a_controller_asks_for(evaporator, paper):
     trajectory = simulate(evaporator, Hold([1000.0, -5.0]), 10, seed=0)
     np.testing.assert_array_equal(trajectory.actions, np.tile([400.0, 100.0], (10, 1)))
-
-
-def test_only_changed_samples_count_as_explored(evaporator, paper):
-    def explore(action, rng):
-        return action + 1.0 if rng.random() < 0.3 else None
-
-    trajectory = simulate(evaporator, Hold([200.0, 200.0]), 200, seed=4, exploration=explore)
-    moved = (trajectory.actions != 200.0).all(axis=1)
-    np.testing.assert_array_equal(trajectory["explored"], moved)
-    assert trajectory.summary()["explored"] == moved.sum() > 30
 
 
 @pytest.mark.parametrize("phase", ["prepare", "feedback"])
@@ -90,18 +74,6 @@ def test_a_failed_solve_repeats_the_last_action_and_is_counted(evaporator, paper
     assert summary["failures"] == 3
     assert summary["statuses"] == {"fallback": 3, "solved": 17}
     assert controller.resets == 1 + 3
-
-
-def test_a_failure_leaves_the_exploration_noise_in_step(evaporator, paper):
-    def explore(action, rng):
-        return action + rng.normal(size=2)
-
-    whole = simulate(evaporator, Hold(paper.reference_action), 20, seed=6, exploration=explore)
-    failing = Failing(paper, at=[4])
-    failing._gain = 0.0
-    broken = simulate(evaporator, failing, 20, seed=6, exploration=explore)
-    np.testing.assert_array_equal(whole.actions[5:], broken.actions[5:])
-    np.testing.assert_array_equal(broken.actions[4], broken.actions[3])
 
 
 def test_residuals_that_nobody_wants_are_not_computed(evaporator, paper):

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import atexit
 import errno
-import hashlib
 import json
 import os
 import secrets
 import shutil
-import socket
 import stat
 import tempfile
 import tomllib
@@ -104,108 +102,58 @@ CACHE_VARIABLE = "COSIM_CACHE"
 _caches: dict[Path, Path] = {}
 
 
-def user_cache(kind: str) -> Path:
-    """The user's folder for cached files of a kind, which need not exist yet.
-
-    It lies under the environment's COSIM_CACHE, else where the platform keeps caches.
-    """
-    chosen = os.environ.get(CACHE_VARIABLE)
-    root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
-    return root.absolute() / kind
-
-
 def cache_folder(kind: str) -> Path:
     """The folder for cached files of a `kind`: the user's, made if need be, or a temporary one.
 
-    Temporary, until this process ends, where the user's cannot be written or others could write it:
+    The user's lies under the environment's COSIM_CACHE, else where the platform keeps caches.
+    Temporary, until this process ends, where that cannot be written or others could write it:
     native code is loaded from here.
     """
-    folder = user_cache(kind)
-    if folder in _caches and _caches[folder].is_dir():
-        return _caches[folder]
-    try:
-        folder.parent.parent.mkdir(parents=True, exist_ok=True)
-        for level in (folder.parent, folder):
-            level.mkdir(mode=0o700, exist_ok=True)
-        usable = is_trusted(folder) and os.access(folder, os.W_OK | os.X_OK)
-    except OSError:
-        usable = False
-    if usable:
-        _caches[folder] = folder
-    else:
-        _caches[folder] = _make_temporary(f"cosim-{kind}-", None)
-        atexit.register(shutil.rmtree, _caches[folder], ignore_errors=True)
+    chosen = os.environ.get(CACHE_VARIABLE)
+    root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
+    folder = root.absolute() / kind
+    if folder not in _caches or not _caches[folder].is_dir():
+        if _is_ours_alone(folder):
+            _caches[folder] = folder
+        else:
+            _caches[folder] = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))
+            atexit.register(shutil.rmtree, _caches[folder], ignore_errors=True)
     return _caches[folder]
 
 
-def is_trusted(path: Path) -> bool:
-    """Whether a cached file, or folder, and the two folders above it are the user's alone.
+def _is_ours_alone(folder: Path) -> bool:
+    """Whether a cache's folder, made if need be, and the one above are the user's alone.
 
     Each must belong to the user, be closed to others for writing and be no link. Windows closes a
     user's profile by other means and is trusted.
     """
-    if os.name == "nt":
-        return path.exists()
+    levels = (folder.parent, folder)
     try:
-        found = [level.lstat() for level in (path, path.parent)]
+        folder.parent.parent.mkdir(parents=True, exist_ok=True)
+        for level in levels:
+            level.mkdir(mode=0o700, exist_ok=True)
+        found = [level.lstat() for level in levels]
     except OSError:
         return False
-    return all(
+    return os.name == "nt" or all(
         status.st_uid == os.geteuid()
-        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-        and not stat.S_ISLNK(status.st_mode)
+        and status.st_mode & (stat.S_IRWXU | stat.S_IWGRP | stat.S_IWOTH) == stat.S_IRWXU
+        and stat.S_ISDIR(status.st_mode)
         for status in found
     )
-
-
-def _delete(entry: Path) -> None:
-    if entry.is_dir() and not entry.is_symlink():
-        shutil.rmtree(entry, ignore_errors=True)
-    else:
-        entry.unlink(missing_ok=True)
 
 
 @contextmanager
 def temporary_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
     """A new folder that only this user can enter, deleted at the end of the block.
 
-    `parent` is where it lies, by default where the system keeps temporary files. Its name has the
-    prefix, the machine and this process's number: a folder whose process was killed is deleted by
-    the next call with the same prefix. Raises OSError where it cannot be made.
+    `parent` is where it lies, by default where the system keeps temporary files. Raises OSError
+    where it cannot be made.
     """
-    folder = _make_temporary(prefix, parent)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _make_temporary(prefix: str, parent: Path | None) -> Path:
-    root = Path(tempfile.gettempdir() if parent is None else parent).absolute()
-    start = prefix + hashlib.sha256(socket.gethostname().encode()).hexdigest()[:6]
-    for other in root.glob(f"{start}-*-????????"):
-        if _is_abandoned(other):
-            _delete(other)
-    folder = root / f"{start}-{os.getpid()}-{secrets.token_hex(4)}"
-    folder.mkdir(mode=0o700)
-    return folder
-
-
-def _is_abandoned(folder: Path) -> bool:
-    """Whether the process that made a temporary folder of this user has ended."""
-    import psutil  # noqa: PLC0415 (most commands meet no such folder)
-
-    try:
-        number = int(folder.name.rpartition("-")[0].rpartition("-")[2])
-        status = folder.lstat()
-        if number == os.getpid() or (os.name != "nt" and status.st_uid != os.geteuid()):
-            return False
-        # A process that began after the folder was last changed has its number again.
-        return bool(psutil.Process(number).create_time() > status.st_mtime + 2.0)
-    except psutil.NoSuchProcess:
-        return True
-    except (OSError, ValueError, psutil.Error):
-        return False
+    with tempfile.TemporaryDirectory(
+        prefix=prefix, dir=parent, ignore_cleanup_errors=True
+    ) as folder:
+        yield Path(folder).absolute()
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -227,33 +175,36 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 LARGEST = 1 << 24
 """Bytes of the largest document that is read."""
-DEEPEST = 32
-"""Tables and lists within each other in a document."""
 
 
 def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
     """Document of a TOML file; `origin` is what messages call it.
 
-    Raises `error` where there is no such regular file, or where it is not UTF-8, not TOML, larger
-    than `LARGEST` or nested deeper than `DEEPEST`.
+    Raises `error` where there is no such regular file, or where it is not UTF-8, not TOML or larger
+    than `LARGEST`.
     """
     return parse_toml(_text(path, origin, error), origin, error)
 
 
 def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
     """Document of a JSON file, an object; raises `error` as `read_toml` does."""
-    return parse_json(_text(path, origin, error), origin, error)
-
-
-def parse_json(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a JSON text; raises `error` where it is no object, or nested beyond `DEEPEST`."""
+    text = _text(path, origin, error)
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as cause:
         raise error(f"{origin} is not valid JSON: {cause}") from None
     if not isinstance(document, dict):
         raise error(f"{origin} is not a JSON object")
-    return _shallow(document, origin, error)
+    return document
+
+
+def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
+    """Document of a TOML text; raises `error` where it is none."""
+    try:
+        return tomllib.loads(text)
+    # Nesting without end exhausts the parser's stack, a number without end Python's patience.
+    except (ValueError, RecursionError) as cause:
+        raise error(f"{origin} is not valid TOML: {cause}") from None
 
 
 def _text(path: str | Path, origin: str, error: type[Exception]) -> str:
@@ -272,28 +223,3 @@ def _text(path: str | Path, origin: str, error: type[Exception]) -> str:
         return content.decode("utf-8")
     except UnicodeDecodeError:
         raise error(f"{origin} is not UTF-8 text") from None
-
-
-def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a TOML text; raises `error` where it is none, or nested beyond `DEEPEST`."""
-    try:
-        document = tomllib.loads(text)
-    # Nesting without end exhausts the parser's stack, a number without end Python's patience.
-    except (ValueError, RecursionError) as cause:
-        raise error(f"{origin} is not valid TOML: {cause}") from None
-    return _shallow(document, origin, error)
-
-
-def _shallow(document: dict[str, Any], origin: str, error: type[Exception]) -> dict[str, Any]:
-    """The document, unless it is nested beyond `DEEPEST`."""
-    layer: list[Any] = [document]
-    for _ in range(DEEPEST):
-        layer = [
-            inner
-            for value in layer
-            for inner in (value.values() if isinstance(value, dict) else value)
-            if isinstance(inner, dict | list)
-        ]
-        if not layer:
-            return document
-    raise error(f"{origin} is nested more than {DEEPEST} deep")

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import atexit
-import json
 import os
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from cosim.errors import CosimError, PlantError
 from cosim.files import temporary_folder
@@ -24,7 +22,6 @@ from cosim.files import temporary_folder
 # psutil and filelock are imported where they are needed: every command imports this file.
 if TYPE_CHECKING:
     import filelock
-    import psutil
 
 
 class Terminated(BaseException):
@@ -36,19 +33,24 @@ class Interrupted(BaseException):
 
 
 _unwound = threading.Event()
+_commands: list[str] = []
+_watched = False
+"""Whether another process has started this one, and watches it."""
 _SIGNALS = [
     getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name)
 ]
 
 
 @contextmanager
-def unwinding_on_signals() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt, SIGTERM and SIGHUP `Terminated`, once per command.
+def command_process() -> Iterator[None]:
+    """Run a command: foreign code in it is watched, and signals unwind it.
 
-    Signals that the caller ignores, as nohup and a shell's background jobs do, stay ignored.
-    Restores the previous handlers; at interpreter shutdown the signals are ignored.
+    Ctrl-C raises KeyboardInterrupt, SIGTERM and SIGHUP `Terminated`, once. Signals that the caller
+    ignores, as nohup and a shell's background jobs do, stay ignored. Restores the previous
+    handlers; at interpreter shutdown the signals are ignored.
     """
     _unwound.clear()
+    _commands.append(sys.argv[0])
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     for number in _SIGNALS:
         if before[number] in (signal.SIG_DFL, signal.default_int_handler):
@@ -57,6 +59,7 @@ def unwinding_on_signals() -> Iterator[None]:
         yield
     finally:
         _unwound.set()
+        _commands.pop()
         atexit.register(_ignore)
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
@@ -177,17 +180,14 @@ def _end(child: subprocess.Popen[bytes]) -> None:
     """End a child and its descendants: politely, then, after two seconds, at once."""
     import psutil  # noqa: PLC0415
 
-    family: list[psutil.Process] = []
-    with suppress(psutil.Error):
-        family = psutil.Process(child.pid).children(recursive=True)
-    for process in (child, *family):
-        with suppress(psutil.Error, OSError):
-            process.terminate()
-    with suppress(subprocess.TimeoutExpired):
-        child.wait(2.0)
-    for process in (*psutil.wait_procs(family, 0.1)[1], child):
-        with suppress(psutil.Error, OSError):
-            process.kill()
+    with suppress(psutil.NoSuchProcess):
+        parent = psutil.Process(child.pid)
+        family = [parent, *parent.children(recursive=True)]
+        for end in (psutil.Process.terminate, psutil.Process.kill):
+            for process in family:
+                with suppress(psutil.Error):
+                    end(process)
+            family = psutil.wait_procs(family, 2.0)[1]
     child.wait()
 
 
@@ -208,7 +208,7 @@ def run_child(
 
 
 LOCK = ".cosim.lock"
-HOLDER = ".cosim.lock.json"
+HOLDER = ".cosim.lock.holder"
 _held: dict[Path, filelock.BaseFileLock] = {}
 
 
@@ -227,15 +227,17 @@ def hold(folder: Path) -> None:
     try:
         lock.acquire()
     except filelock.Timeout:
-        raise CosimError(f"{_holder(folder)}; wait for it or choose another --out") from None
+        who = "another process"
+        with suppress(OSError, ValueError):
+            who = (folder / HOLDER).read_text("utf-8") or who
+        raise CosimError(
+            f"folder '{folder}' is being written by {who}; wait for it or choose another --out"
+        ) from None
     _held[folder] = lock
-    holder = {
-        "command": " ".join(["cosim", *sys.argv[1:]]),
-        "process": os.getpid(),
-        "machine": socket.gethostname(),
-        "since": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    (folder / HOLDER).write_text(json.dumps(holder), "utf-8")
+    since = datetime.now(UTC).isoformat(timespec="seconds")
+    command = " ".join(["cosim", *sys.argv[1:]])
+    holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
+    (folder / HOLDER).write_text(holder, "utf-8")
 
 
 def release() -> list[Path]:
@@ -249,18 +251,6 @@ def release() -> list[Path]:
                 (folder / name).unlink()
         lock.release()
     return folders
-
-
-def _holder(folder: Path) -> str:
-    try:
-        found = json.loads((folder / HOLDER).read_text("utf-8"))
-        who = (
-            f"process {found['process']} on {found['machine']} ({found['command']}) since "
-            f"{found['since']}"
-        )
-    except (OSError, ValueError, KeyError, TypeError):
-        who = "another process"
-    return f"folder '{folder}' is being written by {who}"
 
 
 _stdout: list[int] = []
@@ -291,40 +281,30 @@ def output_turned_aside() -> Iterator[int | None]:
         os.close(_stdout.pop())
 
 
-MARK = "COSIM_FINISHED"
-"""Environment variable of a watched command: its parent's number and the file that it leaves."""
-PATIENCE = 3.0
-_marks: list[str | None] = []
-"""Of a process of the command line: its mark, or None where nobody watches it."""
-
-
 class Finished(BaseException):
     """A watched command has ended; its argument is the exit code."""
 
 
-@contextmanager
-def command_process() -> Iterator[None]:
-    """Mark this process as the command line's: one that may be watched, or that is.
+def run_watched(main: Callable[[], None], parent: int, mark: str) -> NoReturn:
+    """Run the command line for a process that watches it, and leave a file where it ends.
 
-    Foreign code may call `exit(0)`, be killed, or close what the process has open: a process that
-    is watched leaves word that the command came to its end, whatever its exit code.
+    Foreign code may call `exit(0)` or be killed: then there is none. Threads that foreign code has
+    left do not keep the process.
     """
-    # Taken out, so that what this command starts does not take itself for it.
-    _marks.append(os.environ.pop(MARK, None))
-    if _marks[-1] is not None:
-        follow_parent(int(_marks[-1].partition(" ")[0]))
-    code: object = 1
+    global _watched  # noqa: PLW0603
+    _watched = True
+    follow_parent(parent)
+    code: Any = 0
     try:
-        yield
+        main()
     except SystemExit as error:
         code = error.code
-        raise
-    finally:
-        if (mark := _marks.pop()) is not None:
-            with suppress(OSError, ValueError):
-                sys.stdout.flush()
-            with suppress(OSError):
-                Path(mark.partition(" ")[2]).write_text(str(code or 0), "utf-8")
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        code = code or 1
+    Path(mark).touch()
+    os._exit(code or 0)
 
 
 def watch(suspect: str) -> None:
@@ -334,19 +314,21 @@ def watch(suspect: str) -> None:
     process, and where no command line was called. Raises PlantError where the process ended before
     the command did.
     """
-    if not _marks or _marks[-1] is not None:
+    if not _commands or _watched:
         return
     flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
-    # With this process's import path: a folder of the user's may have the name of a package.
-    program = f"import sys; sys.path[:] = {sys.path}; from cosim.cli import main; main()"
-    command = [sys.executable, *flags, "-c", program, *sys.argv[1:]]
     folders = release()  # for the process that does the work
     with temporary_folder("cosim-") as temporary:
         mark = temporary / "finished"
-        environment = os.environ | {MARK: f"{os.getpid()} {mark}"}
-        child = subprocess.Popen(command, stdout=(*_stdout, None)[0], env=environment)
+        # With this process's import path: a folder of the user's may have the name of a package.
+        program = (
+            f"import sys; sys.path[:] = {sys.path}; from cosim import cli, processes; "
+            f"processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"
+        )
+        words = [sys.executable, *flags, "-c", program, *sys.argv[1:]]
+        child = subprocess.Popen(words, stdout=(*_stdout, None)[0])
         try:
-            code = _outcome(child, mark)
+            code = child.wait()
         except BaseException as error:
             if not isinstance(error, KeyboardInterrupt):  # Ctrl-C reached the child, too
                 child.terminate()
@@ -360,16 +342,3 @@ def watch(suspect: str) -> None:
             hold(folder)
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
     raise PlantError(f"{suspect} ended the process {how} before the command finished")
-
-
-def _outcome(child: subprocess.Popen[bytes], mark: Path) -> int:
-    """The child's exit code; it is killed where a thread keeps it `PATIENCE` s beyond its end."""
-    while True:
-        with suppress(subprocess.TimeoutExpired):
-            return child.wait(1.0)
-        with suppress(OSError, ValueError):
-            if time.time() - mark.stat().st_mtime > PATIENCE:
-                code = int(mark.read_text("utf-8"))
-                child.kill()
-                child.wait()
-                return code

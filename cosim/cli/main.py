@@ -34,7 +34,6 @@ from cosim.processes import (
     Interrupted,
     Terminated,
     command_process,
-    unwinding_on_signals,
     unwound,
 )
 
@@ -163,7 +162,7 @@ def main() -> None:
     a report with the traceback and exit code 70.
     """
     _open_streams()
-    with unwinding_on_signals(), command_process():
+    with command_process():
         _run()
 
 

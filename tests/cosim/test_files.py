@@ -2,17 +2,13 @@
 
 import os
 import stat
-import subprocess
-import sys
 
 import pytest
 
 from cosim import files
 from cosim.files import (
-    DEEPEST,
     LARGEST,
     cache_folder,
-    is_trusted,
     read_json,
     read_toml,
     temporary_folder,
@@ -70,15 +66,6 @@ def test_a_document_that_is_none_is_one_line_that_names_it(tmp_path, read, conte
     assert str(caught.value).startswith("the document ")
 
 
-def test_documents_may_be_nested_to_a_limit(tmp_path):
-    path = tmp_path / "document"
-    path.write_text("a = " + "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1))
-    read_toml(path, "it", LookupError)
-    path.write_text("a = " + "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1))
-    with pytest.raises(LookupError):
-        read_toml(path, "it", LookupError)
-
-
 @pytest.fixture
 def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
@@ -116,16 +103,6 @@ def test_a_cache_that_others_can_write_is_not_used(own_cache, tmp_path, monkeypa
     assert cache_folder("compiled") == folder
 
 
-@posix
-def test_a_cached_file_that_others_can_write_is_not_trusted(own_cache):
-    path = cache_folder("compiled") / "library"
-    assert not is_trusted(path)
-    path.touch(0o600)
-    assert is_trusted(path)
-    path.chmod(0o620)
-    assert not is_trusted(path)
-
-
 def test_a_temporary_folder_is_deleted_with_what_is_in_it_whatever_is_raised(tmp_path):
     with pytest.raises(ZeroDivisionError), temporary_folder("mine-", tmp_path) as folder:
         assert folder.parent == tmp_path
@@ -134,28 +111,3 @@ def test_a_temporary_folder_is_deleted_with_what_is_in_it_whatever_is_raised(tmp
             assert stat.S_IMODE(folder.stat().st_mode) == 0o700
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
-
-
-PROGRAM = (
-    "import sys, time\n"
-    "from pathlib import Path\n"
-    "from cosim.files import temporary_folder\n"
-    "with temporary_folder('mine-', Path(sys.argv[1])) as folder:\n"
-    "    print(folder.name, flush=True)\n    sys.stdin.read()\n"
-)
-
-
-def test_the_folder_of_a_killed_process_is_deleted_by_the_next_run_and_a_living_ones_is_not(
-    tmp_path,
-):
-    words, pipe = [sys.executable, "-c", PROGRAM, str(tmp_path)], subprocess.PIPE
-    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True) as process:
-        name = process.stdout.readline().strip()
-        with temporary_folder("mine-", tmp_path):
-            assert (tmp_path / name).is_dir()
-        process.kill()
-    assert (tmp_path / name).is_dir()
-    (tmp_path / "mine-kept").mkdir()
-    with temporary_folder("mine-", tmp_path):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == ["mine-kept"]

@@ -48,10 +48,10 @@ def test_workers_end_with_the_parent(tmp_path):
 
 CHILD = (
     "import subprocess, sys\n"
-    "from cosim.processes import run_child, unwinding_on_signals\n"
+    "from cosim.processes import command_process, run_child\n"
     "words = [sys.executable, '-c', 'import os, time; print(os.getpid(), flush=True);'\n"
     "         'time.sleep(600)']\n"
-    "with unwinding_on_signals():\n    run_child(words, timeout=600.0)\n"
+    "with command_process():\n    run_child(words, timeout=600.0)\n"
 )
 
 
@@ -138,7 +138,7 @@ def test_a_folder_that_is_being_written_is_refused(holder, tmp_path, command):
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert re.search(rf"written by process {holder.pid} on \S+ \(.*\) since \S+; ", done.stderr)
-    (tmp_path / "out" / processes.HOLDER).write_text("{")
+    (tmp_path / "out" / processes.HOLDER).unlink()
     with pytest.raises(CosimError, match="another process"):
         processes.hold(tmp_path / "out")
 

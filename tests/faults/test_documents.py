@@ -25,7 +25,6 @@ READERS = {
 CONTENTS = {
     "a number of 5000 digits": b"schema = " + b"9" * 5000,
     "lists within lists without end": b"schema = " + b"[" * 5000 + b"]" * 5000,
-    "tables within tables": b"a." * 3000 + b"b = 1",
     "not UTF-8": b"name = '\xff'",
     "nothing": b"",
     "a date": b"schema = 2026-01-01",

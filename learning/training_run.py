@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -30,13 +30,16 @@ Vector = NDArray[np.float64]
 CONTROLLERS = ("rti", "converged")
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
-MOST = 100_000_000
-"""Samples of the longest run."""
-
-
-def _about(text: str, least: int | None = None, most: int = MOST) -> dict[str, Any]:
-    """A field's help and range, of which the command's option is made too."""
-    return {"text": text, "least": least, "most": most}
+LEAST = {
+    "samples": 1,
+    "seed": 0,
+    "log_every": 1,
+    "evaluate_every": 1,
+    "checkpoint_every": 1,
+    "evaluation_seeds": 1,
+    "evaluation_steps": 1,
+    "rest_after": 1,
+}
 
 
 @dataclass(frozen=True)
@@ -53,39 +56,26 @@ class TrainingRun:
 
     algorithm: str
     scenario: Scenario
-    samples: int = field(
-        metadata=_about("Plant samples; default: 50 000, or what the algorithm says.", 1)
-    )
-    seed: int = field(metadata=_about("Seed of noise and exploration.", 0, 999_999))
+    samples: int
+    seed: int
     configuration: Configuration
-    controller: str = field(default="rti", metadata=_about("What carries θ: rti or converged."))
-    log_every: int = field(default=1000, metadata=_about("Samples per row of the log.", 1))
-    evaluate_every: int = field(default=5000, metadata=_about("Samples per greedy evaluation.", 1))
-    checkpoint_every: int = field(default=5000, metadata=_about("Samples per checkpoint.", 1))
-    evaluation_seeds: int = field(
-        default=4, metadata=_about("Held-out runs per evaluation.", 1, 1_000_000)
-    )
-    evaluation_steps: int = field(default=500, metadata=_about("Samples of each of them.", 1))
-    divergence: float = field(
-        default=1.5, metadata=_about("Times the start's J at which a run has diverged.")
-    )
-    start: str = field(
-        default="naive",
-        metadata=_about("Where θ starts: naive, tuned, commissioned or a parameters file."),
-    )
-    rest_after: int | None = field(
-        default=None,
-        metadata=_about("Samples after which θ stays and nothing explores; default: never.", 1),
-    )
+    controller: str = "rti"
+    log_every: int = 1000
+    evaluate_every: int = 5000
+    checkpoint_every: int = 5000
+    evaluation_seeds: int = 4
+    evaluation_steps: int = 500
+    divergence: float = 1.5
+    start: str = "naive"
+    rest_after: int | None = None
 
     def __post_init__(self) -> None:
         """Complete the configuration and check the counts."""
         completed = self.configuration.for_scenario(self.scenario)
         object.__setattr__(self, "configuration", completed)
-        for option in fields(self):
-            value, least = getattr(self, option.name), option.metadata.get("least")
-            if least is not None and value is not None and value < least:
-                raise ConfigurationError(f"{option.name} must be at least {least}, not {value}")
+        for name, least in LEAST.items():
+            if (value := getattr(self, name)) is not None and value < least:
+                raise ConfigurationError(f"{name} must be at least {least}, not {value}")
         for name in ("evaluate_every", "checkpoint_every"):
             if getattr(self, name) % self.log_every:
                 raise ConfigurationError(

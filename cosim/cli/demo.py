@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from cosim.cli.options import JsonOption, OutOption, SeedOption, StepsOption, count
-from cosim.cli.output import Output, dump, open_folder, output
+from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from learning.training import Training
@@ -20,12 +19,12 @@ RUNS = 10
 
 def demo(
     samples: Annotated[
-        int, count("--samples", least=1000, most=1_000_000, text="Plant samples of learning.")
+        int, cli.count("--samples", least=1000, most=1_000_000, text="Plant samples of learning.")
     ] = 20_000,
-    steps: StepsOption = 500,
-    seed: SeedOption = 0,
-    out: OutOption = Path("cosim-demo"),
-    json: JsonOption = False,
+    steps: cli.StepsOption = 500,
+    seed: cli.SeedOption = 0,
+    out: cli.OutOption = Path("cosim-demo"),
+    json: cli.JsonOption = False,
 ) -> None:
     """Let a controller whose model is wrong learn from its plant, and compare it.
 
@@ -33,7 +32,7 @@ def demo(
     before-after.png, demo.rrd, summary.json, and of the training learning.csv, learning.png,
     training.rrd, parameters.toml and scenario.toml.
     """
-    with output(json) as out_:
+    with cli.output(json) as out_:
         import pandas
 
         from cosim.cli.train import record_training
@@ -46,15 +45,17 @@ def demo(
         from cosim.recording import record_overlay
         from cosim.scenario import Scenario
         from cosim.simulation import simulate
+        from cosim.statistics import shown
         from cosim.text_tables import markdown_table
         from learning.training import HELD_OUT
 
         scenario = Scenario.load(SCENARIO)
-        folder = open_folder(out).absolute()
+        folder = cli.open_folder(out)
         out_.note(scenario.description)
-        backed_off = _train("backoff", "tuned", BACKOFF_SAMPLES, seed, {}, out_)
-        learnt = _train("search", "naive", samples, seed, {"rule": "q-learning"}, out_)
-        trained = {BACKED_OFF: backed_off, LEARNT: learnt}
+        trained = {
+            BACKED_OFF: _train("backoff", "tuned", BACKOFF_SAMPLES, seed, {}, out_),
+            LEARNT: _train("search", "naive", samples, seed, {"rule": "q-learning"}, out_),
+        }
         first = 2 * HELD_OUT + seed  # noise that no training met
         with temporary_folder("cosim-demo-") as work, FmuPlant(scenario) as plant:
             named = {NAIVE: NAIVE, BACKED_OFF: "", LEARNT: "", OPTIMAL: OPTIMAL}
@@ -68,7 +69,7 @@ def demo(
                 name: simulate(plant, build_controller(named[name], scenario), steps, first)
                 for name in (NAIVE, LEARNT, OPTIMAL)
             }
-        rows = [
+        rows: list[dict[str, Any]] = [
             {
                 "controller": name,
                 "plant_samples": trained[name].plant_samples if name in trained else 0,
@@ -79,38 +80,48 @@ def demo(
             for name, row in found.summary()["controllers"].items()
         ]
         title = f"{SCENARIO}, {RUNS} runs of {steps} samples, the same disturbances for all"
-        header, cells = _table(rows)
+        header = ("controller", "plant samples", "J", "regret %", "economic cost", "violating %")
+        cells = [
+            (
+                row["controller"],
+                str(row["plant_samples"]),
+                f"{row['J']:.1f}",
+                shown(row["regret"], row["regret_interval"], 100, 3),
+                f"{row['economic_cost']:.1f}",
+                f"{100 * row['violating_share']:.1f}",
+            )
+            for row in rows
+        ]
         out_.table(title, header, cells)
         save(overlay_figure(runs), folder / "before-after.png")
-        learnt.save(folder)
+        trained[LEARNT].save(folder)
         about = f"# {title}\n\n{scenario.description}\n\n{markdown_table(header, cells)}"
         signals = {
             name: RunSignals(name, run.signals, run.status, scenario.limits)
             for name, run in runs.items()
         }
         record_overlay(folder / "demo.rrd", signals, about)
-        record_training(folder / "training.rrd", learnt)
+        record_training(folder / "training.rrd", trained[LEARNT])
         flat = pandas.DataFrame(rows).drop(columns="regret_interval")
         write_atomically(folder / "demo.csv", flat.to_csv(index=False, lineterminator="\n"))
-        summary: dict[str, Any] = {
-            "scenario": SCENARIO,
-            "steps": steps,
-            "seed": seed,
-            "controllers": rows,
-            "training": learnt.summary(),
-        }
-        write_atomically(folder / "summary.json", dump(summary))
         out_.note(
             f"pictures   {folder / 'before-after.png'}, {folder / 'learning.png'}\n"
             f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}   "
             f"(look at them with: cosim view {folder / 'demo.rrd'})\n"
             f"learnt θ   {folder / 'parameters.toml'}   (a controller's name in every command)"
         )
-        out_.json(summary | {"out": str(out)})
+        summary = {
+            "scenario": SCENARIO,
+            "steps": steps,
+            "seed": seed,
+            "controllers": rows,
+            "training": trained[LEARNT].summary(),
+        }
+        out_.json(summary, folder)
 
 
 def _train(
-    algorithm: str, start: str, samples: int, seed: int, settings: dict[str, Any], out_: Output
+    algorithm: str, start: str, samples: int, seed: int, settings: dict[str, Any], out_: cli.Output
 ) -> Training:
     from cosim.cli.train import remark
     from learning.training import train
@@ -129,21 +140,3 @@ def _train(
             evaluate_every=every,
             checkpoint_every=every,
         )
-
-
-def _table(rows: list[dict[str, Any]]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and cells: what each controller cost to learn and costs to run."""
-    from cosim.statistics import shown
-
-    header = ("controller", "plant samples", "J", "regret %", "economic cost", "violating %")
-    return header, [
-        (
-            row["controller"],
-            str(row["plant_samples"]),
-            f"{row['J']:.1f}",
-            shown(row["regret"], row["regret_interval"], 100, 3),
-            f"{row['economic_cost']:.1f}",
-            f"{100 * row['violating_share']:.1f}",
-        )
-        for row in rows
-    ]

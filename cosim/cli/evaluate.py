@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.options import (
-    JobsOption,
-    JsonOption,
-    OutOption,
-    ScenarioOption,
-    SchedulerOption,
-    StepsOption,
-    count,
-)
-from cosim.cli.output import Output, dump, load_scenario, open_folder, output, resumable
+from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from cosim.scenario import Scenario
@@ -34,14 +25,14 @@ def evaluate(
             "file or module:factory; NAME=… gives one another name.",
         ),
     ] = "naive",
-    scenario: ScenarioOption = "paper",
-    seeds: Annotated[int, count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
+    scenario: cli.ScenarioOption = "paper",
+    seeds: Annotated[int, cli.count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
     first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
-    steps: StepsOption = 1000,
+    steps: cli.StepsOption = 1000,
     burn_in: Annotated[
-        int, count("--burn-in", least=0, text="Samples run before those that count.")
+        int, cli.count("--burn-in", least=0, text="Samples run before those that count.")
     ] = 0,
-    out: OutOption = Path("cosim-evaluation"),
+    out: cli.OutOption = Path("cosim-evaluation"),
     trajectories: Annotated[
         Path | None,
         typer.Option(
@@ -51,34 +42,33 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
-    json: JsonOption = False,
+    jobs: cli.JobsOption = None,
+    scheduler: cli.SchedulerOption = None,
+    json: cli.JsonOption = False,
 ) -> None:
     """Compare controllers on the same disturbances, seed by seed.
 
     Writes evaluation.csv (a row per controller and seed), evaluation.png, summary.json, timing.csv
     and scenario.toml. Run again with the same --out to go on after an interruption.
     """
-    with output(json) as out_:
+    with cli.output(json) as out_:
         from loky import cpu_count
 
         from cosim.evaluation import evaluate as run
         from cosim.files import write_atomically
 
-        task = load_scenario(scenario)
+        task = cli.load_scenario(scenario)
         if trajectories is not None:
-            _judge(task, trajectories, out, out_)
+            _judge(task, trajectories, cli.open_folder(out), out_)
             return
         named = named_controllers(controllers)
-        options: dict[str, Any] = {"scenario": scenario, "controllers": controllers, "seeds": seeds}
-        options |= {"first-seed": first_seed} if first_seed else {}
-        options |= {"steps": steps} | ({"burn-in": burn_in} if burn_in else {})
-        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-        folder = open_folder(out).absolute()
-        out_.announce(task)
+        words = ["--scenario", scenario, "--controllers", controllers, "--seeds", str(seeds)]
+        words += ["--first-seed", str(first_seed)] * (first_seed > 0) + ["--steps", str(steps)]
+        words += ["--burn-in", str(burn_in)] * (burn_in > 0)
+        folder = cli.open_folder(out)
+        out_.announce(task.plant.fmu)
         total = (len(named) + ("optimal" not in named)) * seeds * (burn_in + steps)
-        with resumable(), out_.progress(f"samples on {task.name}", total) as progress:
+        with cli.resumable(), out_.progress(f"samples on {task.name}", total) as progress:
 
             def report(samples: int, line: str) -> None:
                 progress(samples)
@@ -100,20 +90,25 @@ def evaluate(
         summary = evaluation.summary()
         evaluation.write(folder)
         write_atomically(folder / "scenario.toml", task.to_toml())
-        write_atomically(folder / "summary.json", dump(summary))
-        show(summary, out_)
+        _show(summary, out_)
         out_.note(f"files are in {folder.resolve()}")
-        out_.json(summary)
+        out_.json(summary, folder)
 
 
-def _judge(scenario: Scenario, trajectories: Path, out: Path, output: Output) -> None:
-    """Judge recorded runs: judged.csv and summary.json in `out`, a table of means."""
+def _judge(scenario: Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
+    """Judge recorded runs: judged.csv and summary.json in `folder`, a table of means."""
     from cosim.files import write_atomically
     from cosim.judge import judge
     from cosim.statistics import mean, regret, shown
 
     table = judge(scenario, trajectories)
     cost, optimum = table["J"].to_numpy(), table["optimum"].to_numpy()
+    write_atomically(folder / "judged.csv", table.to_csv(index=False))
+    rows = [
+        (row.file, str(row.seed), str(row.steps), shown(row.J, digits=6), f"{100 * row.regret:.3f}")
+        for row in table.itertuples()
+    ]
+    output.table("judged runs", ("file", "seed", "steps", "J", "regret %"), rows)
     summary = {
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,
@@ -122,15 +117,7 @@ def _judge(scenario: Scenario, trajectories: Path, out: Path, output: Output) ->
         "regret": regret(cost, optimum).to_dict(),
         "violating_share": float(table["violating_share"].mean()),
     }
-    folder = open_folder(out)
-    write_atomically(folder / "judged.csv", table.to_csv(index=False))
-    write_atomically(folder / "summary.json", dump(summary))
-    rows = [
-        (row.file, str(row.seed), str(row.steps), shown(row.J, digits=6), f"{100 * row.regret:.3f}")
-        for row in table.itertuples()
-    ]
-    output.table("judged runs", ("file", "seed", "steps", "J", "regret %"), rows)
-    output.json(summary)
+    output.json(summary, folder)
 
 
 def named_controllers(text: str) -> dict[str, str]:
@@ -153,42 +140,34 @@ def named_controllers(text: str) -> dict[str, str]:
     return named
 
 
-def show(summary: dict[str, Any], output: Output) -> None:
+def _show(summary: dict[str, Any], output: cli.Output) -> None:
     """Print the table of controllers and the paired comparisons."""
     from cosim.statistics import shown
 
-    seeds, burn_in = len(summary["seeds"]), summary.get("burn_in", 0)
+    found, timing = summary["controllers"], summary["timing"]
+    burn_in = summary.get("burn_in", 0)
     after = f" after {burn_in}" if burn_in else ""
-    settles = any(isfinite(row["settling_time"]) for row in summary["controllers"].values())
-    known = summary["optimum"] is not None
-    rows = []
-    for name, row in summary["controllers"].items():
-        timing, settled = summary["timing"][name], row["settling_time"]
-        rows.append(
-            (
-                name,
-                shown(row["J"], digits=6),
-                *([_interval(row["regret"], 100.0)] if known else []),
-                shown(row["economic_cost"], digits=6),
-                f"{100 * row['violating_share']:.2f}",
-                *([f"{settled:.0f}" if isfinite(settled) else "–"] if settles else []),
-                str(row["failures"]),
-                f"{timing['prepare_median_us'] + timing['feedback_median_us']:.0f}",
-            )
-        )
-    header = (
-        "controller",
-        "J",
-        *(["regret %"] if known else []),
-        "economic cost",
-        "violating %",
-        *(["settling s"] if settles else []),
-        "failures",
-        "step µs",
-    )
-    title = f"{summary['scenario']}, {summary['steps']} samples{after} × {seeds} seeds"
-    output.table(title, header, rows)
-    if known:
+    columns = {
+        "controller": list(found),
+        "J": [shown(row["J"], digits=6) for row in found.values()],
+        "regret %": [_interval(row.get("regret"), 100.0) for row in found.values()],
+        "economic cost": [shown(row["economic_cost"], digits=6) for row in found.values()],
+        "violating %": [f"{100 * row['violating_share']:.2f}" for row in found.values()],
+        "settling s": [
+            f"{row['settling_time']:.0f}" if isfinite(row["settling_time"]) else ""
+            for row in found.values()
+        ],
+        "failures": [str(row["failures"]) for row in found.values()],
+        "step µs": [
+            f"{timing[name]['prepare_median_us'] + timing[name]['feedback_median_us']:.0f}"
+            for name in found
+        ],
+    }
+    header = [name for name, cells in columns.items() if any(cells)]  # what is known of any
+    rows = list(zip(*(columns[name] for name in header), strict=True))
+    title = f"{summary['scenario']}, {summary['steps']} samples{after}"
+    output.table(f"{title} × {len(summary['seeds'])} seeds", header, rows)
+    if summary["optimum"] is not None:
         output.note(
             "regret = (J − J*)/|J*|, paired over seeds, 95 %; J* on these seeds is "
             f"{shown(summary['optimal_J'], digits=6)}"
@@ -208,10 +187,10 @@ def show(summary: dict[str, Any], output: Output) -> None:
         )
 
 
-def _interval(estimate: dict[str, Any], scale: float = 1.0) -> str:
+def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:
     """An estimate of a summary with its t interval; nothing where it is undefined."""
     from cosim.statistics import shown
 
-    if not isfinite(estimate["value"]):
+    if estimate is None or not isfinite(estimate["value"]):
         return ""
     return shown(estimate["value"], estimate["t"], scale, 3)

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.options import JsonOption, ScenarioOption
-from cosim.cli.output import output
+from cosim.cli.output import JsonOption, ScenarioOption, output
 
 
 class Format(StrEnum):
@@ -73,7 +72,7 @@ def export(
             out_.note(f"wrote {', '.join(summary['files'])} to {out}")
             out_.json(summary)
             return
-        out_.announce(loaded)
+        out_.announce(loaded.plant.fmu)
         with FmuPlant(loaded) as plant:
             units = plant.units
         system = sampled_controller(rti, loaded, units)

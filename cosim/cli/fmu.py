@@ -8,8 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.options import JsonOption
-from cosim.cli.output import output, writable_folder
+from cosim.cli.output import JsonOption, output, writable_folder
 
 DIFFERENT = 1
 SHOWN = 500
@@ -87,7 +86,7 @@ def check(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
 
         from fmus.check import check as run_checks
 
-        out_.announce_fmu(file)
+        out_.announce(file)
         findings = run_checks(_path(file))
         out_.table(str(_path(file)), ("check", "result", "detail"), list(map(astuple, findings)))
         passed = all(f.status != "failed" for f in findings)

@@ -18,13 +18,10 @@ from cosim.cli import (
     export,
     fmu,
     optimum,
-    reproduce,
-    results,
     scenario,
     simulate,
     study,
     train,
-    tuning,
     view,
 )
 from cosim.errors import CosimError
@@ -58,14 +55,6 @@ class _Commands(TyperGroup):
         protect(inputs)
         return super().parse_args(ctx, args)
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command; `train` gets the options that are made of TrainingRun's fields."""
-        name, command, rest = super().resolve_command(ctx, args)
-        if name == "train" and command is not None:
-            epilog, command = command.epilog, train.command()
-            command.epilog = epilog
-        return name, command, rest
-
     def invoke(self, ctx: Any) -> Any:
         """Let Ctrl-C through, which Typer would end without a word."""
         try:
@@ -96,19 +85,19 @@ for panel, function, example in (
     (RUN, view.view, "view cosim-run/run.rrd --png run.png"),
     (RUN, compare.compare, "compare cosim-run other-run --relative 1e-9"),
     (LEARN, optimum.optimum, "optimum --scenario paper"),
-    (LEARN, tuning.tuning, "tuning --scenario paper --out tuned.toml"),
+    (LEARN, optimum.tuning, "tuning --scenario paper --out tuned.toml"),
     (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
-    (RUN, reproduce.reproduce, "reproduce --budget quick --out reproduction"),
+    (RUN, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
     app.command(rich_help_panel=panel, epilog=f"Example: cosim {example}")(function)
-for panel, module, example in (
-    (BUILD, scenario, "scenario init mine.fmu --out mine.toml"),
-    (LEARN, study, "study run study.toml --out study"),
-    (LEARN, results, "results check quick"),
-    (BUILD, fmu, "fmu info mine.fmu"),
+for panel, group, example in (
+    (BUILD, scenario.app, "scenario init mine.fmu --out mine.toml"),
+    (LEARN, study.app, "study run study.toml --out study"),
+    (LEARN, study.results, "results check quick"),
+    (BUILD, fmu.app, "fmu info mine.fmu"),
 ):
-    name = module.__name__.rpartition(".")[2]
-    app.add_typer(module.app, name=name, rich_help_panel=panel, epilog=f"Example: cosim {example}")
+    name = example.partition(" ")[0]
+    app.add_typer(group, name=name, rich_help_panel=panel, epilog=f"Example: cosim {example}")
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70
@@ -169,13 +158,9 @@ def main() -> None:
 def _open_streams() -> None:
     """Make both standard streams writable whatever the caller left of them.
 
-    A character that a stream's encoding lacks is written as its escape. A closed stream swallows
-    what it is given; `--json`, whose document would be lost, refuses a closed standard output.
+    A character that a stream's encoding lacks is written as its escape; a closed stream swallows
+    what it is given.
     """
-    if sys.stdout is None and "--json" in sys.argv:
-        if sys.stderr is not None:
-            print("error: standard output is closed: --json prints nowhere", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:

@@ -1,4 +1,4 @@
-"""`cosim optimum`: the best that any controller can do on a scenario."""
+"""`cosim optimum` and `cosim tuning`: the best on a scenario, and the cost tuned towards it."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.options import JsonOption, ScenarioOption
-from cosim.cli.output import Output, load_scenario, output
+from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from controllers.dynamic_programming.policy_iteration import Figure, Optimum, Progress
     from controllers.optimum import QuasiStaticPolicy
     from cosim.scenario import Scenario
 
-UNSTABLE = 1
 SEEDS, STEPS = range(900_000, 900_010), 10_000
 """Runs on which a searched θ is compared with the policy."""
 
 
 def optimum(
-    scenario: ScenarioOption = "paper",
+    scenario: cli.ScenarioOption = "paper",
     refine: Annotated[
         bool,
         typer.Option(
@@ -44,7 +42,7 @@ def optimum(
     recompute: Annotated[
         bool, typer.Option("--recompute", help="Solve even if the policy is stored.")
     ] = False,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> None:
     """Mean cost per sample J* of the optimal policy, by dynamic programming, with its bounds.
 
@@ -53,10 +51,10 @@ def optimum(
     it is a reference, printed with its spread. With --refine, exit code 1 where they do not agree.
     A plant that fouls or jumps has the quasi-static reference: J* of the plant as it is.
     """
-    from controllers.optimum import QuasiStaticPolicy, change_of
+    with cli.output(json) as out_:
+        from controllers.optimum import QuasiStaticPolicy, change_of
 
-    with output(json) as out_:
-        task = load_scenario(scenario)
+        task = cli.load_scenario(scenario)
         if change_of(task) is not None:
             with _progress(out_) as show:
                 _show_quasi_static(QuasiStaticPolicy.from_scenario(task, progress=show), task, out_)
@@ -64,10 +62,10 @@ def optimum(
         document = _solve(task, refine, against, recompute, out_)
         out_.json(document)
     if refine and not document["stable"]:
-        raise typer.Exit(UNSTABLE)
+        raise typer.Exit(1)
 
 
-def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: Output) -> None:
+def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Output) -> None:
     names = list(policy.law.present(0.0))
     table = [{name: plant[name] for name in names} | {"J": gain} for plant, gain in policy.gains]
     rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
@@ -80,7 +78,7 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: Output) 
 
 
 def _solve(
-    task: Scenario, refine: bool, against: Path | None, recompute: bool, out_: Output
+    task: Scenario, refine: bool, against: Path | None, recompute: bool, out_: cli.Output
 ) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
@@ -171,7 +169,7 @@ def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) 
 
 
 @contextmanager
-def _progress(out_: Output) -> Iterator[Callable[[Progress], None]]:
+def _progress(out_: cli.Output) -> Iterator[Callable[[Progress], None]]:
     """Show the round and the closing bounds on standard error."""
     console = out_.console()
     if out_.as_json or not console.is_terminal:
@@ -182,3 +180,49 @@ def _progress(out_: Output) -> Iterator[Callable[[Progress], None]]:
             f"grid {p.level} ({p.states} states), round {p.round}: "
             f"{p.lower:.1f} ≤ J* ≤ {p.upper:.1f}"
         )
+
+
+def tuning(
+    scenario: cli.ScenarioOption = "paper",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Write the tuned θ to this TOML file.")
+    ] = None,
+    json: cli.JsonOption = False,
+) -> None:
+    """Tune the NMPC's cost by economics (controller `tuned`) and show the certificate.
+
+    It says which constraint enters, the eigenvalues of the economic and of the convexified
+    cost's Hessian, and the local feedback gain of both.
+    """
+    with cli.output(json) as out_:
+        from controllers.economic import tune
+        from controllers.factories import value_offset
+        from controllers.problem import Problem
+
+        task = cli.load_scenario(scenario)
+        problem = Problem.from_scenario(task)
+        result = tune(problem, value_offset=value_offset(task, problem))
+        steady, convex = result.steady_state, result.convexification
+        rows = [tuple(line.split("  ", 1)) for line in str(result).splitlines()]
+        out_.table(f"economic tuning of {scenario}", ("", "certificate"), rows)
+        if out is not None:
+            result.parameters.save(out)
+            out_.note(f"θ {result.parameters.hash} is in {out.resolve()}")
+        states, actions = steady.x.tolist(), steady.u.tolist()
+        prices = (steady.C @ steady.multipliers).tolist()
+        document = {
+            "scenario": scenario,
+            "steady_state": {"states": states, "actions": actions, "cost": steady.cost},
+            "active": dict(zip(steady.active, prices, strict=True)),
+            "economic_eigenvalues": steady.eigenvalues.tolist(),
+            "convexified_eigenvalues": convex.eigenvalues.tolist(),
+            "alpha": convex.alpha,
+            "beta": convex.beta,
+            "F": convex.F.tolist(),
+            "delta_P": convex.delta_P.tolist(),
+            "economic_gain": result.economic.gain.tolist(),
+            "tuned_gain": result.tuned.gain.tolist(),
+            "gain_error": result.gain_error,
+            "parameters": result.parameters.hash,
+        }
+        out_.json(document)

@@ -1,4 +1,4 @@
-"""What a command prints and writes: tables, progress, notes, JSON; its folder."""
+"""What commands share: options; tables, progress, notes and JSON; the folder that is written."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from cosim.errors import CosimError
+from cosim.files import write_atomically
 from cosim.processes import Terminated, hold, output_turned_aside, release, watch
 
 if TYPE_CHECKING:
@@ -19,8 +22,34 @@ if TYPE_CHECKING:
 
     from cosim.scenario import Scenario
 
-LONG = 200
-"""Stages of a horizon above which building a controller takes seconds."""
+MOST = 100_000_000
+"""Samples of the longest run."""
+
+
+def count(*names: str, least: int = 1, most: int = MOST, text: str) -> Any:
+    """An option that is a number of samples, or of something else."""
+    return typer.Option(*names, min=least, max=most, help=text)
+
+
+ScenarioOption = Annotated[
+    str,
+    typer.Option("--scenario", "-s", help="Preset (paper, fouled, mismatched, …) or TOML file."),
+]
+StepsOption = Annotated[int, count("--steps", "-n", text="Number of samples.")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the disturbances.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")]
+RecordOption = Annotated[bool, typer.Option("--record", help="Write a Rerun recording too.")]
+JobsOption = Annotated[
+    int | None, count("--jobs", "-j", most=1024, text="Processes; default: one per core.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs."),
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print a JSON summary on standard output, nothing else.")
+]
+
 AGAIN = "what is finished is kept: the same command goes on from there"
 """How a command goes on that finds again what it has finished."""
 
@@ -78,14 +107,14 @@ class Output:
                 console.width = max(console.width, wanted)
             console.print(table)
 
-    def json(self, document: Mapping[str, Any]) -> None:
-        """Print the document if JSON was asked for."""
-        if not self.as_json:
-            return
+    def json(self, document: Mapping[str, Any], folder: Path | None = None) -> None:
+        """Print the document if JSON was asked for; with a folder, write its summary.json too."""
         text = dump(document)
-        if self._stdout is not None:
+        if folder is not None:
+            write_atomically(folder / "summary.json", text)
+        if self.as_json and self._stdout is not None:
             os.write(self._stdout, text.encode())
-        else:
+        elif self.as_json:
             sys.stdout.write(text)
 
     @contextmanager
@@ -113,23 +142,14 @@ class Output:
             finally:
                 self._live = None
 
-    def announce(self, scenario: Scenario) -> None:
-        """Say which foreign native code is about to run, and that a long horizon takes its time."""
-        self.announce_fmu(scenario.plant.fmu)
-        if (stages := scenario.controller.horizon) > LONG:
-            self.note(
-                f"horizon {stages}: building the controller takes its time "
-                "(1000 stages: 25 s of CPU, 1.4 GB)"
-            )
-
-    def announce_fmu(self, name: str) -> None:
+    def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""
         from cosim.plant.archive import SHIPPED, unpack
 
-        if name not in SHIPPED:
-            fmu = unpack(name)
-            watch(f"FMU '{fmu.path}', or other native code,")
-            self.note(f"native code of {fmu.path}, sha256 {fmu.sha256}")
+        if fmu not in SHIPPED:
+            found = unpack(fmu)
+            watch(f"FMU '{found.path}', or other native code,")
+            self.note(f"native code of {found.path}, sha256 {found.sha256}")
 
 
 def _parts(widths: Sequence[int], room: int) -> list[list[int]]:
@@ -193,13 +213,12 @@ def _finite(value: Any) -> Any:
 
 
 def open_folder(folder: Path) -> Path:
-    """Create an output folder, make sure that it can be written, and hold it to the command's end.
+    """A `writable_folder`, absolute since an FMU may change the working directory, and held.
 
-    Raises CosimError before the work where it cannot be written or another process holds it.
+    Raises CosimError before the work where another process holds it.
     """
-    writable_folder(folder)
-    hold(folder)
-    return folder
+    hold(writable_folder(folder))
+    return folder.absolute()
 
 
 def writable_folder(folder: Path) -> Path:

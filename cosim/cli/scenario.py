@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.core import TyperGroup
 
-from cosim.cli.options import JsonOption
-from cosim.cli.output import output
+from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from cosim.scenario import Scenario
@@ -48,10 +47,10 @@ def show(
             show_default=False,
         ),
     ] = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> None:
     """List the presets, or print a scenario with every field written out, as TOML."""
-    with output(json) as out_:
+    with cli.output(json) as out_:
         from cosim.scenario import Scenario, presets
 
         if name is None:
@@ -103,7 +102,7 @@ def init(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the file if it is there.")
     ] = False,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> None:
     """Draft a scenario for an FMU: a commented TOML file, to be read and corrected.
 
@@ -111,7 +110,7 @@ def init(
     modelDescription.xml; the steady state near the start values is found by stepping the FMU,
     whose native code this runs.
     """
-    with output(json) as out_:
+    with cli.output(json) as out_:
         from cosim.errors import CosimError
         from cosim.files import write_atomically
         from cosim.plant.draft import NO_NOISE, draft_scenario
@@ -122,7 +121,7 @@ def init(
             raise CosimError(
                 f"'{target}' is there already; replace it by --overwrite, or use --out"
             )
-        out_.announce_fmu(fmu)
+        out_.announce(fmu)
         text = draft_scenario(
             fmu,
             target,

@@ -1,20 +1,22 @@
-"""`cosim study`: cases × scenarios × training seeds from one file, and the report of it."""
+"""`cosim study`, `results` and `reproduce`: studies from files, stored ones, the paper's."""
 
 from __future__ import annotations
 
+from enum import StrEnum
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.options import JobsOption, JsonOption, OutOption, SchedulerOption
-from cosim.cli.output import Output, dump, open_folder, output, resumable
+from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from cosim.studies.results import StudyResults
     from cosim.studies.run import State
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
+results = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
 
 ColumnsOption = Annotated[
     str | None,
@@ -26,16 +28,19 @@ ColumnsOption = Annotated[
     ),
 ]
 FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+NamesArgument = Annotated[
+    list[str] | None, typer.Argument(help="Studies; default: all that apply.")
+]
 
 
 @app.command()
 def run(
     file: FileArgument,
-    out: OutOption = Path("cosim-study"),
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
+    out: cli.OutOption = Path("cosim-study"),
+    jobs: cli.JobsOption = None,
+    scheduler: cli.SchedulerOption = None,
     columns: ColumnsOption = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> None:
     """Train and evaluate every case on every scenario with every training seed.
 
@@ -43,18 +48,17 @@ def run(
     Run again with the same --out to go on after an interruption, a failure or a change of the
     file: what is finished is not done again. Exit code 1: some runs failed, all others are done.
     """
-    with output(json) as out_:
-        results = execute(file, out, out_, jobs=jobs, scheduler=scheduler)
-        summary = write_summary(results)
-        show(results, out_, columns)
+    with cli.output(json) as out_:
+        found = _execute(file, out, out_, jobs=jobs, scheduler=scheduler)
+        _show(found, out_, columns)
         out_.note(f"tables are in {out.resolve()}; cosim study report {out} draws them")
-        out_.json(summary)
+        out_.json(_summary(found), found.folder)
 
 
-def execute(
+def _execute(
     file: Path,
     out: Path,
-    out_: Output,
+    out_: cli.Output,
     *,
     jobs: int | None,
     scheduler: str | None = None,
@@ -68,17 +72,17 @@ def execute(
     from cosim.studies.run import study
 
     definition = Study.load(file)
-    folder = open_folder(out)
+    folder = cli.open_folder(out)
     for scenario in definition.scenarios.values():
-        out_.announce(scenario)
+        out_.announce(scenario.plant.fmu)
     planned = plan(definition)
-    label, total = f"{definition.name}, thousands of samples", _thousands(planned.samples)
-    with resumable(), out_.progress(label, total) as bar:
+    label, total = f"{definition.name}, thousands of samples", round(planned.samples / 1000)
+    with cli.resumable(), out_.progress(label, total) as bar:
 
         def report(state: State, line: str) -> None:
             failed = f", {state.failed} failed" if state.failed else ""
             runs = f"{state.runs}/{state.all_runs} runs{failed}"
-            bar(_thousands(state.samples), runs)
+            bar(round(state.samples / 1000), runs)
             if line:
                 out_.note(f"{runs}  {line}")
 
@@ -99,9 +103,9 @@ def execute(
 
 
 @app.command("plan")
-def show_plan(file: FileArgument, json: JsonOption = False) -> None:
+def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
     """Show what a study will do, and about how long: nothing is trained or written."""
-    with output(json) as out_:
+    with cli.output(json) as out_:
         from cosim.studies.estimate import estimate
         from cosim.studies.plan import Study, plan
 
@@ -115,62 +119,162 @@ def show_plan(file: FileArgument, json: JsonOption = False) -> None:
             rows.astype(str).to_numpy().tolist(),
         )
         out_.note(f"about {seconds / 3600:.2f} h of one core, as fast as this one is now")
-        out_.json(
-            {
-                "runs": len(planned.runs),
-                "samples": planned.samples,
-                "timing": {"estimated_seconds": seconds},
-            }
-        )
+        timing = {"estimated_seconds": seconds}
+        out_.json({"runs": len(planned.runs), "samples": planned.samples, "timing": timing})
 
 
 @app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of a study.", show_default=False)],
     columns: ColumnsOption = None,
-    json: JsonOption = False,
+    json: cli.JsonOption = False,
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
 
     A study that is not finished, or a stored one, is reported with what it has.
     """
-    with output(json) as out_:
+    with cli.output(json) as out_:
         from cosim.studies.results import StudyResults
 
-        results = StudyResults.load(folder)
-        page = results.report()
-        show(results, out_, columns)
+        found = StudyResults.load(folder)
+        page = found.report()
+        _show(found, out_, columns)
         out_.note(f"the report is {page.resolve()}")
-        out_.json({"report": str(page), "runs": len(results.runs)})
+        out_.json({"report": str(page), "runs": len(found.runs)})
 
 
-def _thousands(samples: int) -> int:
-    return round(samples / 1000)
-
-
-def write_summary(results: StudyResults) -> dict[str, Any]:
-    """Write summary.json and return what it says; `timing` is what timing.csv says of each run."""
-    from cosim.files import write_atomically
+def _summary(found: StudyResults) -> dict[str, Any]:
+    """The study as a JSON document; `timing` is what timing.csv says of each run."""
     from cosim.studies.results import TIMING
     from cosim.studies.tables import read_table
 
-    document = {
-        **results.about,
-        "summary": results.summary.to_dict("records"),
-        "aggregate": results.aggregate.to_dict("records"),
+    timing = read_table(found.folder / TIMING, types={"run": str}).to_dict("records")
+    return {
+        **found.about,
+        "summary": found.summary.to_dict("records"),
+        "aggregate": found.aggregate.to_dict("records"),
         "timing": {
-            row["run"]: {"training_seconds": float(row["training_seconds"])}
-            for row in read_table(results.folder / TIMING, types={"run": str}).to_dict("records")
+            row["run"]: {"training_seconds": float(row["training_seconds"])} for row in timing
         },
     }
-    write_atomically(results.folder / "summary.json", dump(document))
-    return document
 
 
-def show(results: StudyResults, out_: Output, columns: str | None = None) -> None:
+def _show(found: StudyResults, out_: cli.Output, columns: str | None = None) -> None:
     """Print a table for each scenario, with the columns that `--columns` names."""
     from cosim.studies.report import COLUMNS, SHORT
 
     chosen = COLUMNS if columns == "all" else columns.split(",") if columns else SHORT
-    for scenario in results.scenarios:
-        out_.table(f"{results.name}: {scenario}", *results.lines(scenario, tuple(chosen)))
+    for scenario in found.scenarios:
+        out_.table(f"{found.name}: {scenario}", *found.lines(scenario, tuple(chosen)))
+
+
+class Budget(StrEnum):
+    """The budgets of `reproduce`."""
+
+    quick = "quick"
+    full = "full"
+
+
+def reproduce(
+    budget: Annotated[
+        Budget,
+        typer.Option(
+            "--budget",
+            help="quick: minutes on 2 cores; full: hours, with more seeds and samples.",
+        ),
+    ] = Budget.quick,
+    out: cli.OutOption = Path("cosim-reproduction"),
+    jobs: cli.JobsOption = None,
+    json: cli.JsonOption = False,
+) -> None:
+    """Train the paper's rule and ours, and compare with (a) naive, (b) tuned and the optimum.
+
+    A study (results/reproduce.toml, results/reproduce-full.toml): writes report.html and report.md
+    with the paper's comparison at each reading of its open points and the paper's figure, and the
+    tables of `cosim study run`. Run again with the same --out to go on after an interruption.
+    """
+    with cli.output(json) as out_:
+        from cosim.studies.stored import stored_results
+
+        name = "reproduce" if budget is Budget.quick else "reproduce-full"
+        found = _execute(stored_results() / f"{name}.toml", out, out_, jobs=jobs)
+        page = found.report()
+        _show(found, out_)
+        out_.table(*found.paper())
+        out_.note(f"the report is {page.resolve()}")
+        out_.json(_summary(found), found.folder)
+
+
+@results.command()
+def check(
+    names: NamesArgument = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--results",
+            help="Folder with the studies and tolerances.toml; default: ./results, else the "
+            "installed ones.",
+            show_default=False,
+        ),
+    ] = None,
+    jobs: cli.JobsOption = None,
+    json: cli.JsonOption = False,
+) -> None:
+    """Run the studies again that say `check = true`, and compare with the stored tables.
+
+    Exit code 1 where a signal differs by more than its tolerance, with the first row that differs;
+    2 where a stored table is missing or damaged. Writes nothing.
+    """
+    with cli.output(json) as out_:
+        from cosim.files import temporary_folder
+        from cosim.studies import stored
+        from cosim.studies.results import StudyResults
+
+        local = Path("results")
+        folder = folder or (local if local.is_dir() else stored.stored_results())
+        tolerances, studies = stored.load_tolerances(folder), stored.stored_studies(folder)
+        quick = names or [name for name, table in studies.items() if table.check]
+        quick = stored.chosen(studies, quick)
+        for name in quick:
+            StudyResults.load(folder / name)
+        found: dict[str, list[str]] = {}
+        with temporary_folder("cosim-results-") as work:
+            for name in quick:
+                _execute(folder / f"{name}.toml", work / name, out_, jobs=jobs, figures=False)
+                found[name] = stored.differences(name, folder / name, work / name, tolerances)
+        verdicts = {name: "differs" if lines else "same" for name, lines in found.items()}
+        rows = [(name, verdicts.get(name, "not recomputed")) for name in studies]
+        out_.table("stored studies", ("study", "verdict"), rows)
+        for line in chain(*found.values()):
+            out_.note(line)
+        out_.json({"same": not any(found.values()), "differences": found})
+    if any(found.values()):
+        raise typer.Exit(1)
+
+
+@results.command()
+def update(
+    names: NamesArgument = None,
+    folder: Annotated[
+        Path, typer.Option("--results", help="Folder with the studies and tolerances.toml.")
+    ] = Path("results"),
+    jobs: cli.JobsOption = None,
+    json: cli.JsonOption = False,
+) -> None:
+    """Run studies and store their tables, figures and reports, and the folder's README.
+
+    What long studies have finished is kept in the folder's `.work`; run again to go on.
+    """
+    with cli.output(json) as out_:
+        from cosim.studies import stored
+
+        studies = stored.stored_studies(folder)
+        for name in stored.chosen(studies, names or list(studies)):
+            out = folder / stored.WORK / name
+            _execute(folder / f"{name}.toml", out, out_, jobs=jobs)
+            stored.report(out)
+            for table in stored.store(folder, name, out):
+                out_.note(f"{name}: {table} is too large to be stored")
+        stored.write_readme(folder, studies)
+        out_.note(f"stored {', '.join(names or studies)} in {folder.resolve()}")
+        out_.json({"updated": list(names or studies)})

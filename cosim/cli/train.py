@@ -1,18 +1,15 @@
-"""`cosim train`: learn θ from plant data."""
+"""`cosim train`: learn θ from plant samples."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
-from dataclasses import fields
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cosim.cli.options import JsonOption, OutOption, RecordOption, ScenarioOption
-from cosim.cli.output import Output, dump, load_scenario, open_folder, output, resumable
+from cosim.cli import output as cli
 from cosim.errors import CosimError
 
 if TYPE_CHECKING:
@@ -27,8 +24,6 @@ FILES = (
     "training.rrd",
 )
 """What a training leaves in its folder; each belongs to the same run."""
-DEFAULTS = {"samples": None, "seed": 0}
-"""Of fields of `TrainingRun` that have none."""
 # Columns of the log behind the progress bar: name, text, scale, format.
 FIGURES = (
     ("J", "J", 1, ".0f"),
@@ -44,8 +39,21 @@ def train(
         str,
         typer.Option("--algorithm", "-a", help="A registered one or module:Class."),
     ],
-    scenario: ScenarioOption = "paper",
-    out: OutOption = Path("cosim-train"),
+    scenario: cli.ScenarioOption = "paper",
+    samples: Annotated[
+        int | None,
+        cli.count("--samples", "-n", text="Plant samples; default: the algorithm's, or 50 000."),
+    ] = None,
+    seed: Annotated[
+        int, cli.count("--seed", least=0, most=999_999, text="Seed of noise and exploration.")
+    ] = 0,
+    start: Annotated[
+        str,
+        typer.Option(
+            "--start", help="Where θ starts: naive, tuned, commissioned or a parameters file."
+        ),
+    ] = "naive",
+    out: cli.OutOption = Path("cosim-train"),
     resume: Annotated[
         bool,
         typer.Option(
@@ -59,6 +67,12 @@ def train(
         list[str] | None,
         typer.Option("--set", help="Hyperparameter as name=value; may be repeated."),
     ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")
+    ] = False,
+    controller: Annotated[
+        str, typer.Option("--controller", help="What carries θ: rti or converged.")
+    ] = "rti",
     optimum: Annotated[
         str | None,
         typer.Option(
@@ -66,20 +80,41 @@ def train(
             help="Controller whose J is J*; default: optimal, where its solution is stored.",
         ),
     ] = None,
-    explain: Annotated[
-        bool, typer.Option("--explain", help="List the algorithm's hyperparameters and stop.")
-    ] = False,
-    record: RecordOption = False,
-    json: JsonOption = False,
-    **options: Any,
+    log_every: Annotated[int, cli.count("--log-every", text="Samples per row of the log.")] = 1000,
+    evaluate_every: Annotated[
+        int, cli.count("--evaluate-every", text="Samples per greedy evaluation.")
+    ] = 5000,
+    checkpoint_every: Annotated[
+        int, cli.count("--checkpoint-every", text="Samples per checkpoint.")
+    ] = 5000,
+    evaluation_seeds: Annotated[
+        int, cli.count("--evaluation-seeds", most=1_000_000, text="Held-out runs per evaluation.")
+    ] = 4,
+    evaluation_steps: Annotated[
+        int, cli.count("--evaluation-steps", text="Samples of each of them.")
+    ] = 500,
+    divergence: Annotated[
+        float,
+        typer.Option(
+            "--divergence", min=1.0, help="Times the start's J at which a run has diverged."
+        ),
+    ] = 1.5,
+    rest_after: Annotated[
+        int | None,
+        cli.count(
+            "--rest-after",
+            text="Samples after which θ stays and nothing explores; default: never.",
+        ),
+    ] = None,
+    record: cli.RecordOption = False,
+    json: cli.JsonOption = False,
 ) -> None:
     """Train a controller's θ; write parameters.toml, learning.csv, learning.png, summary.json.
 
     Exit code 1: learning diverged; the files hold the θ that the run ended with and the summary
     says why.
     """
-    with output(json) as out_:
-        from cosim.files import write_atomically
+    with cli.output(json) as out_:
         from learning.algorithm import load_algorithm
         from learning.training import CHECKPOINT, run_training, stored_optimum
         from learning.training_run import prepare
@@ -91,87 +126,53 @@ def train(
             out_.json({name: {"default": given, "meaning": text} for name, given, text in rows})
             return
         settings = found.Configuration.from_assignments(assignments or [])
-        samples = options.pop("samples")
-        run = prepare(algorithm, load_scenario(scenario), samples, settings, options)
-        folder = open_folder(out).absolute()
+        options = {
+            "seed": seed,
+            "start": start,
+            "controller": controller,
+            "log_every": log_every,
+            "evaluate_every": evaluate_every,
+            "checkpoint_every": checkpoint_every,
+            "evaluation_seeds": evaluation_seeds,
+            "evaluation_steps": evaluation_steps,
+            "divergence": divergence,
+            "rest_after": rest_after,
+        }
+        run = prepare(algorithm, cli.load_scenario(scenario), samples, settings, options)
+        folder = cli.open_folder(out)
         there = [name for name in FILES if (folder / name).exists()]
         if there and not (resume or overwrite):
             raise CosimError(
                 f"folder '{folder}' holds another training ({there[0]}); go on with it by "
                 "--resume, begin anew by --overwrite, or choose another --out"
             )
-        out_.announce(run.scenario)
+        out_.announce(run.scenario.plant.fmu)
         checkpoint = folder / CHECKPOINT
 
         def how() -> str:
             go_on = f"the same command with --resume goes on from {checkpoint}"
             return go_on if checkpoint.is_file() else ""
 
-        with resumable(how), out_.progress(algorithm, run.samples) as progress:
+        with cli.resumable(how), out_.progress(algorithm, run.samples) as progress:
             best = optimum or stored_optimum(run.scenario)
             training = run_training(
                 run, folder, resume=resume, optimum=best, progress=remark(progress)
             )
         if reason := training.without_checkpoint:
             out_.note(f"left no checkpoint, --resume is not possible: {reason}")
-        summary = training.summary()
-        summary["timing"] = {
-            "wall_seconds": training.wall_seconds,
-            "functions": training.functions,
-        }
+        timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
+        summary = training.summary() | {"timing": timing}
         training.save(folder)
-        write_atomically(folder / "summary.json", dump(summary))
         if record:
             record_training(folder / "training.rrd", training)
-        if overwrite and not record:
+        elif overwrite:
             # Only now: had this run failed, the one before it would have been lost.
             (folder / "training.rrd").unlink(missing_ok=True)
         _show(summary, out_)
         out_.note(f"the learning curve is {folder / 'learning.png'}")
-        out_.json(summary)
+        out_.json(summary, folder)
     if training.status != "finished":
         raise typer.Exit(1)
-
-
-_SIGNATURE = inspect.signature(train, eval_str=True)
-# What the list of all commands needs: without the options that `command` adds.
-train.__signature__ = _SIGNATURE.replace(  # type: ignore[attr-defined]
-    parameters=list(_SIGNATURE.parameters.values())[:-1]
-)
-
-
-def command() -> Any:
-    """The command with an option for each further field of `TrainingRun`.
-
-    Made only where it is asked for: the fields' module imports the whole of learning.
-    """
-    from learning.training_run import TrainingRun
-
-    types = get_type_hints(TrainingRun)
-    parameters = list(inspect.signature(train).parameters.values())
-    for field in (field for field in fields(TrainingRun) if field.metadata):
-        default, about = DEFAULTS.get(field.name, field.default), field.metadata
-        kind: Any = types[field.name] | None if default is None else types[field.name]
-        names = [f"--{field.name.replace('_', '-')}", *(["-n"] if field.name == "samples" else [])]
-        bounds = {"min": about["least"], "max": about["most"]} if about["least"] is not None else {}
-        option = typer.Option(*names, help=about["text"], **bounds)
-        parameters.append(
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=default,
-                annotation=Annotated[kind, option],
-            )
-        )
-
-    def complete(**values: Any) -> None:
-        train(**values)
-
-    complete.__doc__ = train.__doc__
-    complete.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    app = typer.Typer(add_completion=False)
-    app.command("train")(complete)
-    return typer.main.get_command(app)
 
 
 def remark(progress: Callable[..., None]) -> Callable[[int, LogRow], None]:
@@ -208,13 +209,12 @@ def record_training(path: Path, training: Training) -> None:
     )
 
 
-def _show(summary: dict[str, Any], output: Output) -> None:
+def _show(summary: dict[str, Any], output: cli.Output) -> None:
     from cosim.statistics import shown
 
     title = (
         "{algorithm} ({asks_for}) on {scenario}, {samples} samples, seed {seed}: {status}"
     ).format(**summary)
-    regret, gap = summary["regret"], summary["gap_closed"]
     rows = [
         ("greedy J on held-out noise", shown(summary["J"], digits=6)),
         ("economic cost", shown(summary["economic_cost"], digits=6)),
@@ -223,7 +223,7 @@ def _show(summary: dict[str, Any], output: Output) -> None:
         ("failures", str(summary["failures"])),
         ("plant samples", str(summary["plant_samples"])),
     ]
-    if regret is not None:
-        rows.append(("regret %", shown(regret, summary["regret_interval"], 100, 3)))
-        rows.append(("gap closed %", shown(gap, None, 100, 4)))
+    if summary["regret"] is not None:
+        rows.append(("regret %", shown(summary["regret"], summary["regret_interval"], 100, 3)))
+        rows.append(("gap closed %", shown(summary["gap_closed"], None, 100, 4)))
     output.table(title, ("per sample", "value"), rows)

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.options import JsonOption
-from cosim.cli.output import output
+from cosim.cli.output import JsonOption, output
 
 
 def view(

@@ -1,4 +1,4 @@
-"""The rows of the review's attacks, and about a hundred of our own, as tables."""
+"""What plug-ins, names, files and comparisons may be made to do: one line, or nothing wrong."""
 
 import errno
 import os
@@ -65,37 +65,19 @@ def one_line(error):
 GOOD = [200.0, 200.0]
 ACTIONS = {
     "list": GOOD,
-    "tuple": tuple(GOOD),
     "float": 200.0,
     "None": None,
     "text": "200 200",
-    "bytes": bytes(2),
-    "dict": {"P100": 200.0, "F200": 200.0},
-    "set": {200.0, 201.0},
     "generator": (x for x in GOOD),
-    "class": np.ndarray,
     "scalar array": np.array(200.0),
-    "short": np.array([200.0]),
     "long": np.array([200.0] * 3),
     "column": np.array([GOOD]).T,
-    "row": np.array([GOOD]),
-    "empty": np.array([]),
     "complex": np.array(GOOD, complex),
     "objects": np.array(GOOD, object),
-    "words": np.array(["200", "200"]),
     "truths": np.array([True, False]),
-    "dates": np.array([0, 1], "datetime64[s]"),
     "NaN": np.array([np.nan, 200.0]),
 }
-SOLUTIONS = {
-    "None": None,
-    "an action": np.array(GOOD),
-    "a list": GOOD,
-    "a dict": {"action": np.array(GOOD)},
-    "a class": object,
-    "a number": 0.0,
-    "a coroutine's like": iter(GOOD),
-}
+SOLUTIONS = {"None": None, "an action": np.array(GOOD), "a dict": {"action": np.array(GOOD)}}
 
 
 @pytest.mark.parametrize("kind", ACTIONS)
@@ -114,12 +96,9 @@ def test_what_is_no_solution_is_one_line_and_no_failure_to_solve(plant, kind):
 
 X, U = np.zeros((11, 2)), np.zeros((10, 2))
 PREDICTIONS = {
-    "shorter later": lambda k: (X[: 11 - k], U),
     "longer later": lambda k: (np.zeros((11 + k, 2)), U),
     "actions shorter later": lambda k: (X, U[: 10 - k]),
-    "another dimension later": lambda k: (X if k == 0 else X[0, 0] + np.zeros((3, 4, 5)), U),
     "words later": lambda k: (X if k == 0 else "predicted", U),
-    "objects later": lambda k: (X if k == 0 else np.full((11, 2), object()), U),
     "ragged later": lambda k: (X, U if k == 0 else [[1.0], [1.0, 2.0]] * 5),
 }
 
@@ -138,16 +117,9 @@ def test_a_prediction_that_changes_its_shape_or_kind_is_one_line(plant, kind):
 # What a plug-in is given ------------------------------------------------------------------------
 
 WRITES = {
-    "an entry": lambda s: s.__setitem__(0, 0.0),
-    "all": lambda s: s.__setitem__(slice(None), 0.0),
     "in place": lambda s: s.__imul__(0.0),
-    "fill": lambda s: s.fill(0.0),
-    "sort": lambda s: s.sort(),
-    "out of a ufunc": lambda s: np.add(s, 1.0, out=s),
     "through a view": lambda s: s[:].__setitem__(0, 0.0),
-    "put": lambda s: s.put(0, 0.0),
     "copyto": lambda s: np.copyto(s, 0.0),
-    "shuffle": lambda s: np.random.default_rng(0).shuffle(s),
 }
 
 
@@ -177,8 +149,7 @@ def test_what_a_rule_observes_cannot_be_written(name):
 
 # Names ------------------------------------------------------------------------------------------
 
-NAMES = [".", "..", "...", " ", "", ". .", "/", "/etc", "a/b", "../a", "a/..", "./a", "a/", "\\",
-         "a\\b", "..\\a", "C:\\a", "//a"]  # fmt: skip
+NAMES = [".", "..", " ", "", "/etc", "../a", "a/", "a\\b", "C:\\a"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -190,8 +161,7 @@ def test_a_name_that_leads_elsewhere_is_refused_for_scenarios_and_cases(name):
 
 # Files ------------------------------------------------------------------------------------------
 
-SAYS = {name: getattr(errno, name) for name in ("EACCES", "EBUSY", "EPERM", "ENOSPC", "EIO",
-        "EROFS", "EDQUOT", "ESTALE", "ENOLCK")}  # fmt: skip
+SAYS = {name: getattr(errno, name) for name in ("EACCES", "ENOSPC", "ESTALE")}
 """What Windows says of a file that another process has open (EACCES), disks, network folders."""
 
 
@@ -217,7 +187,6 @@ def test_a_file_system_that_says_no_leaves_the_old_file_and_no_other(
 
 LINKS = {
     "itself": lambda path: path,
-    "by another way": lambda path: path.parent / "." / ".." / path.parent.name / path.name,
     "a symbolic link": lambda path: linked(path, os.symlink),
     "a hard link": lambda path: linked(path, os.link),
 }
@@ -244,8 +213,6 @@ def test_an_input_is_never_replaced_whatever_it_is_called(tmp_path, way):
     "words",
     [
         "compare a b --record a/trajectory.csv",
-        "compare a b --record b/trajectory.csv",
-        "compare a/trajectory.csv b --record a/trajectory.csv",
         "compare a b --record=./a/../a/trajectory.csv",
         "train -a q-learning -n 200 --start out/parameters.toml --out out --overwrite",
         "tuning -s mine.toml --out mine.toml",
@@ -337,17 +304,11 @@ def test_a_comparison_sees_every_change(runs, what):
 
 ENDS = {
     "os._exit(0)": ("os._exit(0)", 2, "with exit code 0"),
-    "os._exit(3)": ("os._exit(3)", 2, "with exit code 3"),
     "sys.exit(0)": ("sys.exit(0)", 2, "exit(0)"),
-    "sys.exit()": ("sys.exit()", 2, "exit(None)"),
     "a closed pipe": ("raise BrokenPipeError", 2, "pipe"),
     "a signal": ("os.kill(os.getpid(), 9)", 2, "SIGKILL"),
-    "abort": ("os.abort()", 2, "SIGABRT"),
     "no Exception": ("raise BaseException('x')", 70, "BaseException: x"),
-    "GeneratorExit": ("raise GeneratorExit", 70, "GeneratorExit"),
-    "an end without a word": ("os.close(1); os.close(2); os._exit(0)", 2, "with exit code 0"),
     "a thread that stays": ("threading.Thread(target=time.sleep, args=(900,)).start()", 0, ""),
-    "a process that stays": ("subprocess.Popen(['sleep', '5'], stderr=-3)", 0, ""),
 }
 PLUGIN = """\
 import os, subprocess, sys, threading, time
@@ -382,13 +343,11 @@ def test_exit_code_0_means_results_whatever_a_plug_in_does(tmp_path, what):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", ["import", "factory", "evaluate", "workers"])
+@pytest.mark.parametrize("where", ["import", "evaluate", "workers"])
 def test_an_early_exit_elsewhere_is_one_line_too(tmp_path, where):
     text = PLUGIN.format(body="os._exit(0)" if where in ("evaluate", "workers") else "pass")
     if where == "import":
         text = "import os; os._exit(0)"
-    elif where == "factory":
-        text = text.replace("return Mine", "os._exit(0)\n    return Mine")
     (tmp_path / "mine.py").write_text(text)
     jobs = 2 if where == "workers" else 1
     words = f"evaluate -c mine:make --seeds 2 -n 2 --jobs {jobs} --out out"

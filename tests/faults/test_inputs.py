@@ -162,8 +162,9 @@ def numeric_options():
                     "--first-seed",
                     "--seed-values",
                 )
-                # These two are numbers to a parser; what they mean is tested with a file.
-                odd = bad in ("nan", "inf") and parameter.opts[0] in ("--relative", "--at")
+                # These are numbers to a parser; what they mean is tested with a file.
+                numbers = ("--relative", "--at", "--divergence")
+                odd = bad in ("nan", "inf") and parameter.opts[0] in numbers
                 if is_seed or odd or (bad == "-1" and parameter.min is None):
                     continue
                 yield [*words, *needed, parameter.opts[0], bad]

@@ -1,7 +1,7 @@
 """Imports run one way: between the packages as designed, between files in no circle."""
 
 import ast
-from graphlib import CycleError, TopologicalSorter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -93,11 +93,3 @@ def graph(known):
 
 def test_no_file_imports_itself_in_a_circle():
     TopologicalSorter(graph(modules())).prepare()
-
-
-def test_a_circle_is_seen(tmp_path):
-    for name, other in (("one", "two"), ("two", "one")):
-        (tmp_path / f"{name}.py").write_text(f"def f():\n    from {other} import g\n")
-    known = {name: tmp_path / f"{name}.py" for name in ("one", "two")}
-    with pytest.raises(CycleError):
-        TopologicalSorter(graph(known)).prepare()

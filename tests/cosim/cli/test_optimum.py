@@ -1,10 +1,12 @@
-"""`cosim optimum`: J*, bounds, files and errors."""
+"""`cosim optimum`: J*, bounds, files and errors; `cosim tuning`: certificate and θ file."""
 
 import json
 
 import pytest
 
+from controllers import factories
 from controllers import optimum as store
+from cosim import Scenario
 
 
 def test_stored_optimum_as_json(cosim):
@@ -44,3 +46,23 @@ def test_solving_anew_ends_in_the_optimum_that_is_shipped(cosim, tmp_path, monke
     assert code == 0
     assert json.loads(out)["J"] == pytest.approx(6337.8, rel=3e-5)
     assert len(list(tmp_path.glob("**/*.npz"))) == 1
+
+
+def test_the_tunings_certificate_as_json(cosim):
+    code, out, _ = cosim("tuning", "--scenario", "paper", "--json")
+    document = json.loads(out)
+    assert code == 0
+    assert abs(document["active"]["X2 ≥ 25 %"] - 60.29) < 0.01
+    assert document["economic_eigenvalues"][0] < 0 < document["convexified_eigenvalues"][0]
+    assert document["gain_error"] < 1e-8
+
+
+def test_tuned_parameters_are_a_controller(cosim, tmp_path):
+    path = tmp_path / "tuned.toml"
+    code, _, err = cosim("tuning", "--out", path)
+    assert code == 0
+    assert str(path) in err.replace("\n", "")
+    scenario = Scenario.load("paper")
+    assert factories.from_file(scenario, path).parameters.hash == (
+        factories.tuned(scenario).parameters.hash
+    )

@@ -4,7 +4,7 @@ import re
 import pytest
 import rich.console
 
-from cosim.cli.output import LONG, Output
+from cosim.cli.output import Output
 
 HEADER, ROW = ("a heading", "b" * 30, "c"), ("x" * 40, "y", "z" * 40)
 
@@ -59,9 +59,3 @@ def test_only_numbers_stand_on_the_right(printed, cells, right):
     line = next(line for line in text.splitlines() if cells[0] in line)
     assert line.startswith(f"│ {cells[0]}") is not right
     assert line.endswith(f"{cells[0]} │") is right
-
-
-@pytest.mark.parametrize(("stages", "said"), [(10, 0), (LONG, 0), (LONG + 1, 1), (1000, 1)])
-def test_a_horizon_that_takes_its_time_is_announced(capsys, paper, stages, said):
-    Output(False).announce(paper.replace({"controller": {"horizon": stages}}))
-    assert capsys.readouterr().err.count(f"horizon {stages}: building") == said

@@ -25,15 +25,6 @@ def test_the_cursor_needs_a_png(cosim, recording):
     assert "--png" in err
 
 
-def test_without_a_display_the_message_says_how_to_draw(cosim, recording, monkeypatch):
-    monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    code, _, err = cosim("view", recording)
-    assert code == 2
-    assert "no display" in err
-
-
 @pytest.mark.slow
 def test_png_draws_the_recording(cosim, recording, tmp_path):
     code, _, err = cosim("view", recording, "--png", "run.png", "--at", 600)

@@ -1,11 +1,10 @@
-import re
 import threading
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import contextmanager, suppress
 from time import sleep
 from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 from matplotlib.image import imread
 
@@ -49,8 +48,9 @@ def test_the_viewer_listens_on_loopback_only_and_ends(recording, tmp_path):
 
     def watch():
         while not stop.is_set():
-            for process in processes():
-                seen.update(listening(process))
+            with suppress(psutil.Error):
+                found = [c for viewer in viewers() for c in viewer.net_connections("inet")]
+                seen.update(c.laddr.ip for c in found if c.status == psutil.CONN_LISTEN)
             sleep(0.05)
 
     watcher = threading.Thread(target=watch)
@@ -60,36 +60,14 @@ def test_the_viewer_listens_on_loopback_only_and_ends(recording, tmp_path):
     finally:
         stop.set()
         watcher.join()
-    assert seen == {"0100007F"}
-    assert not processes()
+    assert seen == {"127.0.0.1"}
+    assert not viewers()
 
 
-def processes():
-    """Viewers without a window that this test's user runs."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            command = (entry / "cmdline").read_bytes().split(b"\0")
-        except OSError:
-            continue
-        if b"--headless" in command and Path(command[0].decode()).name == "rerun":
-            found.append(entry)
-    return found
-
-
-def listening(process):
-    """Local addresses (hexadecimal) of the process's listening sockets."""
-    try:
-        inodes = {
-            match[1]
-            for link in (process / "fd").iterdir()
-            if (match := re.match(r"socket:\[(\d+)\]", str(link.readlink())))
-        }
-        rows = [line.split() for line in (process / "net/tcp").read_text().splitlines()[1:]]
-        six = [line.split() for line in (process / "net/tcp6").read_text().splitlines()[1:]]
-    except OSError:
-        return set()
-    return {row[1].split(":")[0] for row in rows + six if row[3] == "0A" and row[9] in inodes}
+def viewers():
+    """Viewers without a window that this test has started."""
+    children = psutil.Process().children(recursive=True)
+    return [child for child in children if child.name() == "rerun"]
 
 
 @slow

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
 from cosim.errors import EvaluationError, StudyError
-from cosim.files import temporary_folder, write_atomically
+from cosim.files import replacing, temporary_folder
 from cosim.kpis import comes_to_rest, displaced
 from cosim.plant import FmuPlant
 from cosim.plugins import (
@@ -23,53 +22,30 @@ from cosim.plugins import (
     parameters_hash,
     versions,
 )
-from cosim.protocols import Controller
+from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
 from cosim.shown import Shown
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, check_folders
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING
-from cosim.text_tables import cell, csv_pieces
+from cosim.studies.tables import to_csv
 from learning.training import stored_optimum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 OPTIMAL = "optimal"
 Factory = Callable[[Scenario], Controller]
 
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
 COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
-INDICATORS = (*MEANS, "failures")
-DRAWN = ("J", "economic_cost", "mean_violation")
-PROVENANCE = (
-    "version",
-    "versions",
-    "code_hash",
-    "scenario_hash",
-    "fmu_sha256",
-    "parameters_hash",
-    "command",
-)
-COLUMNS = (
-    "controller",
-    "scenario",
-    "seed",
-    "steps",
-    "economic_cost",
-    "mean_violation",
-    "violating_share",
-    "J",
-    "regret",
-    "gap_closed",
-    "gain_in_J",
-    "input_effort",
-    "settling_time",
-    "failures",
-    *PROVENANCE,
-)
+COLUMNS = [
+    "controller", "scenario", "seed", "steps", "economic_cost", "mean_violation",
+    "violating_share", "J", "regret", "gap_closed", "gain_in_J", "input_effort", "settling_time",
+    "failures", "version", "versions", "code_hash", "scenario_hash", "fmu_sha256",
+    "parameters_hash", "command",
+]  # fmt: skip
 
 
 def evaluate(
@@ -156,11 +132,15 @@ def evaluate(
         runner.go(jobs, scheduler)
         for failure in runner.failures.values():
             raise failure.error()
-        columns, timing, settling = {}, {}, {}
-        for name, store in zip(named, runner.stores.values(), strict=True):
-            columns[name] = _columns(store.indicators(EVALUATION), numbers)
-            timing[name] = _columns(store.indicators(TIMING), numbers)
-            settling[name] = store.settling
+        stores = dict(zip(named, runner.stores.values(), strict=True))
+        columns, timing = (
+            {
+                name: pd.DataFrame.from_dict(store.indicators(file), "index").reindex(numbers)
+                for name, store in stores.items()
+            }
+            for file in (EVALUATION, TIMING)
+        )
+        settling = {name: store.settling for name, store in stores.items()}
     return Evaluation(wanted, numbers, columns, timing, settling, parameters, facts)
 
 
@@ -169,14 +149,6 @@ def _qualified(factory: Factory) -> str:
     inner = getattr(factory, "func", factory)
     arguments = f"{getattr(factory, 'args', '')}{getattr(factory, 'keywords', '')}"
     return f"{inner.__module__}:{getattr(inner, '__qualname__', type(inner).__name__)}{arguments}"
-
-
-def _columns(figures: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> dict[str, Array]:
-    """Figures by name over the seeds, (S,) each; NaN where a seed has none."""
-    names = list(next(iter(figures.values()), {}))
-    nothing = dict.fromkeys(names, float("nan"))
-    rows = [figures.get(seed, nothing) for seed in seeds]
-    return {name: np.array([row[name] for row in rows]) for name in names}
 
 
 def _named(controllers: Mapping[str, Factory | str] | Sequence[str]) -> dict[str, Factory | str]:
@@ -209,19 +181,19 @@ def _check(
         raise EvaluationError(f"steps must be at least 1, not {steps}; burn-in at least 0")
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Evaluation(Shown):
     """Indicators of controllers × seeds on common random numbers.
 
-    `columns` and `timing` hold, by controller, what was measured over the seeds by name, (S,)
-    each; `settling` the settling time in s, NaN where permanent disturbances let nothing settle;
-    `parameters` each controller's hash; `facts` are the columns that do not vary.
+    `columns` and `timing` hold, by controller, what was measured: a frame with a row for each
+    seed. `settling` is the settling time in s, NaN where permanent disturbances let nothing
+    settle; `parameters` each controller's hash; `facts` are the columns that do not vary.
     """
 
     controllers: Sequence[str]
     seeds: Sequence[int]
-    columns: Mapping[str, Mapping[str, Array]]
-    timing: Mapping[str, Mapping[str, Array]]
+    columns: Mapping[str, pd.DataFrame]
+    timing: Mapping[str, pd.DataFrame]
     settling: Mapping[str, float]
     parameters: Mapping[str, str]
     facts: Mapping[str, Any]
@@ -254,70 +226,52 @@ class Evaluation(Shown):
     @property
     def optimal(self) -> Array:
         """J of the optimum over the seeds, (S,), NaN where it is not known."""
-        if self.optimum is None:
-            return np.full(len(self.seeds), np.nan)
-        return self.column(self.optimum, "J")
+        return self._cost(self.optimum)
 
     def column(self, controller: str, name: str) -> Array:
         """An indicator of a controller over the seeds, (S,)."""
-        return self.columns[controller][name]
+        found: Array = self.columns[controller][name].to_numpy()
+        return found
 
-    @cached_property
+    def _cost(self, controller: str | None) -> Array:
+        if controller is None:
+            return np.full(len(self.seeds), np.nan)
+        return self.column(controller, "J")
+
+    @property
     def rows(self) -> list[dict[str, Any]]:
-        """The rows, by controller as given, then by seed; NaN where an indicator is undefined."""
-        return list(self._rows())
+        """The rows of `to_pandas` as mappings."""
+        found: list[dict[str, Any]] = self.to_pandas().to_dict("records")
+        return found
 
-    def _rows(self) -> Iterator[dict[str, Any]]:
-        nothing = np.full(len(self.seeds), np.nan)
-        naive = nothing if self.naive is None else self.column(self.naive, "J")
-        for controller in self.controllers:
-            constant = {
-                "controller": controller,
-                "settling_time": self.settling[controller],
-                "parameters_hash": self.parameters[controller],
+    def to_pandas(self) -> pd.DataFrame:
+        """A row for each controller, as given, and seed; NaN where an indicator is undefined."""
+        naive, frames = self._cost(self.naive), []
+        for name in self.controllers:
+            cost = self.column(name, "J")
+            frame = self.columns[name].assign(
                 **self.facts,
-            }
-            columns, cost = self.columns[controller], self.column(controller, "J")
-            figures = {name: columns[name] for name in INDICATORS} | {
-                "regret": regrets(cost, self.optimal),
-                "gap_closed": gaps_closed(cost, naive, self.optimal),
-                "gain_in_J": gains(cost, self.column(self.reference, "J")),
-            }
-            for row, seed in enumerate(self.seeds):
-                values = {name: float(column[row]) for name, column in figures.items()}
-                values["failures"] = int(values["failures"])
-                yield {**constant, "seed": seed, **values}
+                controller=name,
+                seed=self.seeds,
+                settling_time=self.settling[name],
+                parameters_hash=self.parameters[name],
+                regret=regrets(cost, self.optimal),
+                gap_closed=gaps_closed(cost, naive, self.optimal),
+                gain_in_J=gains(cost, self._cost(self.reference)),
+            )
+            frames.append(frame[COLUMNS].astype({"failures": int}))
+        return pd.concat(frames, ignore_index=True)
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
-        return "".join(self._csv())
-
-    def _csv(self) -> Iterator[str]:
-        return csv_pieces(COLUMNS, ([cell(row[name]) for name in COLUMNS] for row in self._rows()))
-
-    def _timing_csv(self) -> Iterator[str]:
-        names = list(self.timing[self.controllers[0]])
-        return csv_pieces(
-            ["controller", "seed", *names],
-            (
-                [controller, str(seed), *(f"{self.timing[controller][n][row]:.6g}" for n in names)]
-                for controller in self.controllers
-                for row, seed in enumerate(self.seeds)
-            ),
-        )
-
-    def to_pandas(self) -> Any:
-        """The rows as a pandas data frame."""
-        import pandas as pd  # noqa: PLC0415 - half a second
-
-        return pd.DataFrame(self.rows, columns=list(COLUMNS))
+        return to_csv(self.to_pandas())
 
     def figure(self) -> Figure:
         """Regret (J where J* is not known) with its intervals; economic cost against violation."""
-        from cosim.figures.evaluation import Costs, evaluation_figure  # noqa: PLC0415 - matplotlib
+        from cosim.figures.evaluation import evaluation_figure  # noqa: PLC0415 - matplotlib
 
         return evaluation_figure(
-            {name: Costs(*(self.column(name, key) for key in DRAWN)) for name in self.controllers},
+            {name: self.columns[name] for name in self.controllers},
             title=f"{self.facts['scenario']}, {self.facts['steps']} samples × {len(self.seeds)} "
             "seeds, the same disturbances for all",
             optimal=None if self.optimum is None else self.optimal,
@@ -331,9 +285,13 @@ class Evaluation(Shown):
 
     def write(self, folder: Path) -> None:
         """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""
-        write_atomically(folder / EVALUATION, self._csv())
         self.plot(folder / "evaluation.png")
-        write_atomically(folder / TIMING, self._timing_csv())
+        clock = pd.concat({name: self.timing[name] for name in self.controllers})
+        clock = clock.rename_axis(["controller", "seed"]).reset_index()
+        for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock.round(3))):
+            # Rows as they are written: their text takes ten times the memory of their numbers.
+            with replacing(folder / name) as path:
+                frame.to_csv(path, index=False, lineterminator="\n")
 
     def summary(self) -> dict[str, Any]:
         """The evaluation as a JSON document: controllers, comparisons, provenance, timing.
@@ -346,43 +304,34 @@ class Evaluation(Shown):
         is of 95 %, paired over seeds, once by Student's t and once by BCa bootstrap. `optimal_J`
         is J* on the same seeds.
         """
-        names = list(self.controllers)
         return {
             **self.facts,
             "seeds": list(self.seeds),
             "reference": self.reference,
             "optimum": self.optimum,
             "optimal_J": None if self.optimum is None else float(np.mean(self.optimal)),
-            "controllers": {name: self._controller(name) for name in names},
+            "controllers": {name: self._controller(name) for name in self.controllers},
             "comparisons": [
                 self._comparison(name, reference)
-                for i, name in enumerate(names)
-                for reference in names[:i]
+                for i, name in enumerate(self.controllers)
+                for reference in self.controllers[:i]
             ],
-            "timing": {
-                name: {key: float(np.median(values)) for key, values in self.timing[name].items()}
-                for name in names
-            },
+            "timing": {name: self.timing[name].median().to_dict() for name in self.controllers},
         }
 
     def _controller(self, name: str) -> dict[str, Any]:
-        estimates = {key: mean(self.column(name, key)) for key in MEANS}
-        document: dict[str, Any] = {key: estimate.value for key, estimate in estimates.items()}
+        estimates = {key: mean(self.column(name, key)).to_dict() for key in MEANS}
+        document: dict[str, Any] = {key: one.pop("value") for key, one in estimates.items()}
         document |= {
             "failures": int(np.sum(self.column(name, "failures"))),
             "settling_time": self.settling[name],
             "parameters_hash": self.parameters[name],
-            "intervals": {
-                key: {"t": estimate.t, "bootstrap": estimate.bootstrap}
-                for key, estimate in estimates.items()
-            },
+            "intervals": estimates,
         }
-        if self.optimum is None:
-            return document
-        cost = self.column(name, "J")
-        document["regret"] = regret(cost, self.optimal).to_dict()
-        if self.naive is not None:
-            naive = self.column(self.naive, "J")
+        cost, naive = self._cost(name), self._cost(self.naive)
+        if self.optimum is not None:
+            document["regret"] = regret(cost, self.optimal).to_dict()
+        if self.optimum is not None and self.naive is not None:
             document["gap_closed"] = gap_closed(cost, naive, self.optimal).to_dict()
         return document
 
@@ -394,5 +343,5 @@ class Evaluation(Shown):
                 key: mean(self.column(name, key) - self.column(reference, key)).to_dict()
                 for key in COMPARED
             },
-            "gain_in_J": gain(self.column(name, "J"), self.column(reference, "J")).to_dict(),
+            "gain_in_J": gain(self._cost(name), self._cost(reference)).to_dict(),
         }

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim.penalty import VIOLATING
-from cosim.protocols import Controller, Plant
+from cosim.protocols import Array, Controller, Plant
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from cosim.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 DISPLACEMENT = 0.1
 BAND = 0.05

@@ -14,10 +14,9 @@ from math import floor, isfinite, log10
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from cosim.protocols import Array
 
 Interval = tuple[float, float] | None
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
@@ -21,10 +21,10 @@ from cosim.figures.style import (
     plain,
     regret_axis,
 )
-from cosim.statistics import Estimate, regret, regret_terms
+from cosim.protocols import Array
 from cosim.statistics import mean as mean_of
+from cosim.statistics import regret, regret_terms
 
-Array = NDArray[np.float64]
 VIOLATION = 1e-3
 """Violation per sample below which its axis is linear."""
 DECADE = 10.0
@@ -33,20 +33,12 @@ FLOOR = 0.1
 """Regret in % of single seeds below which its axis is linear."""
 
 
-@dataclass(frozen=True)
-class Costs:
-    """Figures of a controller over S noise seeds, (S,) each."""
-
-    J: Array
-    economic_cost: Array
-    mean_violation: Array
-
-
 def evaluation_figure(
-    controllers: Mapping[str, Costs], *, title: str, optimal: Array | None = None
+    controllers: Mapping[str, pd.DataFrame], *, title: str, optimal: Array | None = None
 ) -> Figure:
     """Left: J of each controller; right: economic cost against violation.
 
+    `controllers` have the columns `J`, `economic_cost` and `mean_violation`, a row for each seed.
     Small dots are seeds, the large ones means with 95 % t intervals. `optimal` is J* (S,) on the
     same seeds: the left panel then shows the regret (J − J*)/|J*| in %, paired over the seeds.
     The grey line joins the controllers that no other one beats in both cost and violation.
@@ -61,15 +53,19 @@ def evaluation_figure(
 
 
 def _rows(
-    axes: Axes, controllers: Mapping[str, Costs], looks: Mapping[str, Look], optimal: Array | None
+    axes: Axes,
+    controllers: Mapping[str, pd.DataFrame],
+    looks: Mapping[str, Look],
+    optimal: Array | None,
 ) -> None:
     everything = []
     for row, (name, costs) in enumerate(controllers.items()):
         color = looks[name].color
-        values, estimate, scale = costs.J, mean_of(costs.J), 1.0
+        values, scale = costs.J.to_numpy(), 1.0
+        estimate = mean_of(values)
         if optimal is not None:
-            values, scale = 100 * regret_terms(costs.J, optimal), 100.0
-            estimate = regret(costs.J, optimal)
+            estimate, scale = regret(values, optimal), 100.0
+            values = 100 * regret_terms(values, optimal)
         everything.append(values)
         spread = np.linspace(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(1)
         axes.plot(values, row + spread, ".", color=color, markersize=4, alpha=0.4, mew=0)
@@ -91,7 +87,7 @@ def _rows(
     axes.set_xlabel("J per sample, 95 % interval")
 
 
-def _pareto(axes: Axes, controllers: Mapping[str, Costs], looks: Mapping[str, Look]) -> None:
+def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[str, Look]) -> None:
     means = {
         name: (float(np.mean(c.mean_violation)), float(np.mean(c.economic_cost)))
         for name, c in controllers.items()
@@ -108,8 +104,8 @@ def _pareto(axes: Axes, controllers: Mapping[str, Costs], looks: Mapping[str, Lo
             costs.mean_violation, costs.economic_cost, ".", color=color, ms=3, alpha=0.35, mew=0
         )
         axes.errorbar(
-            *means[name], xerr=_half_width(mean_of(costs.mean_violation)),
-            yerr=_half_width(mean_of(costs.economic_cost)), fmt="o", color=color, markersize=5,
+            *means[name], xerr=_half_width(costs.mean_violation),
+            yerr=_half_width(costs.economic_cost), fmt="o", color=color, markersize=5,
             capsize=2, linewidth=1.0,
         )  # fmt: skip
     top = max(float(costs.mean_violation.max()) for costs in controllers.values())
@@ -121,7 +117,8 @@ def _pareto(axes: Axes, controllers: Mapping[str, Costs], looks: Mapping[str, Lo
     axes.set_ylabel("economic cost per sample")
 
 
-def _half_width(estimate: Estimate) -> float:
+def _half_width(values: pd.Series[float]) -> float:
+    estimate = mean_of(values.to_numpy())
     return 0.0 if estimate.t is None else (estimate.t[1] - estimate.t[0]) / 2
 
 

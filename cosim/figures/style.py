@@ -15,13 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
-from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from cosim.errors import FigureError
 from cosim.files import write_atomically
-
-Array = NDArray[np.float64]
+from cosim.protocols import Array
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""

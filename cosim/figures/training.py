@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FuncFormatter
-from numpy.typing import NDArray
 
 from cosim.figures.style import (
     DASHED,
@@ -25,9 +24,9 @@ from cosim.figures.style import (
     plain,
     symbol,
 )
+from cosim.protocols import Array
 from cosim.statistics import regrets
 
-Array = NDArray[np.float64]
 GREEDY, TRAINING = SERIES[0], SERIES[1]
 DECADES = 30.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""

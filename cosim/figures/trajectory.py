@@ -22,9 +22,8 @@ from cosim.figures.style import (
     palette,
     plain,
 )
+from cosim.protocols import Array
 from cosim.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 class Run(Protocol):

@@ -25,9 +25,9 @@ from cosim.figures.style import (
     plain,
     regret_axis,
 )
+from cosim.protocols import Array
 from cosim.statistics import LEVEL, regrets
 
-Array = NDArray[np.float64]
 BANDED = 6
 """Curves of a panel, at most, that have bands: more bands cannot be told apart."""
 INK = "#222222"

@@ -11,7 +11,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
-from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.figures.style import (
@@ -24,6 +23,7 @@ from cosim.figures.style import (
     plain,
     regret_axis,
 )
+from cosim.protocols import Array
 from cosim.statistics import regret, regret_terms, regrets, shown
 from cosim.studies.store import ONLINE
 from cosim.studies.tables import read_table
@@ -32,7 +32,6 @@ from cosim.validation import suggestion
 if TYPE_CHECKING:
     from cosim.studies.plan import Run
 
-Array = NDArray[np.float64]
 Course = tuple[Array, Array, Array]
 """Samples (K,) at the blocks' ends, mean costs (R, K) of the runs, and the optimum's (R, K)."""
 HEADER = ("case", "runs", "regret %, mean [95 %]", "median", "worst")

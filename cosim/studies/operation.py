@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
-from numpy.typing import NDArray
 
 from controllers import compile_functions
 from controllers.optimum import Fouling, QuasiStaticPolicy, change_of
@@ -29,7 +28,7 @@ from cosim.figures.style import (
 from cosim.penalty import VIOLATING
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
-from cosim.protocols import Controller
+from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
 from cosim.statistics import paired_difference, shown
 from cosim.studies.plan import Run, greedy_file
@@ -40,7 +39,6 @@ from learning.errors import DivergenceError
 from learning.training import LogRow
 from learning.training_run import TrainingRun, begin
 
-Array = NDArray[np.float64]
 Table = tuple[str, Sequence[str], list[list[str]]]
 """Title, header and rows."""
 WINDOW = 100

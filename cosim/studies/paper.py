@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cosim.protocols import Array
 from cosim.statistics import Estimate, gain, shown
 
-Array = NDArray[np.float64]
 PAPER = {"naive": 21.0, "tuned": 15.0}
 """Gain of the paper's RL-tuned RTI-NMPC over (a) and (b), in per cent."""
 NEAR = 3.0

@@ -11,14 +11,13 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from cosim.figures import overlay_figure, parameters_figure, save, trajectory_figure
 from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, plain
 from cosim.files import write_atomically
 from cosim.penalty import VIOLATING
 from cosim.plugins import build_controller
-from cosim.protocols import Controller
+from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
 from cosim.statistics import TD_WINDOW, td_error_mean
 from cosim.studies.document import TrajectoryTable
@@ -27,7 +26,6 @@ from cosim.studies.store import LOG, PARAMETERS
 from cosim.studies.tables import read_table
 from cosim.trajectory import Trajectory, read_csv
 
-Array = NDArray[np.float64]
 Policy = Callable[[Array], Array]
 TRAJECTORIES, LOGS, KEPT, FIGURES = "trajectories", "logs", "parameters", "figures"
 SUFFIXES = ("svg", "png")

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.figures.style import palette, save
 from cosim.files import read_json, write_atomically
+from cosim.protocols import Array
 from cosim.shown import Shown
 from cosim.statistics import (
     Estimate,
@@ -38,7 +38,6 @@ from cosim.validation import suggestion
 if TYPE_CHECKING:
     from cosim.studies.plan import Plan
 
-Array = NDArray[np.float64]
 
 ABOUT = "study.json"
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"

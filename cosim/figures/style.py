@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter
 from scipy.optimize import isotonic_regression
 
 from cosim.errors import FigureError
@@ -170,16 +170,6 @@ def label(name: str, unit: str) -> str:
     return f"{text} [{shown}]" if shown else text
 
 
-def limit(axes: Axes, value: float, text: str = "") -> None:
-    """Draw a bound across the axes, named right of them: within, the data would hide it."""
-    axes.axhline(value, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
-    if text:
-        axes.annotate(
-            text, (1.0, value), xycoords=("axes fraction", "data"), xytext=(3, 0),
-            textcoords="offset points", ha="left", va="center", fontsize=6.5, color=BOUND,
-        )  # fmt: skip
-
-
 def percent(value: float, _: object = None) -> str:
     """A tick in plain digits."""
     return f"{value:g}"
@@ -213,13 +203,25 @@ class EndLabel(NamedTuple):
     color: str
 
 
-def label_ends(axes: Axes, labels: Sequence[EndLabel], size: float = 6.5) -> None:
-    """Write names right of the axes, each at its line's end, pushed apart where they overlap.
+def samples_axis(axes: Axes, end: float, text: str = "") -> None:
+    """Let an abscissa show samples from 0 to `end`."""
+    axes.set_xlim(0.0, end)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlabel(text)
+
+
+def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]]) -> None:
+    """Write names right of each axes at their lines' ends, pushed apart where they overlap.
 
     The limits and the scale of the ordinate must be set before.
     """
-    if not labels:
-        return
+    drawn.draw_without_rendering()
+    for axes, own in labels:
+        if own:
+            _label_ends(axes, own)
+
+
+def _label_ends(axes: Axes, labels: Sequence[EndLabel], size: float = 6.5) -> None:
     height = axes.get_window_extent().height * 72 / axes.figure.dpi
     low, high = (axes.transData.transform((0, y))[1] for y in axes.get_ylim())
     ends = np.array([axes.transData.transform((0, item.y))[1] for item in labels])

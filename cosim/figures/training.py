@@ -22,6 +22,7 @@ from cosim.figures.style import (
     label_ends,
     percent,
     plain,
+    samples_axis,
     symbol,
 )
 from cosim.protocols import Array
@@ -78,14 +79,11 @@ def training_figure(
             else:
                 named.append((axes, _cost(axes, log, start, baselines, best)))
             axes.set_title(name, loc="left", fontsize=8.0)
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.set_xlim(0.0, max(float(log["samples"][-1]), 1.0))
+            samples_axis(axes, max(float(log["samples"][-1]), 1.0))
         for axes in grid[-columns:]:
             axes.set_xlabel("training samples")
         drawn.suptitle(plain(title), fontsize=8.5)
-        drawn.draw_without_rendering()
-        for axes, labels in named:
-            label_ends(axes, labels)
+        label_ends(drawn, named)
     return drawn
 
 
@@ -183,9 +181,7 @@ def parameters_figure(
             axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
         axes = drawn.add_subplot(grid[rows, :], sharex=first)
         axes.plot(samples, td_error, color=SERIES[1], linewidth=1.0)
-        axes.set_xlim(0.0, float(samples[-1]))
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.set_xlabel("samples")
+        samples_axis(axes, float(samples[-1]), "samples")
         title = f"TD error, root mean square of the preceding {window} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
         most = max((values.shape[1] for values in moving.values()), default=0)

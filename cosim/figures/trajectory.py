@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,45 +18,14 @@ from cosim.figures.style import (
     SERIES,
     figure,
     label,
-    limit,
     palette,
     plain,
 )
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 
-
-class Run(Protocol):
-    """What a figure asks of a run; a `Trajectory`, which draws itself, has it."""
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario that was run."""
-
-    @property
-    def signals(self) -> Mapping[str, Any]:
-        """Signals by name, each with `unit` and `values`."""
-
-    @property
-    def time(self) -> Array:
-        """Sample instants in s, (K,)."""
-
-    @property
-    def controller(self) -> str:
-        """The controller's name."""
-
-    @property
-    def seed(self) -> int | None:
-        """The noise's seed."""
-
-    def summary(self) -> dict[str, Any]:
-        """Means of the run and its counts."""
-
-    def __getitem__(self, name: str) -> Array:
-        """Values of a signal, (K,)."""
-
-    def __len__(self) -> int:
-        """Return the number of samples K."""
+Run = Any
+"""A `cosim.trajectory.Trajectory`, which draws itself with what is here."""
 
 
 def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[Run] = ()) -> Figure:
@@ -208,10 +177,15 @@ def _limits(axes: Axes, lower: float, upper: float) -> None:
     span = max(high - low, 1e-9)
     far = []
     for name, bound, distance in (("≥", lower, low - lower), ("≤", upper, upper - high)):
-        if distance < span:
-            limit(axes, bound, f"{name} {bound:g}")
-        else:
+        if distance >= span:
             far.append(f"{name} {bound:g}")
+            continue
+        axes.axhline(bound, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
+        # Right of the axes: within, the data would hide it.
+        axes.annotate(
+            f"{name} {bound:g}", (1.0, bound), xycoords=("axes fraction", "data"), xytext=(3, 0),
+            textcoords="offset points", ha="left", va="center", fontsize=6.5, color=BOUND,
+        )  # fmt: skip
     if far:
         axes.annotate(
             f"bound {', '.join(far)}", (1.0, 1.0), xycoords="axes fraction", ha="right",

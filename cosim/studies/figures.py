@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from cosim.figures.style import (
@@ -24,6 +24,7 @@ from cosim.figures.style import (
     percent,
     plain,
     regret_axis,
+    samples_axis,
 )
 from cosim.protocols import Array
 from cosim.statistics import LEVEL, regrets
@@ -139,13 +140,10 @@ def curves_figure(
                 axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
             cost_axis(axes, np.concatenate(reached), relative=relative)
             axes.set_ylabel(f"{unit} of the {'training samples' if not ends else 'greedy policy'}")
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             ends.append(labels)
-        grid[1].set_xlim(0.0, max(float(curve.samples[-1]) for curve in curves.values()))
-        grid[1].set_xlabel("training samples")
-        drawn.draw_without_rendering()
-        for axes, labels in zip(grid, ends, strict=True):
-            label_ends(axes, labels)
+        end = max(float(curve.samples[-1]) for curve in curves.values())
+        samples_axis(grid[1], end, "training samples")
+        label_ends(drawn, zip(grid, ends, strict=True))
     return drawn
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
 from cosim.errors import StudyError
 from cosim.figures.style import (
@@ -22,6 +21,7 @@ from cosim.figures.style import (
     label_ends,
     plain,
     regret_axis,
+    samples_axis,
 )
 from cosim.protocols import Array
 from cosim.statistics import regret, regret_terms, regrets, shown
@@ -161,12 +161,9 @@ def online_figure(
                 axes.plot(shown_cases[case][0], values, color=color, linestyle=line, linewidth=1.2)
             regret_axis(axes, "y", np.concatenate([[0.0], *means.values()]), 0.1)
             axes.set_ylabel(title)
-        panels[-1].set_xlim(0.0, end)
-        panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
-        panels[-1].set_xlabel("samples of the run")
-        drawn.draw_without_rendering()
+        samples_axis(panels[-1], end, "samples of the run")
         ends = [EndLabel(plain(c), float(so_far[c][-1]), looks[c].color) for c in so_far]
-        label_ends(panels[-1], ends)
+        label_ends(drawn, [(panels[-1], ends)])
     return drawn
 
 

@@ -327,6 +327,5 @@ def operation_figure(
             axes.set_title(title, pad=12)
             axes.set_xlabel("samples of the plant")
         panels[0].set_ylabel("regret %")
-        drawn.draw_without_rendering()
-        label_ends(panels[1], ends)
+        label_ends(drawn, [(panels[1], ends)])
     return drawn

@@ -145,7 +145,7 @@ def report(
 
 def _summary(found: StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is what timing.csv says of each run."""
-    from cosim.studies.results import TIMING
+    from cosim.studies.store import TIMING
     from cosim.studies.tables import read_table
 
     timing = read_table(found.folder / TIMING, types={"run": str}).to_dict("records")

@@ -117,6 +117,17 @@ def save(drawn: Figure, path: str | Path) -> Path:
     return path
 
 
+def save_set(figures: Iterable[tuple[str, Figure]], folder: Path) -> list[str]:
+    """Write named figures into a folder, each as SVG and as PNG; returns the names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = []
+    for name, drawn in figures:
+        names.append(name)
+        for suffix in ("svg", "png"):
+            save(drawn, folder / f"{name}.{suffix}")
+    return names
+
+
 class Look(NamedTuple):
     """Colour and line style of a case, the same in every figure of a set."""
 

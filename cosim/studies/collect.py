@@ -6,15 +6,14 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.files import read_json
-from cosim.studies import online, theta
+from cosim.studies import theta
 from cosim.studies.plan import EVALUATION, GREEDY
 from cosim.studies.report import commit
-from cosim.studies.store import INDICATORS, LOG, RUN
+from cosim.studies.store import INDICATORS, LOG, RUN, accompanied, measured
 from cosim.studies.tables import CURVE, KEYS, STATE, read_table
 
 if TYPE_CHECKING:
@@ -118,22 +117,17 @@ def frames(plan: Plan, out: Path) -> list[pd.DataFrame]:
 def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | None:
     """State, evaluation and curves of a run; None while it is not finished."""
     folder = out / run.key.folder
-    noise = {}
-    for file, (seeds, steps) in run.noise.items():
-        path = folder / file
-        if not path.is_file():
-            return None
-        rows = read_table(path, (), {"seed": int, "steps": int, "burn_in": int})
-        rows = rows[(rows.steps == steps) & (rows.burn_in == run.burn_in(file))]
-        rows = rows.drop_duplicates("seed").set_index("seed")
-        if not set(seeds) <= set(rows.index):
-            return None
-        noise[file] = rows.loc[list(seeds)].reset_index()
-    if run.online is not None and not online.finished(run, out):
+    if not (folder / RUN).is_file():
         return None
     document = read_json(folder / RUN, f"'{folder / RUN}'", StudyError)
+    noise = {file: measured(folder, run, file) for file in run.noise}
     if run.training is not None and not document.get("status"):
         return None
+    if any(set(seeds) - set(noise[file].index) for file, (seeds, _) in run.noise.items()):
+        return None
+    if (beside := run.online) and set(beside.seeds) - set(accompanied(folder, beside).seed):
+        return None
+    own = noise[EVALUATION].loc[list(run.sizes.seeds)].reset_index()
     key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}
     state = key | {
         "status": document.get("status") or EVALUATED,
@@ -144,8 +138,9 @@ def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.Data
     if run.training is not None:
         curve = read_table(folder / LOG).reindex(columns=CURVE)
     elif run.greedy:
-        curve = pd.DataFrame([{"greedy_J": float(np.mean(noise[GREEDY].J))}], columns=CURVE)
-    found = pd.DataFrame([state]), noise[EVALUATION][["seed", "steps", *INDICATORS]], curve
+        greedy = noise[GREEDY].loc[list(run.noise[GREEDY][0])]
+        curve = pd.DataFrame([{"greedy_J": float(greedy.J.mean())}], columns=CURVE)
+    found = pd.DataFrame([state]), own, curve
     one, other, third = (frame.assign(**key) for frame in found)
     types = {"training_seed": "Int64"}
     return (

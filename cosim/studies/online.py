@@ -25,8 +25,7 @@ from cosim.figures.style import (
 )
 from cosim.protocols import Array
 from cosim.statistics import regret, regret_terms, regrets, shown
-from cosim.studies.store import ONLINE
-from cosim.studies.tables import read_table
+from cosim.studies.store import accompanied
 from cosim.validation import suggestion
 
 if TYPE_CHECKING:
@@ -36,21 +35,6 @@ Course = tuple[Array, Array, Array]
 """Samples (K,) at the blocks' ends, mean costs (R, K) of the runs, and the optimum's (R, K)."""
 HEADER = ("case", "runs", "regret %, mean [95 %]", "median", "worst")
 COLUMNS = ["scenario", "case", "training_seed", "samples", "J"]
-
-
-def finished(run: Run, out: Path) -> bool:
-    """Whether a controller has run beside every training that it accompanies."""
-    assert run.online is not None
-    return set(run.online.seeds) <= set(_blocks(run, out).seed)
-
-
-def _blocks(run: Run, out: Path) -> pd.DataFrame:
-    """Rows of a controller's online.csv that are of the plan's steps and block."""
-    path, online = out / run.key.folder / ONLINE, run.online
-    if online is None or not path.is_file():
-        return pd.DataFrame(columns=["seed", "steps", "block", "J"])
-    rows = read_table(path, types={"seed": int, "steps": int, "block": int})
-    return rows[(rows.steps == online.steps) & (rows.block == online.block)]
 
 
 def collected(runs: Sequence[Run], curves: pd.DataFrame, out: Path) -> pd.DataFrame:
@@ -66,7 +50,7 @@ def collected(runs: Sequence[Run], curves: pd.DataFrame, out: Path) -> pd.DataFr
             own = (curves[list(key)] == key).all(axis=1) & (curves.training_seed == run.key.seed)
             found.append(curves[own].dropna(subset="J")[COLUMNS])
         elif run.online is not None:
-            rows = _blocks(run, out)
+            rows = accompanied(out / run.key.folder, run.online)
             ends = run.online.block * (rows.groupby("seed").cumcount() + 1)
             values = {
                 "training_seed": rows.seed.astype("Int64"),

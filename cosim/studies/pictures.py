@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from cosim.figures import overlay_figure, parameters_figure, save, trajectory_figure
-from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, plain
+from cosim.figures import overlay_figure, parameters_figure, trajectory_figure
+from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, plain, save_set
 from cosim.files import write_atomically
 from cosim.penalty import VIOLATING
 from cosim.plugins import build_controller
@@ -22,13 +22,13 @@ from cosim.scenario import Scenario
 from cosim.statistics import TD_WINDOW, td_error_mean
 from cosim.studies.document import TrajectoryTable
 from cosim.studies.plan import Plan, Run, safe
+from cosim.studies.report import FOLDER
 from cosim.studies.store import LOG, PARAMETERS
 from cosim.studies.tables import read_table
 from cosim.trajectory import Trajectory, read_csv
 
 Policy = Callable[[Array], Array]
-TRAJECTORIES, LOGS, KEPT, FIGURES = "trajectories", "logs", "parameters", "figures"
-SUFFIXES = ("svg", "png")
+TRAJECTORIES, LOGS, KEPT = "trajectories", "logs", "parameters"
 PREFIX = "theta "
 GRID, BINS = 13, 80
 
@@ -47,13 +47,7 @@ def keep(plan: Plan, out: Path) -> None:
 
 def draw(plan: Plan, out: Path) -> list[str]:
     """Draw the kept trajectories and logs into `out`/figures; returns the figures' names."""
-    (out / FIGURES).mkdir(parents=True, exist_ok=True)
-    names = []
-    for stem, drawn in _figures(plan, out):
-        names.append(stem)
-        for suffix in SUFFIXES:
-            save(drawn, out / FIGURES / f"{stem}.{suffix}")
-    return names
+    return save_set(_figures(plan, out), out / FOLDER)
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -14,12 +14,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cosim.errors import StudyError
-from cosim.figures.style import palette, save
+from cosim.figures.style import Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.shown import Shown
 from cosim.statistics import (
     Estimate,
+    Interval,
     gap_closed,
     over_runs,
     paired_difference,
@@ -28,9 +29,9 @@ from cosim.statistics import (
     two_way,
 )
 from cosim.studies import collect, figures, online, operation, paper, report, theta
-from cosim.studies.plan import EVALUATION, safe
+from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, safe
 from cosim.studies.report import COLUMNS, SHORT
-from cosim.studies.store import INDICATORS, ONLINE
+from cosim.studies.store import INDICATORS, ONLINE, TIMING
 from cosim.studies.tables import CURVE, KEYS, STATE, WHERE, read_table, to_csv
 from cosim.text_tables import markdown_table
 from cosim.validation import suggestion
@@ -41,10 +42,7 @@ if TYPE_CHECKING:
 
 ABOUT = "study.json"
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
-THETA, TIMING, LOGS = "theta.csv", "timing.csv", "logs"
-OPERATION, GREEDY = "operation.csv", "greedy.csv"
-SUFFIXES = ("svg", "png")
-BASELINES = "baselines"
+THETA, LOGS, OPERATION = "theta.csv", "logs", "operation.csv"
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -190,22 +188,6 @@ class StudyResults(Shown):
         cost = self.indicator(self.about[kind].get(scenario, ""), scenario)
         return cost[0] if len(cost) else None
 
-    def _paired(self, case: str, scenario: str) -> Array:
-        """J (R, S); raises StudyError where it was measured on other noise than the optimum's."""
-        own = self._arrays[scenario, case]
-        best = self._arrays.get((scenario, self.about["optimum"].get(scenario, "")))
-        for name in ("seed", "steps") if best is not None else ():
-            if (
-                best is None
-                or own[name].shape[1] != best[name].shape[1]
-                or (own[name] != best[name][0]).any()
-            ):
-                raise StudyError(
-                    f"{case} and {self.about['optimum'][scenario]} on {scenario} were evaluated on "
-                    "different noise; run the study again"
-                )
-        return own["J"]
-
     def regret(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
         """(J − J*)/|J*| of a run, or of the mean of several, paired over the noise seeds.
 
@@ -214,14 +196,14 @@ class StudyResults(Shown):
         best = self.reference("optimum", scenario)
         if best is None:
             return Estimate(float("nan"))
-        return regret(self._paired(case, scenario)[list(runs)].mean(axis=0), best)
+        return regret(self.indicator(case, scenario)[list(runs)].mean(axis=0), best)
 
     def gap_closed(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
         """(J_naive − J)/(J_naive − J*), likewise."""
         best, naive = (self.reference(kind, scenario) for kind in ("optimum", "naive"))
         if best is None or naive is None:
             return Estimate(float("nan"))
-        return gap_closed(self._paired(case, scenario)[list(runs)].mean(axis=0), naive, best)
+        return gap_closed(self.indicator(case, scenario)[list(runs)].mean(axis=0), naive, best)
 
     @cached_property
     def runs(self) -> pd.DataFrame:
@@ -231,14 +213,12 @@ class StudyResults(Shown):
             own = self._arrays[scenario, case]
             for run, known in enumerate(state.to_dict("records")):
                 found = self.regret(case, scenario, [run])
-                rows.append(
-                    known
-                    | {"J": _finite(np.mean(own["J"][run])), "regret": found.value}
-                    | _ends("regret", found.t)
-                    | {"gap_closed": self.gap_closed(case, scenario, [run]).value}
-                    | {name: float(np.mean(own[name][run])) for name in MEANS}
-                    | {"failures": int(np.sum(own["failures"][run]))}
-                )
+                cost = float(own["J"][run].mean())
+                known["J"] = cost if np.isfinite(cost) else np.inf
+                known |= {"regret": found.value, **_ends("regret", found.t)}
+                known["gap_closed"] = self.gap_closed(case, scenario, [run]).value
+                known |= {name: float(own[name][run].mean()) for name in MEANS}
+                rows.append(known | {"failures": int(own["failures"][run].sum())})
         frame = pd.DataFrame(rows, columns=RUN_COLUMNS)
         return frame.astype({"training_seed": "Int64"})
 
@@ -264,6 +244,13 @@ class StudyResults(Shown):
         middle = order[(len(order) - 1) // 2 : len(order) // 2 + 1]
         median = self.regret(case, scenario, list(middle))
         spread = over_runs([values[order]]) if len(runs) > 1 else Estimate(float(values[0]))
+        best, other = self.reference("optimum", scenario), self.cases[case].get("against")
+        wide: Interval = None
+        found: tuple[float, Interval, float] = (np.nan, None, np.nan)
+        if best is not None and not self._single(case, scenario):
+            wide = two_way(own["J"], best)
+        if best is not None and other is not None and len(self.indicator(other, scenario)):
+            found = paired_difference(*self._pairs(case, other, scenario), best)
         return {
             "scenario": scenario,
             "case": case,
@@ -282,24 +269,20 @@ class StudyResults(Shown):
             "gap_closed_median": self.gap_closed(case, scenario, list(middle)).value,
             **{name: float(np.median(runs[name])) for name in MEANS},
             "failures": int(own["failures"].sum()),
-            **self._wide(case, scenario),
-            **self._difference(case, scenario),
+            **_ends("regret_wide", wide),
+            "against": other,
+            "difference": found[0],
+            **_ends("difference", found[1]),
+            "difference_p": found[2],
         }
 
     def _single(self, case: str, scenario: str) -> bool:
         """Whether a case has one training only: nothing is known of its spread."""
         return bool(self.cases[case]["trained"]) and len(self.indicator(case, scenario)) < 2
 
-    def _wide(self, case: str, scenario: str) -> dict[str, float]:
-        """Interval of the median regret over training seeds and noise together."""
-        best, interval = self.reference("optimum", scenario), None
-        if best is not None and not self._single(case, scenario):
-            interval = two_way(self._paired(case, scenario), best)
-        return _ends("regret_wide", interval)
-
     def _pairs(self, case: str, other: str, scenario: str) -> tuple[Array, Array]:
         """J (R, S) of two cases over the training seeds that both have; a controller has any."""
-        costs = [self._paired(name, scenario) for name in (case, other)]
+        costs = [self.indicator(name, scenario) for name in (case, other)]
         seeds = [self.of(name, scenario).training_seed for name in (case, other)]
         if seeds[0].notna().all() and seeds[1].notna().all():
             common = sorted(set(seeds[0]) & set(seeds[1]))
@@ -309,19 +292,6 @@ class StudyResults(Shown):
             ]
         one, two = np.broadcast_arrays(*costs)
         return one, two
-
-    def _difference(self, case: str, scenario: str) -> dict[str, Any]:
-        """Paired difference of the regrets of a case and of that which it is `against`."""
-        other, best = self.cases[case].get("against"), self.reference("optimum", scenario)
-        found: tuple[float, Any, float] = (float("nan"), None, float("nan"))
-        if other is not None and best is not None and len(self.indicator(other, scenario)):
-            found = paired_difference(*self._pairs(case, other, scenario), best)
-        return {
-            "against": other,
-            "difference": found[0],
-            **_ends("difference", found[1]),
-            "difference_p": found[2],
-        }
 
     def _ranked(self, scenario: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """Give rows that cannot be told from the first of their group its rank."""
@@ -482,19 +452,20 @@ class StudyResults(Shown):
 
     def draw(self, folder: Path) -> dict[str, list[str]]:
         """Draw all figures into a folder; returns their names by scenario, "" for all."""
-        folder.mkdir(parents=True, exist_ok=True)
-        names: dict[str, list[str]] = {}
-        for scenario in (*self.scenarios, ""):
-            names[scenario] = []
-            for kind, maker in self._makers.items():
-                if (scenario or kind == "profile") and (drawn := maker(scenario)) is not None:
-                    names[scenario].append(f"{kind}-{safe(scenario)}" if scenario else kind)
-                    for suffix in SUFFIXES:
-                        save(drawn, folder / f"{names[scenario][-1]}.{suffix}")
-        return names
+        return {
+            scenario: save_set(
+                (
+                    (f"{kind}-{safe(scenario)}" if scenario else kind, drawn)
+                    for kind, maker in self._makers.items()
+                    if (scenario or kind == "profile") and (drawn := maker(scenario)) is not None
+                ),
+                folder,
+            )
+            for scenario in (*self.scenarios, "")
+        }
 
-    @cached_property
-    def _looks(self) -> Mapping[str, Any]:
+    @property
+    def _looks(self) -> dict[str, Look]:
         return palette(list(self.cases))
 
     def _regret(self, scenario: str) -> Figure | None:
@@ -643,15 +614,12 @@ class StudyResults(Shown):
             return "No run is finished."
         text = f"Table, regret and profile: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
         text += "samples."
+        text += " Learning curves: "
         if noise := self.about.get("curves", {}).get(scenario):
-            text += f" Learning curves: {noise[0]} other seeds × {noise[1]} samples."
-        else:
-            text += " Learning curves: other noise, and fewer samples."
+            text += f"{noise[0]} other seeds × {noise[1]} samples."
+        else:  # of an older version
+            text += "other noise, and fewer samples."
         return text + " Regrets of a case differ between the two."
-
-
-def _finite(value: Any) -> float:
-    return float(value) if np.isfinite(value) else float("inf")
 
 
 def _ends(name: str, interval: tuple[float, float] | None) -> dict[str, float]:

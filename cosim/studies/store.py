@@ -13,17 +13,19 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.files import read_json, write_atomically
 from cosim.plugins import changed
 from cosim.studies.document import TrajectoryTable
 from cosim.studies.plan import EVALUATION, GREEDY, Online, Run
-from cosim.text_tables import cell, csv_pieces, csv_text, read_records
+from cosim.studies.tables import read_table, to_csv
 
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
@@ -31,14 +33,10 @@ FAILURE, ONLINE, TIMING = "failure.txt", "online.csv", "timing.csv"
 OURS = (CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, ONLINE, TIMING)
 PATTERNS = ("trajectory-*.csv", "greedy-*.csv")
 INDICATORS = (
-    "J",
-    "economic_cost",
-    "mean_violation",
-    "violating_share",
-    "input_effort",
-    "failures",
-)
-KEY = ("seed", "steps", "burn_in")
+    "J", "economic_cost", "mean_violation", "violating_share", "input_effort", "failures",
+)  # fmt: skip
+KEY = ["seed", "steps", "burn_in"]
+BLOCKS = ["seed", "steps", "block", "J"]
 PAUSE = 20
 """Of the time that a table took to write, what passes at least until it is written again."""
 Figures = dict[str, float]
@@ -59,6 +57,31 @@ class Trained:
     clock: Mapping[int, float] = field(default_factory=dict)
 
 
+def measured(folder: Path, run: Run, file: str) -> pd.DataFrame:
+    """What a file of a run holds, by noise seed, of runs as long as the plan's.
+
+    Raises StudyError where it is damaged.
+    """
+    if not (folder / file).is_file():
+        return pd.DataFrame(columns=[*KEY, *INDICATORS]).set_index("seed")
+    columns = () if file == TIMING else (*KEY, *INDICATORS)
+    rows = read_table(folder / file, columns, dict.fromkeys(KEY, int))
+    steps = run.noise[EVALUATION if file == TIMING else file][1]
+    rows = rows[(rows.steps == steps) & (rows.burn_in == run.burn_in(file))]
+    return rows.drop_duplicates("seed").set_index("seed")
+
+
+def accompanied(folder: Path, online: Online) -> pd.DataFrame:
+    """Mean costs of a controller's blocks by training seed, as long as the plan's.
+
+    Raises StudyError where the file is damaged.
+    """
+    if not (folder / ONLINE).is_file():
+        return pd.DataFrame(columns=BLOCKS)
+    rows = read_table(folder / ONLINE, BLOCKS, dict.fromkeys(BLOCKS[:3], int))
+    return rows[(rows.steps == online.steps) & (rows.block == online.block)]
+
+
 class RunStore:
     """The files of one run; `run.facts` say all that its results depend on.
 
@@ -74,7 +97,7 @@ class RunStore:
         self._run = run
         self._facts = json.loads(json.dumps(run.facts))
         self._known: dict[str, dict[int, Figures]] = {}
-        self._unwritten: dict[str, float] = {}
+        self._unwritten: set[str] = set()
         self._next: dict[str, float] = {}
         if not self.folder.resolve().is_relative_to(out.resolve()):
             raise StudyError(f"'{self.folder}' leads out of '{out}'; choose another --out")
@@ -134,11 +157,6 @@ class RunStore:
         return str(self._about.get("status", ""))
 
     @property
-    def about(self) -> Mapping[str, Any]:
-        """run.json: `facts`, and of a training `status`, `samples`, `plant_samples`, `timing`."""
-        return self._about
-
-    @property
     def log(self) -> str:
         """The training's learning.csv, whose first row has θ at the start."""
         return (self.folder / LOG).read_text("utf-8")
@@ -163,27 +181,17 @@ class RunStore:
     def indicators(self, file: str) -> dict[int, Figures]:
         """Indicators by noise seed that a file holds of runs as long as the plan's, read once."""
         if file not in self._known:
-            self._known[file] = self._read(file)
+            rows = self._whole(file, lambda: measured(self.folder, self._run, file))
+            self._known[file] = rows.drop(columns=KEY, errors="ignore").to_dict("index")
         return self._known[file]
 
-    def _read(self, file: str) -> dict[int, Figures]:
-        path, wanted = self.folder / file, self._length(file)
-        if not path.is_file():
-            return {}
+    def _whole(self, file: str, read: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+        """What is read of a file; nothing of a damaged one, which is named."""
         try:
-            found = {}
-            for row in read_records(path, StudyError):
-                seed, steps, burn_in = (int(row.pop(name)) for name in KEY)
-                if (steps, burn_in) == wanted:
-                    found[seed] = {name: float(value or "nan") for name, value in row.items()}
-            return found
-        except (StudyError, KeyError, ValueError):
-            self.remarks.append(f"'{path}' is damaged; made anew")
-            return {}
-
-    def _length(self, file: str) -> tuple[int, int]:
-        name = EVALUATION if file == TIMING else file
-        return self._run.noise[name][1], self._run.burn_in(name)
+            return read()
+        except StudyError:
+            self.remarks.append(f"'{self.folder / file}' is damaged; made anew")
+            return pd.DataFrame()
 
     def missing(self, file: str) -> list[int]:
         """Noise seeds without indicators in a file."""
@@ -195,12 +203,10 @@ class RunStore:
     ) -> None:
         """Add indicators to a file, and what the clock said to timing.csv."""
         self.indicators(file).update(found)
-        changed = [file]
         if file == EVALUATION:
             self.indicators(TIMING).update(clock)
-            changed = [file, TIMING]
-        for name in changed:
-            self._unwritten.setdefault(name, 0.0)
+        for name in (file, TIMING) if file == EVALUATION else (file,):
+            self._unwritten.add(name)
             if time.monotonic() >= self._next.get(name, 0.0):
                 self._write(name)
 
@@ -211,50 +217,34 @@ class RunStore:
 
     def _write(self, file: str) -> None:
         # The rows of many seeds are written again and again: the pause keeps that a small share.
-        begin, known = time.monotonic(), self._known[file]
-        names = list(next(iter(known.values()))) if file == TIMING else list(INDICATORS)
-        length = [str(value) for value in self._length(file)]
-        rows = (
-            [str(seed), *length, *(cell(known[seed][name]) for name in names)]
-            for seed in sorted(known)
-        )
-        write_atomically(self.folder / file, csv_pieces((*KEY, *names), rows))
+        begin = time.monotonic()
+        rows = pd.DataFrame.from_dict(self._known[file], "index").sort_index()
+        steps = self._run.noise[EVALUATION if file == TIMING else file][1]
+        for place, value in enumerate((rows.index, steps, self._run.burn_in(file))):
+            rows.insert(place, KEY[place], value)
+        write_atomically(self.folder / file, to_csv(rows))
         self._next[file] = time.monotonic() + PAUSE * (time.monotonic() - begin)
-        del self._unwritten[file]
+        self._unwritten.discard(file)
 
-    def online(self, online: Online) -> dict[int, list[float]]:
-        """Mean costs of blocks by training seed."""
-        path = self.folder / ONLINE
-        found: dict[int, list[float]] = {}
-        if not path.is_file():
-            return found
-        try:
-            for row in read_records(path, StudyError):
-                if (int(row["steps"]), int(row["block"])) == (online.steps, online.block):
-                    found.setdefault(int(row["seed"]), []).append(float(row["J"]))
-        except (StudyError, KeyError, ValueError):
-            self.remarks.append(f"'{path}' is damaged; made anew")
-            return {}
-        return found
+    def _beside(self, online: Online) -> pd.DataFrame:
+        rows = self._whole(ONLINE, lambda: accompanied(self.folder, online))
+        return rows.reindex(columns=BLOCKS)
 
     def missing_online(self) -> list[int]:
         """Seeds of trainings that the controller has not run beside yet."""
         if self._run.online is None:
             return []
-        known = self.online(self._run.online)
+        known = set(self._beside(self._run.online).seed)
         return [seed for seed in self._run.online.seeds if seed not in known]
 
     def accompany(self, seed: int, costs: Sequence[float]) -> None:
         """Add the mean costs of a run's blocks."""
         online = self._run.online
         assert online is not None
-        known = self.online(online) | {seed: list(costs)}
-        rows = (
-            [str(one), str(online.steps), str(online.block), cell(cost)]
-            for one, costs in sorted(known.items())
-            for cost in costs
-        )
-        write_atomically(self.folder / ONLINE, csv_text(("seed", "steps", "block", "J"), rows))
+        own = {"seed": seed, "steps": online.steps, "block": online.block, "J": costs}
+        rows = [*self._beside(online).to_dict("records"), *pd.DataFrame(own).to_dict("records")]
+        table = pd.DataFrame(rows).sort_values("seed", kind="stable")
+        write_atomically(self.folder / ONLINE, to_csv(table))
 
     @property
     def settling(self) -> float:

@@ -20,7 +20,8 @@ from cosim.studies.document import read as read_study
 from cosim.studies.pictures import LOGS, TRAJECTORIES
 from cosim.studies.plan import EVALUATION, RUNS
 from cosim.studies.report import TABLES
-from cosim.studies.results import ABOUT, CURVES, TIMING, StudyResults
+from cosim.studies.results import ABOUT, CURVES, StudyResults
+from cosim.studies.store import TIMING
 from cosim.text_tables import csv_text, parse_rows
 from cosim.validation import describe, suggestion
 

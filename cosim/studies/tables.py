@@ -23,12 +23,15 @@ TYPES: dict[str, Any] = {"scenario": str, "case": str, "training_seed": "Int64",
 def read_table(
     path: Path, columns: Sequence[str] = (), types: Mapping[str, Any] | None = None
 ) -> pd.DataFrame:
-    """Columns of a CSV, all if none is named; `types` beside `TYPES`. Raises StudyError."""
+    """Columns of a CSV, all if none is named, with those of `types`, which go beside `TYPES`.
+
+    Raises StudyError.
+    """
     header, *rows = read_csv(path, StudyError)
     kinds = TYPES | dict(types or {})
     frame = pd.DataFrame()
     try:
-        for name in columns or header:
+        for name in dict.fromkeys([*(columns or header), *(types or ())]):
             texts = [row[header.index(name)] for row in rows]
             frame[name] = _converted(texts, kinds.get(name, float))
         if any(len(row) != len(header) for row in rows):

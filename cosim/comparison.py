@@ -237,6 +237,10 @@ def _first(differs: Sequence[bool] | np.ndarray) -> int | None:
 
 def as_document(comparison: Comparison) -> dict[str, Any]:
     """Return the comparison as plain values, ready for JSON."""
+    signals = {d.name: asdict(d) for d in comparison.differences}
+    for row in signals.values():
+        for name in ("name", "a", "b"):
+            del row[name]
     return {
         "equal": comparison.equal,
         "first_difference": comparison.first,
@@ -245,11 +249,5 @@ def as_document(comparison: Comparison) -> dict[str, Any]:
         "only_second": list(comparison.only_b),
         "units": {name: list(units) for name, units in comparison.units.items()},
         "order": comparison.order,
-        "signals": {d.name: _row(d) for d in comparison.differences},
-    }
-
-
-def _row(difference: Difference) -> dict[str, Any]:
-    return {
-        key: value for key, value in asdict(difference).items() if key not in ("name", "a", "b")
+        "signals": signals,
     }

@@ -30,11 +30,6 @@ TD_WINDOW = 10_000
 """Samples over which a TD error is averaged (paper.tex, fig. nmpc_learn)."""
 
 
-def undefined() -> Interval:
-    """No interval."""
-    return None
-
-
 @dataclass(frozen=True)
 class Estimate:
     """A value with its 95 % intervals, (low, high): `t` is Student's, `bootstrap` over seeds.
@@ -46,7 +41,7 @@ class Estimate:
 
     value: float
     t: Interval = None
-    resample: Callable[[], Interval] = field(default=undefined, repr=False, compare=False)
+    resample: Callable[[], Interval] = field(default=lambda: None, repr=False, compare=False)
 
     @cached_property
     def bootstrap(self) -> Interval:
@@ -75,7 +70,8 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     The t interval is that of the linearised ratio (delta method): residuals (aₛ − r bₛ)/mean(b).
     NaN without intervals where the denominator's mean is zero.
     """
-    below, value = float(np.mean(denominator)), quotient(numerator, denominator)
+    below = float(np.mean(denominator))
+    value = float(np.mean(numerator)) / below if below else float("nan")
     if not np.isfinite(value):
         return Estimate(value)
     return Estimate(
@@ -156,14 +152,11 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
     value = float(interquartile_mean(np.concatenate(list(strata))))
     if any(len(runs) < 2 for runs in strata) or not all(np.isfinite(r).all() for r in strata):
         return Estimate(value)
-    return Estimate(value, None, lambda: _resampled_runs(strata))
 
-
-def _resampled_runs(strata: Sequence[Array]) -> Interval:
-    def statistic(*resampled: Array, axis: int) -> Any:
+    def middle(*resampled: Array, axis: int) -> Any:
         return interquartile_mean(np.concatenate(resampled, axis=axis), axis)
 
-    return _resampled(strata, statistic, paired=False, method="percentile")
+    return Estimate(value, None, lambda: _resampled(strata, middle, False, "percentile"))
 
 
 def td_error_mean(
@@ -209,12 +202,6 @@ def decimals(value: float, digits: int) -> int:
     return min(max(digits - 1 - floor(log10(abs(value))), 0), 9)
 
 
-def quotient(numerator: Array, denominator: Array) -> float:
-    """Ratio of the means alone; NaN where the denominator's is zero."""
-    below = float(np.mean(denominator))
-    return float(np.mean(numerator)) / below if below else float("nan")
-
-
 def _magnitude(reference: Array) -> Array:
     """The reference with the sign that makes its mean positive: a cost may be a profit."""
     return -reference if float(np.mean(reference)) < 0 else reference
@@ -237,11 +224,11 @@ def _bootstrap(samples: Sequence[Array], statistic: Any) -> tuple[float, float] 
     # BCa is undefined for a statistic that no seed moves; its interval is the point.
     if np.ptp(jackknife) <= 1e-12 * max(1.0, abs(value)):
         return value, value
-    return _resampled(samples, statistic, paired=True, method="BCa")
+    return _resampled(samples, statistic, True, "BCa")
 
 
 def _resampled(
-    samples: Sequence[Array], statistic: Any, *, paired: bool, method: str
+    samples: Sequence[Array], statistic: Any, paired: bool, method: str
 ) -> tuple[float, float]:
     """Bootstrap interval with a fixed seed: the same values give the same interval."""
     interval = stats.bootstrap(
@@ -275,7 +262,8 @@ def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float,
     NaN for fewer than two pairs.
     """
     below = _magnitude(optimum)
-    each = _finite_or_infinite((cost - other).mean(axis=1)) / below.mean()
+    each = (cost - other).mean(axis=1) / below.mean()
+    each = np.where(np.isnan(each), np.inf, each)  # a cost that is no number is the worst
     ranks, count = stats.rankdata(np.abs(each)), len(each)
     if count > 12:
         flips = np.random.default_rng(0).choice([-1.0, 1.0], size=(RESAMPLES, count))
@@ -285,11 +273,6 @@ def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float,
     p = (1 + reached.sum()) / (1 + len(flips)) if count > 12 else reached.mean()
     interval = _two_way(cost - other, below)
     return float(np.median(each)), interval, float(p) if count > 1 else float("nan")
-
-
-def _finite_or_infinite(values: Array) -> Array:
-    """NaN becomes infinite: a cost that is no number is the worst."""
-    return np.where(np.isnan(values), np.inf, values)
 
 
 def _two_way(terms: Array, below: Array) -> Interval:

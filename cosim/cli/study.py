@@ -271,8 +271,7 @@ def update(
         studies = stored.stored_studies(folder)
         for name in stored.chosen(studies, names or list(studies)):
             out = folder / stored.WORK / name
-            _execute(folder / f"{name}.toml", out, out_, jobs=jobs)
-            stored.report(out)
+            _execute(folder / f"{name}.toml", out, out_, jobs=jobs).report()
             for table in stored.store(folder, name, out):
                 out_.note(f"{name}: {table} is too large to be stored")
         stored.write_readme(folder, studies)

@@ -63,19 +63,18 @@ def _client(address: str) -> Iterator[tuple[Any, Any]]:
         # A client made for an address where nobody answers can hang when it is dropped.
         try:
             found = asyncio.run(_identity(dask, address))
-            if found.get("type") != "Scheduler":
-                raise ValueError(f"a {found.get('type', 'program')} answers, not a scheduler")
+            if not isinstance(found, dict) or found.get("type") != "Scheduler":
+                raise ValueError("what answers is no scheduler")
             client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
         except Exception as error:
             raise EvaluationError(
                 f"the Dask cluster at '{address}' does not answer: {_line(error)}"
             ) from None
         try:
-            try:
-                client.wait_for_workers(1, timeout=WORKER_SECONDS)
-            except TimeoutError:
-                raise _without_worker(address) from None
+            client.wait_for_workers(1, timeout=WORKER_SECONDS)
             yield dask, client
+        except TimeoutError:
+            raise _without_worker(address) from None
         finally:
             with suppress(Exception):
                 client.close(timeout=ANSWER_SECONDS)
@@ -84,29 +83,27 @@ def _client(address: str) -> Iterator[tuple[Any, Any]]:
 @contextmanager
 def _translated(dask: Any, address: str) -> Iterator[None]:
     """Say in a line what becomes of a cluster."""
+    same = (
+        "install the same version of rti-cosim, and what the items need, on scheduler and workers"
+    )
     try:
         yield
     except dask.KilledWorker as error:
-        raise EvaluationError(
-            f"workers of the cluster died again and again: {_line(error)}"
-        ) from None
+        text = f"workers of the cluster died again and again: {_line(error)}"
     except ModuleNotFoundError as error:
-        raise EvaluationError(
-            f"a worker of the cluster cannot import '{error.name}'; install the same version of "
-            "rti-cosim, and what the items need, on scheduler and workers"
-        ) from None
+        text = f"a worker of the cluster cannot import '{error.name}'; {same}"
     except (CancelledError, OSError, TimeoutError) as error:
-        raise EvaluationError(
+        text = (
             f"the Dask cluster at '{address}' is gone or does not answer ({_line(error)}); what is "
             "finished is stored: the same command goes on"
-        ) from None
+        )
     except RuntimeError as error:
         if "deserialization" not in str(error):
             raise
-        raise EvaluationError(
-            f"the Dask cluster at '{address}' cannot read its items; install the same version of "
-            "rti-cosim, and what they need, on scheduler and workers"
-        ) from None
+        text = f"the Dask cluster at '{address}' cannot read its items; {same}"
+    else:
+        return
+    raise EvaluationError(text)
 
 
 @contextmanager
@@ -130,29 +127,21 @@ def _without_worker(address: str) -> EvaluationError:
     )
 
 
-async def _identity(dask: Any, address: str) -> dict[str, Any]:
+async def _identity(dask: Any, address: str) -> Any:
     """What a scheduler says of itself; raises TimeoutError where it says nothing."""
-    return await asyncio.wait_for(_ask(dask, address), ANSWER_SECONDS)
-
-
-async def _ask(dask: Any, address: str) -> dict[str, Any]:
-    security = dask.Security().get_connection_args("client")
-    comm = await import_module("distributed.comm").connect(
-        address, timeout=ANSWER_SECONDS, **security
-    )
-    try:
-        await comm.write({"op": "identity", "reply": True})
-        answer: Any = await comm.read()
-    finally:
-        comm.abort()
-    if not isinstance(answer, dict):
-        raise ValueError("what answers does not speak as Dask does")
-    return answer
+    connect = import_module("distributed.comm").connect
+    async with asyncio.timeout(ANSWER_SECONDS):
+        security = dask.Security().get_connection_args("client")
+        comm = await connect(address, timeout=ANSWER_SECONDS, **security)
+        try:
+            await comm.write({"op": "identity", "reply": True})
+            return await comm.read()
+        finally:
+            comm.abort()
 
 
 def _line(error: BaseException) -> str:
     """What an error says, or is, in at most a line."""
-    text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, TimeoutError):
         return f"no answer within {ANSWER_SECONDS:g} s"
-    return text if len(text) <= 300 else f"{text[:300]}…"
+    return " ".join(str(error).split())[:300] or type(error).__name__

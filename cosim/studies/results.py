@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -113,10 +113,10 @@ class StudyResults(Shown):
         """
         return cls(folder, collect.document(plan), *collect.frames(plan, folder))
 
-    def write(self, plan: Plan, *, figures: bool = True) -> None:
+    def write(self, plan: Plan, *, figures: bool = True) -> StudyResults:
         """Write the study's tables and kept files; study.json last, so that its word is true.
 
-        `figures` draws the kept trajectories and logs, too.
+        `figures` draws the kept trajectories and logs, too; returns the results that name them.
         """
         from cosim.studies import pictures  # noqa: PLC0415 - needs controllers
 
@@ -141,8 +141,9 @@ class StudyResults(Shown):
             tables[AGGREGATE] = self.aggregate
         for name, table in tables.items():
             write_atomically(out / name, to_csv(table))
-        about = json.dumps(dict(self.about) | {"pictures": drawn}, indent=1, sort_keys=True)
-        write_atomically(out / ABOUT, about + "\n")
+        about = dict(self.about) | {"pictures": drawn}
+        write_atomically(out / ABOUT, json.dumps(about, indent=1, sort_keys=True) + "\n")
+        return replace(self, about=about)
 
     @property
     def name(self) -> str:

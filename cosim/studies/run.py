@@ -424,8 +424,7 @@ def study(
     for line in runner.remarks:
         report(State(0, 0, len(planned.runs), 0), line)
     runner.go(jobs, scheduler)
-    results = StudyResults.collect(planned, folder)
-    results.write(planned, figures=figures)
+    results = StudyResults.collect(planned, folder).write(planned, figures=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
         more = len(runner.failures) - 1

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import numpy as np
 import pandas as pd
 from pydantic import Field, ValidationError
 
+from cosim.comparison import RunSignals, compare
 from cosim.errors import ResultsError
-from cosim.files import read_toml, write_atomically
+from cosim.files import read_json, read_toml, write_atomically
 from cosim.studies.document import StudyTable, Table
 from cosim.studies.document import read as read_study
 from cosim.studies.pictures import LOGS, TRAJECTORIES
@@ -22,12 +21,15 @@ from cosim.studies.plan import EVALUATION, RUNS
 from cosim.studies.report import TABLES
 from cosim.studies.results import ABOUT, CURVES, StudyResults
 from cosim.studies.store import TIMING
-from cosim.text_tables import csv_text, parse_rows
+from cosim.studies.tables import KEYS, to_csv
+from cosim.trajectory import Signal
 from cosim.validation import describe, suggestion
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"
 """Folder within the folder: what long studies have finished."""
+UNCOMPARED = ["status", "residual"]
+"""Words, and what is of the size of rounding."""
 LARGEST = 4_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
 SUFFIXES = (".csv", ".toml", ".md", ".svg", ".png")
@@ -86,9 +88,7 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
         kept = path.suffix in SUFFIXES or path.name == ABOUT
         if not path.is_file() or relative.parts[0] == RUNS or path.name == TIMING or not kept:
             continue
-        content = path.read_bytes()
-        if path.suffix == ".csv":
-            content = rounded_csv(content.decode()).encode()
+        content = rounded_csv(path) if path.suffix == ".csv" else path.read_bytes()
         if len(content) > LARGEST:
             left_out.append(relative.as_posix())
             continue
@@ -97,11 +97,6 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
     shutil.rmtree(target, ignore_errors=True)
     fresh.replace(target)
     return left_out
-
-
-def report(out: Path) -> None:
-    """Draw a study's figures and write its report as Markdown."""
-    StudyResults.load(out).report()
 
 
 def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
@@ -150,17 +145,12 @@ def load_tolerances(folder: Path) -> dict[str, Tolerance]:
         raise ResultsError(f"'{path}': {describe(error, _Tolerances)}") from None
 
 
-def compared_tables(folder: Path) -> dict[str, tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Tables of a study's folder that a check compares: key columns, and columns left out."""
-    run = ("scenario", "case", "training_seed")
-    found: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-        EVALUATION: ((*run, "seed"), ()),
-        CURVES: ((*run, "samples"), ()),
-    }
-    for path in sorted((folder / LOGS).glob("*.csv")):
-        found[path.relative_to(folder).as_posix()] = (("samples",), ())
-    for path in sorted((folder / TRAJECTORIES).glob("**/*.csv")):
-        found[path.relative_to(folder).as_posix()] = (("time",), ("status", "residual"))
+def compared_tables(folder: Path) -> dict[str, list[str]]:
+    """Key columns of the tables of a study's folder that a check compares."""
+    found = {EVALUATION: [*KEYS, "seed"], CURVES: [*KEYS, "samples"]}
+    for kept, key in ((LOGS, "samples"), (TRAJECTORIES, "time")):
+        for path in sorted((folder / kept).glob("**/*.csv")):
+            found[path.relative_to(folder).as_posix()] = [key]
     return found
 
 
@@ -175,7 +165,7 @@ def differences(
     wanted, found = compared_tables(stored), compared_tables(now)
     extra = [table for table in found if table not in wanted]
     lines = [f"{name}: {table} is computed but not stored" for table in extra]
-    for table, (keys, drop) in reversed(wanted.items()):
+    for table, keys in reversed(wanted.items()):
         if not (stored / table).is_file():
             raise ResultsError(
                 f"the stored table '{stored / table}' is missing; make it with: "
@@ -184,27 +174,30 @@ def differences(
         if not (now / table).is_file():
             lines.append(f"{name}: {table} is stored but not computed any more")
             continue
-        one, other = (_read(folder / table, list(keys), drop) for folder in (stored, now))
+        one, other = (_read(folder / table, keys) for folder in (stored, now))
         lines += _table_differences(f"{name}/{table}", one, other, tolerances)
-    if lines and EVALUATION in wanted and (now / EVALUATION).is_file():
-        lines[:0] = [f"{name}: {words}" for words in _cause(stored, now, tolerances)]
+        if lines and table == EVALUATION:  # the last of them
+            about = read_json(stored / ABOUT, f"'{stored / ABOUT}'", ResultsError)
+            lines[:0] = [f"{name}: {words}" for words in _cause(about, one, other, tolerances)]
     return lines
 
 
-def _cause(stored: Path, now: Path, tolerances: Mapping[str, Tolerance]) -> list[str]:
+def _cause(
+    about: Mapping[str, Any],
+    stored: pd.DataFrame,
+    now: pd.DataFrame,
+    tolerances: Mapping[str, Tolerance],
+) -> list[str]:
     """Where to look, by the cases whose evaluation differs; [] where none does.
 
     The optimum is a stored table, so that it differs with the plant and the cost alone; controllers
     that learn nothing differ with their model and problem too, and the others with their algorithm.
     """
-    keys, drop = compared_tables(stored)[EVALUATION]
-    both = [_read(folder / EVALUATION, list(keys), drop) for folder in (stored, now)]
-    about = json.loads((stored / ABOUT).read_text("utf-8"))
     cases = {case["name"]: case for case in about["cases"]}
     differing = []
     for case in cases:
-        was, value = (frame[frame.index.get_level_values("case") == case] for frame in both)
-        if _table_differences("", was, value, tolerances):
+        one, other = (t[t.index.get_level_values("case") == case] for t in (stored, now))
+        if _table_differences("", one, other, tolerances):
             differing.append(case)
     if not differing:
         return []
@@ -220,12 +213,8 @@ def _cause(stored: Path, now: Path, tolerances: Mapping[str, Tolerance]) -> list
     return [f"evaluations that differ: {', '.join(differing)}; the same: {same}; look at {place}"]
 
 
-def _read(path: Path, keys: list[str], drop: tuple[str, ...]) -> pd.DataFrame:
-    """A stored CSV by its key columns; `attrs` are the units of its signals.
-
-    Raises ResultsError if a key's column is missing, two rows have the same keys, or another column
-    holds something else than numbers.
-    """
+def _read(path: Path, keys: list[str]) -> pd.DataFrame:
+    """A stored CSV by its key columns; `attrs` are the units of its signals."""
     try:
         frame = pd.read_csv(path, dtype=str, na_filter=False)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
@@ -233,7 +222,7 @@ def _read(path: Path, keys: list[str], drop: tuple[str, ...]) -> pd.DataFrame:
     parts = {title: title.removesuffix("]").partition(" [") for title in frame}
     frame = frame.rename(columns={title: name for title, (name, _, _) in parts.items()})
     try:
-        frame = frame.map(_rounded).set_index(keys).drop(columns=list(drop), errors="ignore")
+        frame = frame.map(_rounded).set_index(keys).drop(columns=UNCOMPARED, errors="ignore")
         frame = frame.replace("", "nan").astype(float)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"the stored table '{path}' is damaged: {error}") from None
@@ -246,11 +235,7 @@ def _read(path: Path, keys: list[str], drop: tuple[str, ...]) -> pd.DataFrame:
 def _table_differences(
     name: str, stored: pd.DataFrame, now: pd.DataFrame, tolerances: Mapping[str, Tolerance]
 ) -> list[str]:
-    """What differs between two tables, in words.
-
-    The first row that differs is named by its keys, with each signal that differs there, both
-    values, unit and tolerance; rows that only one has are named too.
-    """
+    """What differs between two tables, in words: rows of one alone, the first row that differs."""
     lines = []
     for one, other, text in (
         (stored, now, "stored but not computed any more"),
@@ -259,26 +244,29 @@ def _table_differences(
         if len(lone := one.index[~one.index.isin(other.index)]):
             lines.append(f"{name}: row {_row(one, lone[0])} is {text}")
     common = stored.index[stored.index.isin(now.index)]
-    firsts = {}
-    for signal in (column for column in stored if column in now):
-        allowed = _tolerance(str(signal), stored.attrs[signal], tolerances)
-        was, value = (table.loc[common, signal].to_numpy() for table in (stored, now))
-        same = (was == value) | (np.isnan(was) & np.isnan(value))
-        beyond = ~same & ~(np.abs(was - value) <= allowed.absolute)
-        if beyond.any():
-            row = int(np.argmax(beyond))
-            firsts[signal] = (row, float(was[row]), float(value[row]), allowed)
-    begin = min((row for row, *_ in firsts.values()), default=0)
-    for signal, (row, was, value, allowed) in sorted(firsts.items(), key=lambda i: i[1][0] > begin):
-        where = f"{name}: row {_row(stored, common[row])}: signal {signal}"
-        unit = "" if allowed.unit in ("", "1") else f" {allowed.unit}"
+    units = now.attrs | stored.attrs
+    a, b = (
+        RunSignals(name, {c: Signal(c, units[c], t.loc[common, c].to_numpy()) for c in t})
+        for t in (stored, now)
+    )
+    allowed = {c: _tolerance(c, units[c], tolerances) for c in stored if c in now}
+    result = compare(a, b, {signal: one.absolute for signal, one in allowed.items()})
+    first = result.first
+    for found in sorted(result.differences, key=lambda one: one.first != first):
+        if found.first is None:
+            continue
+        where = f"{name}: row {_row(stored, common[found.first])}: signal {found.name}"
+        if found.first != first:
+            lines.append(f"{where} differs from here on")
+            continue
+        was, value = (float(run.signals[found.name].values[found.first]) for run in (a, b))
+        unit = allowed[found.name].unit.removeprefix("1")
         lines.append(
-            f"{where} differs from here on" if row > begin else
             f"{where} is {value!r} now, {was!r} stored: {abs(value - was):.3g} apart, tolerance "
-            f"{allowed.absolute:g}{unit}"
-        )  # fmt: skip
-    for one, other, text in ((stored, now, "stored, not computed"), (now, stored, "not stored")):
-        if lost := [str(signal) for signal in one if signal not in other]:
+            f"{found.tolerance:g} {unit}".rstrip()
+        )
+    for lost, text in ((result.only_a, "stored, not computed"), (result.only_b, "not stored")):
+        if lost:
             lines.append(f"{name}: signal {', '.join(lost)} is {text}")
     return lines
 
@@ -303,10 +291,9 @@ def _row(table: pd.DataFrame, row: object) -> str:
     return ", ".join(f"{key}={value}" for key, value in pairs if value)
 
 
-def rounded_csv(text: str) -> str:
-    """A CSV with numbers of eight digits, as tables are stored: a last bit is no change."""
-    header, *rows = parse_rows(text)
-    return csv_text(header, ([_rounded(cell) for cell in row] for row in rows))
+def rounded_csv(path: Path) -> bytes:
+    """A CSV file with numbers of eight digits, as tables are stored: a last bit is no change."""
+    return to_csv(pd.read_csv(path, dtype=str, na_filter=False).map(_rounded)).encode()
 
 
 def _rounded(cell: str) -> str:

@@ -39,21 +39,7 @@ _HOMES = {
     "simulate": "cosim.simulation",
     "train": "learning.training",
 }
-__all__ = [
-    "Evaluation",
-    "FmuPlant",
-    "Parameters",
-    "Scenario",
-    "Study",
-    "StudyResults",
-    "Training",
-    "Trajectory",
-    "build_controller",
-    "evaluate",
-    "simulate",
-    "study",
-    "train",
-]
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -47,8 +47,12 @@ def import_from(folder: str | Path) -> None:
 
 
 @contextmanager
-def _importable() -> Iterator[None]:
-    """Search the folders of `import_from` and the working directory after all other places."""
+def _importing(module: str) -> Iterator[None]:
+    """Search the folders of `import_from` and the working directory after all other places.
+
+    What is imported meanwhile is noted as brought by the module.
+    """
+    before = set(sys.modules)
     here = [folder for folder in (*_folders, str(Path.cwd())) if Path(folder) != ROOT]
     added = [folder for folder in here if folder not in sys.path]
     for package in OURS:  # a folder of such a name would be found before an editable install
@@ -63,6 +67,8 @@ def _importable() -> Iterator[None]:
         for folder in added:
             with suppress(ValueError):
                 sys.path.remove(folder)
+        _brought.setdefault(module, set()).update(set(sys.modules) - before)
+        _hash_foreign_modules()
 
 
 def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
@@ -77,18 +83,14 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
     module, _, attribute = target.partition(":")
     if module.partition(".")[0] not in OURS:
         watch(f"plug-in '{target}'")
-    before = set(sys.modules)
     try:
-        with _importable():
+        with _importing(module):
             found: Any = importlib.import_module(module)
         for part in attribute.split("."):
             found = getattr(found, part)
     # A module may raise anything while it is imported, and one that is a script may even exit.
     except (Exception, SystemExit) as cause:
         raise error(f"{what} cannot be imported: {blamed(cause)}") from cause
-    finally:
-        _brought.setdefault(module, set()).update(set(sys.modules) - before)
-        _hash_foreign_modules()
     return found
 
 
@@ -132,9 +134,8 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
     factory = load_plugin(target, f"controller '{name}'", ControllerLookupError)
     if not callable(factory):
         raise ControllerLookupError(f"controller '{name}' is not a factory of one scenario")
-    before = set(sys.modules)
     try:
-        with _importable():
+        with _importing(target.partition(":")[0]):
             controller = factory(scenario)
     except TypeError as error:
         raise ControllerLookupError(
@@ -146,9 +147,6 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
                 f"the factory of controller '{name}' failed: {blamed(error)}"
             ) from error
         raise
-    finally:
-        _brought[target.partition(":")[0]].update(set(sys.modules) - before)
-        _hash_foreign_modules()
     if not isinstance(controller, Controller):
         raise ControllerLookupError(
             f"controller '{name}' made a {type(controller).__name__}, which lacks reset, prepare "

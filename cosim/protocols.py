@@ -149,14 +149,9 @@ class Recorder(Protocol):
         """Finish the record; also called when the run fails."""
 
 
-def is_solver_failure(error: BaseException) -> bool:
-    """Whether an exception is a controller's declared failure to solve its problem."""
-    return bool(getattr(type(error), "is_solver_failure", False))
-
-
 def recover(controller: Controller, error: Exception) -> None:
     """Reset a controller that declared this failure; raise every other error."""
-    if not is_solver_failure(error):
+    if not getattr(type(error), "is_solver_failure", False):
         raise error
     controller.reset()
 

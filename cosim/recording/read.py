@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 import warnings
 from collections import Counter, defaultdict
 from dataclasses import dataclass
@@ -24,14 +21,6 @@ from cosim.recording.stream import SAMPLE, SIGNAL, TIME
 
 _SCALARS = rr.Scalars.descriptor_scalars().component
 _STATUS = rr.StateChange.descriptor_state().component
-
-
-PROBE = """\
-import sys, warnings
-from rerun.chunk import RrdReader
-warnings.simplefilter("ignore")
-RrdReader(sys.argv[1]).stream().to_chunks()
-"""
 
 
 @dataclass(frozen=True)
@@ -127,7 +116,6 @@ def _chunks(path: Path) -> list[Chunk]:
     try:
         if not path.is_file():
             raise RecordingError(f"there is no recording {path}")
-        _require_survivable(path)
         with warnings.catch_warnings():
             # A file without its end is reported below, once.
             warnings.simplefilter("ignore", RerunWarning)
@@ -137,16 +125,6 @@ def _chunks(path: Path) -> list[Chunk]:
             f"{path} is not a readable recording ({str(error).splitlines()[0]}); if its process "
             "was killed, repair it with: rerun rrd optimize FILE -o REPAIRED"
         ) from None
-
-
-def _require_survivable(path: Path) -> None:
-    """Read the file in a process of its own first: some damage makes Rerun's reader abort."""
-    probe = subprocess.run(
-        [sys.executable, "-c", PROBE, str(path)], capture_output=True, check=False
-    )
-    if probe.returncode < 0:
-        name = signal.Signals(-probe.returncode).name
-        raise RecordingError(f"{path} is not a readable recording (its reader died by {name})")
 
 
 def _texts(column: pa.Array) -> list[str]:

@@ -27,15 +27,6 @@ SHARE = 0.1
 EPISODE_STEPS = 500
 SHOWN = 120
 """Samples that a rendered image looks back."""
-_SEED_LIMIT = 1 << 63
-
-
-def _spaces(plant: FmuPlant) -> tuple[gymnasium.Space[Array], gymnasium.Space[Array]]:
-    """Observation space, as wide as the FMU says its states can be, and action space."""
-    observation = Box(*plant.state_range, dtype=np.float64)
-    lower, upper = plant.scenario.action_lower.copy(), plant.scenario.action_upper.copy()
-    action = Box(lower, upper, dtype=np.float64)
-    return observation, action
 
 
 class PlantEnv(gymnasium.Env[Array, Array]):
@@ -59,7 +50,10 @@ class PlantEnv(gymnasium.Env[Array, Array]):
             )
         self.render_mode = render_mode
         self._plant = FmuPlant(scenario)
-        self.observation_space, self.action_space = _spaces(self._plant)
+        limits = self.scenario.action_lower.copy(), self.scenario.action_upper.copy()
+        # As wide as the FMU says its states can be.
+        self.observation_space = Box(*self._plant.state_range, dtype=np.float64)
+        self.action_space = Box(*limits, dtype=np.float64)
         self._states: deque[Array] = deque(maxlen=SHOWN + 1)
         self._actions: deque[Array] = deque(maxlen=SHOWN)
 
@@ -77,7 +71,8 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         if unknown:
             raise PlantError(f"unknown reset option {sorted(unknown)}; there is initial_state")
         start = (options or {}).get("initial_state")
-        s = self._plant.reset(_plant_seed(seed, self.np_random), start)
+        drawn = int(self.np_random.integers(1 << 63)) if seed is None else spawn_seeds(seed)[0]
+        s = self._plant.reset(drawn, start)
         self._states.clear()
         self._actions.clear()
         self._states.append(s)
@@ -114,12 +109,6 @@ class PlantEnv(gymnasium.Env[Array, Array]):
     def close(self) -> None:
         """Free the plant."""
         self._plant.close()
-
-
-def _plant_seed(seed: int | None, rng: np.random.Generator) -> int:
-    if seed is not None:
-        return spawn_seeds(seed)[0]
-    return int(rng.integers(_SEED_LIMIT))
 
 
 def normalised(

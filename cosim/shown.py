@@ -17,7 +17,7 @@ class Shown:
 
     def _facts(self) -> Mapping[str, object]:
         """What is shown of it, by label."""
-        raise NotImplementedError
+        return {}
 
     def _picture(self) -> Figure | None:
         """The picture below the facts in a notebook."""

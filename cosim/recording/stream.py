@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
-import tempfile
+import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -97,16 +97,14 @@ class Stream:
 
     def __init__(self, path: str | Path, name: str, layout: rrb.Blueprint) -> None:
         self.path = check_target(path)
+        name_of_partial = f".{self.path.stem}.{secrets.token_hex(4)}.partial.rrd"
+        self._partial = self.path.with_name(name_of_partial)
         try:
-            handle, name_of_partial = tempfile.mkstemp(
-                dir=self.path.parent, prefix=f".{self.path.stem}.", suffix=".partial.rrd"
-            )
-            os.close(handle)
+            self._partial.touch()
         except OSError as error:
             raise RecordingError(
                 f"cannot write the recording {self.path}: {error.strerror}"
             ) from None
-        self._partial = Path(name_of_partial)
         # Without it a column of the wrong shape is dropped with no more than a warning.
         rr.set_strict_mode(True)
         self._stream = rr.RecordingStream("rti-cosim")

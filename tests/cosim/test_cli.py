@@ -59,35 +59,6 @@ def test_a_written_scenario_repeats_the_run(cosim, tmp_path):
     assert files[0] == files[1]
 
 
-def test_simulate_takes_a_factory_from_the_working_directory(cosim, tmp_path):
-    (tmp_path / "my_controller.py").write_text(
-        "import numpy as np\nfrom types import SimpleNamespace\n"
-        "class Mine:\n"
-        "    def reset(self): pass\n"
-        "    def prepare(self): pass\n"
-        "    def feedback(self, s, a=None):\n"
-        "        nan = float('nan')\n"
-        "        return SimpleNamespace(action=np.array([200., 200.]), value=nan, residual=nan,\n"
-        "            status='solved', predicted_states=None, predicted_actions=None)\n"
-        "def make(scenario): return Mine()\n"
-    )
-    code, out, err = cosim(
-        "simulate", "-c", "my_controller:make", "--steps", 5, "--out", "o", "--json"
-    )
-    assert code == 0, err
-    assert json.loads(out)["controller"] == "my_controller:make"
-
-
-def test_simulate_takes_a_parameters_file(cosim, tmp_path, paper):
-    from controllers.factories import naive
-
-    naive(paper).parameters.save(tmp_path / "theta.toml")
-    assert cosim("simulate", "--steps", 30, "--out", "a")[0] == 0
-    assert cosim("simulate", "-c", "theta.toml", "--steps", 30, "--out", "b")[0] == 0
-    files = [(tmp_path / folder / "trajectory.csv").read_bytes() for folder in ("a", "b")]
-    assert files[0] == files[1]
-
-
 def test_a_foreign_fmu_is_announced_with_its_hash(cosim, tmp_path):
     import hashlib
 

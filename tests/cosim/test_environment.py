@@ -71,13 +71,6 @@ def test_later_episodes_of_a_seed_differ_and_repeat(env):
     assert episodes() == first
 
 
-def test_an_episode_is_truncated_by_the_time_limit():
-    env = gymnasium.make("cosim/Evaporator-v0", max_episode_steps=3)
-    env.reset(seed=0)
-    assert [env.step(np.array([200.0, 200.0]))[3] for _ in range(3)] == [False, False, True]
-    env.close()
-
-
 def test_episodes_can_start_from_a_given_state(env):
     start = np.array([30.0, 60.0])
     np.testing.assert_array_equal(env.reset(seed=0, options={"initial_state": start})[0], start)
@@ -105,19 +98,3 @@ def test_the_vector_form_is_many_single_ones():
     vector.close()
     for single in singles:
         single.close()
-
-
-def test_the_vector_form_starts_a_new_episode_in_the_step_after_truncation():
-    vector = gymnasium.make_vec("cosim/Evaporator-v0", num_envs=2, max_episode_steps=2)
-    first, _ = vector.reset(seed=1)
-    action = np.full((2, 2), 200.0)
-    assert not vector.step(action)[3].any()
-    assert vector.step(action)[3].all()
-    states, rewards, _, truncated, info = vector.step(action)
-    np.testing.assert_array_equal(states, first)
-    np.testing.assert_array_equal(rewards, 0.0)
-    assert not truncated.any()
-    assert "stage_cost" not in info
-    after = vector.step(action)
-    assert after[4]["_stage_cost"].all()
-    vector.close()

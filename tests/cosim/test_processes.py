@@ -92,18 +92,6 @@ def test_a_child_has_its_exit_code_and_its_temporary_files_in_its_folder(tmp_pat
     assert (tmp_path / "here").read_text() == str(tmp_path)
 
 
-def test_sigterm_unwinds_the_command_and_says_so(tmp_path):
-    options = ["--controller", "naive", "--steps", "2000000", "--out", str(tmp_path / "out")]
-    with start_cosim("simulate", "--scenario", "paper", *options) as process:
-        assert eventually((tmp_path / "out").is_dir)
-        time.sleep(1.0)  # into the run
-        process.terminate()
-        _, words = process.communicate(timeout=60)
-    assert process.returncode == 143
-    assert words == "terminated\n"
-    assert list((tmp_path / "out").iterdir()) == []
-
-
 HOLD = (
     "import sys, time\n"
     "from pathlib import Path\n"
@@ -176,14 +164,6 @@ def test_an_fmu_that_ends_the_process_is_one_line_and_exit_code_2(tmp_path, faul
     (line,) = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
     assert words in line
     assert list((tmp_path / "out").iterdir()) == []
-
-
-@SLOW
-@pytest.mark.parametrize("fault", [5, 6, 7, 10], ids=["chdir", "closes all", "SIGTERM", "thread"])
-def test_an_fmu_that_meddles_has_no_exit_code_0_without_results(tmp_path, fault):
-    result = run_foreign(tmp_path, build_kind(tmp_path, 3), fault)
-    assert (result.returncode == 0) <= (tmp_path / "out" / "summary.json").exists()
-    assert fault != 7 or result.returncode == 143
 
 
 def test_json_and_notes_come_through_the_watching_process(tmp_path):

@@ -19,11 +19,8 @@ pytest.importorskip("distributed")
 FORMS = [
     "",
     "nonsense",
-    "processes",
-    "tcp://127.0.0.1:port",
     "tcp://127.0.0.1:9",
     "tcp://127.0.0.1:99999",
-    "tcp://no\0where:1",
     "tls://127.0.0.1:9",
     "gateway://x:1",
 ]

@@ -16,7 +16,7 @@ from benchmarks.kill import JOBS, campaign
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.factories import naive
 from controllers.qp.backends import DaqpBackend
-from cosim import FmuPlant, Scenario, processes, simulate
+from cosim import FmuPlant, Scenario, simulate
 from tests.helpers.command import run_cosim
 from tests.helpers.drawing import skip_without_driver
 from tests.helpers.tank import build_tank, write_scenario
@@ -110,22 +110,6 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, wo
     said = refused(command_line(tmp_path, *words.split(), "--out", "locked"))
     assert "cannot write to folder 'locked': Permission denied" in said
     assert not list(folder.iterdir())
-
-
-def test_a_folder_that_was_locked_in_mid_run_is_one_line(tmp_path):
-    (tmp_path / "lock.py").write_text(LOCKING + STILL)
-    words = ["simulate", "-c", "lock:make", "-n", "20", "--out", "out"]
-    said = refused(command_line(tmp_path, *words))
-    assert "Permission denied" in said
-    # In a folder that is locked, not even the command's own lock can be removed.
-    left = {path.name for path in (tmp_path / "out").iterdir()}
-    assert left <= {processes.LOCK, processes.HOLDER}
-
-
-LOCKING = """
-from pathlib import Path
-Path("out").chmod(0o555)
-"""
 
 
 # Clocks ----------------------------------------------------------------------------------------

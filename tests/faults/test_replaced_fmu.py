@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 import fmus
-from controllers.factories import naive
-from cosim import FmuPlant, Scenario, evaluate, simulate
+from cosim import Scenario, evaluate
 from cosim.errors import EvaluationError, PlantError
 from cosim.studies import run
 from tests.helpers.loop import Proportional
@@ -31,32 +30,6 @@ def replacing(scenario, how):
 
 
 HOW = ["another FMU", "nothing"]
-
-
-@pytest.mark.parametrize("how", HOW)
-def test_a_plant_keeps_to_what_it_was_made_from(scenario, how):
-    with FmuPlant(scenario) as plant:
-        whole = simulate(plant, naive(scenario), 40, 0).to_csv()
-    with FmuPlant(scenario) as plant:
-        digest = plant.fmu_sha256
-
-        class Replacing(Proportional):
-            def prepare(self):
-                if self.left == 20:
-                    replacing(scenario, how)
-                self.left -= 1
-                policy.prepare()
-
-            def feedback(self, s, a=None):
-                return policy.feedback(s, a)
-
-            def reset(self):
-                policy.reset()
-
-        policy, controller = naive(scenario), Replacing(scenario)
-        controller.left = 40
-        assert simulate(plant, controller, 40, 0).to_csv() == whole
-        assert plant.fmu_sha256 == digest
 
 
 @pytest.mark.parametrize("how", HOW)

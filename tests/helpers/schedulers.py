@@ -40,18 +40,13 @@ def silent(connection: socket.socket) -> None:
     """Say nothing."""
 
 
-def noise(connection: socket.socket) -> None:
-    with suppress(OSError):
-        connection.sendall(b"\xff" * 4096)
-
-
 def web(connection: socket.socket) -> None:
     with suppress(OSError):
         connection.sendall(b"HTTP/1.0 400 Bad request\r\n\r\n")
         connection.close()
 
 
-ANSWERS = {answer.__name__: answer for answer in (silent, noise, web)}
+ANSWERS = {answer.__name__: answer for answer in (silent, web)}
 
 
 @dataclass

@@ -95,13 +95,15 @@ def no_process(command, **_):
     yield SimpleNamespace(wait=lambda: 0, command=command)
 
 
-def test_the_window_binds_loopback(recording, monkeypatch):
-    commands = []
+def test_the_window_binds_loopback_and_calls_nobody(recording, monkeypatch):
+    started = []
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(
-        viewer, "child_process", lambda *a, **k: commands.append(*a) or no_process(*a)
+        viewer, "child_process", lambda *a, **k: started.append((*a, *k.values())) or no_process(*a)
     )
     open_viewer(recording)
-    command = commands[0]
+    ((command, environment),) = started
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert command[-1] == str(recording)
+    assert environment["CI"] == "true"
+    assert environment["https_proxy"] == environment["HTTP_PROXY"] == "http://127.0.0.1:9"

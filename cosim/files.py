@@ -73,28 +73,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def publish(temporary: Path, path: Path) -> None:
-    """Rename a complete file into place, synchronised and with the rights of any new file.
-
-    Raises OSError, and what `check_target` raises.
-    """
+    """Rename a complete file into place, synchronised; raises OSError, as `check_target` too."""
     check_target(path)
     with temporary.open("rb+") as stream:
         os.fsync(stream.fileno())
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(0o666 & ~umask)
     temporary.replace(path)
 
 
-def write_atomically(path: str | Path, data: bytes | str | Iterable[str]) -> Path:
-    """Write a file as `replacing` does.
-
-    Text, whole or in pieces that are written as they come, is encoded as UTF-8.
-    """
-    pieces = (data,) if isinstance(data, bytes | str) else data
-    with replacing(path) as temporary, temporary.open("xb") as stream:
-        for piece in pieces:
-            stream.write(piece.encode() if isinstance(piece, str) else piece)
+def write_atomically(path: str | Path, data: bytes | str) -> Path:
+    """Write a file as `replacing` does; text is encoded as UTF-8."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
     return Path(path)
 
 

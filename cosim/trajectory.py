@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim import text_tables
 from cosim.errors import TrajectoryError
-from cosim.files import write_atomically
+from cosim.files import replacing, write_atomically
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
 from cosim.shown import Shown
 from cosim.signals import signal_names, whole
-from cosim.text_tables import PIECE, csv_pieces
+from cosim.text_tables import csv_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 STATUS = "status"
+PART = 10_000
 SOLVED = "solved"
 QUANTILES = {"median_us": 0.5, "p95_us": 0.95, "p99_us": 0.99, "max_us": 1.0}
 FALLBACK = "fallback"
@@ -163,34 +166,36 @@ class Trajectory(Shown):
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
-        return "".join(self._csv())
+        stream = io.StringIO()
+        self._write(stream)
+        return stream.getvalue()
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `to_csv` to a file, whole or not at all."""
-        return write_atomically(path, self._csv())
+        with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
+            self._write(stream)
+        return Path(path)
 
     def write_timing_csv(self, path: str | Path) -> Path:
         """Write the wall-clock times in µs to a file of their own, one row per sample."""
         header = [f"{name} [us]" for name in self.timing]
         rows = ([f"{1e6 * v:.3f}" for v in row] for row in _rows(list(self.timing.values())))
-        return write_atomically(path, csv_pieces(header, rows))
+        return write_atomically(path, csv_text(header, rows))
 
-    def _csv(self) -> Iterator[str]:
+    def _write(self, stream: TextIO) -> None:
         signals, counted = list(self.signals.values()), whole()
-        numbers = _rows([signal.values for signal in signals])
         text = [(lambda v: repr(int(v))) if s.name in counted else repr for s in signals]
-        rows = (
-            [*(write(value) for write, value in zip(text, row, strict=True)), status]
-            for row, status in zip(numbers, self.status, strict=True)
-        )
-        return csv_pieces([*(signal.header for signal in signals), STATUS], rows)
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*(signal.header for signal in signals), STATUS])
+        numbers = _rows([signal.values for signal in signals])
+        for row, status in zip(numbers, self.status, strict=True):
+            writer.writerow([*(write(v) for write, v in zip(text, row, strict=True)), status])
 
 
 def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:
-    """Rows of equally long columns, turned to Python's numbers a part at a time."""
-    for first in range(0, len(columns[0]) if columns else 0, PIECE):
-        parts = (column[first : first + PIECE].tolist() for column in columns)
-        yield from zip(*parts, strict=True)
+    """Rows of equally long columns; a part at a time, since Python's numbers take more memory."""
+    for first in range(0, len(columns[0]) if columns else 0, PART):
+        yield from zip(*(column[first : first + PART].tolist() for column in columns), strict=True)
 
 
 def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:

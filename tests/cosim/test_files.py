@@ -11,6 +11,7 @@ from cosim.files import (
     cache_folder,
     read_json,
     read_toml,
+    replacing,
     temporary_folder,
     write_atomically,
 )
@@ -21,12 +22,9 @@ posix = pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
 def test_what_stood_there_survives_a_failure(tmp_path, monkeypatch):
     path = write_atomically(tmp_path / "file", "old")
 
-    def broken():
-        yield "half"
+    with pytest.raises(RuntimeError), replacing(path) as half:
+        half.write_text("half")
         raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        write_atomically(path, broken())
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(5, "disk full")))
     with pytest.raises(OSError, match="disk full") as caught:
         write_atomically(path, "new")

@@ -12,7 +12,7 @@ from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from learning.algorithm import Transition
 from learning.errors import ConfigurationError
-from learning.prediction_errors import KnownPenalty, OneStepModel
+from learning.prediction_errors import OneStepModel, known_penalty
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -79,7 +79,7 @@ class BackOffSearch:
                 f"a search of the back-off needs at least {least} samples, it has {budget}"
             )
         self.start, self._budget = start, budget
-        self._penalty, self._model = KnownPenalty(scenario), OneStepModel(scenario)
+        self._penalty, self._model = scenario.state_penalty, OneStepModel(scenario)
         self._settling = problem.horizon
         n, self._actions = problem.n_states, problem.n_actions
         self._n = n
@@ -213,7 +213,7 @@ class BackOffSearch:
         def estimate(value: float) -> float:
             near = np.abs(kappa - value) < reach + RESOLUTION / 2
             moved = states[near] + np.outer(value - kappa[near], slope[1:])
-            return float(slope[0] * value + self._penalty(moved).mean())
+            return float(slope[0] * value + known_penalty(self._penalty, moved).mean())
 
         def best_of(values: Vector) -> float:
             costs = mean + np.array([estimate(value) for value in values])

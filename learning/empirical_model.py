@@ -25,7 +25,6 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim.protocols import recover
-from learning.prediction_errors import SortedErrors
 
 Array = NDArray[np.float64]
 PARAMETER_DEVIATION = 0.15
@@ -233,28 +232,6 @@ class Rollout:
             h[step] = size[0]
             s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
         return len(picks)
-
-
-def bound_costs(
-    problem: Problem, predicted: Array, scales: Array, errors: SortedErrors, widened: float
-) -> Array:
-    """Mean penalty of each bound, lower then upper, (2n,): its expectation over all errors.
-
-    `predicted` states f and `scales` h, (M, n) each; s₊ = f + `widened` h e.
-    """
-    n = problem.n_states
-    costs = np.zeros(2 * n)
-    for i in range(n):
-        h = widened * scales[:, i]
-        for above, bound in ((False, problem.state_lower[i]), (True, problem.state_upper[i])):
-            if not np.isfinite(bound):
-                continue
-            first, second = errors.beyond(i, (bound - predicted[:, i]) / h, above=above)
-            penalty = (
-                problem.penalty_linear[i] * h * first + problem.penalty_quadratic[i] * h**2 * second
-            )
-            costs[i + n * above] = penalty.mean()
-    return costs
 
 
 def _design(G: Array, standardised: Array) -> Array:

@@ -22,11 +22,12 @@ from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim.penalty import Penalty
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import group, prefixed
 from learning.configuration import Configuration, Count
-from learning.empirical_model import EmpiricalModel, Features, Rollout, bound_costs
-from learning.prediction_errors import SortedErrors
+from learning.empirical_model import EmpiricalModel, Features, Rollout
+from learning.prediction_errors import SortedErrors, expected_penalties
 from learning.step import moved
 
 Array = NDArray[np.float64]
@@ -252,6 +253,12 @@ class BackOffs:
         n = problem.n_states
         self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
         self._start, self._rng = visited[-1, :n], rng
+        self._penalty = Penalty(
+            problem.state_lower,
+            problem.state_upper,
+            problem.penalty_linear,
+            problem.penalty_quadratic,
+        )
         errors = model.residuals[:, :n]
         self._errors = SortedErrors(errors)
         self._widened = 1 + TAIL * (TAIL_SAMPLES / len(errors)) ** 0.5
@@ -281,7 +288,9 @@ class BackOffs:
         inputs, predicted, h = (part[BURN:] for part in parts)
         if len(inputs) < len(picks) - BURN or not np.isfinite(predicted).all():
             return Promise(np.inf, np.zeros_like(model.mean))
-        penalties = bound_costs(self._problem, predicted, h, self._errors, self._widened)
+        penalties = expected_penalties(
+            self._penalty, predicted[:, :n], self._errors, self._widened * h
+        ).T.reshape(-1)
         stage = float(predicted[:, n].mean())
         self._worth = np.maximum(self._worth, penalties / abs(stage))
         return Promise(stage + float(penalties.sum()), model.cost_row(inputs[::THINNED]))

@@ -10,6 +10,7 @@ from controllers.functions import BufferedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim.penalty import Penalty
 from cosim.scenario import Scenario
 
 Vector = NDArray[np.float64]
@@ -64,31 +65,11 @@ class OneStepModel:
         return np.atleast_2d(next_states) - predicted
 
 
-class KnownPenalty:
-    """p(x) of many states at once: the scenario's penalty of its true bounds."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._lower, self._upper = scenario.state_lower, scenario.state_upper
-        self._linear, self._quadratic = scenario.penalty_linear, scenario.penalty_quadratic
-
-    def __call__(self, states: Matrix) -> Vector:
-        """Penalty of states (…, n), shape (…)."""
-        violation = np.maximum(np.maximum(self._lower - states, states - self._upper), 0.0)
-        penalty: Vector = (violation * (self._linear + self._quadratic * violation)).sum(axis=-1)
-        return penalty
-
-    def expected(self, predictions: Matrix, errors: SortedErrors) -> float:
-        """Mean of p(f + e) over predictions f (K, n) and the errors, all pairs.
-
-        The penalty is a sum over states and bounds, so sums over the errors beyond a bound do.
-        """
-        total = 0.0
-        for i, column in enumerate(predictions.T):
-            low = errors.beyond(i, self._lower[i] - column)
-            high = errors.beyond(i, self._upper[i] - column, above=True)
-            for first, second in (low, high):
-                total += float((self._linear[i] * first + self._quadratic[i] * second).mean())
-        return total
+def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
+    """Penalty of many states (…, n), shape (…)."""
+    violation = penalty.violation(states)
+    found: Vector = (violation * (penalty.linear + penalty.quadratic * violation)).sum(axis=-1)
+    return found
 
 
 class SortedErrors:
@@ -117,6 +98,25 @@ class SortedErrors:
         return np.maximum(linear, 0.0), np.maximum(quadratic, 0.0)
 
 
+def expected_penalties(
+    penalty: Penalty, predictions: Matrix, errors: SortedErrors, scales: Matrix | None = None
+) -> Matrix:
+    """Mean penalty of each state's lower and upper bound, (n, 2), over all pairs f + h e.
+
+    `predictions` f and `scales` h are (K, n), h one if not given. The penalty is a sum over states
+    and bounds, so sums over the errors beyond a bound do.
+    """
+    costs = np.zeros((predictions.shape[1], 2))
+    for i, predicted in enumerate(predictions.T):
+        h = np.ones(len(predicted)) if scales is None else scales[:, i]
+        for k, bound in enumerate((penalty.lower[i], penalty.upper[i])):
+            if np.isfinite(bound):
+                first, second = errors.beyond(i, (bound - predicted) / h, above=bool(k))
+                due = penalty.linear[i] * h * first + penalty.quadratic[i] * h**2 * second
+                costs[i, k] = due.mean()
+    return costs
+
+
 class PredictionErrors:
     """The last `capacity` errors e = s₊ − f(s, a), and the mean penalty that they make likely.
 
@@ -128,7 +128,7 @@ class PredictionErrors:
     KEPT = ("_errors", "_count")
 
     def __init__(self, scenario: Scenario, capacity: int) -> None:
-        self._penalty = KnownPenalty(scenario)
+        self._penalty = scenario.state_penalty
         self._errors = np.zeros((capacity, scenario.state_lower.size))
         self._count = 0
 
@@ -145,4 +145,5 @@ class PredictionErrors:
     def expected_penalty(self, prediction: Vector) -> float:
         """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""
         values = self.values
-        return float(self._penalty(prediction + values).mean()) if len(values) else float("nan")
+        due = known_penalty(self._penalty, prediction + values)
+        return float(due.mean()) if len(values) else float("nan")

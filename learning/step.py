@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,46 +92,35 @@ def td_step(td_error: float, gradient: Vector, step_size: float) -> Fit:
     )
 
 
-def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix | None = None) -> Fit:
+def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix) -> Fit:
     """Fit min ∇Jᵀd + dᵀFd/α (paper.tex, eq. pg_solution), d = −α F⁻¹∇J / 2.
 
-    `gradient` ∇J (n,) in scaled coordinates; `metric` F (n, n), positive definite, is the identity
-    for the plain gradient and the Fisher matrix E[∇π ∇πᵀ] for the natural one.
+    `gradient` ∇J (n,) in scaled coordinates; `metric` F (n, n), positive definite, the Fisher
+    matrix E[∇π ∇πᵀ].
     """
     half = -gradient / 2
-    if metric is None:
-        return Fit(half, step_size * half, lambda: np.eye(gradient.size) / step_size)
     minimiser = step_size * cho_solve(cho_factor(metric), half)
     return Fit(half, minimiser, lambda: metric / step_size)
 
 
-@dataclass(frozen=True)
-class Certificate:
-    """What vouches for a step: `eigenvalues`, the least of each Hessian block after it, by block.
+class Certificate(NamedTuple):
+    """What vouches for a step: the `smallest` eigenvalue of B_l and B_Vf after it.
 
     `corrected` says that the free step would have violated the constraint, `refused` that no
     admissible step was found and θ stays.
     """
 
-    eigenvalues: dict[str, float]
+    smallest: float
     corrected: bool = False
     refused: bool = False
-
-    @property
-    def smallest(self) -> float:
-        """Least eigenvalue of all blocks."""
-        return min(self.eigenvalues.values())
 
 
 def certificate(
     blocks: ThetaBlocks, theta: Vector, *, corrected: bool = False, refused: bool = False
 ) -> Certificate:
     """Least eigenvalue of B_l and B_Vf at θ."""
-    return Certificate(
-        {name: float(np.linalg.eigvalsh(matrix_of(blocks, theta, name))[0]) for name in HESSIANS},
-        corrected,
-        refused,
-    )
+    least = [np.linalg.eigvalsh(matrix_of(blocks, theta, name))[0] for name in HESSIANS]
+    return Certificate(float(min(least)), corrected, refused)
 
 
 def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
@@ -140,56 +129,45 @@ def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
     return block.unpack(theta[blocks.slices[name]] / block.packed_unit)
 
 
-class LinearMatrixInequality:
+def definite(
+    blocks: ThetaBlocks, theta: Vector, fit: Fit, smallest: float
+) -> tuple[Vector, Certificate]:
     """The fit's own minimiser under B ⪰ εI, by Clarabel where the free minimiser violates it.
 
     min dᵀMd − 2bᵀd  s.t.  B_l(θ+Sd) ⪰ εI, B_Vf(θ+Sd) ⪰ εI with scaled steps d (S = diag scale):
     a quadratic programme over positive semidefinite cones (paper.tex, eq. q_solution, pg_solution).
+    Returns the new θ; a failure of the solver refuses the step.
     """
-
-    def __init__(self, blocks: ThetaBlocks, smallest: float) -> None:
-        self._blocks, self._smallest = blocks, smallest
-        self._rows = {name: sdp.svec_order(blocks.block(name).dimension) for name in HESSIANS}
-
-    def __call__(self, theta: Vector, fit: Fit) -> tuple[Vector, Certificate]:
-        """Step of the constrained fit; a failure of the solver refuses the step."""
-        blocks = self._blocks
-        free = theta + blocks.scale * fit.minimiser
-        found = certificate(blocks, free)
-        if found.smallest >= self._smallest:
-            return free, found
-        step = self.solve(theta, fit)
-        if step is None:
-            return theta, certificate(blocks, theta, corrected=True, refused=True)
-        # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
-        theta = clip_eigenvalues(blocks, theta + blocks.scale * step, self._smallest)
-        return theta, certificate(blocks, theta, corrected=True)
-
-    def solve(self, theta: Vector, fit: Fit) -> Vector | None:
-        """Scaled step of the constrained fit by the conic solver, (n,), or None where it fails."""
-        blocks = self._blocks
-        size = blocks.size
-        matrices, offsets, cones = [], [], []
-        for name in HESSIANS:
-            block, where = blocks.block(name), blocks.slices[name]
-            order, weight = self._rows[name]
-            shifted = matrix_of(blocks, theta, name) - self._smallest * np.eye(block.dimension)
-            scale = blocks.scale[where] / block.packed_unit
-            rows = np.zeros((block.size, size))
-            rows[np.arange(block.size), where.start + order] = -weight * scale[order]
-            matrices.append(rows)
-            offsets.append(weight * block.pack(shifted)[order])
-            cones.append(sdp.semidefinite(block.dimension))
-        # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
-        metric = fit.metric()
-        unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
-        return sdp.solve(
-            2 * metric / unit,
-            -2 * fit.gradient / unit,
-            np.vstack(matrices),
-            np.concatenate(offsets),
-            cones,
-        ).x
+    free = theta + blocks.scale * fit.minimiser
+    found = certificate(blocks, free)
+    if found.smallest >= smallest:
+        return free, found
+    matrices, offsets, cones = [], [], []
+    for name in HESSIANS:
+        block, where = blocks.block(name), blocks.slices[name]
+        order, weight = sdp.svec_order(block.dimension)
+        shifted = matrix_of(blocks, theta, name) - smallest * np.eye(block.dimension)
+        scale = blocks.scale[where] / block.packed_unit
+        rows = np.zeros((block.size, blocks.size))
+        rows[np.arange(block.size), where.start + order] = -weight * scale[order]
+        matrices.append(rows)
+        offsets.append(weight * block.pack(shifted)[order])
+        cones.append(sdp.semidefinite(block.dimension))
+    # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
+    metric = fit.metric()
+    unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
+    step = sdp.solve(
+        2 * metric / unit,
+        -2 * fit.gradient / unit,
+        np.vstack(matrices),
+        np.concatenate(offsets),
+        cones,
+    ).x
+    if step is None:
+        return theta, certificate(blocks, theta, corrected=True, refused=True)
+    # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
+    theta = clip_eigenvalues(blocks, theta + blocks.scale * step, smallest)
+    return theta, certificate(blocks, theta, corrected=True)
 
 
 def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vector:
@@ -225,8 +203,7 @@ class ConstrainedStep:
         blocks = controller.parameters.blocks
         self.blocks = blocks if scale is None else rescaled(blocks, scale)
         self.scale: Vector = self.blocks.scale
-        least = least_eigenvalue(configuration, controller.parameters)
-        self._enforce = LinearMatrixInequality(self.blocks, least)
+        self._smallest = least_eigenvalue(configuration, controller.parameters)
         self._least = {block.name: np.array(block.least) for block in blocks if block.least}
 
     def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
@@ -238,15 +215,15 @@ class ConstrainedStep:
         theta = self._controller.theta
         if not np.isfinite(fit.minimiser).all():
             raise DivergenceError("the step of θ is not finite")
-        new, vouched = self._enforce(theta, fit)
+        new, vouched = definite(self.blocks, theta, fit, self._smallest)
         new = self._admissible(new)
         reach = 0.0 if fit.reach is None else fit.reach((new - theta) / self.scale)
         if reach > 1.0:
             new = theta + (new - theta) / reach
-            vouched = replace(certificate(self.blocks, new), corrected=vouched.corrected)
+            vouched = certificate(self.blocks, new, corrected=vouched.corrected)
         lower, upper = self.blocks.slices["x_l"], self.blocks.slices["x_u"]
         if not (new[lower] < new[upper]).all():
-            return theta, replace(certificate(self.blocks, theta), corrected=True, refused=True)
+            return theta, certificate(self.blocks, theta, corrected=True, refused=True)
         return new, vouched
 
     def take(self, fit: Fit, td_error: float) -> Update:
@@ -254,13 +231,8 @@ class ConstrainedStep:
         old = self._controller.theta
         new, vouched = self.proposal(fit)
         self._controller.theta = new
-        return Update(
-            td_error=td_error,
-            step=float(np.linalg.norm((new - old) / self.scale)),
-            smallest_eigenvalue=vouched.smallest,
-            corrected=vouched.corrected,
-            refused=vouched.refused,
-        )
+        size = float(np.linalg.norm((new - old) / self.scale))
+        return Update(td_error, size, *vouched)
 
     def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
         """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), and say so.

@@ -6,22 +6,18 @@ from controllers.theta import Parameters, ThetaBlocks
 from cosim.penalty import Penalty
 from learning.checkpoint import arrays_of, take_up
 from learning.prediction_errors import (
-    KnownPenalty,
     OneStepModel,
     PredictionErrors,
     SortedErrors,
+    expected_penalties,
+    known_penalty,
 )
 
 
 def test_the_penalty_of_many_states_is_that_of_each(scenario, rng):
     states = np.array([32.0, 60.0]) + rng.normal(size=(50, 2)) * [10.0, 20.0]
-    single = Penalty(
-        scenario.state_lower,
-        scenario.state_upper,
-        scenario.penalty_linear,
-        scenario.penalty_quadratic,
-    )
-    assert KnownPenalty(scenario)(states) == pytest.approx([single(list(s)) for s in states])
+    each = [scenario.state_penalty(list(s)) for s in states]
+    assert known_penalty(scenario.state_penalty, states) == pytest.approx(each)
 
 
 def test_the_model_rests_at_the_reference_steady_state(scenario):
@@ -34,14 +30,14 @@ def test_the_model_rests_at_the_reference_steady_state(scenario):
 
 def test_the_expected_penalty_has_the_mean_of_the_realised_one_and_less_spread(scenario, rng):
     """Plant s₊ = f + e with uniform e, as the model has it: both estimate E[p(s₊) | s, a]."""
-    penalty, errors = KnownPenalty(scenario), PredictionErrors(scenario, 4000)
+    penalty, errors = scenario.state_penalty, PredictionErrors(scenario, 4000)
     draws = rng.uniform(-2.0, 2.0, size=(4000, 2))
     for e in draws:
         errors.add(e)
     prediction = np.array([26.0, 60.0])
     exact = 1e5 * 1.0**2 / 2 / 4 + 1.0**3 / 3 / 4  # E[b v + B v²], v = max(-1 - e, 0)
     assert errors.expected_penalty(prediction) == pytest.approx(exact, rel=0.1)
-    realised = penalty(prediction + rng.uniform(-2.0, 2.0, size=(4000, 2)))
+    realised = known_penalty(penalty, prediction + rng.uniform(-2.0, 2.0, size=(4000, 2)))
     assert realised.mean() == pytest.approx(exact, rel=0.1)
     assert realised.std() > exact
 
@@ -57,12 +53,18 @@ def test_the_oldest_errors_are_forgotten(scenario):
     assert np.array_equal(other.values, errors.values)
 
 
-def test_all_pairs_are_averaged(scenario, rng):
-    penalty = KnownPenalty(scenario)
+def test_all_pairs_are_averaged_and_an_infinite_bound_costs_nothing(scenario, rng):
+    penalty = scenario.state_penalty
     predictions = np.array([25.0, 80.0]) + rng.normal(size=(5, 2))
-    errors = rng.normal(size=(7, 2))
-    one_by_one = [penalty(f + e) for f in predictions for e in errors]
-    assert penalty.expected(predictions, SortedErrors(errors)) == pytest.approx(np.mean(one_by_one))
+    errors, scales = rng.normal(size=(7, 2)), rng.uniform(0.5, 2.0, size=(5, 2))
+    one_by_one = [
+        penalty(f + h * e) for f, h in zip(predictions, scales, strict=True) for e in errors
+    ]
+    found = expected_penalties(penalty, predictions, SortedErrors(errors), scales)
+    assert found.sum() == pytest.approx(np.mean(one_by_one))
+    open_above = Penalty(penalty.lower, [np.inf, np.inf], penalty.linear, penalty.quadratic)
+    found_open = expected_penalties(open_above, predictions, SortedErrors(errors), scales)
+    assert found_open[:, 1].tolist() == [0.0, 0.0] and np.array_equal(found_open[:, 0], found[:, 0])
 
 
 def test_errors_are_those_of_the_model_with_thetas_parameters_and_offset(scenario, problem, rng):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controllers.theta import Parameters
-from learning.search_plan import (
+from learning.search import (
     Block,
     Learn,
     Learned,

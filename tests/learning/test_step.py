@@ -11,9 +11,9 @@ from learning.configuration import Configuration
 from learning.step import (
     ConstrainedStep,
     Fit,
-    LinearMatrixInequality,
     certificate,
     clip_eigenvalues,
+    definite,
     matrix_of,
     policy_gradient_fit,
     prior_deviation,
@@ -49,10 +49,9 @@ def test_td_fit_is_normalised_and_the_td_step_is_not(rng):
     check(td_step(2.0, gradient, 0.3))
 
 
-@pytest.mark.parametrize("natural", [False, True])
-def test_policy_gradient_fit_descends_and_equals_its_programme(rng, natural):
+def test_policy_gradient_fit_descends_and_equals_its_programme(rng):
     root = rng.normal(size=(SIZE, SIZE))
-    metric = root @ root.T + np.eye(SIZE) if natural else None
+    metric = root @ root.T + np.eye(SIZE)
     gradient = rng.normal(size=SIZE)
     fit = policy_gradient_fit(gradient, 0.7, metric)
     check(fit)
@@ -104,11 +103,10 @@ def objective(blocks, theta, new, fit):
 
 
 def test_every_step_is_definite_and_certified(blocks, parameters, rng):
-    enforce = LinearMatrixInequality(blocks, SMALLEST)
     theta = parameters.theta
     corrected = 0
     for _ in range(30):
-        new, vouched = enforce(theta, random_fit(blocks, rng))
+        new, vouched = definite(blocks, theta, random_fit(blocks, rng), SMALLEST)
         assert vouched.smallest >= SMALLEST * (1 - 1e-9)
         assert vouched.smallest == pytest.approx(certificate(blocks, new).smallest)
         assert not vouched.refused
@@ -118,7 +116,7 @@ def test_every_step_is_definite_and_certified(blocks, parameters, rng):
 
 def test_a_free_step_that_is_definite_is_taken_as_it_is(blocks, parameters, rng):
     fit = random_fit(blocks, rng, size=1e-3)
-    new, vouched = LinearMatrixInequality(blocks, SMALLEST)(parameters.theta, fit)
+    new, vouched = definite(blocks, parameters.theta, fit, SMALLEST)
     assert np.array_equal(new, parameters.theta + blocks.scale * fit.minimiser)
     assert not vouched.corrected
 
@@ -129,7 +127,7 @@ def test_lmi_step_equals_a_generic_conic_solution(blocks, parameters, rng):
         root = rng.normal(size=(blocks.size, blocks.size)) / np.sqrt(blocks.size)
         metric = root @ root.T + 0.3 * np.eye(blocks.size)
         fit = fit_towards(2.0 * rng.normal(size=blocks.size), metric)
-        new, vouched = LinearMatrixInequality(blocks, SMALLEST)(theta, fit)
+        new, vouched = definite(blocks, theta, fit, SMALLEST)
         assert vouched.corrected
         reference = projected_gradient(blocks, theta, fit)
         assert objective(blocks, theta, new, fit) == pytest.approx(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isnan
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,19 +14,9 @@ from scipy.linalg import cho_factor, cho_solve
 from controllers.errors import QpError
 from controllers.rti import LinearisationPoint
 from learning.algorithm import LearnableController, LearnableSolution, Transition, Update
-from learning.configuration import Configuration, Count, ExplorationProbability, ExplorationShare
+from learning.configuration import Count
 from learning.errors import DivergenceError
-from learning.q_learning import (
-    OUTLIER,
-    AverageCost,
-    Discount,
-    ErrorsKept,
-    InnovationClip,
-    MeasureOffset,
-    PriorWidth,
-    ValueRule,
-    VarianceMemory,
-)
+from learning.q_learning import OUTLIER, AverageCost, ValueConfiguration, ValueRule
 from learning.step import Fit
 
 Vector = NDArray[np.float64]
@@ -36,33 +26,16 @@ NEXT_POINT = tuple(f"next_{name}" for name in POINT)
 COLUMNS = ("number", "s", "a", "explored", "cost", "next_s", *POINT, *NEXT_POINT)
 
 
-class BatchQLearningConfiguration(Configuration):
+class BatchQLearningConfiguration(ValueConfiguration):
     """Hyperparameters of batch Q-learning."""
 
-    exploration_probability: ExplorationProbability = 0.3
-    exploration_share: ExplorationShare = 1 / 30
-    discount: Discount = None
-    prior_width: PriorWidth = 0.3
     batch_size: Count = Field(500, description="samples between two updates")
     first_batch: Count | None = Field(
         None,
         description="samples of the first batch, which gives noise and widths; as the others if "
         "not given",
     )
-    measure_offset: MeasureOffset = True
     relinearisations: Count = Field(2, description="replays and steps of θ per batch")
-    innovation_clip: InnovationClip = 3.0
-    variance_memory: VarianceMemory = 2000.0
-    prediction_errors: ErrorsKept = 1000
-
-    @property
-    def criterion(self) -> float:
-        """Discount of the TD error."""
-        return 1.0 if self.discount is None else self.discount
-
-    def narrowed(self, width: float) -> Self:
-        """Copy whose prior is `width` times as wide."""
-        return self.model_copy(update={"prior_width": width * self.prior_width})
 
 
 class BatchQLearning(ValueRule):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 from typing import Any
@@ -99,7 +98,7 @@ class TrainingLoop:
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
-        self._penalty, self._saturate = scenario.state_penalty, scenario.saturate
+        self._penalty = scenario.state_penalty
         self._applied = scenario.reference_action
         self._policy: LearnableSolution | None = None
         self._point: LinearisationPoint | None = None
@@ -111,7 +110,7 @@ class TrainingLoop:
         """Begin an episode at the state s (n,) to which the plant has been reset."""
         self.s = s
         self.controller.reset()
-        self._policy = self._solve()
+        self._policy = self._solve(self.s, prepare=True)
 
     @property
     def parameters(self) -> Parameters:
@@ -157,7 +156,7 @@ class TrainingLoop:
         """Solve once more for the present state, at the guess as it was: θ has moved."""
         if self._point is not None:
             self.controller.prepare_at(self._point)
-            self._policy = self._feedback(self.s)
+            self._policy = self._solve(self.s)
 
     def next(self) -> tuple[Transition | None, float]:
         """One sample of the plant: its transition, None after a failure, and its cost."""
@@ -165,7 +164,7 @@ class TrainingLoop:
         a, explored = (self._applied, False) if policy is None else self._choose(policy.action)
         action_value = policy
         if explored and self.algorithm.needs_action_value:
-            action_value = self._feedback(s, a)
+            action_value = self._solve(s, a)
         if policy is not None and number % CHECKED_EVERY == 0:
             self.counts.weakly_active += policy.weakly_active
             self.counts.licq_failed += not policy.licq
@@ -173,7 +172,7 @@ class TrainingLoop:
         for array in (s, a, step.s, step.disturbance):
             array.flags.writeable = False  # a rule reads what was measured, and changes nothing
         self._applied, self.s, self.counts.number = a, step.s, number + 1
-        self._policy = self._solve()
+        self._policy = self._solve(self.s, prepare=True)
         cost = step.stage_cost + step.penalty
         if policy is None or action_value is None or self._policy is None:
             return None, cost
@@ -200,12 +199,11 @@ class TrainingLoop:
         if not self.rests and getattr(self.algorithm, "explores", True):
             explored = self._strategy(action, self.rng)
         # The QP keeps bounds to its tolerance, the actuator exactly.
-        if explored is None:
-            return self._saturate(action), False
-        a = self._saturate(explored)
-        self.counts.explored += 1
-        self.counts.saturated += bool(((a == self._lower) | (a == self._upper)).any())
-        return a, True
+        a = np.clip(action if explored is None else explored, self._lower, self._upper)
+        if explored is not None:
+            self.counts.explored += 1
+            self.counts.saturated += bool(((a == self._lower) | (a == self._upper)).any())
+        return a, explored is not None
 
     def _asked(self, privilege: str) -> FmuPlant:
         """The plant with all that a simulator can; PrivilegeError where none was asked for."""
@@ -227,24 +225,15 @@ class TrainingLoop:
 
     # the controller -----------------------------------------------------------------------------
 
-    def _solve(self) -> LearnableSolution | None:
-        """V(s) and π(s) at the present state, prepared anew."""
-
-        def solve() -> LearnableSolution:
-            self.controller.prepare()
-            self._point = self.controller.linearisation_point
-            return self.controller.feedback(self.s)
-
-        return self._attempt(solve)
-
-    def _feedback(self, s: Vector, a: Vector | None = None) -> LearnableSolution | None:
-        """V(s) and π(s), or Q(s, a), as prepared."""
-        return self._attempt(lambda: self.controller.feedback(s, a))
-
-    def _attempt(self, solve: Callable[[], LearnableSolution]) -> LearnableSolution | None:
-        """What `solve` returns, or None where the controller fails, which is counted."""
+    def _solve(
+        self, s: Vector, a: Vector | None = None, *, prepare: bool = False
+    ) -> LearnableSolution | None:
+        """V(s) and π(s), or Q(s, a); None where the controller fails, which is counted."""
         try:
-            return solve()
+            if prepare:
+                self.controller.prepare()
+                self._point = self.controller.linearisation_point
+            return self.controller.feedback(s, a)
         except Exception as error:
             recover(self.controller, error)
         self.counts.failures += 1
@@ -257,13 +246,11 @@ class TrainingLoop:
         Called at a checkpoint in the run that goes on as in the one that resumes, so that both
         see the same digits ever after.
         """
-        point = self._point
         self.controller.reset()
-        if point is None:
-            self._policy = self._solve()
+        if self._point is None:
+            self._policy = self._solve(self.s, prepare=True)
         else:
-            self.controller.prepare_at(point)
-            self._policy = self._feedback(self.s)
+            self.renew()
 
     # checkpoints --------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,57 +42,58 @@ AS_PRINTED: dict[str, Any] = {
 }
 """Hyperparameters of the rule as the paper prints it (paper.tex, Simulations)."""
 
-# The Kalman forms, online and in batches, share these.
-Discount = Annotated[
-    float | None,
-    Field(
+
+class ValueConfiguration(Configuration):
+    """Hyperparameters that Q-learning has online and in batches."""
+
+    exploration_probability: ExplorationProbability = 0.3
+    exploration_share: ExplorationShare = 1 / 30
+    discount: float | None = Field(
+        None,
         gt=0,
         le=1,
         description="of the TD error; if not given 1, that is the mean cost, which no sampling "
         "time alters, and for the rules td and fit the scenario's",
-    ),
-]
-PriorWidth = Annotated[
-    Positive,
-    Field(description="how far θ may be from its start, as a share of the start's cost"),
-]
-MeasureOffset = Annotated[
-    bool,
-    Field(
+    )
+    prior_width: Positive = Field(
+        0.3, description="how far θ may be from its start, as a share of the start's cost"
+    )
+    measure_offset: bool = Field(
+        True,
         description="c_f becomes the mean of the first prediction errors; false: it starts as it "
-        "is, for a start that has learnt its offset"
-    ),
-]
-InnovationClip = Annotated[
-    Positive, Field(description="innovations are cut at this many standard deviations")
-]
-VarianceMemory = Annotated[
-    Positive, Field(description="samples over which the innovations' variance is taken")
-]
-ErrorsKept = Annotated[
-    Count, Field(description="prediction errors over which the next penalty is expected")
-]
+        "is, for a start that has learnt its offset",
+    )
+    innovation_clip: Positive = Field(
+        3.0, description="innovations are cut at this many standard deviations"
+    )
+    variance_memory: Positive = Field(
+        2000.0, description="samples over which the innovations' variance is taken"
+    )
+    prediction_errors: Count = Field(
+        1000, description="prediction errors over which the next penalty is expected"
+    )
+
+    @property
+    def criterion(self) -> float | None:
+        """Discount of the TD error, None for the scenario's."""
+        return 1.0 if self.discount is None else self.discount
+
+    def narrowed(self, width: float) -> Self:
+        """Copy whose prior is `width` times as wide."""
+        return self.model_copy(update={"prior_width": width * self.prior_width})
 
 
-class QLearningConfiguration(Configuration):
+class QLearningConfiguration(ValueConfiguration):
     """Hyperparameters of online Q-learning; `AS_PRINTED` has those of the paper's rule."""
 
-    exploration_probability: ExplorationProbability = 0.3
-    exploration_share: ExplorationShare = 1 / 30
     rule: Literal["kalman", "td", "fit"] = Field(
         "kalman",
         description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
     )
-    discount: Discount = None
-    prior_width: PriorWidth = 0.3
     prior_samples: Count = Field(
         500, description="first samples, at which θ rests: they give noise and widths"
     )
-    measure_offset: MeasureOffset = True
     step_every: Count = Field(50, description="samples per step of θ")
-    innovation_clip: InnovationClip = 3.0
-    variance_memory: VarianceMemory = 2000.0
-    prediction_errors: ErrorsKept = 1000
     parameter_drift: NonNegative = Field(
         0.0,
         description="variance that each sample adds to θ, in units of the prior's, so that "
@@ -106,11 +107,7 @@ class QLearningConfiguration(Configuration):
     @property
     def criterion(self) -> float | None:
         """Discount of the TD error, None for the scenario's."""
-        return 1.0 if self.discount is None and self.rule == "kalman" else self.discount
-
-    def narrowed(self, width: float) -> Self:
-        """Copy whose prior is `width` times as wide."""
-        return self.model_copy(update={"prior_width": width * self.prior_width})
+        return super().criterion if self.rule == "kalman" else self.discount
 
     def without_part(self) -> Mapping[str, str]:
         """What belongs to other rules than the chosen one."""

@@ -48,28 +48,13 @@ HELD_OUT = 1_000_000
 """First of the held-out seeds; training seeds stay below."""
 FIGURES = ("economic_cost", "mean_violation", "violating_share", "J", "failures")
 COLUMNS = (
-    "samples",
-    "updates",
-    "J",
-    "td_error",
-    "step",
-    "smallest_eigenvalue",
-    "corrected",
-    "refused",
-    "failures",
-    "explored",
-    "saturated",
-    "weakly_active",
-    "licq_failed",
-    "plant_samples",
-    "greedy_J",
-    "greedy_economic_cost",
-    "greedy_mean_violation",
-    "greedy_violating_share",
-    "greedy_failures",
-    "regret",
-    "gap_closed",
-)
+    "samples", "updates", "J", "td_error", "step", "smallest_eigenvalue", "corrected", "refused",
+    "failures", "explored", "saturated", "weakly_active", "licq_failed", "plant_samples",
+    "greedy_J", "greedy_economic_cost", "greedy_mean_violation", "greedy_violating_share",
+    "greedy_failures", "regret", "gap_closed",
+)  # fmt: skip
+DAMAGED = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, PlantError)
+"""What a checkpoint raises that is whole, and of something else."""
 
 
 class LogRow(dict[str, float]):
@@ -613,14 +598,7 @@ class _Session:
             take_up(self.totals, group(arrays, "totals "))
             self.plant.restore(self.plant.deserialise(arrays["plant"].tobytes()))
             self.loop.restore(found.state, arrays)
-        except (
-            LookupError,
-            TypeError,
-            ValueError,
-            ArithmeticError,
-            AttributeError,
-            PlantError,
-        ) as e:
+        except DAMAGED as e:
             raise CheckpointError(
                 f"{path}: its content is not that of this run ({type(e).__name__}: {e}); start the "
                 "run anew"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from controllers.economic import tune
 from controllers.factories import nmpc
@@ -169,64 +169,39 @@ def starting_parameters(
     """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
 
     `start` is `naive`, `tuned` or the path of a parameters file. `naive` and `tuned` take c_lambda
-    from the configuration; blocks that a file has
-    stand as they are, those of the configuration's parametrisation that it lacks start as with
-    `naive`. Raises ConfigurationError where the file has slack weights and the parametrisation
-    none, ParameterError on a bad file, TuningError where the tuning fails.
+    from the configuration; blocks that a file has stand as they are, those of the configuration's
+    parametrisation that it lacks start as with `naive`. Raises ConfigurationError where the file
+    has slack weights and the parametrisation none, ParameterError on a bad file, TuningError where
+    the tuning fails.
     """
-    blocks = ThetaBlocks.of(
-        problem,
-        slack_weights=configuration.parametrisation == "extended",
-        model_parameters=configuration.learned_parameters(problem.model),
-    )
-    offset = _value_offset(problem, configuration)
-    naive = Parameters.naive(problem, blocks, value_offset=offset)
-    if start == "naive":
-        return naive.replace(_slack_weights(blocks))
-    if start == "tuned":
-        tuned = tune(problem, blocks, value_offset=offset).parameters
-        return tuned.replace(_slack_weights(blocks))
-    return _extended(problem, configuration, start)
-
-
-def _value_offset(problem: Problem, configuration: Configuration) -> float | None:
-    """c_lambda at the start, None for ℓ_s; the level of V is that of the TD error's discount."""
-    chosen: float | None = getattr(configuration, "discount", None)
-    return problem.value_level(chosen) if configuration.value_offset == "discounted" else None
-
-
-def _slack_weights(blocks: ThetaBlocks) -> dict[str, Vector]:
-    """The slack weights at the start by block, of the problem's scale; none for the paper's θ."""
-    names = [name for name in ("w_sigma", "W_sigma") if name in blocks]
-    return {name: blocks.scale[blocks.slices[name]] for name in names}
-
-
-def _extended(problem: Problem, configuration: Configuration, path: str) -> Parameters:
-    """θ of a file, with the blocks that it lacks."""
-    found = Parameters.load(path, problem)
-    learned = "w_sigma" in found.blocks
-    if learned and configuration.parametrisation == "paper":
+    file = None if start in ("naive", "tuned") else Parameters.load(start, problem)
+    if file is not None and "w_sigma" in file.blocks and configuration.parametrisation == "paper":
         raise ConfigurationError(
-            f"{path}: θ has slack weights, which the parametrisation 'paper' has not; set "
+            f"{start}: θ has slack weights, which the parametrisation 'paper' has not; set "
             "parametrisation=extended"
         )
-    names = found.blocks.block("p").labels if "p" in found.blocks else ()
-    more = tuple(
-        name for name in configuration.learned_parameters(problem.model) if name not in names
-    )
+    learned = configuration.learned_parameters(problem.model)
+    given = file.blocks.block("p").labels if file is not None and "p" in file.blocks else ()
     blocks = ThetaBlocks.of(
         problem,
         slack_weights=configuration.parametrisation == "extended",
-        model_parameters=(*names, *more),
+        model_parameters=(*given, *(name for name in learned if name not in given)),
     )
-    values: dict[str, ArrayLike] = {block.name: found[block.name] for block in found.blocks}
-    if not learned:
-        values |= _slack_weights(blocks)
-    if more:
-        chosen = problem.model.parameter_indices(more)
-        nominal = problem.model.nominal_parameters[chosen]
-        values["p"] = np.concatenate([values.get("p", np.empty(0)), nominal])
-    return Parameters.naive(problem, blocks).replace(values)
+    # The level of V is that of the TD error's discount.
+    chosen: float | None = getattr(configuration, "discount", None)
+    discounted = configuration.value_offset == "discounted"
+    offset = problem.value_level(chosen) if discounted else None
+    if start == "tuned":
+        found = tune(problem, blocks, value_offset=offset).parameters
+    else:
+        found = Parameters.naive(problem, blocks, value_offset=offset)
+    names = [name for name in ("w_sigma", "W_sigma") if name in blocks]
+    values: dict[str, Vector] = {name: blocks.scale[blocks.slices[name]] for name in names}
+    if file is not None:
+        values |= {block.name: file[block.name] for block in file.blocks}
+    if given:
+        values["p"] = np.concatenate([values["p"], found["p"][len(given) :]])
+    return found.replace(values)
 
 
 def learnable(kind: str, scenario: Scenario, parameters: Parameters) -> LearnableController:

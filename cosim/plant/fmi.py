@@ -7,31 +7,22 @@ import itertools
 import os
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
 
 import fmpy
 import numpy as np
-from fmpy import calloc, free
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
-from fmpy.fmi3 import FMU3Slave
+from fmpy import fmi2, fmi3
 from fmpy.logging import addLoggerProxy
 from numpy.typing import NDArray
 
 from cosim.errors import CapabilityError, PlantError
 from cosim.plant.archive import UnpackedFmu
-from fmus import BuildError
 from fmus.build import platforms_of, present
 from fmus.model import C_IDENTIFIER
 
@@ -50,7 +41,10 @@ def library_path(fmu: UnpackedFmu) -> Path:
         raise PlantError(
             f"FMU '{fmu.path}' is refused: modelIdentifier {identifier!r} is not a C identifier"
         )
-    wanted, folders = _wanted(str(fmu.description.fmiVersion))
+    platform, version = present(), str(fmu.description.fmiVersion)
+    folders = [platform.folder(version)]
+    if version.startswith("2") and platform.tuple in _FALLBACKS:
+        folders.append(_FALLBACKS[platform.tuple])
     others = []
     for folder in folders:
         entry = f"binaries/{folder}/{identifier}{fmpy.sharedLibraryExtension}"
@@ -60,32 +54,16 @@ def library_path(fmu: UnpackedFmu) -> Path:
         if not path.resolve().is_relative_to(fmu.folder.resolve()):
             raise PlantError(f"FMU '{fmu.path}' is refused: '{entry}' leads outside its folder")
         made_for = platforms_of(path.read_bytes())
-        if wanted in made_for:
+        if platform.tuple in made_for:
             return path
         what = f"made for {' and '.join(made_for)}" if made_for else "not a shared library"
         others.append(f"its '{entry}' is {what}")
+    found = {name.split("/")[1] for name in fmu.entries if name.startswith("binaries/")}
+    why = "; ".join(others) or f"it has: {', '.join(sorted(found)) or 'none'}"
     raise PlantError(
-        f"FMU '{fmu.path}' has no binary for {wanted} ({'; '.join(others) or _found(fmu)}); build "
-        "one from its sources, the shipped FMU's by `cosim fmu build --out DIR` with a C "
-        "compiler, and name that file"
+        f"FMU '{fmu.path}' has no binary for {platform.tuple} ({why}); build one from its sources, "
+        "the shipped FMU's by `cosim fmu build --out DIR` with a C compiler, and name that file"
     )
-
-
-def _wanted(version: str) -> tuple[str, list[str]]:
-    """This platform's tuple, and the folders that its library may lie in, the best first."""
-    try:
-        platform = present()
-    except BuildError:
-        return str(fmpy.platform_tuple), [str(fmpy.platform_tuple), str(fmpy.platform)]
-    folders = [platform.folder(version)]
-    if version.startswith("2") and platform.tuple in _FALLBACKS:
-        folders.append(_FALLBACKS[platform.tuple])
-    return platform.tuple, folders
-
-
-def _found(fmu: UnpackedFmu) -> str:
-    folders = {name.split("/")[1] for name in fmu.entries if name.startswith("binaries/")}
-    return f"it has: {', '.join(sorted(folders)) or 'none'}"
 
 
 OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
@@ -93,12 +71,11 @@ ACCEPTED = frozenset((OK, WARNING))
 _STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 # fmpy changes the working directory while it loads a library.
-construction_lock = threading.Lock()
+_construction_lock = threading.Lock()
 _alive: Counter[str] = Counter()
 
 
-@dataclass(frozen=True)
-class StartValue:
+class StartValue(NamedTuple):
     """A start value to write at every reset: value reference and FMI type of its variable."""
 
     reference: int
@@ -106,8 +83,7 @@ class StartValue:
     value: float
 
 
-@dataclass(frozen=True)
-class Wiring:
+class Wiring(NamedTuple):
     """Value references of what a plant exchanges with its FMU."""
 
     inputs: Sequence[int]
@@ -133,19 +109,21 @@ NOT_FINITE = 5
 """What failed in a compiled loop: an output or state is not finite; below it a call of FMI."""
 
 
-class Instance:
+class Instance(ABC):
     """One co-simulation instance, called through raw function pointers and fixed buffers.
 
     The pointers carry no argument types: ctypes then passes the ready-made C objects through,
-    at half the cost of a checked call. `inputs`, `outputs` and `states` are the buffers, each
-    with a NumPy view of the same memory (`…_view`).
+    at half the cost of a checked call. `inputs`, `outputs` and `states` are the buffers, the last
+    two with a NumPy view of the same memory (`…_view`).
     """
 
     prefix: ClassVar[str]
     real: ClassVar[str]
-    state_suffix: ClassVar[str]
     setters: ClassVar[dict[str, tuple[str, Any]]]
-    _deserialise_name: ClassVar[str]
+    """By the type of a variable that can be set, the setter's name and the type of its values."""
+    _state: ClassVar[str]
+    """What FMI calls a saved state."""
+    _deserialise: ClassVar[str]
     _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
     """The calls that initialise, with their arguments after the instance."""
     _step_arguments: tuple[Any, ...]
@@ -153,43 +131,48 @@ class Instance:
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         self.fmu = fmu
         self.messages: deque[str] = deque(maxlen=8)
-        interface = fmu.description.coSimulation
-        self._can_save = bool(interface.canGetAndSetFMUstate)
-        self._can_serialise = bool(interface.canSerializeFMUstate)
         self.fatal = False
-        if interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
+        self._interface = fmu.description.coSimulation
+        if self._interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
             raise CapabilityError(
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
             )
         self._slave = self._load()
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
-        self._free_instance = self._slave.dll[f"{self.prefix}FreeInstance"]
-        self._free_instance.restype = None
+        self._functions: dict[str, Any] = {}
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
         self.inputs, _, self._set_inputs = self._exchange(wiring.inputs)
         self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs)
         self.states, self.states_view, self._get_states = self._exchange(wiring.states)
-        self._reset = self._function("Reset")
         self._set_values = self._function(f"Set{self.real}")
         self._get_values = self._function(f"Get{self.real}")
         self._do_step = self._function("DoStep")
-        if self._can_save:
-            self._get_state = self._function(f"Get{self.state_suffix}")
-            self._set_state = self._function(f"Set{self.state_suffix}")
-            self._free_state = self._function(f"Free{self.state_suffix}")
-        self._starts: list[tuple[str, Any, tuple[Any, ...]]] = []
+        self._starts: list[tuple[str, tuple[Any, ...]]] = []
         self._slots: dict[tuple[str, int], tuple[Any, int]] = {}
         for kind in dict.fromkeys(start.type for start in wiring.starts):
             self._add_starts([start for start in wiring.starts if start.type == kind])
 
+    @abstractmethod
+    def _instantiate(self, **where: Any) -> Any:
+        """An instance by fmpy, which logs to `messages`; `where` is what its constructor takes."""
+
+    @abstractmethod
+    def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
+        """The arguments of a call that sets or gets variables, the instance first."""
+
     def _load(self) -> Any:
         library = str(library_path(self.fmu).resolve())
-        with construction_lock:
+        with _construction_lock:
             folder = Path.cwd()
             try:
-                return self._instantiate(library)
+                return self._instantiate(
+                    guid=self.fmu.description.guid,
+                    modelIdentifier=self._interface.modelIdentifier,
+                    unzipDirectory=str(self.fmu.folder),
+                    libraryPath=library,
+                )
             # fmpy raises bare Exception when the library does not load or instantiate.
             except Exception as error:
                 raise PlantError(
@@ -198,16 +181,27 @@ class Instance:
             finally:
                 os.chdir(folder)
 
+    def _function(self, name: str) -> Any:
+        """A function pointer of our own, free of the argument types that fmpy attaches."""
+        if name not in self._functions:
+            pointer = self._functions[name] = self._slave.dll[self.prefix + name]
+            pointer.restype = ctypes.c_int
+        return self._functions[name]
+
+    def _call(self, name: str, *arguments: Any) -> None:
+        """Call a function of FMI; raises PlantError where it fails."""
+        if (status := self._function(name)(*arguments)) not in ACCEPTED:
+            self.fail(name, status)
+
     def initialise(self, started: bool) -> None:
         """Reset (if started before), write the start values, initialise and read the states."""
-        if started and (status := self._reset(self._component)) not in ACCEPTED:
-            self.fail("Reset", status)
-        self._write_starts()
+        if started:
+            self._call("Reset", self._component)
+        for name, arguments in self._starts:
+            self._call(name, *arguments)
         for name, arguments in self._begin:
-            if (status := self._function(name)(self._component, *arguments)) not in ACCEPTED:
-                self.fail(name, status)
-        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
-            self.fail(f"Get{self.real}", status)
+            self._call(name, self._component, *arguments)
+        self._call(f"Get{self.real}", *self._get_states)
 
     def advance(self, time: float) -> None:
         """Write the inputs, read the outputs at `time`, step, and read the states after it."""
@@ -221,32 +215,20 @@ class Instance:
         if (status := self._get_values(*self._get_states)) not in ACCEPTED:
             self.fail(f"Get{self.real}", status)
 
-    def _instantiate(self, library: str) -> Any:
-        raise NotImplementedError
-
-    def _function(self, name: str) -> Any:
-        """A function pointer of our own, free of the argument types that fmpy attaches."""
-        pointer = self._slave.dll[self.prefix + name]
-        pointer.restype = ctypes.c_int
-        return pointer
-
     def _exchange(
         self, references: Sequence[int]
     ) -> tuple[Any, NDArray[np.float64], tuple[Any, ...]]:
+        """A buffer for real variables, NumPy's view of it, the arguments to set or get them."""
         buffer = (ctypes.c_double * len(references))()
         view: NDArray[np.float64] = np.frombuffer(memoryview(buffer), dtype=np.float64)
         return buffer, view, self._arguments(references, buffer)
-
-    def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
-        raise NotImplementedError
 
     def _add_starts(self, starts: list[StartValue]) -> None:
         suffix, ctype = self.setters[starts[0].type]
         convert = float if ctype in (ctypes.c_double, ctypes.c_float) else int
         buffer = (ctype * len(starts))(*(convert(start.value) for start in starts))
         arguments = self._arguments([start.reference for start in starts], buffer)
-        name = f"Set{suffix}"
-        self._starts.append((name, self._function(name), arguments))
+        self._starts.append((f"Set{suffix}", arguments))
         # FMI 2 counts value references anew for each type.
         self._slots |= {(s.type, s.reference): (buffer, i) for i, s in enumerate(starts)}
 
@@ -259,17 +241,7 @@ class Instance:
         """A function that writes values to real variables between two steps."""
         buffer, _, arguments = self._exchange(references)
         buffer[:] = values
-
-        def write() -> None:
-            if (status := self._set_values(*arguments)) not in ACCEPTED:
-                self.fail(f"Set{self.real}", status)
-
-        return write
-
-    def _write_starts(self) -> None:
-        for name, function, arguments in self._starts:
-            if (status := function(*arguments)) not in ACCEPTED:
-                self.fail(name, status)
+        return lambda: self._call(f"Set{self.real}", *arguments)
 
     @cached_property
     def native(self) -> Native:
@@ -297,56 +269,40 @@ class Instance:
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
-        if not self._can_save:
+        if not self._interface.canGetAndSetFMUstate:
             self._lacks("save and restore its state", "canGetAndSetFMUstate")
-        if (status := self._get_state(self._component, ctypes.byref(handle))) not in ACCEPTED:
-            self.fail(f"Get{self.state_suffix}", status)
+        self._call(f"Get{self._state}", self._component, ctypes.byref(handle))
 
     def load(self, handle: ctypes.c_void_p) -> None:
         """Set the FMU's state from a handle and read the plant's states."""
-        if (status := self._set_state(self._component, handle)) not in ACCEPTED:
-            self.fail(f"Set{self.state_suffix}", status)
-        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
-            self.fail("Get", status)
-
-    def free(self, handle: ctypes.c_void_p) -> None:
-        """Free a handle's memory."""
-        if handle.value is not None and not self.fatal:
-            self._free_state(self._component, ctypes.byref(handle))
+        self._call(f"Set{self._state}", self._component, handle)
+        self._call(f"Get{self.real}", *self._get_states)
 
     def serialise(self, handle: ctypes.c_void_p) -> bytes:
         """Return a saved state as bytes that any instance of this FMU can read."""
-        if not self._can_serialise:
+        if not self._interface.canSerializeFMUstate:
             self._lacks("serialise its state", "canSerializeFMUstate")
         size = ctypes.c_size_t()
-        name = f"Serialized{self.state_suffix}Size"
-        if (
-            status := self._function(name)(self._component, handle, ctypes.byref(size))
-        ) not in ACCEPTED:
-            self.fail(name, status)
+        arguments = (self._component, handle)
+        self._call(f"Serialized{self._state}Size", *arguments, ctypes.byref(size))
         buffer = ctypes.create_string_buffer(size.value)
-        name = f"Serialize{self.state_suffix}"
-        if (status := self._function(name)(self._component, handle, buffer, size)) not in ACCEPTED:
-            self.fail(name, status)
+        self._call(f"Serialize{self._state}", *arguments, buffer, size)
         return buffer.raw
 
     def deserialise(self, data: bytes, handle: ctypes.c_void_p) -> None:
         """Fill a handle from bytes; raises PlantError if the FMU refuses them."""
-        if not self._can_serialise:
+        if not self._interface.canSerializeFMUstate:
             self._lacks("serialise its state", "canSerializeFMUstate")
         buffer = ctypes.create_string_buffer(data, len(data))
         size = ctypes.c_size_t(len(data))
-        name = self._deserialise_name
-        pointer = ctypes.byref(handle)
-        if (status := self._function(name)(self._component, buffer, size, pointer)) not in ACCEPTED:
-            self.fail(name, status)
+        self._call(self._deserialise, self._component, buffer, size, ctypes.byref(handle))
 
-    def _lacks(self, ability: str, flag: str) -> None:
+    def _lacks(self, ability: str, flag: str) -> NoReturn:
         raise CapabilityError(
             f"FMU '{self.fmu.path}' cannot {ability}: its model description lacks {flag}"
         )
 
-    def fail(self, function: str, status: int) -> None:
+    def fail(self, function: str, status: int) -> NoReturn:
         """Raise PlantError for a failed call, with what the FMU logged about it."""
         self.fatal |= status == FATAL
         label = _STATUS.get(status, f"status {status}, which FMI does not have")
@@ -359,14 +315,20 @@ class Instance:
         self.messages.clear()
         return f": {text}" if text else ""
 
-    def close(self) -> None:
-        """Free the instance; after a fatal error FMI forbids every call, this one too.
+    def close(self, handles: Iterable[ctypes.c_void_p]) -> None:
+        """Free saved states and the instance; after a fatal error FMI forbids these calls, too.
 
         The library stays loaded, as fmpy would not leave it: the FMU may have started threads.
         """
         _alive[self.fmu.sha256] -= 1
-        if not self.fatal:
-            self._free_instance(self._component)
+        if self.fatal:
+            return
+        for handle in handles:
+            if handle.value is not None:
+                self._function(f"Free{self._state}")(self._component, ctypes.byref(handle))
+        free = self._slave.dll[f"{self.prefix}FreeInstance"]
+        free.restype = None
+        free(self._component)
 
 
 _numbers = itertools.count()
@@ -382,10 +344,10 @@ def _log(_: Any, instance: bytes, status: int, category: bytes, message: bytes) 
 
 
 # fmpy's proxy, which formats the variadic message, knows one Python logger per process.
-_callbacks = fmi2CallbackFunctions()
-_callbacks.logger = fmi2CallbackLoggerTYPE(_log)
-_callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
-_callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
+_callbacks = fmi2.fmi2CallbackFunctions()
+_callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_log)
+_callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
+_callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
 addLoggerProxy(ctypes.byref(_callbacks))
 
 _FALSE = ctypes.c_int(0)
@@ -396,13 +358,6 @@ class Fmi2Instance(Instance):
     """An FMI 2.0 co-simulation instance."""
 
     prefix = "fmi2"
-    state_suffix = "FMUstate"
-    _deserialise_name = "DeSerializeFMUstate"
-    _begin = (
-        ("SetupExperiment", (_FALSE, _ZERO, _ZERO, _FALSE, _ZERO)),
-        ("EnterInitializationMode", ()),
-        ("ExitInitializationMode", ()),
-    )
     real = "Real"
     setters: ClassVar[dict[str, tuple[str, Any]]] = {
         "Real": ("Real", ctypes.c_double),
@@ -410,22 +365,23 @@ class Fmi2Instance(Instance):
         "Enumeration": ("Integer", ctypes.c_int),
         "Boolean": ("Boolean", ctypes.c_int),
     }
+    _state = "FMUstate"
+    _deserialise = "DeSerializeFMUstate"
+    _begin = (
+        ("SetupExperiment", (_FALSE, _ZERO, _ZERO, _FALSE, _ZERO)),
+        ("EnterInitializationMode", ()),
+        ("ExitInitializationMode", ()),
+    )
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         super().__init__(fmu, wiring, step_size)
         # The last argument is false: a snapshot may take the FMU back before this step.
         self._step_arguments = (self._component, self._time, self._step_size, _FALSE)
 
-    def _instantiate(self, library: str) -> FMU2Slave:
+    def _instantiate(self, **where: Any) -> Any:
         name = f"cosim-{next(_numbers)}"
         _logs[name.encode()] = self.messages
-        slave = FMU2Slave(
-            guid=self.fmu.description.guid,
-            modelIdentifier=self.fmu.description.coSimulation.modelIdentifier,
-            unzipDirectory=str(self.fmu.folder),
-            libraryPath=library,
-            instanceName=name,
-        )
+        slave = fmi2.FMU2Slave(instanceName=name, **where)
         slave.instantiate(callbacks=_callbacks, loggingOn=True)
         return slave
 
@@ -442,57 +398,43 @@ class Fmi3Instance(Instance):
     """An FMI 3.0 co-simulation instance, without event mode and early return."""
 
     prefix = "fmi3"
-    state_suffix = "FMUState"
-    _deserialise_name = "DeserializeFMUState"
+    real = "Float64"
+    setters: ClassVar[dict[str, tuple[str, Any]]] = {
+        name: (name, getattr(fmi3, f"fmi3{name}"))
+        for name in (
+            "Float64", "Float32", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64",
+            "UInt64", "Boolean",
+        )
+    } | {"Enumeration": ("Int64", fmi3.fmi3Int64)}  # fmt: skip
+    _state = "FMUState"
+    _deserialise = "DeserializeFMUState"
     _begin = (
         ("EnterInitializationMode", (_NO, _ZERO, _ZERO, _NO, _ZERO)),
         ("ExitInitializationMode", ()),
     )
-    real = "Float64"
-    setters: ClassVar[dict[str, tuple[str, Any]]] = {
-        "Float64": ("Float64", ctypes.c_double),
-        "Float32": ("Float32", ctypes.c_float),
-        "Int8": ("Int8", ctypes.c_int8),
-        "UInt8": ("UInt8", ctypes.c_uint8),
-        "Int16": ("Int16", ctypes.c_int16),
-        "UInt16": ("UInt16", ctypes.c_uint16),
-        "Int32": ("Int32", ctypes.c_int32),
-        "UInt32": ("UInt32", ctypes.c_uint32),
-        "Int64": ("Int64", ctypes.c_int64),
-        "UInt64": ("UInt64", ctypes.c_uint64),
-        "Enumeration": ("Int64", ctypes.c_int64),
-        "Boolean": ("Boolean", ctypes.c_bool),
-    }
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         super().__init__(fmu, wiring, step_size)
-        self._event = ctypes.c_bool()
+        event = ctypes.c_bool()
         self._terminate = ctypes.c_bool()
         self._early = ctypes.c_bool()
         self._last_time = ctypes.c_double()
+        found = (event, self._terminate, self._early, self._last_time)
         self._step_arguments = (
             self._component,
             self._time,
             self._step_size,
             _NO,  # a snapshot may take the FMU back before this step
-            ctypes.byref(self._event),
-            ctypes.byref(self._terminate),
-            ctypes.byref(self._early),
-            ctypes.byref(self._last_time),
+            *(ctypes.byref(each) for each in found),
         )
 
-    def _instantiate(self, library: str) -> FMU3Slave:
-        slave = FMU3Slave(
-            guid=self.fmu.description.guid,
-            modelIdentifier=self.fmu.description.coSimulation.modelIdentifier,
-            unzipDirectory=str(self.fmu.folder),
-            libraryPath=library,
-        )
+    def _instantiate(self, **where: Any) -> Any:
         messages = self.messages
 
         def log(_: Any, status: int, category: bytes, message: bytes) -> None:
             messages.append(message.decode("utf-8", "replace"))
 
+        slave = fmi3.FMU3Slave(**where)
         slave.instantiate(loggingOn=True, logMessage=log)
         return slave
 

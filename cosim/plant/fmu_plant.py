@@ -28,65 +28,20 @@ _MAGIC = b"cosimfs1"
 class Snapshot:
     """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
 
-    Its memory belongs to the FMU and is handed to a later snapshot when this one is dropped.
+    Its memory belongs to the FMU and is handed to a later snapshot when this one is dropped: what
+    an FMU allocates leaks until freed.
     """
 
-    __slots__ = ("_plant", "handle", "k")
+    __slots__ = ("handle", "k", "plant")
 
     def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
-        self._plant = plant
+        self.plant = plant
         self.handle = handle
         self.k = k
 
-    def belongs_to(self, plant: FmuPlant) -> bool:
-        """Whether the plant made this snapshot."""
-        return self._plant is plant
-
     def __del__(self) -> None:
         """Give the memory back to the plant."""
-        self._plant.recycle(self.handle)
-
-
-class Memory:
-    """The FMU's memory of saved states, used again: what an FMU allocates leaks until freed."""
-
-    def __init__(self) -> None:
-        self._all: list[ctypes.c_void_p] = []
-        self._free: list[ctypes.c_void_p] = []
-
-    def take(self) -> ctypes.c_void_p:
-        """A dropped snapshot's memory, or none yet: the FMU allocates what it needs."""
-        if self._free:
-            return self._free.pop()
-        handle = ctypes.c_void_p()
-        self._all.append(handle)
-        return handle
-
-    def give(self, handle: ctypes.c_void_p) -> None:
-        """Keep a dropped snapshot's memory for the next one."""
-        self._free.append(handle)
-
-    def free(self, fmi: Instance) -> None:
-        """Hand all of it back to the FMU."""
-        for handle in self._all:
-            fmi.free(handle)
-
-
-def packed(k: int, sha256: str, state: bytes) -> bytes:
-    """Return an FMU's serialised state with its sample number and the FMU's hash before it."""
-    return _HEADER.pack(_MAGIC, k, bytes.fromhex(sha256)) + state
-
-
-def unpacked(data: bytes, sha256: str) -> tuple[int, bytes]:
-    """Return sample number and FMU state; raises PlantError unless `packed` made them so."""
-    if len(data) < _HEADER.size or data[:8] != _MAGIC:
-        raise PlantError("these bytes are not a serialised plant state")
-    _, k, digest = _HEADER.unpack_from(data)
-    if digest.hex() != sha256:
-        raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
-    if k < 0:
-        raise PlantError("these bytes are not a serialised plant state")
-    return k, data[_HEADER.size :]
+        self.plant.recycle(self.handle)
 
 
 class FmuPlant:
@@ -109,7 +64,8 @@ class FmuPlant:
     def __init__(self, scenario: Scenario | str | Path, fmu: str | Path | None = None) -> None:
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self._fmi: Instance | None = None
-        self._memory = Memory()
+        self._handles: list[ctypes.c_void_p] = []
+        self._free_handles: list[ctypes.c_void_p] = []
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
         version = str(archive.description.fmiVersion)
         for refusal in refusals(archive):
@@ -123,8 +79,7 @@ class FmuPlant:
         self.fmu_sha256 = archive.sha256
         wiring = wirer.wiring()
         self.units = wirer.units()
-        lower, upper = wirer.state_range()
-        self.state_range = (np.array(lower), np.array(upper))
+        self.state_range = wirer.state_range()
         self.penalty = self.scenario.state_penalty
         self._seeds = wirer.seeds()
         self._initial = wirer.initial_states()
@@ -229,14 +184,14 @@ class FmuPlant:
         fmi = self._instance
         if self._k < 0:
             self._refuse_unstarted()
-        handle = self._memory.take()
+        handle = self._handle()
         fmi.save(handle)
         return Snapshot(self, handle, self._k)
 
     def restore(self, snapshot: Snapshot) -> Array:
         """Go back to a snapshot of this very plant; return its state (n,)."""
         fmi = self._instance
-        if not snapshot.belongs_to(self):
+        if snapshot.plant is not self:
             raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
         fmi.load(snapshot.handle)
         self._k = snapshot.k
@@ -246,24 +201,37 @@ class FmuPlant:
     def serialise(self, snapshot: Snapshot) -> bytes:
         """Return a snapshot as bytes for `deserialise`, also in another process."""
         fmi = self._instance
-        if not snapshot.belongs_to(self):
+        if snapshot.plant is not self:
             raise PlantError("this snapshot was taken from another plant")
-        return packed(snapshot.k, self.fmu_sha256, fmi.serialise(snapshot.handle))
+        header = _HEADER.pack(_MAGIC, snapshot.k, bytes.fromhex(self.fmu_sha256))
+        return header + fmi.serialise(snapshot.handle)
 
     def deserialise(self, data: bytes) -> Snapshot:
         """Return the snapshot that `serialise` wrote, of any plant with the very same FMU file."""
         fmi = self._instance
-        k, state = unpacked(data, self.fmu_sha256)
+        if len(data) < _HEADER.size:
+            raise PlantError("these bytes are not a serialised plant state")
+        magic, k, digest = _HEADER.unpack_from(data)
+        if magic != _MAGIC or k < 0:
+            raise PlantError("these bytes are not a serialised plant state")
+        if digest.hex() != self.fmu_sha256:
+            raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
         if not self._started:
             self.reset(0)
-        handle = self._memory.take()
-        fmi.deserialise(state, handle)
+        handle = self._handle()
+        fmi.deserialise(data[_HEADER.size :], handle)
         return Snapshot(self, handle, k)
+
+    def _handle(self) -> ctypes.c_void_p:
+        """A dropped snapshot's memory, or none yet: the FMU allocates what it needs."""
+        if not self._free_handles:
+            self._handles.append(handle := ctypes.c_void_p())
+            return handle
+        return self._free_handles.pop()
 
     def recycle(self, handle: ctypes.c_void_p) -> None:
         """Keep a dropped snapshot's memory for the next one."""
-        if self._fmi is not None:
-            self._memory.give(handle)
+        self._free_handles.append(handle)
 
     def close(self) -> None:
         """Free the FMU instance and every snapshot; a closed plant refuses all calls."""
@@ -271,8 +239,7 @@ class FmuPlant:
             return
         fmi, self._fmi = self._fmi, None
         self._k = _NOT_STARTED
-        self._memory.free(fmi)
-        fmi.close()
+        fmi.close(self._handles)
 
     def __enter__(self) -> Self:
         """Return the plant itself."""

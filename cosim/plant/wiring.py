@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Iterator, Sequence
-from math import ceil
+from collections.abc import Iterator, Sequence
+from math import ceil, inf
 from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cosim.errors import PlantError
 from cosim.plant.archive import UnpackedFmu, unpack
@@ -13,6 +16,7 @@ from cosim.plant.fmi import Fmi2Instance, Instance, StartValue, Wiring, library_
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
+Array = NDArray[np.float64]
 _REAL = ("Real", "Float64")
 
 
@@ -21,15 +25,12 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
     description, name = fmu.description, f"FMU '{fmu.path}'"
     simulation = description.coSimulation
     if simulation is None:
-        others = [
-            words
-            for words, face in (
-                ("model exchange", description.modelExchange),
-                ("scheduled execution", description.scheduledExecution),
-            )
-            if face is not None
-        ]
-        yield f"{name} has no co-simulation interface (it has: {', '.join(others) or 'none'})"
+        faces = {
+            "model exchange": description.modelExchange,
+            "scheduled execution": description.scheduledExecution,
+        }
+        others = ", ".join(words for words, face in faces.items() if face is not None)
+        yield f"{name} has no co-simulation interface (it has: {others or 'none'})"
     else:
         if simulation.needsExecutionTool:
             yield (
@@ -128,11 +129,12 @@ class Wirer:
         words = []
         for name in self._scenario.plant.mapping.seed:
             variable = self._find(name, "plant.mapping.seed")
-            wide = variable.type in _WIDE
-            words.append(
-                SeedWord(self._seed_type(name), int(variable.valueReference), 64 if wide else 32)
-            )
-            if wide:
+            if variable.type not in (*_WIDE, "Integer", "Int32", "UInt32"):
+                what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
+                raise self._misfit(name, "plant.mapping.seed", what)
+            bits = 64 if variable.type in _WIDE else 32
+            words.append(SeedWord(str(variable.type), int(variable.valueReference), bits))
+            if bits == 64:
                 break
         return words
 
@@ -141,11 +143,12 @@ class Wirer:
         names = self._scenario.plant.mapping.initial_state
         return [self._real(name, "plant.mapping.initial_state") for name in names]
 
-    def state_range(self) -> tuple[list[float], list[float]]:
-        """Least and greatest value that the FMU declares for each state, infinite if none."""
+    def state_range(self) -> tuple[Array, Array]:
+        """Least and greatest value, (n,), that the FMU declares for the states; else infinite."""
         found = [self._find(name, "plant.states") for name in self._scenario.plant.states]
-        lower = [float("-inf") if v.min is None else float(v.min) for v in found]
-        return lower, [float("inf") if v.max is None else float(v.max) for v in found]
+        lower = [-inf if v.min is None else float(v.min) for v in found]
+        upper = [inf if v.max is None else float(v.max) for v in found]
+        return np.array(lower), np.array(upper)
 
     def units(self) -> dict[str, str]:
         """Unit of each exchanged variable by name, empty where the FMU states none."""
@@ -155,30 +158,24 @@ class Wirer:
 
     def _starts(self) -> list[StartValue]:
         scenario, mapping = self._scenario, self._scenario.plant.mapping
-        law = scenario.disturbance
-        starts = [
-            *self._start("initial_state", mapping.initial_state, scenario.plant.initial_state),
-            *self._start("sampling_time", mapping.sampling_time, [scenario.sampling_time]),
-            *self._start("stochastic", mapping.stochastic, [float(law.law != "none")]),
-        ]
-        if law.law in mapping.law_codes:
-            starts += self._start("law", mapping.law, [float(mapping.law_codes[law.law])])
-        if law.nominal:
-            starts += self._start("nominal", mapping.nominal, law.nominal)
-        if law.ranges:
-            starts += self._start("ranges", mapping.ranges, law.ranges)
+        law, codes = scenario.disturbance, mapping.law_codes
+        fields: dict[str, tuple[str | Sequence[str] | None, Sequence[float]]] = {
+            "initial_state": (mapping.initial_state, scenario.plant.initial_state),
+            "sampling_time": (mapping.sampling_time, [scenario.sampling_time]),
+            "stochastic": (mapping.stochastic, [float(law.law != "none")]),
+            "law": (mapping.law, [codes[law.law]] if law.law in codes else []),
+            "nominal": (mapping.nominal, law.nominal),
+            "ranges": (mapping.ranges, law.ranges),
+        }
+        starts = []
+        for field, (names, values) in fields.items():
+            listed = [names] if isinstance(names, str) else names or ()
+            # Either may be left out; the scenario has seen to it that they fit.
+            for name, value in zip(listed, values, strict=False):
+                starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
         for name, value in scenario.plant.parameters.items():
             starts.append(self._start_value(name, float(value), "plant.parameters"))
-        starts += [StartValue(word.reference, word.type, 0.0) for word in self.seeds()]
-        return starts
-
-    def _start(
-        self, field: str, names: str | Iterable[str] | None, values: Iterable[float]
-    ) -> list[StartValue]:
-        names = [names] if isinstance(names, str) else list(names or ())
-        table = f"plant.mapping.{field}"
-        pairs = zip(names, values, strict=True) if names else ()
-        return [self._start_value(name, value, table) for name, value in pairs]
+        return starts + [StartValue(word.reference, word.type, 0.0) for word in self.seeds()]
 
     def _start_value(self, name: str, value: float, table: str) -> StartValue:
         variable = self._find(name, table)
@@ -191,16 +188,6 @@ class Wirer:
         if not has_start(variable):
             raise self._misfit(name, table, f"is {_a(variable.causality)} without a start to set")
         return StartValue(int(variable.valueReference), variable.type, value)
-
-    def _seed_type(self, name: str) -> str:
-        variable = self._variables[name]
-        if variable.type not in (*_WIDE, "Integer", "Int32", "UInt32"):
-            raise self._misfit(
-                name,
-                "plant.mapping.seed",
-                f"is {_a(variable.type)}, not an integer of 32 or 64 bits",
-            )
-        return str(variable.type)
 
     def _input(self, name: str) -> int:
         reference = self._real(name, "plant.actions")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from math import ceil, isfinite, log10
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
 Array = NDArray[np.float64]
-TUNABLE = "tunable"
 NO_NOISE = (
     "no noise was found (no output NAME with parameters NAME_nominal and NAME_range): the plant is "
     "taken as undisturbed"
@@ -29,8 +27,9 @@ NO_NOISE = (
 HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
-SAMPLES = 500
-"""Samples of the FMU's own experiment, where it states no step."""
+REALS = ("Real", "Float64", "Float32")
+INTEGERS = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
+COSTS = ("cost", "loss", "objective")
 
 
 def draft_scenario(
@@ -50,78 +49,46 @@ def draft_scenario(
     begins. Raises PlantError, which says what to give, where nothing can be guessed.
     """
     archive = unpack(fmu)
-    roles = guess_roles(archive, states, actions, stage_cost)
     known = {variable.name: variable for variable in archive.description.modelVariables}
-    parameters = dict(
-        zip(roles.states, roles.mapping.get("initial_state", roles.states), strict=True)
-    )
-    x = _start([known[parameters[name]] for name in roles.states], state, "state")
-    u = _start([known[name] for name in roles.actions], action, "action")
-    document = _document(fmu, archive, roles, known, x, u, sampling_time)
-    with FmuPlant(Scenario.from_dict(document | {"disturbance": {"law": "none"}})) as plant:
-        x, u, cost = nearest_steady_state(plant, x, u)
-        units = plant.units
-    weight = 10.0 ** ceil(log10(10 * max(abs(cost), 1.0)) - 0.5)
-    document["penalty"]["linear"] = [weight] * len(roles.states)
-    document["plant"]["initial_state"] = x.tolist()
-    document["controller"] |= {
-        "reference_state": x.tolist(),
-        "reference_action": u.tolist(),
-        "reference_cost": cost,
-    }
-    if str(fmu) in SHIPPED:
-        document["controller"]["model"] = "controllers.evaporator:model"
-    else:
-        document["plant"]["fmu"] = _relative(archive.path, target)
-    notes = [f"# {field}: {note}" for field, note in _comments(document, roles, units).items()]
-    return "\n".join([HEAD, *notes, "", tomli_w.dumps(document)])
-
-
-def _start(variables: Sequence[Any], given: Sequence[float], kind: str) -> Array:
-    if given and len(given) != len(variables):
-        names = ", ".join(variable.name for variable in variables)
-        raise PlantError(f"--{kind} takes {len(variables)} numbers ({names}), not {len(given)}")
-    return np.array(given or [float(variable.start or 0.0) for variable in variables], dtype=float)
-
-
-def _document(
-    fmu: str | Path,
-    archive: UnpackedFmu,
-    roles: Roles,
-    known: dict[str, Any],
-    x: Array,
-    u: Array,
-    sampling_time: float | None,
-) -> dict[str, Any]:
-    limits = [
-        _limits(known[name], value) for name, value in zip(roles.actions, u.tolist(), strict=True)
-    ]
-    ranges = [(known[name].min, known[name].max) for name in roles.states]
-    mapping = dict(roles.mapping)
+    for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
+        if name not in known:
+            raise PlantError(
+                f"FMU '{archive.path.name}' has no variable '{name}'{suggestion(name, known)}"
+            )
+    noise = [name for name in _reals(known, "output") if f"{name}_nominal" in known]
+    cost = stage_cost or _cost(archive, known)
+    states = list(states) or _states(archive, known, [*noise, cost])
+    actions = list(actions) or _actions(archive, known, noise)
+    mapping = _mapping(known, states, noise)
+    starts = [known[name] for name in mapping.get("initial_state", states)]
+    x = _start(starts, state, "state")
+    u = _start([known[name] for name in actions], action, "action")
+    limits = [_limits(known[name], value) for name, value in zip(actions, u.tolist(), strict=True)]
     disturbance: dict[str, Any] = {"law": "none"}
     if "nominal" in mapping and "ranges" in mapping:
         disturbance["law"] = next(iter(mapping.get("law_codes", {"uniform": 1})))
         for field in ("nominal", "ranges"):
             disturbance[field] = [float(known[name].start) for name in mapping[field]]
-    return {
+    shipped = str(fmu) in SHIPPED
+    document: dict[str, Any] = {
         "schema": 1,
         "name": Path(fmu).stem,
         "description": str(archive.description.description or archive.description.modelName),
-        "sampling_time": sampling_time or _sampling_time(archive, roles, known),
+        "sampling_time": sampling_time or _sampling_time(archive, known, mapping),
         "discount": 0.99,
         "plant": {
-            "fmu": str(fmu) if str(fmu) in SHIPPED else str(archive.path),
-            "states": list(roles.states),
-            "actions": list(roles.actions),
-            "disturbances": list(roles.disturbances),
-            "stage_cost": roles.stage_cost,
+            "fmu": str(fmu) if shipped else str(archive.path),
+            "states": states,
+            "actions": actions,
+            "disturbances": noise,
+            "stage_cost": cost,
             "initial_state": x.tolist(),
             "mapping": mapping,
         },
         "disturbance": disturbance,
         "bounds": {
-            "state_lower": [-np.inf if low is None else float(low) for low, _ in ranges],
-            "state_upper": [np.inf if high is None else float(high) for _, high in ranges],
+            "state_lower": [_number(known[name].min, -np.inf) for name in states],
+            "state_upper": [_number(known[name].max, np.inf) for name in states],
             "action_lower": [low for low, _ in limits],
             "action_upper": [high for _, high in limits],
         },
@@ -132,29 +99,49 @@ def _document(
             "reference_cost": 0.0,
         },
     }
+    with FmuPlant(Scenario.from_dict(document | {"disturbance": {"law": "none"}})) as plant:
+        x, u, found = nearest_steady_state(plant, x, u)
+        units = plant.units
+    weight = 10.0 ** ceil(log10(10 * max(abs(found), 1.0)) - 0.5)
+    document["penalty"]["linear"] = [weight] * len(x)
+    document["plant"]["initial_state"] = x.tolist()
+    document["controller"] |= {
+        "reference_state": x.tolist(),
+        "reference_action": u.tolist(),
+        "reference_cost": found,
+    }
+    if shipped:
+        document["controller"]["model"] = "controllers.evaporator:model"
+    else:
+        document["plant"]["fmu"] = _relative(archive.path, target)
+    notes = [f"# {field}: {note}" for field, note in _comments(document, units).items()]
+    return "\n".join([HEAD, *notes, "", tomli_w.dumps(document)])
+
+
+def _start(variables: Sequence[Any], given: Sequence[float], kind: str) -> Array:
+    if given and len(given) != len(variables):
+        names = ", ".join(variable.name for variable in variables)
+        raise PlantError(f"--{kind} takes {len(variables)} numbers ({names}), not {len(given)}")
+    return np.array(given or [_number(variable.start, 0.0) for variable in variables], dtype=float)
+
+
+def _number(stated: str | None, otherwise: float) -> float:
+    return otherwise if stated is None else float(stated)
 
 
 def _limits(variable: Any, value: float) -> tuple[float, float]:
     """Range of an input: what the FMU states, else as much again about its start value."""
     reach = abs(value) or 1.0
-    low = value - reach if variable.min is None else float(variable.min)
-    high = value + reach if variable.max is None else float(variable.max)
-    return low, high
+    return _number(variable.min, value - reach), _number(variable.max, value + reach)
 
 
-def _sampling_time(fmu: UnpackedFmu, roles: Roles, known: dict[str, Any]) -> float:
-    parameter = known.get(roles.mapping.get("sampling_time", ""))
-    if parameter is not None and parameter.start is not None:
-        return float(parameter.start)
-    experiment = fmu.description.defaultExperiment
-    if getattr(experiment, "stepSize", None):
-        return float(experiment.stepSize)
-    if getattr(experiment, "stopTime", None):
-        return float(experiment.stopTime) / SAMPLES
-    raise PlantError(
-        f"FMU '{fmu.path.name}' states neither a step size nor a stop time; give --sampling-time "
-        "SECONDS"
-    )
+def _sampling_time(fmu: UnpackedFmu, known: dict[str, Any], mapping: Mapping[str, Any]) -> float:
+    parameter = known.get(mapping.get("sampling_time", ""))
+    experiment = getattr(fmu.description.defaultExperiment, "stepSize", None)
+    stated = getattr(parameter, "start", None) or experiment
+    if not stated:
+        raise PlantError(f"FMU '{fmu.path.name}' states no step size; give --sampling-time SECONDS")
+    return float(stated)
 
 
 def _relative(path: Path, target: Path) -> str:
@@ -164,21 +151,19 @@ def _relative(path: Path, target: Path) -> str:
         return path.as_posix()
 
 
-def _comments(document: dict[str, Any], roles: Roles, units: dict[str, str]) -> dict[str, str]:
+def _comments(document: dict[str, Any], units: dict[str, str]) -> dict[str, str]:
     """Remark on each field and table by its dotted name."""
-
-    def named(names: Sequence[str]) -> str:
-        return ", ".join(f"{n} [{units[n]}]" if units.get(n) else n for n in names)
-
-    bounds, why = document["bounds"], roles.reasons
-    ranges = zip(roles.states, bounds["state_lower"], bounds["state_upper"], strict=True)
+    plant, bounds = document["plant"], document["bounds"]
+    listed = {
+        field: ", ".join(f"{n} [{units[n]}]" if units.get(n) else n for n in plant[field])
+        for field in ("states", "actions", "disturbances")
+    }
+    ranges = zip(plant["states"], bounds["state_lower"], bounds["state_upper"], strict=True)
     free = [name for name, low, high in ranges if not isfinite(low) and not isfinite(high)]
     comments = {
         "sampling_time": "s; CHECK",
-        "plant.states": f"{why['states']}: {named(roles.states)}",
-        "plant.actions": f"{why['actions']}: {named(roles.actions)}",
-        "plant.disturbances": why.get("disturbances", "none was found"),
-        "plant.stage_cost": f"{why['stage_cost']}; CHECK: a cost, not a profit",
+        **{f"plant.{field}": names or "none was found" for field, names in listed.items()},
+        "plant.stage_cost": "CHECK: a cost, not a profit",
         "plant.initial_state": "the steady state below",
         "plant.mapping": "each reset writes these; what the FMU has no parameter for is left out",
         "bounds": "CHECK: states are bounded softly, by the penalty, actions hard; from min and max"
@@ -192,78 +177,6 @@ def _comments(document: dict[str, Any], roles: Roles, units: dict[str, str]) -> 
     if "model" not in document["controller"]:
         comments["controller"] += '; add model = "my_plant:model", a model in CasADi'
     return comments
-
-
-REALS = ("Real", "Float64", "Float32")
-INTEGERS = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
-CODES = (*INTEGERS, "Enumeration")
-COSTS = ("cost", "loss", "objective")
-LAWS = ("uniform", "normal")
-SEEDS = (("seed",), ("seed", "seedHigh"), ("seed", "seed_high"), ("random_seed",), ("rng_seed",))
-SAMPLINGS = ("sampling_time", "sample_time", "samplingTime", "sampleTime", "Ts", "T_s", "ts")
-SWITCHES = ("stochastic", "noise", "noisy")
-
-
-@dataclass(frozen=True)
-class Roles:
-    """The variables of an FMU by what a scenario uses them for, with the words that led there.
-
-    `mapping` is the table `[plant.mapping]`; `reasons` says of each field why it is as it is.
-    """
-
-    states: tuple[str, ...]
-    actions: tuple[str, ...]
-    disturbances: tuple[str, ...]
-    stage_cost: str
-    mapping: Mapping[str, Any]
-    reasons: Mapping[str, str]
-
-
-def guess_roles(
-    fmu: UnpackedFmu,
-    states: Sequence[str] = (),
-    actions: Sequence[str] = (),
-    stage_cost: str | None = None,
-) -> Roles:
-    """Guess the roles of an FMU's variables; what is given is taken as it is.
-
-    Raises PlantError, which says what to give, where nothing or too much could be meant.
-    """
-    known = {variable.name: variable for variable in fmu.description.modelVariables}
-    for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
-        if name not in known:
-            raise PlantError(
-                f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, known)}"
-            )
-    reasons = {}
-    noise = tuple(n for n in _reals(known, "output") if f"{n}_nominal" in known)
-    if noise:
-        reasons["disturbances"] = "outputs that have a parameter NAME_nominal"
-    cost = stage_cost or _cost(fmu, known)
-    reasons["stage_cost"] = "as given" if stage_cost else "the output that is called so"
-    found_states = tuple(states)
-    reasons["states"] = "as given"
-    if not found_states:
-        found_states, reasons["states"] = _states(fmu, known, (*noise, cost))
-    found_actions = tuple(actions)
-    reasons["actions"] = "as given"
-    if not found_actions:
-        inputs = _reals(known, "input")
-        # An input D_in beside an output D takes the disturbance's place: it is no actuator.
-        found_actions = tuple(n for n in inputs if n.removesuffix("_in") not in noise)
-        reasons["actions"] = "the real inputs"
-        if len(found_actions) < len(inputs):
-            reasons["actions"] += ", but for those that replace a disturbance"
-    if not found_actions:
-        tunable = [
-            name for name in _reals(known, "parameter") if known[name].variability == TUNABLE
-        ]
-        raise PlantError(
-            f"FMU '{fmu.path.name}' has no real input to act on"
-            + (f"; give --actions A,B,…, of its tunable {', '.join(tunable)}" if tunable else "")
-        )
-    mapping = _mapping(known, found_states, noise)
-    return Roles(found_states, found_actions, noise, cost, mapping, reasons)
 
 
 def _reals(known: Mapping[str, Any], causality: str) -> list[str]:
@@ -288,31 +201,36 @@ def _cost(fmu: UnpackedFmu, known: Mapping[str, Any]) -> str:
     )
 
 
-def _states(
-    fmu: UnpackedFmu, known: Mapping[str, Any], others: Iterable[str]
-) -> tuple[tuple[str, ...], str]:
+def _states(fmu: UnpackedFmu, known: Mapping[str, Any], others: Sequence[str]) -> list[str]:
     """Continuous states, else outputs with a start parameter."""
-    derived = [
-        variable.derivative.name
-        for variable in known.values()
-        if getattr(variable, "derivative", None) is not None
-    ]
-    if derived:
-        return tuple(dict.fromkeys(derived)), "the continuous states"
+    rates = [variable for variable in known.values() if getattr(variable, "derivative", None)]
+    if rates:
+        return list(dict.fromkeys(variable.derivative.name for variable in rates))
     outputs = [name for name in _reals(known, "output") if name not in others]
-    started = [name for name in outputs if f"{name}_start" in known]
-    if started:
-        return tuple(started), "outputs that have a parameter NAME_start"
+    if started := [name for name in outputs if f"{name}_start" in known]:
+        return started
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no parameters "
         f"NAME_start); give --states A,B,…, of {', '.join(_reals(known, 'output'))}"
     )
 
 
+def _actions(fmu: UnpackedFmu, known: Mapping[str, Any], noise: Sequence[str]) -> list[str]:
+    """Real inputs, but for an input D_in beside an output D: it takes the disturbance's place."""
+    inputs = [name for name in _reals(known, "input") if name.removesuffix("_in") not in noise]
+    if inputs:
+        return inputs
+    tunable = [n for n in _reals(known, "parameter") if known[n].variability == "tunable"]
+    raise PlantError(
+        f"FMU '{fmu.path.name}' has no real input to act on"
+        + (f"; give --actions A,B,…, of its tunable {', '.join(tunable)}" if tunable else "")
+    )
+
+
 def _mapping(
     known: Mapping[str, Any], states: Sequence[str], noise: Sequence[str]
 ) -> dict[str, Any]:
-    """What a reset can write."""
+    """What a reset can write, by the names that the benchmark's own plants have."""
 
     def of(name: str, types: Sequence[str]) -> bool:
         return name in known and known[name].type in types and known[name].causality == "parameter"
@@ -323,32 +241,21 @@ def _mapping(
         table["initial_state"] = starts
     elif all(has_start(known[name]) for name in states):
         table["initial_state"] = list(states)
-    seeds = [words for words in SEEDS if all(of(word, INTEGERS) for word in words)]
-    if seeds:
-        table["seed"] = list(max(seeds, key=len))
-    for field, names, types in (
-        ("sampling_time", SAMPLINGS, REALS),
-        ("stochastic", SWITCHES, ("Boolean",)),
-        ("law", ("law", "distribution"), CODES),
-    ):
-        if found := [name for name in names if of(name, types)]:
-            table[field] = found[0]
-    if codes := _law_codes(known.get(table.get("law", ""))):
-        table["law_codes"] = codes
-    else:
-        table.pop("law", None)
+    if of("seed", INTEGERS):
+        table["seed"] = [name for name in ("seed", "seedHigh") if of(name, INTEGERS)]
+    for name, types in (("sampling_time", REALS), ("stochastic", ("Boolean",))):
+        if of(name, types):
+            table[name] = name
+    declared = getattr(known.get("law"), "declaredType", None)
+    items = getattr(declared, "items", None) or []
+    codes = {item.name: int(item.value) for item in items if item.name in ("uniform", "normal")}
+    if codes and of("law", ("Enumeration",)):
+        table |= {"law": "law", "law_codes": codes}
     for field, suffix in (("nominal", "_nominal"), ("ranges", "_range")):
         parameters = [f"{name}{suffix}" for name in noise]
         if parameters and all(of(name, REALS) for name in parameters):
             table[field] = parameters
     return table
-
-
-def _law_codes(variable: Any) -> dict[str, int]:
-    """Numbers of the laws that an enumeration names as the benchmark does."""
-    declared = getattr(variable, "declaredType", None)
-    items = getattr(declared, "items", None) or []
-    return {item.name: int(item.value) for item in items if item.name in LAWS}
 
 
 DIFFERENCE = 1e-5

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import re
 import shutil
 import stat
 import threading
@@ -47,8 +45,15 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
     An FMU is native code that runs with the caller's rights, so a foreign one is taken only from
     the very path given. Raises PlantError on a missing, corrupt or suspicious archive.
     """
-    path = _locate(fmu).resolve()
+    path = fmus.path(str(fmu)) if str(fmu) in SHIPPED else Path(fmu)
+    if path.suffix != ".fmu" and len(path.parts) == 1:
+        raise PlantError(
+            f"unknown FMU '{fmu}'; shipped are {', '.join(SHIPPED)}, or give the path of an .fmu"
+        )
     try:
+        path = path.resolve()
+        if not path.is_file():
+            raise PlantError(f"FMU '{path}' does not exist or is not a file")
         status = path.stat()
     except OSError as error:
         raise PlantError(f"FMU '{path}' cannot be read: {error.strerror}") from None
@@ -59,28 +64,12 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
         return _unpacked[key]
 
 
-def _locate(fmu: str | Path) -> Path:
-    if str(fmu) in SHIPPED:
-        return Path(fmus.path(str(fmu)))
-    path = Path(fmu)
-    if path.suffix != ".fmu" and len(path.parts) == 1:
-        raise PlantError(
-            f"unknown FMU '{fmu}'; shipped are {', '.join(SHIPPED)}, or give the path of an .fmu"
-        )
-    try:
-        found = path.is_file()
-    except OSError as error:
-        raise PlantError(f"FMU '{path}' cannot be read: {error.strerror}") from None
-    if not found:
-        raise PlantError(f"FMU '{path}' does not exist or is not a file")
-    return path
-
-
 def _unpack(path: Path) -> UnpackedFmu:
     try:
         with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
             _check_entries(path, archive)
-            description = _describe(path, archive)
+            if DESCRIPTION not in archive.namelist():
+                raise PlantError(f"'{path}' is not an FMU: it has no {DESCRIPTION}")
             stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
             folder = place(archive, digest)
@@ -94,7 +83,7 @@ def _unpack(path: Path) -> UnpackedFmu:
         raise PlantError(
             f"FMU '{path}' is corrupt or not an FMU ({error}); copy or build it again"
         ) from None
-    return UnpackedFmu(path, digest, folder, description, entries)
+    return UnpackedFmu(path, digest, folder, _describe(path, folder), entries)
 
 
 def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
@@ -124,16 +113,9 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
     archive.NameToInfo = {entry.filename: entry for entry in entries}
 
 
-def _describe(path: Path, archive: zipfile.ZipFile) -> Any:
-    if DESCRIPTION not in archive.namelist():
-        raise PlantError(f"'{path}' is not an FMU: it has no {DESCRIPTION}")
-    # Damage of the archive is told from damage of the text: zipfile checks what it reads.
-    text = archive.read(DESCRIPTION)
-    version = _fmi_version(text)
-    if version is not None and version[:2] not in ("2.", "3."):
-        raise PlantError(f"FMU '{path}' is FMI {version}; 2.0 and 3.0 are supported")
+def _describe(path: Path, folder: Path) -> Any:
     try:
-        return read_model_description(_alone(archive))
+        description = read_model_description(str(folder))
     except ValidationError as error:
         problems = error.problems
         raise PlantError(
@@ -143,25 +125,9 @@ def _describe(path: Path, archive: zipfile.ZipFile) -> Any:
     # fmpy raises bare Exception and whatever lxml does on text that is not XML.
     except Exception as error:
         raise PlantError(f"FMU '{path}' has an unreadable model description: {error}") from None
-
-
-def _fmi_version(description: bytes) -> str | None:
-    """The version that the root element states, if it can be found without parsing the rest."""
-    found = re.search(
-        rb"<fmiModelDescription[^>]*?\sfmiVersion\s*=\s*[\"']([^\"'<>]*)", description
-    )
-    return found.group(1).decode("utf-8", "replace") if found else None
-
-
-def _alone(archive: zipfile.ZipFile) -> io.BytesIO:
-    """What fmpy reads of the archive, and nothing else: it finds no folder behind backslashes."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as copy:
-        for name in (DESCRIPTION, "sources/buildDescription.xml"):
-            if name in archive.namelist():
-                copy.writestr(name, archive.read(name))
-    stream.seek(0)
-    return stream
+    if description.fmiVersion[:2] not in ("2.", "3."):
+        raise PlantError(f"FMU '{path}' is FMI {description.fmiVersion}; 2.0 and 3.0 are supported")
+    return description
 
 
 _CHUNK = 1 << 20

@@ -9,8 +9,8 @@ import math
 import re
 from collections.abc import Mapping
 from functools import cached_property
-from importlib.resources import files
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cosim.errors import ScenarioError
-from cosim.files import parse_toml, read_toml
+from cosim.files import read_toml
 from cosim.penalty import Penalty
 from cosim.shown import Shown
 from cosim.validation import describe, suggestion
@@ -204,51 +204,46 @@ class Scenario(Shown, Table):
     @model_validator(mode="after")
     def _sizes_and_signs_fit(self) -> Self:
         plant, mapping, law = self.plant, self.plant.mapping, self.disturbance.law
-        n, m, p = len(plant.states), len(plant.actions), len(plant.disturbances)
-        for table, size, of, optional in (
-            ("plant.initial_state", n, "state", False),
-            ("plant.mapping.initial_state", n, "state", True),
-            ("plant.mapping.nominal", p, "disturbance", True),
-            ("plant.mapping.ranges", p, "disturbance", True),
-            ("disturbance.nominal", p, "disturbance", law == "none"),
-            ("disturbance.ranges", p, "disturbance", law == "none"),
-            ("bounds.state_lower", n, "state", False),
-            ("bounds.state_upper", n, "state", False),
-            ("bounds.action_lower", m, "action", False),
-            ("bounds.action_upper", m, "action", False),
-            ("penalty.linear", n, "state", False),
-            ("penalty.quadratic", n, "state", False),
-            ("controller.reference_state", n, "state", False),
-            ("controller.reference_action", m, "action", False),
+        sizes = {
+            kind: len(getattr(plant, f"{kind}s")) for kind in ("state", "action", "disturbance")
+        }
+        explores = self.exploration is not None and self.exploration.kind != "none"
+        for field, of, optional in (
+            ("plant.initial_state", "state", False),
+            ("plant.mapping.initial_state", "state", True),
+            ("plant.mapping.nominal", "disturbance", True),
+            ("plant.mapping.ranges", "disturbance", True),
+            ("disturbance.nominal", "disturbance", law == "none"),
+            ("disturbance.ranges", "disturbance", law == "none"),
+            ("bounds.state_lower", "state", False),
+            ("bounds.state_upper", "state", False),
+            ("bounds.action_lower", "action", False),
+            ("bounds.action_upper", "action", False),
+            ("penalty.linear", "state", False),
+            ("penalty.quadratic", "state", False),
+            ("controller.reference_state", "state", False),
+            ("controller.reference_action", "action", False),
+            *([("exploration.standard_deviation", "action", False)] if explores else []),
         ):
-            value: Any = self
-            for part in table.split("."):
-                value = getattr(value, part)
-            if len(value) != size and not (optional and not value):
-                raise _misfit(
-                    table,
-                    f"must have one entry per {of} (plant.{of}s has {size}), not {len(value)}",
+            entries = len(attrgetter(field)(self))
+            if entries != sizes[of] and not (optional and not entries):
+                raise ValueError(
+                    f"{field}: must have one entry per {of} (plant.{of}s has {sizes[of]}), "
+                    f"not {entries}"
                 )
-        explored = self.exploration
-        deviations = () if explored is None else explored.standard_deviation
-        if explored is not None and explored.kind != "none" and len(deviations) != m:
-            raise _misfit(
-                "exploration.standard_deviation",
-                f"must have one entry per action (plant.actions has {m}), not {len(deviations)}",
-            )
         for kind in ("state", "action"):
             lower = getattr(self.bounds, f"{kind}_lower")
             upper = getattr(self.bounds, f"{kind}_upper")
             if not all(low < high for low, high in zip(lower, upper, strict=True)):
-                raise _misfit(f"bounds.{kind}_lower", f"must be below {kind}_upper in every entry")
+                raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper in every entry")
         times = [change.time for change in plant.changes or ()]
         if any(first >= second for first, second in pairwise(times)):
-            raise _misfit("plant.changes", "must have increasing times")
+            raise ValueError("plant.changes: must have increasing times")
         names = (*plant.states, *plant.actions, *plant.disturbances)
         if twice := next((name for name in names if names.count(name) > 1), None):
-            raise _misfit("plant", f"names '{twice}' twice among states, actions and disturbances")
+            raise ValueError(f"plant: names '{twice}' twice among states, actions and disturbances")
         if law != "none" and not (mapping.law and law in mapping.law_codes):
-            raise _misfit("disturbance.law", f"'{law}' needs plant.mapping.law and its law_codes")
+            raise ValueError(f"disturbance.law: '{law}' needs plant.mapping.law and its law_codes")
         return self
 
     def _facts(self) -> dict[str, object]:
@@ -270,16 +265,11 @@ class Scenario(Shown, Table):
         `random-SEED` is the evaporator with the random errors of a seed, see `random_plant`.
         A document with `extends = NAME_OR_PATH` states only what differs from another one.
         """
-        document, origin = read(source)
-        return cls._validated(document, origin)
+        return cls.from_dict(*read(source))
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], origin: str = "scenario") -> Scenario:
         """Validate a document, structured like the TOML file; raises ScenarioError."""
-        return cls._validated(document, origin)
-
-    @classmethod
-    def _validated(cls, document: Mapping[str, Any], origin: str) -> Scenario:
         try:
             return cls.model_validate(document)
         except ValidationError as error:
@@ -290,7 +280,7 @@ class Scenario(Shown, Table):
 
         Tables are merged, everything else is replaced; the result is validated as a whole.
         """
-        return self._validated(merged(self.to_dict(), changes), f"scenario '{self.name}'")
+        return self.from_dict(merged(self.to_dict(), changes), f"scenario '{self.name}'")
 
     def at(self, time: float) -> Scenario:
         """The scenario of the plant as it is at a time in s, with no further change to come.
@@ -392,30 +382,18 @@ class Scenario(Shown, Table):
         return _frozen(self.controller.reference_action)
 
 
-def _misfit(field: str, message: str) -> ValueError:
-    return ValueError(f"{field}: {message}")
-
-
 def _frozen(values: tuple[float, ...]) -> NDArray[np.float64]:
     array = np.array(values, dtype=np.float64)
     array.flags.writeable = False
     return array
 
 
-# Documents: presets and TOML files, and what they extend
-
-LONGEST = 16
-"""Files that may extend one another in a chain."""
+PRESETS = Path(__file__).parent / "presets"
 
 
 def presets() -> list[str]:
     """Names of the scenarios that the package ships."""
-    folder = files("cosim.presets")
-    return sorted(
-        entry.name.removesuffix(".toml")
-        for entry in folder.iterdir()
-        if entry.name.endswith(".toml")
-    )
+    return sorted(path.stem for path in PRESETS.glob("*.toml"))
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -478,66 +456,40 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
     `seen` are the files that led here. An FMU's relative path is made absolute, as seen from the
     file that names it. Raises ScenarioError.
     """
-    path = Path(source)
+    path, origin = Path(source), f"scenario file '{source}'"
     if (drawn := RANDOM.fullmatch(str(source))) is not None:
         return read("paper")[0] | random_plant(int(drawn[1])), f"preset '{source}'"
     if str(source) in presets():
-        origin = f"preset '{source}'"
-        preset = files("cosim.presets").joinpath(f"{source}.toml").read_text("utf-8")
-        document, folder = parse_toml(preset, origin, ScenarioError), None
-    elif path.suffix == ".toml" or len(path.parts) > 1 or _is_file(path):
-        origin = f"scenario file '{source}'"
-        document, folder = read_toml(path, origin, ScenarioError), path.resolve().parent
-    else:
+        path, origin = PRESETS / f"{source}.toml", f"preset '{source}'"
+    elif path.suffix != ".toml" and len(path.parts) < 2:
         raise ScenarioError(
             f"unknown scenario '{source}'{suggestion(str(source), presets())}; presets are "
             f"{', '.join(presets())} and random-SEED, or give the path of a TOML file"
         )
-    return resolved(document, origin, folder, (*seen, str(path.resolve()))), origin
+    document = read_toml(path, origin, ScenarioError)
+    where = path.resolve()
+    return resolved(document, origin, where.parent, (*seen, str(where))), origin
 
 
 def resolved(
-    document: Mapping[str, Any], origin: str, folder: Path | None, seen: tuple[str, ...] = ()
+    document: Mapping[str, Any], origin: str, folder: Path, seen: tuple[str, ...] = ()
 ) -> dict[str, Any]:
     """The document with what it `extends`, its paths made absolute as seen from `folder`.
 
     `seen` are the files that led here. Raises ScenarioError.
     """
     result = copy.deepcopy(dict(document))
-    if folder is not None:
-        _anchor_fmu(result, folder)
-    if (base := result.pop("extends", None)) is not None:
-        result = merged(_extended(base, origin, folder, seen), result)
-    return result
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a name that no file can have
-        return False
-
-
-def _extended(
-    base: object, origin: str, folder: Path | None, seen: tuple[str, ...]
-) -> dict[str, Any]:
-    if not isinstance(base, str):
-        raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
-    if folder is not None and base not in presets() and not RANDOM.fullmatch(base):
-        base = str(folder / base)
-    if "\0" in base:
-        raise ScenarioError(f"{origin}: extends must be a path, not {base!r}")
-    if str(Path(base).resolve()) in seen:
-        raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
-    if len(seen) > LONGEST:
-        raise ScenarioError(f"{origin}: extends another file more than {LONGEST} times over")
-    return read(base, seen)[0]
-
-
-def _anchor_fmu(document: dict[str, Any], folder: Path) -> None:
-    """Make an FMU's relative path absolute, as seen from the scenario's folder."""
-    plant = document.get("plant")
+    plant = result.get("plant")
     if isinstance(plant, dict) and isinstance(plant.get("fmu"), str):
         fmu = Path(plant["fmu"])
         if fmu.suffix == ".fmu" or len(fmu.parts) > 1:
             plant["fmu"] = str(folder / fmu)
+    if (base := result.pop("extends", None)) is None:
+        return result
+    if not isinstance(base, str):
+        raise ScenarioError(f"{origin}: extends must be a preset's name or a path, not {base!r}")
+    if base not in presets() and not RANDOM.fullmatch(base):
+        base = str(folder / base)
+    if str(Path(base).resolve()) in seen:
+        raise ScenarioError(f"{origin}: extends leads back to itself through '{base}'")
+    return merged(read(base, seen)[0], result)

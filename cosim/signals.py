@@ -62,7 +62,7 @@ class SignalKind:
     `vector` is a signal per variable that the scenario's plant names under `name`, in the
     variable's unit; its attribute then holds all of them. `group` is where a recording shows it,
     None if it is not recorded; `whole` marks 0 or 1, `clock` what a clock measured, which stays out
-    of the trajectory's file; `optional` signals may be missing from a file.
+    of the trajectory's file.
     """
 
     name: str
@@ -72,7 +72,6 @@ class SignalKind:
     vector: bool = False
     whole: bool = False
     clock: bool = False
-    optional: bool = False
 
     def names(self, scenario: Scenario) -> tuple[str, ...]:
         """Names of the signals, one but for a vector."""
@@ -108,14 +107,9 @@ SIGNALS: tuple[SignalKind, ...] = (
 )
 
 
-def signal_names(scenario: Scenario, *, required: bool = False) -> list[str]:
-    """Names of a run's signals, in the order of the CSV's columns; with `required` those alone."""
-    return [
-        name
-        for kind in SIGNALS
-        if not kind.clock and not (required and kind.optional)
-        for name in kind.names(scenario)
-    ]
+def signal_names(scenario: Scenario) -> list[str]:
+    """Names of a run's signals, in the order of the CSV's columns."""
+    return [name for kind in SIGNALS if not kind.clock for name in kind.names(scenario)]
 
 
 def signal_units(scenario: Scenario, known: Mapping[str, str]) -> dict[str, str]:
@@ -178,15 +172,17 @@ class SignalColumns:
         for name, column in self.columns.items():
             if name in values and name not in self._unwanted:
                 column[where] = values[name]
-        stored = {name: column[where] for name, column in self.columns.items()}
-        for name, derive in self._derived.items():
-            stored[name][:] = derive(self._scenario, stored)
+        self._derive(where)
 
     def store(self, first: int) -> dict[str, Array]:
         """Store what was read, from sample number `first` on, and return it by name."""
         where = slice(first, first + len(self._rows))
         self._table[where, : len(self._rows[0])] = self._rows
         self._rows.clear()
+        return self._derive(where)
+
+    def _derive(self, where: slice) -> dict[str, Array]:
+        """Compute what follows from the stored samples `where`; return all of them by name."""
         stored = {name: column[where] for name, column in self.columns.items()}
         for name, derive in self._derived.items():
             stored[name][:] = derive(self._scenario, stored)

@@ -69,7 +69,7 @@ class Trajectory(Shown):
 
     def __post_init__(self) -> None:
         """Check that every signal is there and has one value per sample."""
-        expected = signal_names(self.scenario, required=True)
+        expected = signal_names(self.scenario)
         if missing := [name for name in expected if name not in self.signals]:
             raise TrajectoryError(f"the trajectory lacks the signal {', '.join(missing)}")
         samples = len(self.status)

@@ -15,7 +15,7 @@ def distance(scenario, columns):
     return columns["states"][:, 0] - 25.0
 
 
-TOY = SignalKind("distance", distance, "%", "costs", optional=True)
+TOY = SignalKind("distance", distance, "%", "costs")
 
 
 @pytest.fixture
@@ -44,12 +44,3 @@ def test_a_signal_declared_in_one_place_is_simulated_stored_recorded_and_read(to
     assert recording.units["distance"] == "%"
     both = load_run(tmp_path), load_run(tmp_path / "run.rrd")
     assert compare(*both).equal
-
-
-def test_a_file_from_before_a_signal_was_declared_is_still_read(tmp_path, paper, monkeypatch):
-    run(tmp_path, paper)
-    monkeypatch.setattr(cosim.signals, "SIGNALS", (*SIGNALS, TOY))
-    stored = read_csv(tmp_path / "trajectory.csv", paper)
-    assert "distance" in signal_names(paper)
-    with pytest.raises(TrajectoryError, match="no signal 'distance'"):
-        stored["distance"]

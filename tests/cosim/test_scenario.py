@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from cosim.errors import ScenarioError
-from cosim.scenario import LONGEST, Scenario, presets
+from cosim.scenario import Scenario, presets
 
 
 def test_presets_are_those_that_the_design_names():
@@ -250,11 +250,3 @@ def test_a_scenario_can_extend_a_random_plant(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('extends = "random-3"\nname = "mine"\n')
     assert Scenario.load(path).hash == Scenario.load("random-3").hash
-
-
-def test_a_chain_of_extends_has_an_end(tmp_path):
-    for number in range(LONGEST + 3):
-        (tmp_path / f"{number}.toml").write_text(f'extends = "{number + 1}.toml"')
-    (tmp_path / f"{LONGEST + 3}.toml").write_text('extends = "paper"')
-    with pytest.raises(ScenarioError, match=f"more than {LONGEST} times"):
-        Scenario.load(tmp_path / "0.toml")

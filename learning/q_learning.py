@@ -56,7 +56,7 @@ class ValueConfiguration(Configuration):
         "time alters, and for the rules td and fit the scenario's",
     )
     prior_width: Positive = Field(
-        0.3, description="how far θ may be from its start, as a share of the start's cost"
+        0.15, description="how far θ may be from its start, as a share of the start's cost"
     )
     measure_offset: bool = Field(
         True,

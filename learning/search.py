@@ -34,6 +34,8 @@ RULES: dict[str, Any] = {
     "batch-q-learning": BatchQLearning,
     "actor-critic": ActorCritic,
 }
+PRIOR_WIDTH = 0.3
+"""Of a rule within the search, which judges each θ: wider than that of the rule alone."""
 CANDIDATES = 3
 """θ of a phase of learning that are compared, at equal distances in samples."""
 SENSITIVITIES = 100
@@ -575,7 +577,7 @@ class SearchPlan:
             learned.error_deviation,
             self._action_deviation,
             abs(float(start["c_lambda"])),
-            0.3,
+            PRIOR_WIDTH,
         )
         self.comparison.remember(learned.errors)
 
@@ -604,6 +606,8 @@ class SearchConfiguration(Configuration):
         """Settings of a rule in the search: those that they share, and the rule's own."""
         shared = {field: getattr(self, field) for field in Configuration.model_fields}
         own = self.rule_settings if name == self.rule else {}
+        if "prior_width" in RULES[name].Configuration.model_fields:
+            own = {"prior_width": PRIOR_WIDTH} | own
         return RULES[name].Configuration.from_dict(shared | own)
 
     def without_part(self) -> Mapping[str, str]:

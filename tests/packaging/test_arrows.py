@@ -23,6 +23,7 @@ GROUND = (
     "validation",
 )  # fmt: skip
 """Modules of cosim that all packages may import; they import none of controllers and learning."""
+ABOVE = ("controllers", "learning", "fmus", "cosim.cli", "cosim.evaluation", "cosim.studies")
 ONLY = {"rerun": ("cosim.recording",), "fmpy": ("cosim.plant", "fmus", "cosim.cli.fmu")}
 """Third-party packages that only these modules import."""
 
@@ -62,15 +63,7 @@ def test_the_ground_knows_nobody_who_stands_on_it():
     known = modules()
     for name in GROUND:
         found = imported(known[f"cosim.{name}"], known)
-        above = (
-            "controllers",
-            "learning",
-            "fmus",
-            "cosim.cli",
-            "cosim.evaluation",
-            "cosim.studies",
-        )
-        assert not [other for other in found if other.startswith(above)], name
+        assert not [other for other in found if other.startswith(ABOVE)], name
 
 
 @pytest.mark.parametrize("library", ONLY)

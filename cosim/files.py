@@ -111,11 +111,7 @@ def cache_folder(kind: str) -> Path:
 
 
 def _is_ours_alone(folder: Path) -> bool:
-    """Whether a cache's folder, made if need be, and the one above are the user's alone.
-
-    Each must belong to the user, be closed to others for writing and be no link. Windows closes a
-    user's profile by other means and is trusted.
-    """
+    """Whether a cache's folder, made if need be, and the one above are the user's alone."""
     levels = (folder.parent, folder)
     try:
         folder.parent.parent.mkdir(parents=True, exist_ok=True)
@@ -124,7 +120,7 @@ def _is_ours_alone(folder: Path) -> bool:
         found = [level.lstat() for level in levels]
     except OSError:
         return False
-    return os.name == "nt" or all(
+    return os.name == "nt" or all(  # Windows closes a user's profile by other means
         status.st_uid == os.geteuid()
         and status.st_mode & (stat.S_IRWXU | stat.S_IWGRP | stat.S_IWOTH) == stat.S_IRWXU
         and stat.S_ISDIR(status.st_mode)

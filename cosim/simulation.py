@@ -68,7 +68,7 @@ def simulate(
     if recorder is None:
         loop = _compiled_loop(plant, controller)
         if loop is None:
-            run.go(_no_record, progress)
+            run.go(None, progress)
         else:
             run.go_compiled(loop, progress)
         return run.trajectory()
@@ -80,15 +80,8 @@ def simulate(
     return run.trajectory()
 
 
-def _no_record(_: SampleBlock) -> None:
-    return None
-
-
 def _compiled_loop(plant: Plant, controller: Controller) -> CompiledLoop | None:
-    """The controller's own loop with the plant, if both have one; looked for on their classes.
-
-    A wrapper that hands attributes on would otherwise lose what it adds.
-    """
+    """The controller's own loop with the plant, if their classes have one, not a wrapper's."""
     if not hasattr(type(plant), "drive") or not hasattr(type(controller), "compiled_loop"):
         return None
     loop: CompiledLoop | None = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
@@ -116,9 +109,8 @@ class _Run:
         self._final_state: Array | None = None
 
     def go(
-        self, record: Callable[[SampleBlock], None], progress: Callable[[int], None] | None
+        self, record: Callable[[SampleBlock], None] | None, progress: Callable[[int], None] | None
     ) -> None:
-        keeps_predictions = record is not _no_record
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
         sampling_time = self._scenario.sampling_time
         plant, read, solve = self._plant, self._columns.read, self._solve
@@ -155,10 +147,12 @@ class _Run:
                 )
             )
             s = step.s
-            if keeps_predictions and solution is not None:
+            if record is not None and solution is not None:
                 self._keep_prediction(k, solution)
             if (k + 1) % BLOCK == 0 or k + 1 == self._steps:
-                record(self._block(k // BLOCK * BLOCK, k + 1))
+                block = self._block(k // BLOCK * BLOCK, k + 1)
+                if record is not None:
+                    record(block)
                 if progress is not None:
                     progress(k + 1)
         self._final_state = s

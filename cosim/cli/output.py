@@ -86,6 +86,8 @@ class Output:
         from rich.table import Table
 
         console = Console()
+        if not console.is_terminal:
+            console.width = 1000
         columns = [[row[number] for row in rows] for number in range(len(header))]
         # Numbers are never folded, words of a heading and texts may be.
         widths = [
@@ -93,7 +95,7 @@ class Output:
             for k, (name, cells) in enumerate(zip(header, columns, strict=True))
         ]
         widths[0] = max(map(len, [header[0], *columns[0]])) + 3
-        for part in _parts(widths, console.width - 1 if console.is_terminal else 1 << 30):
+        for part in _parts(widths, console.width - 1):
             table = Table(title=escape(title), title_justify="left", min_width=len(title))
             for k in part:
                 right = all(map(_is_number, columns[k]))
@@ -101,10 +103,6 @@ class Output:
                 table.add_column(escape(header[k]), justify=justify, overflow="fold")
             for row in rows:
                 table.add_row(*(escape(row[k]) for k in part))
-            if not console.is_terminal:
-                unlimited = console.options.update(max_width=1000)
-                wanted = console.measure(table, options=unlimited).maximum
-                console.width = max(console.width, wanted)
             console.print(table)
 
     def json(self, document: Mapping[str, Any], folder: Path | None = None) -> None:

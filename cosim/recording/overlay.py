@@ -48,7 +48,7 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
         ]
         for signal in common
     }
-    differences = _differences(common, first, others[0]) if len(runs) == 2 else {}
+    differences = {s: _difference(s, first, others[0]) for s in common if len(runs) == 2}
     seconds = max((float(_time(run)[-1]) for run in runs.values() if len(run)), default=0.0)
     along = axis(seconds=seconds)
     plots = [
@@ -73,19 +73,13 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
             stream.send([channel], rows, values)
 
 
-def _differences(
-    common: list[str], a: RunSignals, b: RunSignals
-) -> dict[str, tuple[Channel, Array]]:
-    found = {}
-    for signal in common:
-        x, y = a.signals[signal].values, b.signals[signal].values
-        length = min(len(x), len(y))
-        with np.errstate(invalid="ignore"):
-            values = x[:length] - y[:length]
-        name, unit = f"difference/{signal}", a.signals[signal].unit
-        channel = Channel(f"difference/{escaped(signal)}", name, unit, SERIES[3])
-        found[signal] = channel.see(values), values
-    return found
+def _difference(signal: str, a: RunSignals, b: RunSignals) -> tuple[Channel, Array]:
+    x, y = a.signals[signal].values, b.signals[signal].values
+    length = min(len(x), len(y))
+    with np.errstate(invalid="ignore"):
+        values = x[:length] - y[:length]
+    name, unit = f"difference/{signal}", a.signals[signal].unit
+    return Channel(f"difference/{escaped(signal)}", name, unit, SERIES[3]).see(values), values
 
 
 def _time(run: RunSignals) -> Array:

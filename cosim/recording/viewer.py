@@ -121,11 +121,9 @@ def _viewer() -> list[str]:
 
 
 def _silent(level: str) -> dict[str, str]:
-    """Environment in which the viewer opens no connection and prints messages from a level on.
-
-    Its usage statistics are off where it finds itself in continuous integration; its look for a
-    newer version has no switch, but goes through a proxy, and nothing listens at this one.
-    """
+    """Environment in which the viewer opens no connection and prints messages from a level on."""
+    # Its usage statistics are off in continuous integration; its look for a newer version has no
+    # switch, but goes through a proxy, and nothing listens at this one.
     kept = {name: value for name, value in os.environ.items() if name != "FORCE_RERUN_ANALYTICS"}
     proxies = dict.fromkeys((*_PROXIES, *(name.upper() for name in _PROXIES)), _NOWHERE)
     local = {"NO_PROXY": LOOPBACK, "no_proxy": LOOPBACK}

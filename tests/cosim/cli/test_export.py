@@ -1,12 +1,12 @@
 """`cosim export`: the FMU and the SSP that it writes, and what it refuses."""
 
-import csv
 import json
 import os
 import shutil
 import subprocess
 import sys
 import zipfile
+from itertools import pairwise
 from pathlib import Path
 
 import fmpy
@@ -67,11 +67,8 @@ def test_its_variables_have_the_plants_names_and_units_and_theta_is_tunable(expo
 
 def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
     """The twenty lines of the example; the two QP solvers differ by rounding."""
-    result = subprocess.run(
-        [sys.executable, "-W", "error", EXAMPLES / "fmpy_ssp.py", exported[1], str(SAMPLES)],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    rows = _rows(result.stdout)
+    printed = master("-W", "error", EXAMPLES / "fmpy_ssp.py", exported[1], SAMPLES)
+    rows = np.array([list(map(float, line.split(","))) for line in printed[1:]])
     scenario = Scenario.load("paper")
 
     with FmuPlant(scenario) as plant:
@@ -80,8 +77,18 @@ def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
         np.testing.assert_allclose(rows[:, column], expected[name], rtol=0, atol=ACTION)
 
 
-def _rows(printed):
-    return np.array([list(map(float, row)) for row in list(csv.reader(printed.split()))[1:]])
+def master(*words):
+    """The lines that a script prints which runs an SSP."""
+    command = [sys.executable, *map(str, words)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    return result.stdout.split()
+
+
+def rows_by(name, ssp, step, samples):
+    """Rows of numbers of a run by another master."""
+    words = master(Path(__file__).parents[2] / "helpers" / f"ssp_by_{name}.py", ssp, step, samples)
+    found = [after for word, after in pairwise(words) if word == "row"]
+    return np.array([list(map(float, row.split(","))) for row in found])
 
 
 def test_another_instance_goes_on_from_its_bytes_with_the_same_bits(exported, tmp_path):
@@ -148,25 +155,19 @@ def test_theta_set_in_the_fmu_is_the_controller_with_that_theta(exported):
 
 
 @pytest.mark.parametrize(
-    ("master", "package"), [("libcosim", "libcosimpy"), ("ecos", "ecospy.EcosSimulation")]
+    ("name", "package"), [("libcosim", "libcosimpy"), ("ecos", "ecospy.EcosSimulation")]
 )
 def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
-    exported, master, package
+    exported, name, package
 ):
     """They step plant and controller side by side: an action arrives one step of theirs late."""
     pytest.importorskip(package, exc_type=Exception)
-    code = Path(__file__).parents[2] / "helpers" / f"ssp_by_{master}.py"
     scenario = Scenario.load("paper")
     with FmuPlant(scenario) as plant:
         expected = simulate(plant, tuned(scenario), 20, 5)
     errors = []
     for step in ("6.0", "3.0"):
-        result = subprocess.run(
-            [sys.executable, code, exported[1], step, "20"], capture_output=True, text=True,
-            check=True,
-        )  # fmt: skip
-        lines = [line.split()[1] for line in result.stdout.splitlines() if line[:4] == "row "]
-        rows = np.array([list(map(float, line.split(","))) for line in lines])
+        rows = rows_by(name, exported[1], step, 20)
         errors.append(np.abs(rows[1:, 0] - expected["X2"][1:]).max())
     assert errors[0] < 0.5
     assert errors[1] < 0.6 * errors[0]
@@ -181,13 +182,8 @@ def test_libcosim_draws_from_the_scenarios_law(tmp_path):
     run_cosim(*words.split(), folder=tmp_path, check=True)
     with FmuPlant(normal) as plant:
         expected = simulate(plant, tuned(normal), 5, 3)
-    code = Path(__file__).parents[2] / "helpers" / "ssp_by_libcosim.py"
-    result = subprocess.run(
-        [sys.executable, code, tmp_path / "l.ssp", "6.0", "5"], capture_output=True, text=True,
-        check=True,
-    )  # fmt: skip
-    lines = [line.split()[1] for line in result.stdout.splitlines() if line[:4] == "row "]
-    assert [float(line.split(",")[2]) for line in lines[1:]] == expected["X1"][1:].tolist()
+    rows = rows_by("libcosim", tmp_path / "l.ssp", "6.0", 5)
+    assert rows[1:, 2].tolist() == expected["X1"][1:].tolist()
 
 
 @pytest.mark.parametrize(

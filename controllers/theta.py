@@ -343,13 +343,17 @@ class Parameters(Shown):
             values["p"] = problem.model.nominal_parameters[chosen]
         return cls(blocks, np.zeros(blocks.size)).replace(values)
 
-    def save(self, path: str | Path) -> Path:
-        """Write θ as TOML with schema version and hash; the file appears whole or not at all."""
+    def to_toml(self) -> str:
+        """θ as TOML with schema version and hash."""
         values = {block.name: self[block.name].tolist() for block in self.blocks}
         document: dict[str, Any] = {"schema": SCHEMA, "hash": self.hash, "theta": values}
         if "p" in self.blocks:
             document["model_parameters"] = list(self.blocks.block("p").labels)
-        return write_atomically(path, tomli_w.dumps(document))
+        return tomli_w.dumps(document)
+
+    def save(self, path: str | Path) -> Path:
+        """Write `to_toml` to a file, which appears whole or not at all."""
+        return write_atomically(path, self.to_toml())
 
     @classmethod
     def load(cls, path: str | Path, problem: Problem) -> Parameters:

@@ -15,7 +15,7 @@ from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.signals import clocked
 from cosim.trajectory import Signal, read_signals
-from cosim.validation import suggestion
+from cosim.validation import instead
 
 # Itself an error, of the size of rounding: no share of it is a tolerance.
 _ERROR = "residual"
@@ -181,8 +181,7 @@ def compare(
     for name, value in tolerances.items():
         if name not in known:
             raise ComparisonError(
-                f"tolerance for the unknown signal '{name}'{suggestion(name, known)}; "
-                f"there are {', '.join(known)}"
+                f"tolerance for the unknown signal '{name}'{instead(name, known)}"
             )
         if not value >= 0:
             raise ComparisonError(f"the tolerance of '{name}' must not be negative, not {value}")

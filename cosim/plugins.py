@@ -175,7 +175,7 @@ EVALUATING = tuple(package for package in OURS if package != "learning")
 """Packages that decide what a controller does on a plant."""
 SUFFIXES = (".py", ".toml", ".fmu", ".npz")
 # Nothing that these files hold bears on a number.
-ASIDE = {"cli", "figures", "recording", "__pycache__", "report.py", "pictures.py", "paper.py"}
+ASIDE = {"cli", "figures", "recording", "__pycache__", "report.py", "pictures.py"}
 
 _brought: dict[str, set[str]] = {}
 """Modules that loading a plug-in, and calling its factory, imported, by the plug-in's module."""

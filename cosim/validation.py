@@ -29,6 +29,12 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     return f" (did you mean '{close[0]}'?)" if close else ""
 
 
+def instead(word: str, known: Iterable[str]) -> str:
+    """What there is in place of an unknown word, the closest first."""
+    known = list(known)
+    return f"{suggestion(word, known)}; there are {', '.join(known)}"
+
+
 def describe(error: ValidationError, model: type[BaseModel]) -> str:
     """Return the first complaint of a failed validation, and how many more there are."""
     details = error.errors(include_url=False)

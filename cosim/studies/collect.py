@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.files import read_json
 from cosim.studies import theta
-from cosim.studies.plan import EVALUATION, GREEDY
+from cosim.studies.plan import EVALUATION, GREEDY, Plan, Run
 from cosim.studies.report import commit
 from cosim.studies.store import INDICATORS, LOG, RUN, accompanied, measured
 from cosim.studies.tables import CURVE, KEYS, STATE, read_table
-
-if TYPE_CHECKING:
-    from cosim.studies.plan import Plan, Run
 
 SCHEMA = 1
 EVALUATED = "evaluated"
@@ -26,7 +23,7 @@ EVALUATED = "evaluated"
 def ordered(plan: Plan) -> list[Run]:
     """The runs by scenario, case and training seed, in the study's order."""
     definition = plan.definition
-    names = [case.name for case in (*definition.references, *definition.cases)]
+    names = [case.name for case in definition.all_cases]
     scenarios = list(definition.scenarios)
     return sorted(
         plan.runs,
@@ -48,7 +45,6 @@ def finished(plan: Plan, state: pd.DataFrame) -> list[Run]:
 def document(plan: Plan) -> dict[str, Any]:
     """The document study.json of a plan."""
     definition = plan.definition
-    cases = [*definition.references, *definition.cases]
     scenarios = list(definition.scenarios)
     sizes = {name: definition.sizes(name) for name in scenarios}
     about = {
@@ -70,7 +66,7 @@ def document(plan: Plan) -> dict[str, Any]:
                 "scenarios": list(case.scenarios),
                 "against": definition.counterpart(case),
             }
-            for case in cases
+            for case in definition.all_cases
         ],
         "file": Path(definition.file).name if definition.file else None,
         "optimum": definition.optima,

@@ -1,17 +1,18 @@
-"""Figures of a study, all rules in one panel: regret of each run, learning curves, profiles."""
+"""Figures of a study: regret of each run, learning curves, profiles, blocks, operation."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
+from cosim.errors import StudyError
 from cosim.figures.style import (
     DASHED,
     FLOOR,
@@ -20,14 +21,18 @@ from cosim.figures.style import (
     Look,
     cost_axis,
     figure,
+    label,
     label_ends,
     percent,
     plain,
     regret_axis,
     samples_axis,
-)
+)  # fmt: skip
 from cosim.protocols import Array
-from cosim.statistics import LEVEL, regrets
+from cosim.statistics import LEVEL, regret_terms, regrets
+from cosim.studies.online import Course
+from cosim.studies.operation import Judged
+from cosim.validation import instead
 
 BANDED = 6
 """Curves of a panel, at most, that have bands: more bands cannot be told apart."""
@@ -189,3 +194,115 @@ def _band(below: Sequence[Array]) -> tuple[Array, Array]:
     draws /= sum(map(len, below))
     low, high = np.quantile(draws, (0.5 - LEVEL / 2, 0.5 + LEVEL / 2), axis=0)
     return low, high
+
+
+def online_figure(
+    courses: Mapping[str, Course],
+    logs: Mapping[str, pd.DataFrame],
+    looks: Mapping[str, Look],
+    settings: Mapping[str, Any],
+    optimum: str,
+) -> Figure:
+    """A panel for each signal of the logs; below the mean regret of each block and since the start.
+
+    `logs` are those of the first training seed by case. Vertical lines stand at multiples of the
+    period. Raises StudyError for a signal that no log has.
+    """
+    names = list(settings["signals"]) if logs else []
+    known = list(dict.fromkeys(column for log in logs.values() for column in log))
+    for name in names:
+        if name not in known:
+            raise StudyError(f"online.signals: no log has a column '{name}'{instead(name, known)}")
+    shown_cases = {case: course for case, course in courses.items() if case != optimum}
+    blocks = {
+        case: np.mean([100 * regret_terms(a, b) for a, b in zip(own, best, strict=True)], axis=0)
+        for case, (_, own, best) in shown_cases.items()
+    }
+    so_far = {c: np.cumsum(v) / np.arange(1, len(v) + 1) for c, v in blocks.items()}
+    with figure(1.25 * (len(names) + 2) + 1.2) as drawn:
+        ratios = [1.0] * len(names) + [1.7, 1.7]
+        grid = drawn.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)
+        panels = [axes for (axes,) in grid]
+        end = max(float(samples[-1]) for samples, *_ in shown_cases.values())
+        for axes in panels:
+            for edge in np.arange(settings["period"], end, settings["period"]):
+                axes.axvline(edge, color=REFERENCE, linewidth=0.6, linestyle=(0, (1, 2)))
+        for axes, name in zip(panels, names, strict=False):
+            _signal(axes, name, {c: log for c, log in logs.items() if name in log}, looks)
+        titles = ("regret % of the block", "regret % since the start")
+        for axes, means, title in zip(panels[-2:], (blocks, so_far), titles, strict=True):
+            for case, values in means.items():
+                color, line = looks[case]
+                axes.plot(shown_cases[case][0], values, color=color, linestyle=line, linewidth=1.2)
+            regret_axis(axes, "y", np.concatenate([[0.0], *means.values()]), 0.1)
+            axes.set_ylabel(title)
+        samples_axis(panels[-1], end, "samples of the run")
+        ends = [EndLabel(plain(c), float(so_far[c][-1]), looks[c].color) for c in so_far]
+        label_ends(drawn, [(panels[-1], ends)])
+    return drawn
+
+
+def _signal(
+    axes: Axes, name: str, logs: Mapping[str, pd.DataFrame], looks: Mapping[str, Look]
+) -> None:
+    """A line for each case, or one where the signal is the same in all."""
+    lines = {case: log[["samples", name]].dropna().to_numpy().T for case, log in logs.items()}
+    first = next(iter(lines.values()))
+    if all(np.array_equal(line, first) for line in lines.values()):
+        axes.plot(*first, color=REFERENCE, linewidth=1.2)
+    else:
+        for case, line in lines.items():
+            color, style = looks[case]
+            axes.plot(*line, color=color, linestyle=style, linewidth=1.2)
+    axes.set_ylabel(label(name.removeprefix("theta "), ""))
+
+
+def operation_figure(
+    found: Judged, about: Mapping[str, Any], looks: Mapping[str, Look], baselines: Sequence[str]
+) -> Figure:
+    """Greedy regret and regret so far against the plant's samples, on log axes.
+
+    Lines are medians over the training seeds, bands from the best to the worst; `baselines` are
+    dashed and have no bands; `about` may name the cases that are `drawn`. Vertical lines stand at
+    an hour, a shift, a day, a week.
+    """
+    named = {"hour": 1, "shift": 8, "day": 24, "week": 168}
+    lives, h = found.lives, about["sampling_time"]
+    lives = lives[lives.case.isin(about["drawn"] or lives.case)]
+    with figure(3.4) as drawn:
+        panels = drawn.subplots(1, 2, sharey=True)
+        titles = ("of θ, run greedily", "of the run so far, exploration included")
+        reached = 100 * lives[["regret", "life_regret"]].to_numpy(dtype=np.float64)
+        for axes, name, title in zip(panels, ("regret", "life_regret"), titles, strict=True):
+            ends = []
+            for case, rows in lives.groupby("case", sort=False):
+                runs = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
+                color, line = looks[str(case)]
+                known = case in baselines
+                axes.plot(
+                    runs.index, runs["median"], color=color, linestyle=DASHED if known else line,
+                    linewidth=0.9 if known else 1.5,
+                )  # fmt: skip
+                if not known:
+                    axes.fill_between(
+                        runs.index, runs["min"], runs["max"], color=color, alpha=0.12, linewidth=0
+                    )
+                ends.append(EndLabel(plain(str(case)), float(runs["median"].iloc[-1]), color))
+            axes.set_xscale("log")
+            first, end = float(lives.samples.min()), float(lives.samples.max())
+            axes.set_xlim(first, end)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            regret_axis(axes, "y", reached)
+            for text, hours in named.items():
+                if first <= (samples := hours * 3600.0 / h) <= end:
+                    axes.axvline(samples, color=REFERENCE, linewidth=0.7, linestyle=(0, (1, 2)))
+                    axes.annotate(
+                        text, (samples, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
+                        textcoords="offset points", ha="center", fontsize=6.5, color=REFERENCE,
+                    )  # fmt: skip
+            axes.set_title(title, pad=12)
+            axes.set_xlabel("samples of the plant")
+        panels[0].set_ylabel("regret %")
+        label_ends(drawn, [(panels[1], ends)])
+    return drawn

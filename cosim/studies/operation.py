@@ -10,21 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, NullFormatter
 
 from controllers import compile_functions
 from controllers.optimum import Fouling, QuasiStaticPolicy, change_of
-from cosim.figures.style import (
-    DASHED,
-    REFERENCE,
-    EndLabel,
-    Look,
-    figure,
-    label_ends,
-    plain,
-    regret_axis,
-)
 from cosim.penalty import VIOLATING
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
@@ -33,14 +21,12 @@ from cosim.scenario import Scenario
 from cosim.statistics import paired_difference, shown
 from cosim.studies.plan import Run, greedy_file
 from cosim.studies.store import LOG, ONLINE
-from cosim.studies.tables import KEYS, read_table
+from cosim.studies.tables import KEYS, Table, read_table
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
 from learning.training import LogRow
 from learning.training_run import TrainingRun, begin
 
-Table = tuple[str, Sequence[str], list[list[str]]]
-"""Title, header and rows."""
 WINDOW = 100
 """Samples in a row of which the dearest are reported."""
 LIFE = ["J", "violating", "dearest", "first_change", "updates", "model_samples"]
@@ -278,54 +264,3 @@ def _percent(share: float) -> str:
 
 def _whole(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.0f}"
-
-
-def operation_figure(
-    found: Judged, about: Mapping[str, Any], looks: Mapping[str, Look], baselines: Sequence[str]
-) -> Figure:
-    """Greedy regret and regret so far against the plant's samples, on log axes.
-
-    Lines are medians over the training seeds, bands from the best to the worst; `baselines` are
-    dashed and have no bands; `about` may name the cases that are `drawn`. Vertical lines stand at
-    an hour, a shift, a day, a week.
-    """
-    named = {"hour": 1, "shift": 8, "day": 24, "week": 168}
-    lives, h = found.lives, about["sampling_time"]
-    lives = lives[lives.case.isin(about["drawn"] or lives.case)]
-    with figure(3.4) as drawn:
-        panels = drawn.subplots(1, 2, sharey=True)
-        titles = ("of θ, run greedily", "of the run so far, exploration included")
-        reached = 100 * lives[["regret", "life_regret"]].to_numpy(dtype=np.float64)
-        for axes, name, title in zip(panels, ("regret", "life_regret"), titles, strict=True):
-            ends = []
-            for case, rows in lives.groupby("case", sort=False):
-                runs = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
-                color, line = looks[str(case)]
-                known = case in baselines
-                axes.plot(
-                    runs.index, runs["median"], color=color, linestyle=DASHED if known else line,
-                    linewidth=0.9 if known else 1.5,
-                )  # fmt: skip
-                if not known:
-                    axes.fill_between(
-                        runs.index, runs["min"], runs["max"], color=color, alpha=0.12, linewidth=0
-                    )
-                ends.append(EndLabel(plain(str(case)), float(runs["median"].iloc[-1]), color))
-            axes.set_xscale("log")
-            first, end = float(lives.samples.min()), float(lives.samples.max())
-            axes.set_xlim(first, end)
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            regret_axis(axes, "y", reached)
-            for text, hours in named.items():
-                if first <= (samples := hours * 3600.0 / h) <= end:
-                    axes.axvline(samples, color=REFERENCE, linewidth=0.7, linestyle=(0, (1, 2)))
-                    axes.annotate(
-                        text, (samples, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
-                        textcoords="offset points", ha="center", fontsize=6.5, color=REFERENCE,
-                    )  # fmt: skip
-            axes.set_title(title, pad=12)
-            axes.set_xlabel("samples of the plant")
-        panels[0].set_ylabel("regret %")
-        label_ends(drawn, [(panels[1], ends)])
-    return drawn

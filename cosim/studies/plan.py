@@ -30,7 +30,7 @@ from cosim.studies.document import (
     read,
     validate,
 )
-from cosim.validation import suggestion
+from cosim.validation import instead
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.training import stored_optimum
@@ -86,9 +86,8 @@ class Training:
 
     def prepare(self) -> TrainingRun:
         """The training run, checked; raises LearningError in one line."""
-        return prepare(
-            self.algorithm, self.scenario, self.samples, self.settings, dict(self.options)
-        )
+        options = dict(self.options)
+        return prepare(self.algorithm, self.scenario, self.samples, self.settings, options)
 
     def controller(self, parameters: str, theta: Sequence[float] = ()) -> Controller:
         """The greedy controller of the θ that a TOML text holds, or of another θ of its blocks."""
@@ -284,31 +283,23 @@ class Study:
         scenarios = tuple(self.scenarios if table.scenarios is None else table.scenarios)
         if unknown := [name for name in scenarios if name not in self.scenarios]:
             raise StudyError(
-                f"case '{table.name}': '{unknown[0]}' is none of the study's scenarios "
-                f"({', '.join(self.scenarios)})"
+                f"case '{table.name}': '{unknown[0]}' is none of the study's scenarios"
+                f"{instead(unknown[0], self.scenarios)}"
             )
         if table.algorithm is None:
             given = table.controller or ""
-            sources = given if isinstance(given, list) else [given]
-            for source in sources:
+            for source in given if isinstance(given, list) else [given]:
                 own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
-                name = table.name or own
-                if table.name is not None and len(sources) > 1:
-                    name = f"{table.name}({own})"
-                yield Case(
-                    name,
-                    scenarios,
-                    table.group or BASELINES,
-                    controller=self._file(source),
-                    against=table.against,
-                )
+                name = f"{table.name}({own})" if table.name and given[1:] else table.name or own
+                group, file = table.group or BASELINES, self._file(source)
+                yield Case(name, scenarios, group, controller=file, against=table.against)
             return
         axes: dict[str, list[Any]] = {}
         for key in ("samples", "start", "nmpc"):
             value = getattr(table, key)
             axes[key] = value if isinstance(value, list) else [value]
         for key, value in table.settings.items():
-            axes[key] = _axis(value, takes_list(table.algorithm, key))
+            axes[key] = _axis(table.algorithm, key, value)
         if empty := [key for key, values in axes.items() if not values]:
             raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
         varied = [key for key, values in axes.items() if len(values) > 1]
@@ -341,14 +332,14 @@ class Study:
         """
         if case.against is None:
             return None
-        names = [other.name for other in [*self.references, *self.cases]]
+        names = [other.name for other in self.all_cases]
         label = case.name[case.name.index("(") :] if "(" in case.name else ""
         for name in (case.against, f"{case.against}{label}"):
             if name in names and name != case.name:
                 return name
         raise StudyError(
             f"case '{case.name}': there is no other case '{case.against}'"
-            f"{suggestion(case.against, names)}; there are {', '.join(names)}"
+            f"{instead(case.against, names)}"
         )
 
     @cached_property
@@ -374,6 +365,11 @@ class Study:
             Case(name, tuple(scenarios), BASELINES, controller=name)
             for name, scenarios in wanted.items()
         ]
+
+    @property
+    def all_cases(self) -> list[Case]:
+        """References and cases, in the order of the tables."""
+        return [*self.references, *self.cases]
 
     def _named(self, controller: str) -> str:
         """A case's name for a controller: the study's, if it has one for it."""
@@ -421,8 +417,7 @@ class Study:
         names = [*self.scenarios, DEFAULT]
         if unknown := [name for name in value if name not in names]:
             raise StudyError(
-                f"{field}: '{unknown[0]}' is no scenario of the study"
-                f"{suggestion(unknown[0], names)}; there are {', '.join(names)}"
+                f"{field}: '{unknown[0]}' is no scenario of the study{instead(unknown[0], names)}"
             )
         number = value.get(scenario, value.get(DEFAULT))
         if number is None:
@@ -457,9 +452,8 @@ class Study:
             "evaluation_steps": sizes.curve_steps,
             **case.training,
         }
-        return Training(
-            case.algorithm, self.scenarios[scenario], samples, dict(case.settings), options
-        )
+        described, settings = self.scenarios[scenario], dict(case.settings)
+        return Training(case.algorithm, described, samples, settings, options)
 
 
 @dataclass(frozen=True)
@@ -483,69 +477,57 @@ def plan(study: Study) -> Plan:
         with FmuPlant(described) as plant:
             plants[name] = {"scenario": described.hash, "fmu": plant.fmu_sha256}
     depends: dict[tuple[str, str], dict[str, str]] = {}
-    runs, prepared = [], set()
-    for case, scenario, seed in _order(study):
-        training = None if seed is None else study.training(case, scenario, seed)
-        if (case.name, scenario) not in depends:
+    runs = []
+    for case, name, seed in _order(study):
+        scenario = study.scenarios[name]
+        training = None if seed is None else study.training(case, name, seed)
+        if (case.name, name) not in depends:
+            # A mistake shows here.
             if ":" in (case.controller or ""):
-                build_controller(case.target, study.scenarios[scenario])  # a mistake shows here
+                build_controller(case.target, scenario)
+            if training is not None:
+                training.prepare()
             parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
-            depends[case.name, scenario] = depends_on(
-                study.scenarios[scenario], *parts, packages=OURS
-            )
-        facts: dict[str, Any] = {**depends[case.name, scenario], "fmu": plants[scenario]["fmu"]}
+            depends[case.name, name] = depends_on(scenario, *parts, packages=OURS)
+        facts: dict[str, Any] = {**depends[case.name, name], "fmu": plants[name]["fmu"]}
         if training is None:
             facts["controller"] = study.relative(case.controller or "")
         else:
-            if (case.name, scenario) not in prepared:
-                prepared.add((case.name, scenario))
-                training.prepare()
             facts["training"] = {
                 "algorithm": training.algorithm,
                 "samples": training.samples,
                 "settings": training.settings,
                 "options": {**training.options, "start": study.relative(case.start)},
             }
-        beside = None if training is not None else _online(study, case, scenario)
-        judged = training is not None or case.name == study.optima.get(scenario)
+        judged = training is not None or case.name == study.optima.get(name)
         runs.append(
             Run(
-                RunKey(scenario, case.name, seed),
+                RunKey(name, case.name, seed),
                 case,
-                study.scenarios[scenario],
+                scenario,
                 case.controller,
                 training,
                 facts,
-                study.sizes(scenario),
-                training is None and any(case.algorithm for case in _on(study, scenario)),
-                _traces(study, case, scenario, seed),
-                beside,
-                marks=study.marks(scenario) if judged else (),
+                study.sizes(name),
+                training is None and any(case.algorithm for case in _on(study, name)),
+                _traces(study, case, name, seed),
+                None if training is not None else _online(study, case, name),
+                marks=study.marks(name) if judged else (),
             )
         )
     _check_names(study)
     check_folders(runs)
-    about = {
-        "versions": versions(),
-        "code_hash": code_hash(OURS),
-        "scenarios": plants,
-        "study": study.name,
-    }
-    return Plan(study, runs, about)
+    about = {"versions": versions(), "code_hash": code_hash(OURS)}
+    return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
 
 
 def _order(study: Study) -> Iterator[tuple[Case, str, int | None]]:
     """Controllers first, then seed after seed: stopped early, every case has fewer seeds."""
-    cases = [*study.references, *study.cases]
-    for scenario in study.scenarios:
-        for case in cases:
-            if case.algorithm is None and scenario in case.scenarios:
-                yield case, scenario, None
-    trained = [case for case in cases if case.algorithm is not None]
-    for seed in sorted({seed for case in trained for seed in case.training_seeds}):
+    seeds = {seed for case in study.cases for seed in case.training_seeds}
+    for seed in (None, *sorted(seeds)):
         for scenario in study.scenarios:
-            for case in trained:
-                if seed in case.training_seeds and scenario in case.scenarios:
+            for case in study.all_cases:
+                if seed in (case.training_seeds or (None,)) and scenario in case.scenarios:
                     yield case, scenario, seed
 
 
@@ -580,20 +562,16 @@ def _online(study: Study, controller: Case, scenario: str) -> Online | None:
 
 def _check_names(study: Study) -> None:
     """Raise StudyError where the study names a case that it does not have."""
-    names = [case.name for case in [*study.references, *study.cases]]
+    names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]
-    asked = [
-        (f"trajectory '{t.name}'", c, names) for t in study.table.trajectory for c in t.cases or []
-    ]
-    asked += [("logs", case, trained) for case in study.table.logs]
+    asked = [(f"trajectory '{t.name}'", t.cases or [], names) for t in study.table.trajectory]
+    asked.append(("logs", study.table.logs, trained))
     if (operation := study.table.operation) is not None:
-        asked += [("operation.drawn", case, trained) for case in operation.drawn]
-    for where, name, known in asked:
-        if name not in known:
-            raise StudyError(
-                f"{where}: there is no case '{name}'{suggestion(name, known)}; there are "
-                f"{', '.join(known)}"
-            )
+        asked.append(("operation.drawn", operation.drawn, trained))
+    for where, wanted, known in asked:
+        for name in wanted:
+            if name not in known:
+                raise StudyError(f"{where}: there is no case '{name}'{instead(name, known)}")
     for case in study.cases:
         study.counterpart(case)
 
@@ -605,16 +583,9 @@ def check_folders(runs: list[Run]) -> None:
         folder = str(run.key.folder).lower()
         if folder in folders:
             raise StudyError(
-                f"'{run.key}' and '{folders[folder]}' would have the same folder; give one another "
-                "name"
+                f"'{run.key}' and '{folders[folder]}' would have one folder; rename one of them"
             )
         folders[folder] = run.key
-
-
-def takes_list(algorithm: str, setting: str) -> bool:
-    """Whether a hyperparameter is a list itself; raises AlgorithmLookupError."""
-    field = load_algorithm(algorithm).Configuration.model_fields.get(setting)
-    return field is not None and _is_sequence(field.annotation)
 
 
 def _is_sequence(annotation: Any) -> bool:
@@ -624,12 +595,13 @@ def _is_sequence(annotation: Any) -> bool:
     return any(_is_sequence(part) for part in get_args(annotation) if part is not Ellipsis)
 
 
-def _axis(value: Any, is_list: bool) -> list[Any]:
+def _axis(algorithm: str, setting: str, value: Any) -> list[Any]:
     """Values of a setting: a list is a grid, but for a setting that is a list itself."""
     if not isinstance(value, list):
         return [value]
+    field = load_algorithm(algorithm).Configuration.model_fields.get(setting)
     nested = bool(value) and all(isinstance(item, list) for item in value)
-    return value if nested or not is_list else [value]
+    return value if nested or field is None or not _is_sequence(field.annotation) else [value]
 
 
 def _text(value: Any) -> str:

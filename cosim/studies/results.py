@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,17 +28,13 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import collect, figures, online, operation, paper, report, theta
-from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, safe
+from cosim.studies import collect, figures, online, operation, pictures, report, theta
+from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, Plan, safe
 from cosim.studies.report import COLUMNS, SHORT
 from cosim.studies.store import INDICATORS, ONLINE, TIMING
-from cosim.studies.tables import CURVE, KEYS, STATE, WHERE, read_table, to_csv
+from cosim.studies.tables import CURVE, KEYS, STATE, WHERE, Table, read_table, to_csv
 from cosim.text_tables import markdown_table
-from cosim.validation import suggestion
-
-if TYPE_CHECKING:
-    from cosim.studies.plan import Plan
-
+from cosim.validation import instead
 
 ABOUT = "study.json"
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
@@ -118,8 +114,6 @@ class StudyResults(Shown):
 
         `figures` draws the kept trajectories and logs, too; returns the results that name them.
         """
-        from cosim.studies import pictures  # noqa: PLC0415 - needs controllers
-
         out = self.folder
         pictures.keep(plan, out)
         drawn = pictures.draw(plan, out) if figures else []
@@ -376,10 +370,7 @@ class StudyResults(Shown):
             columns = list(COLUMNS) if paired else list(COLUMNS)[:-3]
         for name in columns:
             if name not in COLUMNS:
-                raise StudyError(
-                    f"a study's table has no column '{name}'{suggestion(name, COLUMNS)}; it has "
-                    f"{', '.join(COLUMNS)}"
-                )
+                raise StudyError(f"a table has no column '{name}'{instead(name, COLUMNS)}")
         own = self.summary[self.summary.scenario == scenario]
         texts = [report.texts(row) for row in own.to_dict("records")]
         header = [COLUMNS[name] for name in columns]
@@ -402,7 +393,7 @@ class StudyResults(Shown):
         """Tables of all scenarios, for notebooks."""
         return report.tables_html([(name, *self.lines(name, SHORT)) for name in self.scenarios])
 
-    def further(self) -> list[tuple[str, Sequence[str], list[list[str]]]]:
+    def further(self) -> list[Table]:
         """Title, header and rows of the tables that the study asks for beside its summary."""
         found = []
         if self.online is not None:
@@ -423,10 +414,10 @@ class StudyResults(Shown):
             found.append(self.paper())
         return found
 
-    def paper(self) -> tuple[str, Sequence[str], list[list[str]]]:
+    def paper(self) -> Table:
         """Title, header and rows: the gains that the paper's text states, beside the study's."""
         trained = [name for name, case in self.cases.items() if case["trained"]]
-        return paper.comparison(self.scenarios, trained, self.indicator)
+        return report.paper_table(self.scenarios, trained, self.indicator)
 
     def figure(self, name: str) -> Figure:
         """Draw `curves`, `regret`, `profile` or `online` of a scenario: `curves-paper`, say.
@@ -523,7 +514,7 @@ class StudyResults(Shown):
         if not courses:
             return None
         logs = {case: log for case in courses if (log := self.log(case, scenario)) is not None}
-        return online.online_figure(courses, logs, self._looks, self.about["online"], optimum)
+        return figures.online_figure(courses, logs, self._looks, self.about["online"], optimum)
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
@@ -555,7 +546,7 @@ class StudyResults(Shown):
             return None
         baselines = [name for name, case in self.cases.items() if case["group"] == BASELINES]
         about, judged = self.about["operation"][scenario], self._judged(scenario)
-        return operation.operation_figure(judged, about, self._looks, baselines)
+        return figures.operation_figure(judged, about, self._looks, baselines)
 
     def _profile(self, scenario: str) -> Figure | None:
         """Of one scenario, or, for "", of all whose J* is known, where they are several."""

@@ -140,16 +140,12 @@ def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> T
     run, begin = training.prepare(), perf_counter()
     if marks:
         lived, status, clock, taken = operation.live(run, marks)
-        with temporary_folder("cosim-training-") as own:
-            lived[-1].parameters.save(own / "theta.toml")
-            theta = (own / "theta.toml").read_text("utf-8")
+        theta = lived[-1].parameters.to_toml()
         seconds = perf_counter() - begin
         return Trained(marks[-1], status, to_csv(lived), theta, taken, seconds, clock)
     with temporary_folder("cosim-training-") as own:
         out = folder or own
         result = run_training(run, out, resume=(out / CHECKPOINT).is_file())
-        result.parameters.save(own / "theta.toml")
-        theta = (own / "theta.toml").read_text("utf-8")
     rows = result.rows
     # The log of a study starts with θ at the start, from which its increments are counted.
     start = dict.fromkeys(rows[0] if rows else COLUMNS, float("nan")) | {"samples": 0.0}
@@ -157,7 +153,7 @@ def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> T
         int(rows[-1]["samples"]) if rows else 0,
         result.status,
         to_csv([LogRow(start, result.start), *rows]),
-        theta,
+        result.parameters.to_toml(),
         result.plant_samples,
         perf_counter() - begin,
     )

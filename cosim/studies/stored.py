@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +23,7 @@ from cosim.studies.results import ABOUT, CURVES, StudyResults
 from cosim.studies.store import TIMING
 from cosim.studies.tables import KEYS, to_csv
 from cosim.trajectory import Signal
-from cosim.validation import describe, suggestion
+from cosim.validation import describe, instead
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"
@@ -63,14 +63,11 @@ def stored_studies(folder: Path) -> dict[str, StudyTable]:
     return {path.stem: read_study(path) for path in paths}
 
 
-def chosen(known: Iterable[str], names: list[str]) -> list[str]:
+def chosen(known: Mapping[str, StudyTable], names: list[str]) -> list[str]:
     """The named studies; raises ResultsError for a name that is none of them."""
-    known = list(known)
     for name in names:
         if name not in known:
-            raise ResultsError(
-                f"there is no study '{name}'{suggestion(name, known)}; there are {', '.join(known)}"
-            )
+            raise ResultsError(f"there is no study '{name}'{instead(name, known)}")
     return names
 
 

@@ -12,6 +12,8 @@ import pandas as pd
 from cosim.errors import StudyError
 from cosim.text_tables import read_csv
 
+Table = tuple[str, Sequence[str], list[list[str]]]
+"""Title, header and rows of texts."""
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]

@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
+from cosim.studies.plan import Plan, Run, Training
 from cosim.studies.store import LOG
-from cosim.studies.tables import read_table
-from cosim.validation import suggestion
+from cosim.studies.tables import Table, read_table
+from cosim.validation import instead
 
-if TYPE_CHECKING:
-    from cosim.studies.plan import Plan, Run, Training
-
-Table = tuple[str, Sequence[str], list[list[str]]]
 Where = tuple[str, str]
 """Scenario and case."""
 
@@ -84,10 +81,7 @@ def tables(
     blocks = {name: name.removeprefix(PREFIX).partition("[")[0] for name in entries}
     for name in (*settings["without"], *settings["blocks"]):
         if name not in (known := dict.fromkeys(blocks.values())):
-            raise StudyError(
-                f"[theta]: no log has a block '{name}'{suggestion(name, known)}; there are "
-                f"{', '.join(known)}"
-            )
+            raise StudyError(f"[theta]: no log has a block '{name}'{instead(name, known)}")
     counted = [name for name in entries if blocks[name] not in settings["without"]]
     own = [name for name in entries if blocks[name] in settings["blocks"]]
     theta = frame.set_index(["scenario", "case", "share", "training_seed"])[entries].sort_index()
@@ -148,8 +142,7 @@ def _pairs(
     for name in (name for pair in wanted for name in pair):
         if name not in trained:
             raise StudyError(
-                f"[theta], pairs: there is no trained case '{name}'{suggestion(name, trained)}; "
-                f"there are {', '.join(trained)}"
+                f"[theta], pairs: there is no trained case '{name}'{instead(name, trained)}"
             )
     if not wanted:
         return list(combinations(courses, 2))

@@ -154,6 +154,16 @@ class StudyResults(Shown):
         """Cases by name, in the study's order: group, target, trained, samples, settings, …."""
         return {case["name"]: case for case in self.about["cases"]}
 
+    @property
+    def trained(self) -> list[str]:
+        """Names of the cases with an algorithm."""
+        return [name for name, case in self.cases.items() if case["trained"]]
+
+    @property
+    def baselines(self) -> list[str]:
+        """Names of the cases that figures show as lines to compare with."""
+        return [name for name, case in self.cases.items() if case["group"] == BASELINES]
+
     @cached_property
     def _arrays(self) -> dict[tuple[str, str], dict[str, Array]]:
         """Seeds, steps and indicators (R, S) by scenario and case."""
@@ -189,15 +199,14 @@ class StudyResults(Shown):
         `runs` counts the case's runs from 0. NaN where the scenario has no known optimum.
         """
         best = self.reference("optimum", scenario)
-        if best is None:
-            return Estimate(float("nan"))
-        return regret(self.indicator(case, scenario)[list(runs)].mean(axis=0), best)
+        cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
+        return Estimate(np.nan) if best is None else regret(cost, best)
 
     def gap_closed(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
         """(J_naive − J)/(J_naive − J*), likewise."""
         best, naive = (self.reference(kind, scenario) for kind in ("optimum", "naive"))
         if best is None or naive is None:
-            return Estimate(float("nan"))
+            return Estimate(np.nan)
         return gap_closed(self.indicator(case, scenario)[list(runs)].mean(axis=0), naive, best)
 
     @cached_property
@@ -209,11 +218,11 @@ class StudyResults(Shown):
             for run, known in enumerate(state.to_dict("records")):
                 found = self.regret(case, scenario, [run])
                 cost = float(own["J"][run].mean())
-                known["J"] = cost if np.isfinite(cost) else np.inf
-                known |= {"regret": found.value, **_ends("regret", found.t)}
-                known["gap_closed"] = self.gap_closed(case, scenario, [run]).value
-                known |= {name: float(own[name][run].mean()) for name in MEANS}
-                rows.append(known | {"failures": int(own["failures"][run].sum())})
+                row = known | _columns("regret", found.value, found.t)
+                row["J"] = cost if np.isfinite(cost) else np.inf
+                row["gap_closed"] = self.gap_closed(case, scenario, [run]).value
+                row |= {name: float(own[name][run].mean()) for name in MEANS}
+                rows.append(row | {"failures": int(own["failures"][run].sum())})
         frame = pd.DataFrame(rows, columns=RUN_COLUMNS)
         return frame.astype({"training_seed": "Int64"})
 
@@ -238,7 +247,7 @@ class StudyResults(Shown):
         order = np.argsort(cost, kind="stable")
         middle = order[(len(order) - 1) // 2 : len(order) // 2 + 1]
         median = self.regret(case, scenario, list(middle))
-        spread = over_runs([values[order]]) if len(runs) > 1 else Estimate(float(values[0]))
+        spread = over_runs([values[order]]) if len(runs) > 1 else Estimate(values[0])
         best, other = self.reference("optimum", scenario), self.cases[case].get("against")
         wide: Interval = None
         found: tuple[float, Interval, float] = (np.nan, None, np.nan)
@@ -253,21 +262,18 @@ class StudyResults(Shown):
             "plant_samples": runs.plant_samples.max(),
             "finished": int((~runs.status.str.startswith("diverged")).sum()),
             "runs": len(runs),
-            "regret_median": median.value,
-            **_ends("regret_median", median.t),
+            **_columns("regret_median", median.value, median.t),
             "regret_worst": float(values[order[-1]]),
-            "regret_iqm": spread.value,
-            **_ends("regret_iqm", spread.bootstrap),
+            **_columns("regret_iqm", spread.value, spread.bootstrap),
             "J_median": float(np.median(cost)),
             "J_worst": float(cost[order[-1]]),
             "J_iqm": over_runs([cost[order]]).value,
             "gap_closed_median": self.gap_closed(case, scenario, list(middle)).value,
             **{name: float(np.median(runs[name])) for name in MEANS},
             "failures": int(own["failures"].sum()),
-            **_ends("regret_wide", wide),
+            **_columns("regret_wide", np.nan, wide),
             "against": other,
-            "difference": found[0],
-            **_ends("difference", found[1]),
+            **_columns("difference", *found[:2]),
             "difference_p": found[2],
         }
 
@@ -327,17 +333,9 @@ class StudyResults(Shown):
             if not all(map(len, strata)):
                 continue
             spread, everything = over_runs(strata), np.concatenate(strata)
-            rows.append(
-                {
-                    "case": case,
-                    "scenarios": len(strata),
-                    "runs": len(everything),
-                    "regret_median": float(np.median(everything)),
-                    "regret_worst": float(everything.max()),
-                    "regret_iqm": spread.value,
-                    **_ends("regret_iqm", spread.bootstrap),
-                }
-            )
+            row = {"case": case, "scenarios": len(strata), "runs": len(everything)}
+            row |= {"regret_median": np.median(everything), "regret_worst": everything.max()}
+            rows.append(row | _columns("regret_iqm", spread.value, spread.bootstrap))
         rows.sort(key=lambda row: float(row["regret_iqm"]))
         return pd.DataFrame(rows, columns=AGGREGATE_COLUMNS)
 
@@ -381,13 +379,9 @@ class StudyResults(Shown):
         return markdown_table(*self.lines(scenario))
 
     def _facts(self) -> dict[str, object]:
-        return {
-            "name": self.name,
-            "scenarios": len(self.scenarios),
-            "cases": len(self.cases),
-            "runs": len(self.state),
-            "folder": self.folder,
-        }
+        counted = {"scenarios": self.scenarios, "cases": self.cases, "runs": self.state}
+        counts = {name: len(each) for name, each in counted.items()}
+        return {"name": self.name, **counts, "folder": self.folder}
 
     def _repr_html_(self) -> str:
         """Tables of all scenarios, for notebooks."""
@@ -401,23 +395,20 @@ class StudyResults(Shown):
                 optimum = self.about["optimum"].get(scenario, "")
                 own = self.online[self.online.scenario == scenario]
                 found.append(online.table(own, scenario, optimum, self.about["online"]))
-        for scenario in self.about.get("operation") or ():
-            about = self.about["operation"][scenario]
-            found += operation.tables(
-                self._judged(scenario), scenario, about, self._against, self._seconds(scenario)
-            )
+        against = {name: case.get("against") for name, case in self.cases.items()}
+        for scenario, about in (self.about.get("operation") or {}).items():
+            judged, seconds = self._judged(scenario), self._seconds(scenario)
+            found += operation.tables(judged, scenario, about, against, seconds)
         if self.about.get("theta") is not None:
             frame = read_table(self.folder / THETA)
-            trained = [name for name, case in self.cases.items() if case["trained"]]
-            found += theta.tables(frame, self.runs, trained, **self.about["theta"])
+            found += theta.tables(frame, self.runs, self.trained, **self.about["theta"])
         if "paper" in self.about["tables"]:
             found.append(self.paper())
         return found
 
     def paper(self) -> Table:
         """Title, header and rows: the gains that the paper's text states, beside the study's."""
-        trained = [name for name, case in self.cases.items() if case["trained"]]
-        return report.paper_table(self.scenarios, trained, self.indicator)
+        return report.paper_table(self.scenarios, self.trained, self.indicator)
 
     def figure(self, name: str) -> Figure:
         """Draw `curves`, `regret`, `profile` or `online` of a scenario: `curves-paper`, say.
@@ -486,24 +477,21 @@ class StudyResults(Shown):
         curves = {
             str(case): figures.learning_curve(rows, best if known else None)
             for case, rows in trained.groupby("case", sort=False)
-            if self.cases[case]["group"] != BASELINES
+            if case not in self.baselines
         }
         ends = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J.last()
         ends = ends.groupby("case").median()
-        first = self.about["naive"].get(scenario)
+        first, optimum = (self.about[kind].get(scenario) for kind in ("naive", "optimum"))
         marks = {
             name: float(level)
             for name, level in pd.concat([levels, ends]).items()
-            if self.cases[name]["group"] == BASELINES and np.isfinite(level)
-            and name != self.about["optimum"].get(scenario)
-        }  # fmt: skip
+            if name in self.baselines and np.isfinite(level) and name != optimum
+        }
         # Naive stays: it is where the curves begin.
         chosen = sorted(marks, key=lambda name: (name != first, marks[name]))[:LEVELS]
-        if known:
-            marks = {name: float(100 * regrets(np.array(marks[name]), best)) for name in chosen}
-        return figures.curves_figure(
-            curves, {name: marks[name] for name in chosen}, self._looks, relative=bool(known)
-        )
+        shown = (lambda level: float(100 * regrets(np.array(level), best))) if known else float
+        drawn = {name: shown(marks[name]) for name in chosen}
+        return figures.curves_figure(curves, drawn, self._looks, relative=bool(known))
 
     def _online(self, scenario: str) -> Figure | None:
         if self.online is None:
@@ -519,14 +507,8 @@ class StudyResults(Shown):
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
         greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
-        optimum = self.about["optimum"].get(scenario, "")
-        return operation.judged(
-            lives[lives.scenario == scenario], greedy[greedy.scenario == scenario], optimum
-        )
-
-    @property
-    def _against(self) -> dict[str, str | None]:
-        return {name: case.get("against") for name, case in self.cases.items()}
+        own = [table[table.scenario == scenario] for table in (lives, greedy)]
+        return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
 
     def _seconds(self, scenario: str) -> dict[str, float]:
         """Median processor time in s of a case's runs, up to their last sample."""
@@ -544,24 +526,16 @@ class StudyResults(Shown):
     def _operation(self, scenario: str) -> Figure | None:
         if scenario not in (self.about.get("operation") or {}):
             return None
-        baselines = [name for name, case in self.cases.items() if case["group"] == BASELINES]
         about, judged = self.about["operation"][scenario], self._judged(scenario)
-        return figures.operation_figure(judged, about, self._looks, baselines)
+        return figures.operation_figure(judged, about, self._looks, self.baselines)
 
     def _profile(self, scenario: str) -> Figure | None:
         """Of one scenario, or, for "", of all whose J* is known, where they are several."""
         scenarios = self.known if not scenario else [s for s in self.known if s == scenario]
         if not scenarios or (not scenario and len(scenarios) < 2):
             return None
-        strata = {
-            name: [100 * self.regrets(name, one) for one in scenarios]
-            for name, case in self.cases.items()
-            if case["trained"]
-        }
-        strata = {
-            name: runs for name, runs in strata.items()
-            if all(map(len, runs)) and sum(map(len, runs)) > 1
-        }  # fmt: skip
+        strata = {n: [100 * self.regrets(n, one) for one in scenarios] for n in self.trained}
+        strata = {n: v for n, v in strata.items() if all(map(len, v)) and sum(map(len, v)) > 1}
         return figures.profile_figure(strata, self._looks) if strata else None
 
     def report(self, folder: Path | None = None) -> Path:
@@ -614,6 +588,6 @@ class StudyResults(Shown):
         return text + " Regrets of a case differ between the two."
 
 
-def _ends(name: str, interval: tuple[float, float] | None) -> dict[str, float]:
-    low, high = interval or (float("nan"), float("nan"))
-    return {f"{name}_low": low, f"{name}_high": high}
+def _columns(name: str, value: float, interval: Interval) -> dict[str, float]:
+    low, high = interval or (np.nan, np.nan)
+    return {name: value, f"{name}_low": low, f"{name}_high": high}

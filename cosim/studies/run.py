@@ -32,7 +32,7 @@ from cosim.studies.cluster import on_cluster
 from cosim.studies.document import TrajectoryTable
 from cosim.studies.plan import EVALUATION, Plan, Run, Study, Training, greedy_file, plan
 from cosim.studies.results import StudyResults
-from cosim.studies.store import CHECKPOINT, INDICATORS, Figures, RunStore, Trained
+from cosim.studies.store import CHECKPOINT, Measured, RunStore, Trained
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 BLOCK = 20_000
@@ -114,7 +114,6 @@ class Failure:
         return EvaluationError(self.message)
 
 
-Measured = dict[int, tuple[Figures, Figures]]
 Outcome = Trained | Measured | str | list[float] | float | Failure
 
 
@@ -140,9 +139,8 @@ def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> T
     run, begin = training.prepare(), perf_counter()
     if marks:
         lived, status, clock, taken = operation.live(run, marks)
-        theta = lived[-1].parameters.to_toml()
-        seconds = perf_counter() - begin
-        return Trained(marks[-1], status, to_csv(lived), theta, taken, seconds, clock)
+        log, theta = to_csv(lived), lived[-1].parameters.to_toml()
+        return Trained(marks[-1], status, log, theta, taken, perf_counter() - begin, clock)
     with temporary_folder("cosim-training-") as own:
         out = folder or own
         result = run_training(run, out, resume=(out / CHECKPOINT).is_file())
@@ -176,11 +174,9 @@ def _simulate(item: Item) -> Measured | str | list[float] | float:
             cost = run["stage_cost"] + run["penalty"]
             firsts = range(0, item.steps, item.block)
             return [float(cost[first : first + item.block].mean()) for first in firsts]
-        found = {}
-        for seed in item.seeds:
-            figures, clock = measure(plant, controller, seed, item.steps, item.burn_in)
-            found[seed] = ({name: figures[name] for name in INDICATORS}, clock)
-        return found
+        return {
+            seed: measure(plant, controller, seed, item.steps, item.burn_in) for seed in item.seeds
+        }
 
 
 def _controller(item: Item) -> Controller:
@@ -208,10 +204,6 @@ Report = Callable[[State, str], None]
 """Gets the state and a line for what just happened; the line is empty for mere progress."""
 
 
-def silent(state: State, line: str) -> None:
-    """Report nothing."""
-
-
 class Runner:
     """Does the runs of a plan; `out` holds what was finished before (`RunStore`)."""
 
@@ -234,19 +226,14 @@ class Runner:
         if jobs < 1:
             raise EvaluationError(f"jobs must be at least 1, not {jobs}")
         fruitless = 0
-        while True:
-            items = self._missing(shared_disk=scheduler is None)
-            before = len(self._finished)
-            if not items:
-                return
-            done = 0
+        while items := self._missing(shared_disk=scheduler is None):
+            fruitless += 1
             try:
                 with closing(_outcomes(items, jobs, scheduler)) as outcomes:
                     for item, outcome in outcomes:
                         self._take(item, outcome)
-                        done += 1
+                        fruitless = 0
             except BrokenProcessPool as error:
-                fruitless = 0 if done or len(self._finished) > before else fruitless + 1
                 if fruitless == ROUNDS:
                     raise EvaluationError(
                         f"the workers died {ROUNDS} times without finishing one of the work "
@@ -332,11 +319,7 @@ class Runner:
         elif isinstance(outcome, list):
             store.accompany(item.seeds[0], outcome)
         else:
-            store.evaluate(
-                item.file,
-                {seed: figures for seed, (figures, _) in outcome.items()},
-                {seed: clock for seed, (_, clock) in outcome.items()},
-            )
+            store.evaluate(item.file, outcome)
         self._tell(self._finish(name, self._runs[name]))
 
     def _finish(self, name: str, run: Run) -> str:
@@ -392,7 +375,7 @@ def study(
     *,
     jobs: int = 1,
     scheduler: str | None = None,
-    report: Report = silent,
+    report: Report = lambda state, line: None,
     planned: Plan | None = None,
     figures: bool = True,
 ) -> StudyResults:

@@ -40,6 +40,8 @@ BLOCKS = ["seed", "steps", "block", "J"]
 PAUSE = 20
 """Of the time that a table took to write, what passes at least until it is written again."""
 Figures = dict[str, float]
+Measured = dict[int, tuple[Figures, Figures]]
+"""Indicators and what the clock said, by noise seed."""
 
 
 @dataclass(frozen=True)
@@ -198,14 +200,11 @@ class RunStore:
         known = self.indicators(file)
         return [seed for seed in self._run.noise[file][0] if seed not in known]
 
-    def evaluate(
-        self, file: str, found: Mapping[int, Figures], clock: Mapping[int, Figures]
-    ) -> None:
+    def evaluate(self, file: str, found: Measured) -> None:
         """Add indicators to a file, and what the clock said to timing.csv."""
-        self.indicators(file).update(found)
-        if file == EVALUATION:
-            self.indicators(TIMING).update(clock)
-        for name in (file, TIMING) if file == EVALUATION else (file,):
+        parts = [(file, 0), *([(TIMING, 1)] if file == EVALUATION else [])]
+        for name, part in parts:
+            self.indicators(name).update({seed: pair[part] for seed, pair in found.items()})
             self._unwritten.add(name)
             if time.monotonic() >= self._next.get(name, 0.0):
                 self._write(name)
@@ -219,6 +218,7 @@ class RunStore:
         # The rows of many seeds are written again and again: the pause keeps that a small share.
         begin = time.monotonic()
         rows = pd.DataFrame.from_dict(self._known[file], "index").sort_index()
+        rows = rows if file == TIMING else rows[list(INDICATORS)]
         steps = self._run.noise[EVALUATION if file == TIMING else file][1]
         for place, value in enumerate((rows.index, steps, self._run.burn_in(file))):
             rows.insert(place, KEY[place], value)

@@ -26,7 +26,7 @@ from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
 from cosim.shown import Shown
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
-from cosim.studies.plan import EVALUATION, NAIVE, Case, Run, RunKey, Sizes, check_folders
+from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, check_folders
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING
 from cosim.studies.tables import to_csv
@@ -103,7 +103,7 @@ def evaluate(
         "fmu_sha256": fmu,
         "command": command,
     } | ({"burn_in": burn_in} if burn_in else {})
-    sizes = Sizes(numbers, steps, burn_in, 0, 0)
+    noise = {EVALUATION: Noise(numbers, steps, burn_in)}
     settles = comes_to_rest(scenario) and displaced(scenario) is not None
     runs, parameters = [], {}
     for name, item in named.items():
@@ -120,7 +120,7 @@ def evaluate(
             raise EvaluationError(str(error)) from None
         case = Case(name, (scenario.name,), "")
         settle = settles and name in wanted
-        runs.append(Run(key, case, scenario, item, None, depends, sizes, settle=settle))
+        runs.append(Run(key, case, scenario, item, None, depends, noise, settle=settle))
     check_folders(runs)
 
     tell = progress or (lambda samples, line: None)

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from cosim.figures.style import (
     DASHED,
     REFERENCE,
+    Dots,
     Look,
+    dot_rows,
     figure,
     palette,
     percent,
@@ -39,7 +41,7 @@ def evaluation_figure(
     """Left: J of each controller; right: economic cost against violation.
 
     `controllers` have the columns `J`, `economic_cost` and `mean_violation`, a row for each seed.
-    Small dots are seeds, the large ones means with 95 % t intervals. `optimal` is J* (S,) on the
+    Dots are seeds, bars and large dots means with 95 % t intervals. `optimal` is J* (S,) on the
     same seeds: the left panel then shows the regret (J − J*)/|J*| in %, paired over the seeds.
     The grey line joins the controllers that no other one beats in both cost and violation.
     """
@@ -58,25 +60,17 @@ def _rows(
     looks: Mapping[str, Look],
     optimal: Array | None,
 ) -> None:
-    everything = []
-    for row, (name, costs) in enumerate(controllers.items()):
-        color = looks[name].color
+    rows = []
+    for name, costs in controllers.items():
         values, scale = costs.J.to_numpy(), 1.0
         estimate = mean_of(values)
         if optimal is not None:
             estimate, scale = regret(values, optimal), 100.0
             values = 100 * regret_terms(values, optimal)
-        everything.append(values)
-        spread = np.linspace(-0.22, 0.22, len(values)) if len(values) > 1 else np.zeros(1)
-        axes.plot(values, row + spread, ".", color=color, markersize=4, alpha=0.4, mew=0)
-        if estimate.t is not None:
-            low, high = estimate.t
-            axes.hlines(row, scale * low, scale * high, color=color, linewidth=1.6, zorder=3)
-        axes.plot(scale * estimate.value, row, "o", color=color, markersize=5, zorder=4)
-    axes.set_yticks(range(len(controllers)), [plain(name) for name in controllers])
-    axes.set_ylim(len(controllers) - 0.5, -0.5)
-    axes.grid(axis="y", visible=False)
-    values = np.concatenate(everything)
+        ends = (scale * end for end in estimate.t or ())
+        finished = np.ones(len(values), dtype=bool)
+        rows.append(Dots(name, values, finished, scale * estimate.value, *ends))
+    values = dot_rows(axes, rows, looks)
     if optimal is not None:
         axes.axvline(0.0, color=REFERENCE, linewidth=0.8, linestyle=DASHED, zorder=1)
         regret_axis(axes, "x", np.append(values, 0.0), FLOOR)

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter
+from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from cosim.errors import FigureError
@@ -29,6 +30,7 @@ FLOOR = 0.01
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BOUND = "#B2182B"
 REFERENCE = "#5A6570"
+INK = "#222222"
 DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F",
@@ -194,6 +196,36 @@ def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: floa
     getattr(axes, f"set_{which}scale")("symlog", linthresh=floor, linscale=0.5)
     getattr(axes, f"set_{which}lim")(lowest, 1.6 * max(high, floor))
     (axes.xaxis if which == "x" else axes.yaxis).set_major_formatter(FuncFormatter(percent))
+
+
+class Dots(NamedTuple):
+    """Values of a case (K,), whether each finished, and a middle with its interval."""
+
+    case: str
+    values: Array
+    finished: NDArray[np.bool_]
+    middle: float
+    low: float = np.nan
+    high: float = np.nan
+
+
+def dot_rows(axes: Axes, rows: Sequence[Dots], looks: Mapping[str, Look]) -> Array:
+    """A row for each case: its values, crosses where one diverged, and their middle; all values."""
+    for row, dots in enumerate(rows):
+        count = len(dots.values)
+        y = row + (np.linspace(-0.18, 0.18, count) if count > 1 else np.zeros(1))
+        for marker, chosen in (("o", dots.finished), ("x", ~dots.finished)):
+            axes.scatter(
+                dots.values[chosen], y[chosen], marker=marker, s=13, alpha=0.55, zorder=3,
+                color=looks[dots.case].color, linewidths=0 if marker == "o" else 0.9,
+            )  # fmt: skip
+        if np.isfinite([dots.low, dots.high]).all():
+            axes.hlines(row, dots.low, dots.high, color=INK, linewidth=1.1, zorder=4)
+        axes.vlines(dots.middle, row - 0.3, row + 0.3, color=INK, linewidth=1.4, zorder=5)
+    axes.set_yticks(range(len(rows)), [plain(dots.case) for dots in rows])
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.grid(axis="y", visible=False)
+    return np.concatenate([dots.values for dots in rows])
 
 
 def cost_axis(axes: Axes, values: Array, *, relative: bool) -> None:

@@ -46,7 +46,7 @@ def document(plan: Plan) -> dict[str, Any]:
     """The document study.json of a plan."""
     definition = plan.definition
     scenarios = list(definition.scenarios)
-    sizes = {name: definition.sizes(name) for name in scenarios}
+    curves = {name: definition.held_out(name) for name in scenarios}
     about = {
         "schema": SCHEMA,
         "name": definition.name,
@@ -71,7 +71,7 @@ def document(plan: Plan) -> dict[str, Any]:
         "file": Path(definition.file).name if definition.file else None,
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.naive),
-        "curves": {name: [size.curve_seeds, size.curve_steps] for name, size in sizes.items()},
+        "curves": {name: [len(noise.seeds), noise.steps] for name, noise in curves.items()},
         "online": None if definition.table.online is None else definition.table.online.model_dump(),
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
@@ -116,14 +116,14 @@ def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.Data
     if not (folder / RUN).is_file():
         return None
     document = read_json(folder / RUN, f"'{folder / RUN}'", StudyError)
-    noise = {file: measured(folder, run, file) for file in run.noise}
+    found = {file: measured(folder, run, file) for file in run.noise}
     if run.training is not None and not document.get("status"):
         return None
-    if any(set(seeds) - set(noise[file].index) for file, (seeds, _) in run.noise.items()):
+    if any(set(noise.seeds) - set(found[file].index) for file, noise in run.noise.items()):
         return None
     if (beside := run.online) and set(beside.seeds) - set(accompanied(folder, beside).seed):
         return None
-    own = noise[EVALUATION].loc[list(run.sizes.seeds)].reset_index()
+    own = found[EVALUATION].loc[list(run.noise[EVALUATION].seeds)].reset_index()
     key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}
     state = key | {
         "status": document.get("status") or EVALUATED,
@@ -133,11 +133,10 @@ def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.Data
     curve = pd.DataFrame(columns=CURVE)
     if run.training is not None:
         curve = read_table(folder / LOG).reindex(columns=CURVE)
-    elif run.greedy:
-        greedy = noise[GREEDY].loc[list(run.noise[GREEDY][0])]
+    elif GREEDY in run.noise:
+        greedy = found[GREEDY].loc[list(run.noise[GREEDY].seeds)]
         curve = pd.DataFrame([{"greedy_J": float(greedy.J.mean())}], columns=CURVE)
-    found = pd.DataFrame([state]), own, curve
-    one, other, third = (frame.assign(**key) for frame in found)
+    one, other, third = (frame.assign(**key) for frame in (pd.DataFrame([state]), own, curve))
     types = {"training_seed": "Int64"}
     return (
         one[STATE].astype(types),

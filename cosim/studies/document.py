@@ -116,7 +116,7 @@ class OperationTable(Table):
 
 
 class ThetaTable(Table):
-    """Where the trainings led θ: whether it has converged, and how far cases are apart."""
+    """Where the trainings led θ: how far it went, and how far cases are apart."""
 
     without: list[Source] = []
     """Blocks of θ that distances leave out, such as those that no action depends on."""
@@ -124,8 +124,6 @@ class ThetaTable(Table):
     """Blocks whose entries have columns of their own."""
     pairs: list[Annotated[list[Source], Field(min_length=2, max_length=2)]] = []
     """Names of the two cases of each comparison; every two cases, if left out."""
-    late: bool = True
-    """Whether to say how far θ went late in the samples; not of a rule that moves it at the end."""
 
 
 class CaseTable(Table):

@@ -10,16 +10,17 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter
-from numpy.typing import NDArray
 
 from cosim.errors import StudyError
 from cosim.figures.style import (
     DASHED,
     FLOOR,
     REFERENCE,
+    Dots,
     EndLabel,
     Look,
     cost_axis,
+    dot_rows,
     figure,
     label,
     label_ends,
@@ -36,18 +37,6 @@ from cosim.validation import instead
 
 BANDED = 6
 """Curves of a panel, at most, that have bands: more bands cannot be told apart."""
-INK = "#222222"
-
-
-class Dots(NamedTuple):
-    """Runs of a case: regrets in % (R,), whether each finished, a middle and its interval in %."""
-
-    case: str
-    values: Array
-    finished: NDArray[np.bool_]
-    middle: float
-    low: float
-    high: float
 
 
 def regret_figure(rows: Sequence[Dots], looks: Mapping[str, Look]) -> Figure:
@@ -57,21 +46,8 @@ def regret_figure(rows: Sequence[Dots], looks: Mapping[str, Look]) -> Figure:
     """
     with figure(0.21 * len(rows) + 0.9) as drawn:
         axes = drawn.subplots()
-        for row, dots in enumerate(rows):
-            count = len(dots.values)
-            y = row + (np.linspace(-0.18, 0.18, count) if count > 1 else np.zeros(1))
-            for marker, chosen in (("o", dots.finished), ("x", ~dots.finished)):
-                axes.scatter(
-                    dots.values[chosen], y[chosen], marker=marker, s=13, alpha=0.55, zorder=3,
-                    color=looks[dots.case].color, linewidths=0 if marker == "o" else 0.9,
-                )  # fmt: skip
-            if np.isfinite([dots.low, dots.high]).all():
-                axes.hlines(row, dots.low, dots.high, color=INK, linewidth=1.1, zorder=4)
-            axes.vlines(dots.middle, row - 0.3, row + 0.3, color=INK, linewidth=1.4, zorder=5)
-        axes.set_yticks(range(len(rows)), [plain(dots.case) for dots in rows])
-        axes.set_ylim(len(rows) - 0.4, -0.6)
-        axes.grid(axis="y", visible=False)
-        regret_axis(axes, "x", np.concatenate([[0.0], *(dots.values for dots in rows)]))
+        values = dot_rows(axes, rows, looks)
+        regret_axis(axes, "x", np.append(values, 0.0))
         axes.set_xlabel("regret % of runs (crosses diverged); interquartile mean, 95 % interval")
     return drawn
 

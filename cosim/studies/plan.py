@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import product
 from math import gcd
 from pathlib import Path
-from typing import Any, Self, TypeVar, get_args, get_origin
+from typing import Any, NamedTuple, Self, TypeVar, get_args, get_origin
 
 import numpy as np
 
@@ -100,16 +100,12 @@ class Training:
         return learnable(self.options["controller"], self.scenario, found)
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Noise of a scenario: `steps` samples on each of the `seeds` after `burn_in`; `curve_seeds`
-    held-out runs of `curve_steps` samples for a learning curve."""
+class Noise(NamedTuple):
+    """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`."""
 
     seeds: tuple[int, ...]
     steps: int
-    burn_in: int
-    curve_seeds: int
-    curve_steps: int
+    burn_in: int = 0
 
 
 @dataclass(frozen=True)
@@ -169,9 +165,9 @@ class Run:
     """One run: a controller, or a training and the θ that comes of it.
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `greedy` says whether a controller runs on the noise of the learning curves, too;
-    `settle` whether its settling time is wanted; `traces` are runs kept sample by sample. `marks`
-    are the samples of operation at which θ, or the optimum, is judged.
+    training. `noise` is what it is measured on, by the file that keeps the indicators; `settle`
+    says whether its settling time is wanted; `traces` are runs kept sample by sample. `marks` are
+    the samples of operation at which θ, or the optimum, is judged.
     """
 
     key: RunKey
@@ -180,33 +176,17 @@ class Run:
     controller: Any
     training: Training | None
     facts: Mapping[str, Any]
-    sizes: Sizes
-    greedy: bool = False
+    noise: Mapping[str, Noise]
     traces: tuple[TrajectoryTable, ...] = ()
     online: Online | None = None
     settle: bool = False
     marks: tuple[int, ...] = ()
 
     @property
-    def noise(self) -> dict[str, tuple[tuple[int, ...], int]]:
-        """Seeds and samples on each, by the file that keeps the indicators."""
-        sizes = self.sizes
-        found = {EVALUATION: (sizes.seeds, sizes.steps)}
-        held_out = tuple(HELD_OUT + k for k in range(sizes.curve_seeds))
-        files = [*([GREEDY] if self.greedy else []), *map(greedy_file, self.marks)]
-        return found | dict.fromkeys(files, (held_out, sizes.curve_steps))
-
-    def burn_in(self, file: str) -> int:
-        """Samples run before those that count; learning curves have none."""
-        return 0 if file == GREEDY else self.sizes.burn_in
-
-    @property
     def samples(self) -> int:
         """Plant samples of the run; those of greedy evaluations while training apart."""
         trained = 0 if self.training is None else self.training.samples
-        evaluated = sum(
-            len(seeds) * (self.burn_in(file) + steps) for file, (seeds, steps) in self.noise.items()
-        )
+        evaluated = sum(len(n.seeds) * (n.burn_in + n.steps) for n in self.noise.values())
         beside = 0 if self.online is None else len(self.online.seeds) * self.online.steps
         return trained + evaluated + beside + sum(trace.steps for trace in self.traces)
 
@@ -266,12 +246,11 @@ class Study:
         names = [case.name for case in cases]
         if twice := [name for name in names if names.count(name) > 1]:
             raise StudyError(f"two cases are called '{twice[0]}'; give each another name")
+        met = [seed for case in cases for seed in case.training_seeds]
         for scenario in self.scenarios:
-            sizes = self.sizes(scenario)
-            met = {seed for case in cases for seed in case.training_seeds}
-            held_out = range(HELD_OUT, HELD_OUT + sizes.curve_seeds)
+            held_out, own = self.held_out(scenario).seeds, self.noise(scenario).seeds
             for seeds, what in ((met, "a training seed"), (held_out, "a seed of the curves")):
-                if common := sorted(set(seeds) & set(sizes.seeds)):
+                if common := sorted(set(seeds) & set(own)):
                     raise StudyError(
                         f"evaluation: noise seed {common[0]} is {what} too; choose another "
                         "first_seed"
@@ -386,18 +365,18 @@ class Study:
             return path
         return Path(path).relative_to(self.folder).as_posix()
 
-    def sizes(self, scenario: str) -> Sizes:
-        """Noise seeds and samples of a scenario."""
-        evaluation, curves = self.table.evaluation, self.table.curves
-        first = evaluation.first_seed
-        count = self._of(evaluation.seeds, scenario, "evaluation.seeds")
-        return Sizes(
-            tuple(range(first, first + count)),
-            self._of(evaluation.steps, scenario, "evaluation.steps"),
-            evaluation.burn_in,
-            self._of(curves.seeds, scenario, "curves.seeds"),
-            self._of(curves.steps, scenario, "curves.steps"),
-        )
+    def noise(self, scenario: str) -> Noise:
+        """Noise on which the cases of a scenario are compared."""
+        table = self.table.evaluation
+        count = self._of(table.seeds, scenario, "evaluation.seeds")
+        seeds = tuple(range(table.first_seed, table.first_seed + count))
+        return Noise(seeds, self._of(table.steps, scenario, "evaluation.steps"), table.burn_in)
+
+    def held_out(self, scenario: str) -> Noise:
+        """Noise of the greedy evaluations during training."""
+        count = self._of(self.table.curves.seeds, scenario, "curves.seeds")
+        steps = self._of(self.table.curves.steps, scenario, "curves.steps")
+        return Noise(tuple(range(HELD_OUT, HELD_OUT + count)), steps)
 
     def marks(self, scenario: str) -> tuple[int, ...]:
         """Samples of operation at which a scenario's runs are judged; none of another study."""
@@ -427,7 +406,7 @@ class Study:
     def training(self, case: Case, scenario: str, seed: int) -> Training:
         """The training of a case on a scenario with one seed; raises ConfigurationError."""
         assert case.algorithm is not None
-        sizes, samples = self.sizes(scenario), case.samples
+        curves, samples = self.held_out(scenario), case.samples
         if marks := self.marks(scenario):
             samples = marks[-1]
             if (asked := load_algorithm(case.algorithm).asks_for) != "operation":
@@ -448,8 +427,8 @@ class Study:
             "log_every": log_every,
             "evaluate_every": rows * log_every,
             "checkpoint_every": log_every * max(1, round(CHECKPOINT / log_every)),
-            "evaluation_seeds": sizes.curve_seeds,
-            "evaluation_steps": sizes.curve_steps,
+            "evaluation_seeds": len(curves.seeds),
+            "evaluation_steps": curves.steps,
             **case.training,
         }
         described, settings = self.scenarios[scenario], dict(case.settings)
@@ -500,6 +479,12 @@ def plan(study: Study) -> Plan:
                 "options": {**training.options, "start": study.relative(case.start)},
             }
         judged = training is not None or case.name == study.optima.get(name)
+        marks = study.marks(name) if judged else ()
+        noise = {EVALUATION: (own := study.noise(name))}
+        if training is None and any(case.algorithm for case in _on(study, name)):
+            noise[GREEDY] = study.held_out(name)
+        at_mark = study.held_out(name)._replace(burn_in=own.burn_in)
+        noise |= {greedy_file(mark): at_mark for mark in marks}
         runs.append(
             Run(
                 RunKey(name, case.name, seed),
@@ -508,11 +493,10 @@ def plan(study: Study) -> Plan:
                 case.controller,
                 training,
                 facts,
-                study.sizes(name),
-                training is None and any(case.algorithm for case in _on(study, name)),
+                noise,
                 _traces(study, case, name, seed),
                 None if training is not None else _online(study, case, name),
-                marks=study.marks(name) if judged else (),
+                marks=marks,
             )
         )
     _check_names(study)

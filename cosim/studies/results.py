@@ -14,7 +14,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cosim.errors import StudyError
-from cosim.figures.style import Look, palette, save_set
+from cosim.figures.style import Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.shown import Shown
@@ -462,7 +462,7 @@ class StudyResults(Shown):
                 middle, low, high = (100 * row[f"{kind}{end}"] for end in ("", "_low", "_high"))
                 lost = self.of(case, scenario).status.str.startswith("diverged").to_numpy()
                 values = 100 * self.regrets(case, scenario)
-                rows.append(figures.Dots(case, values, ~lost, middle, low, high))
+                rows.append(Dots(case, values, ~lost, middle, low, high))
         return figures.regret_figure(rows, self._looks) if rows else None
 
     def _curves(self, scenario: str) -> Figure | None:

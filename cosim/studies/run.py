@@ -270,8 +270,8 @@ class Runner:
                 return
             base = replace(base, parameters=store.parameters)
             self._done[name] = trained
-        for file, (seeds, steps) in run.noise.items():
-            missing, burn_in = store.missing(file), run.burn_in(file)
+        for file, (seeds, steps, burn_in) in run.noise.items():
+            missing = store.missing(file)
             self._done[name] += (len(seeds) - len(missing)) * (burn_in + steps)
             size = max(1, BLOCK // (burn_in + steps))
             mark = next((mark for mark in run.marks if greedy_file(mark) == file), None)
@@ -288,7 +288,7 @@ class Runner:
             else:
                 yield replace(base, trace=trace, seeds=(trace.seed,), steps=trace.steps)
         if store.unsettled:
-            yield replace(base, settle=True, steps=run.sizes.steps)
+            yield replace(base, settle=True, steps=run.noise[EVALUATION].steps)
         if (online := run.online) is not None:
             beside = store.missing_online()
             self._done[name] += online.steps * (len(online.seeds) - len(beside))
@@ -330,7 +330,8 @@ class Runner:
         store.seal()
         self._finished.add(name)
         found = store.indicators(EVALUATION)
-        cost = sum(found[seed]["J"] for seed in run.sizes.seeds) / len(run.sizes.seeds)
+        seeds = run.noise[EVALUATION].seeds
+        cost = sum(found[seed]["J"] for seed in seeds) / len(seeds)
         status = store.status.partition(":")[0]
         return f"{name}: J {cost:.6g}{f', {status}' if status else ''}"
 

@@ -68,8 +68,8 @@ def measured(folder: Path, run: Run, file: str) -> pd.DataFrame:
         return pd.DataFrame(columns=[*KEY, *INDICATORS]).set_index("seed")
     columns = () if file == TIMING else (*KEY, *INDICATORS)
     rows = read_table(folder / file, columns, dict.fromkeys(KEY, int))
-    steps = run.noise[EVALUATION if file == TIMING else file][1]
-    rows = rows[(rows.steps == steps) & (rows.burn_in == run.burn_in(file))]
+    _, steps, burn_in = run.noise[EVALUATION if file == TIMING else file]
+    rows = rows[(rows.steps == steps) & (rows.burn_in == burn_in)]
     return rows.drop_duplicates("seed").set_index("seed")
 
 
@@ -96,7 +96,7 @@ class RunStore:
         self.folder = out / run.key.folder
         self.remarks: list[str] = []
         """What was found changed or damaged, and is done anew."""
-        self._run = run
+        self._run, self._steps = run, str(run.noise[EVALUATION].steps)
         self._facts = json.loads(json.dumps(run.facts))
         self._known: dict[str, dict[int, Figures]] = {}
         self._unwritten: set[str] = set()
@@ -198,7 +198,7 @@ class RunStore:
     def missing(self, file: str) -> list[int]:
         """Noise seeds without indicators in a file."""
         known = self.indicators(file)
-        return [seed for seed in self._run.noise[file][0] if seed not in known]
+        return [seed for seed in self._run.noise[file].seeds if seed not in known]
 
     def evaluate(self, file: str, found: Measured) -> None:
         """Add indicators to a file, and what the clock said to timing.csv."""
@@ -219,8 +219,8 @@ class RunStore:
         begin = time.monotonic()
         rows = pd.DataFrame.from_dict(self._known[file], "index").sort_index()
         rows = rows if file == TIMING else rows[list(INDICATORS)]
-        steps = self._run.noise[EVALUATION if file == TIMING else file][1]
-        for place, value in enumerate((rows.index, steps, self._run.burn_in(file))):
+        _, *length = self._run.noise[EVALUATION if file == TIMING else file]
+        for place, value in enumerate((rows.index, *length)):
             rows.insert(place, KEY[place], value)
         write_atomically(self.folder / file, to_csv(rows))
         self._next[file] = time.monotonic() + PAUSE * (time.monotonic() - begin)
@@ -249,19 +249,16 @@ class RunStore:
     @property
     def settling(self) -> float:
         """Settling time in s in a run as long as the plan's, NaN where it is not known."""
-        return float(self._about.get("settling", {}).get(str(self._run.sizes.steps), "nan"))
+        return float(self._about.get("settling", {}).get(self._steps, "nan"))
 
     def settle(self, seconds: float) -> None:
         """Store the settling time, as text since NaN is no JSON."""
-        known = self._about.get("settling", {})
-        self.note(settling=known | {str(self._run.sizes.steps): repr(seconds)})
+        self.note(settling=self._about.get("settling", {}) | {self._steps: repr(seconds)})
 
     @property
     def unsettled(self) -> bool:
         """Whether the settling time is wanted and has not been measured."""
-        return self._run.settle and str(self._run.sizes.steps) not in self._about.get(
-            "settling", {}
-        )
+        return self._run.settle and self._steps not in self._about.get("settling", {})
 
     def trajectory(self, trace: TrajectoryTable) -> Path:
         """File of a trajectory, which may not be there yet."""

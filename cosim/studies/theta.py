@@ -1,4 +1,4 @@
-"""Where the trainings of a study led θ: whether it has converged, and how far cases are apart."""
+"""Where the trainings of a study led θ: how far it went, and how far cases are apart."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ Where = tuple[str, str]
 PREFIX = "theta "
 SHARES = (0.0, 0.5, 0.8, 1.0)
 """Shares of a training's samples at which θ is kept."""
-CONVERGED = 0.05
-"""Movement in the last fifth of a training, as a share of the way, below which it converged."""
 
 
 def scales(plan: Plan) -> dict[str, float]:
@@ -95,7 +93,7 @@ def tables(
     title += f" without {', '.join(settings['without'])}" if settings["without"] else ""
     pairs = _pairs(trained, settings["pairs"], list(names))
     return [
-        (title, *_course_table(scaled, names, settings["late"])),
+        (title, *_course_table(scaled, names)),
         (
             "How far θ and J of two cases are apart, training seed by training seed",
             *_apart(pairs, scaled, theta[own], costs, names),
@@ -103,36 +101,22 @@ def tables(
     ]
 
 
-def _way(theta: pd.DataFrame, where: Where, since: float = 0.0) -> pd.Series[float]:
-    """‖θ_K − θ_since·K‖ by training seed."""
-    moved = theta.loc[(*where, 1.0)] - theta.loc[(*where, since)]
+def _way(theta: pd.DataFrame, where: Where) -> pd.Series[float]:
+    """‖θ_K − θ_0‖ by training seed."""
+    moved = theta.loc[(*where, 1.0)] - theta.loc[(*where, 0.0)]
     return pd.Series(np.linalg.norm(moved, axis=1), moved.index)
 
 
 def _course_table(
-    theta: pd.DataFrame, names: Mapping[Where, str], late: bool
+    theta: pd.DataFrame, names: Mapping[Where, str]
 ) -> tuple[Sequence[str], list[list[str]]]:
-    header: tuple[str, ...] = ("case", "runs", "way, median", "between seeds")
-    if late:
-        header += (
-            "last half / way, median", "worst", "last fifth / way, median", "worst",
-            f"converged (< {CONVERGED})",
-        )  # fmt: skip
     rows = []
     for where, name in names.items():
         way, end = _way(theta, where), theta.loc[(*where, 1.0)].to_numpy()
         apart = [float(np.linalg.norm(a - b)) for a, b in combinations(end, 2)]
-        row = [name, str(len(way)), shown(way.median(), None, 1, 3)]
-        row.append(shown(float(np.median(apart)), None, 1, 3) if apart else "")
-        if late:
-            below = way.clip(lower=np.finfo(np.float64).tiny)
-            half, fifth = (_way(theta, where, share) / below for share in (0.5, 0.8))
-            row += [
-                shown(f, None, 1, 2) for part in (half, fifth) for f in (part.median(), part.max())
-            ]
-            row.append(f"{int((fifth < CONVERGED).sum())}/{len(fifth)}")
-        rows.append(row)
-    return header, rows
+        between = shown(float(np.median(apart)), None, 1, 3) if apart else ""
+        rows.append([name, str(len(way)), shown(way.median(), None, 1, 3), between])
+    return ("case", "runs", "way, median", "between seeds"), rows
 
 
 def _pairs(

@@ -62,9 +62,6 @@ def test_the_course_is_in_scaled_entries_without_what_is_left_out(results):
     line = lines_of(results, 0)[0]
     # Of two seeds one goes 10, the other 20, in entries of scale 2.
     assert float(line["way, median"]) == pytest.approx(7.5)
-    assert float(line["last half / way, median"]) == pytest.approx(0.4)
-    assert float(line["last fifth / way, median"]) == pytest.approx(0.1)
-    assert line["converged (< 0.05)"] == "0/2"
     assert float(line["between seeds"]) == pytest.approx(5.0)
 
 

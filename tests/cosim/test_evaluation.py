@@ -67,12 +67,6 @@ def cluster(ledger):
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_of_two_processes_gives_the_bytes_of_one(paper, cluster):
-    there = evaluate(paper, BOTH, 4, 40, scheduler=cluster)
-    assert contents(there) == contents(evaluate(paper, BOTH, 4, 40))
-
-
-@pytest.mark.slow
 def test_a_killed_dask_worker_loses_nothing(paper, cluster, ledger):
     broken = evaluate(paper, {"mortal": mortal}, 5, 20, scheduler=cluster)
     assert len(ledger()) > 5, "no run was begun twice, so none was killed"
@@ -128,14 +122,6 @@ def test_the_optimum_need_not_be_named_for_the_regret(paper):
     for row in evaluation.rows:
         optimum = evaluation.optimal[row["seed"]]
         assert row["regret"] == pytest.approx((row["J"] - optimum) / optimum, abs=1e-15)
-
-
-def test_burn_in_is_run_and_not_counted(paper):
-    evaluation = evaluate(paper, {"p": proportional}, 1, 20, burn_in=30)
-    with FmuPlant(paper) as plant:
-        run = simulate(plant, Proportional(paper), 50, 0)
-    cost = run["stage_cost"] + run["penalty"]
-    assert evaluation.rows[0]["J"] == cost[30:].mean()
 
 
 @pytest.mark.slow

@@ -71,13 +71,6 @@ def test_the_report_has_table_and_figure_and_needs_no_runs(results, tmp_path):
     assert 'alt="online-paper' in page
 
 
-@pytest.mark.slow
-def test_two_workers_give_the_bytes_of_one(results, tmp_path):
-    again = online(tmp_path, jobs=2)
-    content = [(folder / "online.csv").read_bytes() for folder in (results.folder, again.folder)]
-    assert content[0] == content[1]
-
-
 def test_a_run_that_goes_on_does_nothing_twice(results, monkeypatch):
     monkeypatch.setattr(engine, "perform", lambda *_: pytest.fail("was done"))
     again = online(results.folder)

@@ -9,7 +9,6 @@ import pytest
 
 from cosim.studies.results import StudyResults
 from cosim.studies.tables import KEYS, to_csv
-from cosim.text_tables import markdown_table
 from tests.helpers.toy_study import GROW, run_toy
 
 ROOT = Path(__file__).parents[3]
@@ -124,7 +123,3 @@ def test_an_unfinished_study_is_reported_with_what_it_has(results, tmp_path):
         results, folder=tmp_path, about=results.about | {"runs": 99}, state=results.state[:3]
     )
     assert "3 of 99 runs are finished; 96 are missing" in part.report().read_text("utf-8")
-
-
-def test_a_scenarios_table_is_markdown(results):
-    assert results.table("paper") == markdown_table(*results.lines("paper"))

@@ -8,7 +8,6 @@ import pytest
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.studies import run as engine
-from cosim.studies.results import StudyResults
 from cosim.studies.store import Trained
 from tests.helpers.toy_study import GROW, run_toy
 
@@ -77,9 +76,3 @@ def test_two_cases_are_paired_by_training_seed(results):
     cost = [results.of(f"go(rate={rate})", "paper").J.to_numpy() for rate in ("1.0", "3.0")]
     expected = np.mean(np.subtract(cost[1], cost[0]))
     assert float(line["ΔJ, mean [95 %]"].split()[0]) == pytest.approx(expected, rel=5e-2)
-
-
-def test_the_report_has_both_tables_and_needs_no_runs(results, tmp_path):
-    page = StudyResults.load(results.folder).report(tmp_path).read_text("utf-8")
-    assert "Where θ went, in scaled entries without h" in page
-    assert "training seed by training seed" in page

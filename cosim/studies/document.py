@@ -197,6 +197,11 @@ class TrajectoryTable(Table):
     figures: list[Literal["trajectory", "overlay", "density", "phase"]] = []
     """What is drawn of the runs."""
 
+    @property
+    def file(self) -> str:
+        """Name of the file in a run's folder."""
+        return f"trajectory-{self.name}-{self.seed}-{self.steps}.csv"
+
 
 class StudyTable(Table):
     """A study file."""

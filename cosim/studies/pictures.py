@@ -36,24 +36,19 @@ GRID, BINS = 13, 80
 def keep(plan: Plan, out: Path) -> None:
     """Copy the trajectories, logs and θ that the study keeps into folders of their own."""
     for run in plan.runs:
-        folder = out / run.key.folder
-        for table in run.traces:
-            name = f"trajectory-{table.name}-{table.seed}-{table.steps}.csv"
-            _copy(folder / name, _trajectory(out, table, run))
+        files = {table.file: _trajectory(out, table, run) for table in run.traces}
         if _is_logged(plan, run):
-            _copy(folder / LOG, out / LOGS / f"{_stem(run)}.csv")
-            _copy(folder / PARAMETERS, out / KEPT / f"{_stem(run)}.toml")
+            files[LOG] = out / LOGS / f"{_stem(run)}.csv"
+            files[PARAMETERS] = out / KEPT / f"{_stem(run)}.toml"
+        for name, target in files.items():
+            if (source := out / run.key.folder / name).is_file():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(target, source.read_bytes())
 
 
 def draw(plan: Plan, out: Path) -> list[str]:
     """Draw the kept trajectories and logs into `out`/figures; returns the figures' names."""
     return save_set(_figures(plan, out), out / FOLDER)
-
-
-def _copy(source: Path, target: Path) -> None:
-    if source.is_file():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(target, source.read_bytes())
 
 
 def _trajectory(out: Path, table: TrajectoryTable, run: Run) -> Path:
@@ -74,30 +69,28 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
     """Names and figures of the tables `[[trajectory]]`, then of the logs."""
     for name, scenario in plan.definition.scenarios.items():
         for table in plan.definition.table.trajectory:
-            runs = {
-                run.key.case: run
-                for run in plan.runs
-                if run.key.scenario == name
-                and table in run.traces
-                and _trajectory(out, table, run).is_file()
-            }
+            runs = [run for run in plan.runs if run.key.scenario == name and table in run.traces]
+            runs = [run for run in runs if _trajectory(out, table, run).is_file()]
             found = {
                 case: replace(read_csv(_trajectory(out, table, run), scenario), controller=case)
-                for case, run in runs.items()
+                for run in runs
+                for case in [run.key.case]
             }
             for kind in table.figures if found else ():
                 stem = f"{kind}-{safe(name)}-{table.name}"
                 if kind == "trajectory":
+                    beside = list(found.values())
                     for case, one in found.items():
-                        beside = list(found.values())
-                        own = trajectory_figure(one, scenario, beside=beside)
-                        yield f"{stem}-{safe(case)}", own
+                        yield (
+                            f"{stem}-{safe(case)}",
+                            trajectory_figure(one, scenario, beside=beside),
+                        )
                 elif kind == "overlay":
                     yield stem, overlay_figure(found)
                 elif kind == "density":
                     yield stem, density_figure(found, scenario)
                 else:
-                    policies = {case: _policy(plan, run, out) for case, run in runs.items()}
+                    policies = {run.key.case: _policy(plan, run, out) for run in runs}
                     yield stem, phase_figure(found, policies, scenario)
     for run in plan.runs:
         path = out / LOGS / f"{_stem(run)}.csv"
@@ -131,7 +124,7 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
     name, bound = scenario.plant.states[0], float(scenario.state_lower[0])
     unit = next(iter(runs.values())).signals[name].unit
     samples = {case: run[name] for case, run in runs.items()}
-    low, high = np.quantile(np.concatenate(list(samples.values())), (0.001, 0.999))
+    low, high = np.quantile(np.concatenate([*samples.values()]), (0.001, 0.999))
     low, high = min(float(low), bound), max(float(high), bound)
     # Not narrower than the smallest sample can fill (Freedman and Diaconis' rule).
     spans = [

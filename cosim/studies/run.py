@@ -283,7 +283,7 @@ class Runner:
                 block = tuple(missing[first : first + size])
                 yield replace(at_mark, file=file, seeds=block, steps=steps, burn_in=burn_in)
         for trace in run.traces:
-            if store.trajectory(trace).is_file():
+            if (store.folder / trace.file).is_file():
                 self._done[name] += trace.steps
             else:
                 yield replace(base, trace=trace, seeds=(trace.seed,), steps=trace.steps)

@@ -260,13 +260,9 @@ class RunStore:
         """Whether the settling time is wanted and has not been measured."""
         return self._run.settle and self._steps not in self._about.get("settling", {})
 
-    def trajectory(self, trace: TrajectoryTable) -> Path:
-        """File of a trajectory, which may not be there yet."""
-        return self.folder / f"trajectory-{trace.name}-{trace.seed}-{trace.steps}.csv"
-
     def trace(self, trace: TrajectoryTable, trajectory: str) -> None:
         """Store a trajectory."""
-        write_atomically(self.trajectory(trace), trajectory)
+        write_atomically(self.folder / trace.file, trajectory)
 
     def fail(self, trace: str) -> None:
         """Keep the traceback of what failed."""
@@ -280,7 +276,7 @@ class RunStore:
             and not any(self.missing(file) for file in self._run.noise)
             and not self.missing_online()
             and not self.unsettled
-            and all(self.trajectory(trace).is_file() for trace in self._run.traces)
+            and all((self.folder / trace.file).is_file() for trace in self._run.traces)
         )
 
     def seal(self) -> None:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from cosim.errors import EvaluationError, StudyError
 from cosim.files import replacing, temporary_folder
-from cosim.kpis import comes_to_rest, displaced
+from cosim.kpis import displaced
 from cosim.plant import FmuPlant
 from cosim.plugins import (
     OURS,
@@ -104,7 +104,8 @@ def evaluate(
         "command": command,
     } | ({"burn_in": burn_in} if burn_in else {})
     noise = {EVALUATION: Noise(numbers, steps, burn_in)}
-    settles = comes_to_rest(scenario) and displaced(scenario) is not None
+    # Under permanent disturbances nothing settles.
+    settles = scenario.disturbance.law == "none" and displaced(scenario) is not None
     runs, parameters = [], {}
     for name, item in named.items():
         controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
@@ -118,8 +119,7 @@ def evaluate(
             key = RunKey(scenario.name, name)
         except StudyError as error:
             raise EvaluationError(str(error)) from None
-        case = Case(name, (scenario.name,), "")
-        settle = settles and name in wanted
+        case, settle = Case(name, (scenario.name,), ""), settles and name in wanted
         runs.append(Run(key, case, scenario, item, None, depends, noise, settle=settle))
     check_folders(runs)
 

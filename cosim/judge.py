@@ -29,10 +29,9 @@ class _Recorded:
 
     def __init__(self, path: Path, states: pd.DataFrame, actions: NDArray[np.float64]) -> None:
         self._path, self._states, self._actions = path, states, actions
-        self._k = -1
-        self.value, self.residual, self.status = np.nan, np.nan, "solved"
+        self._k, self.action, self.status = -1, actions[0], "solved"
+        self.value, self.residual = np.nan, np.nan
         self.predicted_states = self.predicted_actions = None
-        self.action = actions[0]
 
     def reset(self) -> None:
         """Begin with the first sample."""
@@ -74,14 +73,10 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
     with FmuPlant(scenario) as plant:
         for path in paths:
             seed, recorded, steps = _read(path, scenario)
-            found = indicators(simulate(plant, recorded, steps, seed, residuals=False))
-            cost = np.nan
-            if optimum is not None:
-                cost = measure(plant, optimum, seed, steps)[0]["J"]
-            rows.append(
-                {"file": path.name, "seed": seed, "steps": steps, **found}
-                | {"optimum": cost, "regret": found["J"] / cost - 1}
-            )
+            row: dict[str, Any] = {"file": path.name, "seed": seed, "steps": steps}
+            row |= indicators(simulate(plant, recorded, steps, seed, residuals=False))
+            cost = np.nan if optimum is None else measure(plant, optimum, seed, steps)[0]["J"]
+            rows.append(row | {"optimum": cost, "regret": row["J"] / cost - 1})
     return pd.DataFrame(rows).sort_values("seed", ignore_index=True)
 
 

@@ -74,11 +74,6 @@ def input_effort(actions: Array, lower: Array, upper: Array) -> float:
     return float(np.mean(np.sum(np.abs(np.diff(actions, axis=0)) / (upper - lower), axis=1)))
 
 
-def comes_to_rest(scenario: Scenario) -> bool:
-    """Whether the plant can settle at all: under permanent disturbances it never does."""
-    return scenario.disturbance.law == "none"
-
-
 def displaced(scenario: Scenario) -> Scenario | None:
     """The scenario without disturbances, started away from x_s; None where that is impossible.
 

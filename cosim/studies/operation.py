@@ -146,14 +146,11 @@ def collected(runs: Sequence[Run], out: Path) -> tuple[pd.DataFrame, pd.DataFram
                 rows = pd.DataFrame({"samples": ends, "J": so_far})
                 rows = rows[rows.samples.isin(run.marks)]
                 lives.append(rows.assign(**names, training_seed=seed))
-    return tuple(
-        pd.concat(found, ignore_index=True)
-        .reindex(columns=columns)
-        .astype({"training_seed": "Int64"})
-        if found
-        else pd.DataFrame(columns=columns)
-        for found, columns in ((lives, COLUMNS), (greedy, GREEDY_COLUMNS))
-    )
+    tables = []
+    for found, columns in ((lives, COLUMNS), (greedy, GREEDY_COLUMNS)):
+        table = pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=columns)
+        tables.append(table.reindex(columns=columns).astype({"training_seed": "Int64"}))
+    return tables[0], tables[1]
 
 
 class Judged(NamedTuple):

@@ -9,7 +9,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
-from numpy.typing import NDArray
 
 from cosim.figures.style import (
     DASHED,
@@ -86,8 +85,11 @@ def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[
         name: (float(np.mean(c.mean_violation)), float(np.mean(c.economic_cost)))
         for name, c in controllers.items()
     }
-    kept = nondominated(np.array(list(means.values())))
-    front = sorted(mean for mean, best in zip(means.values(), kept, strict=True) if best)
+    ends = set(means.values())
+    front = [
+        one for one in sorted(ends)
+        if not any(other != one and np.less_equal(other, one).all() for other in ends)
+    ]  # fmt: skip
     if len(front) > 1:
         text = "no other is better in both"
         axes.plot(*np.array(front).T, color=REFERENCE, linewidth=0.9, linestyle=DASHED, label=text)
@@ -114,11 +116,3 @@ def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[
 def _half_width(values: pd.Series[float]) -> float:
     estimate = mean_of(values.to_numpy())
     return 0.0 if estimate.t is None else (estimate.t[1] - estimate.t[0]) / 2
-
-
-def nondominated(points: Array) -> NDArray[np.bool_]:
-    """Points (K, d) that no other one beats: none is as low in all and lower in one."""
-    lower = np.all(points[None] <= points[:, None], axis=2)
-    strictly = np.any(points[None] < points[:, None], axis=2)
-    beaten: NDArray[np.bool_] = np.any(lower & strictly, axis=1)
-    return ~beaten

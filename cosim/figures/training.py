@@ -71,9 +71,10 @@ def training_figure(
         named = []
         for axes, name in zip(grid, panels, strict=True):
             if name.startswith("greedy"):
-                _violation(axes, log)
+                samples, share = _known(log, "greedy_violating_share")
+                _course(axes, samples, 100 * share, GREEDY, 1.0)
             elif name.startswith("TD"):
-                _td_error(axes, log)
+                _course(axes, *_known(log, "td_error"), TRAINING, 1e-12)
             elif name.startswith("change"):
                 named.append((axes, _change(axes, log, {n: norms[n] for n in order[:BLOCKS]})))
             else:
@@ -125,21 +126,15 @@ def _cost(
     return labels
 
 
-def _violation(axes: Axes, log: Mapping[str, Array]) -> None:
-    samples, share = _known(log, "greedy_violating_share")
-    axes.plot(samples, 100 * share, marker="o", color=GREEDY, **_LINE)
-    top = max(100 * float(share.max()), 1.0)
-    axes.set_ylim(-0.04 * top, 1.1 * top)
-
-
-def _td_error(axes: Axes, log: Mapping[str, Array]) -> None:
-    samples, error = _known(log, "td_error")
-    axes.plot(samples, error, marker="." if len(error) < POINTS else "", color=TRAINING, **_LINE)
+def _course(axes: Axes, samples: Array, values: Array, color: str, least: float) -> None:
+    """A line from 0 to `least` or more, logarithmic where it spans decades."""
+    axes.plot(samples, values, marker="." if len(values) < POINTS else "", color=color, **_LINE)
     axes.yaxis.set_major_formatter(EngFormatter(sep=""))
-    if float(error.min()) > 0 and error.max() > DECADES * error.min():
+    low, top = float(values.min()), max(float(values.max()), least)
+    if 0 < DECADES * low < top:
         axes.set_yscale("log")
     else:
-        axes.set_ylim(0.0, 1.08 * max(float(error.max()), 1e-12))
+        axes.set_ylim(-0.04 * top, 1.1 * top)
 
 
 def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) -> list[EndLabel]:

@@ -9,13 +9,7 @@ from cosim.figures import (
     save,
     trajectory_figure,
 )
-from cosim.figures.evaluation import nondominated
 from tests.helpers.loop import Failing, Proportional
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(3)
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +67,3 @@ def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
         run = simulate(plant, Proportional(paper), 1, 0)
     assert save(trajectory_figure(run, paper), tmp_path / "a.png").stat().st_size > 10_000
     assert save(overlay_figure({"one": run}), tmp_path / "b.png").stat().st_size > 10_000
-
-
-def test_the_front_is_what_no_other_point_beats(rng):
-    points = rng.integers(0, 6, size=(60, 2)).astype(float)
-    expected = [
-        not any((q <= p).all() and (q < p).any() for j, q in enumerate(points) if j != i)
-        for i, p in enumerate(points)
-    ]
-    assert nondominated(points).tolist() == expected

@@ -171,6 +171,17 @@ class ControllerTable(Table):
     """ℓ_s."""
 
 
+def _array(field: str) -> cached_property[NDArray[np.float64]]:
+    """A field of the document, by its dotted name, as a read-only array."""
+
+    def array(scenario: Scenario) -> NDArray[np.float64]:
+        values = np.array(attrgetter(field)(scenario), dtype=np.float64)
+        values.flags.writeable = False
+        return values
+
+    return cached_property(array)
+
+
 class Scenario(Shown, Table):
     """A benchmark task: plant, sampling, cost, disturbances, bounds and the controller's settings.
 
@@ -317,30 +328,24 @@ class Scenario(Shown, Table):
         canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
-    @cached_property
-    def initial_state(self) -> NDArray[np.float64]:
-        """State at k = 0, (n,)."""
-        return _frozen(self.plant.initial_state)
-
-    @cached_property
-    def state_lower(self) -> NDArray[np.float64]:
-        """Lower bounds x_l, (n,)."""
-        return _frozen(self.bounds.state_lower)
-
-    @cached_property
-    def state_upper(self) -> NDArray[np.float64]:
-        """Upper bounds x_u, (n,)."""
-        return _frozen(self.bounds.state_upper)
-
-    @cached_property
-    def action_lower(self) -> NDArray[np.float64]:
-        """Lower bounds u_l, (m,)."""
-        return _frozen(self.bounds.action_lower)
-
-    @cached_property
-    def action_upper(self) -> NDArray[np.float64]:
-        """Upper bounds u_u, (m,)."""
-        return _frozen(self.bounds.action_upper)
+    initial_state = _array("plant.initial_state")
+    """State at k = 0, (n,)."""
+    state_lower = _array("bounds.state_lower")
+    """Lower bounds x_l, (n,)."""
+    state_upper = _array("bounds.state_upper")
+    """Upper bounds x_u, (n,)."""
+    action_lower = _array("bounds.action_lower")
+    """Lower bounds u_l, (m,)."""
+    action_upper = _array("bounds.action_upper")
+    """Upper bounds u_u, (m,)."""
+    penalty_linear = _array("penalty.linear")
+    """Linear weights b of the violation, (n,)."""
+    penalty_quadratic = _array("penalty.quadratic")
+    """Quadratic weights B (diagonal) of the violation, (n,)."""
+    reference_state = _array("controller.reference_state")
+    """Operating point x_s, (n,)."""
+    reference_action = _array("controller.reference_action")
+    """Operating point u_s, (m,)."""
 
     @cached_property
     def limits(self) -> dict[str, tuple[float, float]]:
@@ -349,16 +354,6 @@ class Scenario(Shown, Table):
         lower = (*bounds.state_lower, *bounds.action_lower)
         upper = (*bounds.state_upper, *bounds.action_upper)
         return dict(zip(names, zip(lower, upper, strict=True), strict=True))
-
-    @cached_property
-    def penalty_linear(self) -> NDArray[np.float64]:
-        """Linear weights b of the violation, (n,)."""
-        return _frozen(self.penalty.linear)
-
-    @cached_property
-    def penalty_quadratic(self) -> NDArray[np.float64]:
-        """Quadratic weights B (diagonal) of the violation, (n,)."""
-        return _frozen(self.penalty.quadratic)
 
     @cached_property
     def state_penalty(self) -> Penalty:
@@ -370,22 +365,6 @@ class Scenario(Shown, Table):
     def saturate(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """What the actuators make of actions (…, m): the nearest within their bounds."""
         return np.minimum(np.maximum(action, self.action_lower), self.action_upper)
-
-    @cached_property
-    def reference_state(self) -> NDArray[np.float64]:
-        """Operating point x_s, (n,)."""
-        return _frozen(self.controller.reference_state)
-
-    @cached_property
-    def reference_action(self) -> NDArray[np.float64]:
-        """Operating point u_s, (m,)."""
-        return _frozen(self.controller.reference_action)
-
-
-def _frozen(values: tuple[float, ...]) -> NDArray[np.float64]:
-    array = np.array(values, dtype=np.float64)
-    array.flags.writeable = False
-    return array
 
 
 PRESETS = Path(__file__).parent / "presets"

@@ -4,9 +4,8 @@ import pytest
 import cosim.signals
 from cosim import FmuPlant, simulate
 from cosim.comparison import compare, load_run
-from cosim.errors import TrajectoryError
 from cosim.recording import RerunRecorder, read_recording
-from cosim.signals import SIGNALS, SignalKind, signal_names
+from cosim.signals import SIGNALS, SignalKind
 from cosim.trajectory import read_csv
 from tests.helpers.loop import Proportional
 

@@ -32,7 +32,7 @@ class Plant:
         self.model = load_model(self.scenario.controller.model)
 
     def build(self, target, version):
-        return build_plant(plants.PLANTS[self.name](), plants.equations(self.name), target, version)
+        return build_plant(plants.model(self.name), plants.equations(self.name), target, version)
 
 
 @pytest.fixture(scope="module", params=plants.PLANTS)

@@ -30,7 +30,8 @@ Attributes = Mapping[str, object]
 def render(template: str, **values: object) -> str:
     """The text that a template of `TEMPLATES` makes of `values`.
 
-    The filter `attributes` writes a mapping as XML attributes, but for those that are None.
+    Filters: `xml` and `html` escape a text; `attributes` writes a mapping as XML attributes, but
+    for those that are None; `number` writes a number.
     """
     text: str = _template(template).render(values)
     return text
@@ -47,14 +48,24 @@ def _template(name: str) -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"attributes": _attributes, "html": html.escape}
+    environment.filters |= {
+        "attributes": _attributes, "html": html.escape, "number": _number, "xml": _xml,
+    }  # fmt: skip
     return environment.get_template(name)
 
 
+def _xml(text: str) -> str:
+    return escape(text, {'"': "&quot;", "\n": "&#10;"})
+
+
 def _attributes(values: Attributes) -> str:
-    escaped = {'"': "&quot;", "\n": "&#10;"}
     pairs = ((key, value) for key, value in values.items() if value is not None)
-    return "".join(f' {key}="{escape(str(value), escaped)}"' for key, value in pairs)
+    return "".join(f' {key}="{_xml(str(value))}"' for key, value in pairs)
+
+
+def _number(value: float) -> str:
+    """The shortest text that reads back to `value`, without a fraction where there is none."""
+    return repr(float(value)).removesuffix(".0")
 
 
 _CAUSALITY = {
@@ -70,32 +81,15 @@ _CAUSALITY = {
 
 def model_description(version: FmiVersion, token: str, model: Model) -> str:
     """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
-    root = {
-        "fmiVersion": f"{version}.0",
-        "modelName": model.name,
-        "guid" if version == 2 else "instantiationToken": token,
-        "description": model.description,
-        "version": model.version,
-        "license": LICENSE,
-        # The shipped files stay the same from one version to the next.
-        "generationTool": f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
-        "variableNamingConvention": "structured",
-        "numberOfEventIndicators": "0" if version == 2 else None,
-    }
-    experiment = {
-        "startTime": "0",
-        "stopTime": _number(model.stop_time),
-        "tolerance": None if model.sampled else "1e-8",
-        "stepSize": _number(model.step_size),
-    }
     return render(
         "modelDescription.xml",
         version=version,
+        token=token,
         model=model,
-        root=root,
-        interfaces=_interfaces(version, model),
-        lawful=any(variable.type is Type.LAW for variable in model.variables),
-        experiment=experiment,
+        license=LICENSE,
+        # The shipped files stay the same from one version to the next.
+        tool=f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
+        types={variable.type.name for variable in model.variables},
         variables=[
             (_common_attributes(variable, model), *_type(version, variable, model))
             for variable in model.exported(version)
@@ -107,30 +101,6 @@ def model_description(version: FmiVersion, token: str, model: Model) -> str:
 def build_description(version: FmiVersion, model: Model) -> str:
     """The text of sources/buildDescription.xml: one C99 source file, linked with libm."""
     return render("buildDescription.xml", version=version, model=model)
-
-
-def _interfaces(version: FmiVersion, model: Model) -> dict[str, Attributes]:
-    """The attributes of each interface that the model has, by its element."""
-    derivatives = "true" if model.derivatives else "false"
-    state, plural = ("FMUstate", "") if version == 2 else ("FMUState", "s")
-    exchange = {
-        "modelIdentifier": model.identifier,
-        "canBeInstantiatedOnlyOncePerProcess": "false",
-        "canNotUseMemoryManagementFunctions": "true" if version == 2 else None,
-        f"canGetAndSet{state}": "true",
-        f"canSerialize{state}": "true",
-        f"providesDirectionalDerivative{plural}": derivatives,
-        "providesAdjointDerivatives": derivatives if version == 3 else None,
-    }
-    any_step = "false" if model.sampled else "true"
-    simulation = exchange | {"canHandleVariableCommunicationStepSize": any_step}
-    found: dict[str, Attributes] = {"ModelExchange": exchange} if model.model_exchange else {}
-    return found | {"CoSimulation": simulation}
-
-
-def _number(value: float) -> str:
-    """The shortest text that reads back to `value`, without a fraction where there is none."""
-    return repr(float(value)).removesuffix(".0")
 
 
 def _common_attributes(variable: Variable, model: Model) -> Attributes:

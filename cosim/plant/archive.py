@@ -130,9 +130,6 @@ def _describe(path: Path, folder: Path) -> Any:
     return description
 
 
-_CHUNK = 1 << 20
-
-
 def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     """Folder with the archive's content, byte for byte; unpacked unless it is there already.
 
@@ -155,19 +152,12 @@ def _holds(folder: Path, archive: zipfile.ZipFile) -> bool:
     # Of entries with one name the last is what unpacking leaves.
     entries = {entry.filename: entry for entry in archive.infolist() if not entry.is_dir()}
     try:
-        return all(_same(archive, entry, folder / name) for name, entry in entries.items())
+        return all(
+            not (folder / name).is_symlink() and (folder / name).read_bytes() == archive.read(entry)
+            for name, entry in entries.items()
+        )
     except OSError:
         return False
-
-
-def _same(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> bool:
-    if path.is_symlink() or path.stat().st_size != entry.file_size:
-        return False
-    with archive.open(entry) as packed, path.open("rb") as unpacked:
-        while chunk := packed.read(_CHUNK):
-            if chunk != unpacked.read(len(chunk)):
-                return False
-    return True
 
 
 def _publish(partial: Path, folder: Path, archive: zipfile.ZipFile) -> None:

@@ -6,9 +6,9 @@
 
 enum { N_STATES = {{ states|length }}, N_DISTURBANCES = {{ drawn|length }} };
 
-static const unsigned STATE_REFERENCES[N_STATES] = { {%- for x in states %}VR_{{ x }}{{ ", " if not loop.last }}{% endfor -%} };
-static const unsigned DERIVATIVE_REFERENCES[N_STATES] = { {%- for x in states %}VR_der_{{ x }}{{ ", " if not loop.last }}{% endfor -%} };
-static const unsigned START_REFERENCES[N_STATES] = { {%- for x in states %}VR_{{ x }}_start{{ ", " if not loop.last }}{% endfor -%} };
+static const unsigned STATE_REFERENCES[N_STATES] = { {%- for x in states %}VR_{{ x }}{{ ", " if not loop.last else "" }}{% endfor -%} };
+static const unsigned DERIVATIVE_REFERENCES[N_STATES] = { {%- for x in states %}VR_der_{{ x }}{{ ", " if not loop.last else "" }}{% endfor -%} };
+static const unsigned START_REFERENCES[N_STATES] = { {%- for x in states %}VR_{{ x }}_start{{ ", " if not loop.last else "" }}{% endfor -%} };
 
 /* The last row is none: C has no empty array. */
 static const struct {

@@ -5,20 +5,6 @@ from cosim.errors import ScenarioError
 from cosim.scenario import Scenario, presets
 
 
-def test_presets_are_those_that_the_design_names():
-    assert presets() == [
-        "drifting",
-        "fast-sampling",
-        "fouled",
-        "jump",
-        "mismatched",
-        "nominal",
-        "paper",
-        "reactor",
-        "tanks",
-    ]
-
-
 def test_paper_holds_the_numbers_of_the_paper(paper):
     assert paper.sampling_time == 60.0
     assert paper.discount == 0.99

@@ -1,14 +1,12 @@
 from __future__ import annotations
 
-from importlib.resources import files
 from xml.etree import ElementTree
 
 import fmpy
 import pytest
-from lxml import etree
 
 import fmus
-from fmus.description import build_description, model_description
+from fmus.description import model_description
 from fmus.evaporator import BY_NAME, EVAPORATOR, VARIABLES
 from fmus.model import Kind, Type, continuous_dependencies, initial_dependencies
 
@@ -48,17 +46,6 @@ def test_table_and_description_agree(description) -> None:
         assert (float(shown.min), float(shown.max)) == (row.min, row.max)
         assert shown.unit == row.unit
         assert row.start is None or float(shown.start) == row.start
-
-
-@pytest.mark.parametrize("name", ["fmi3BuildDescription", "fmi3TerminalsAndIcons"])
-def test_further_xml_follows_the_standard_schema(name: str) -> None:
-    schema = etree.XMLSchema(etree.parse(str(files("fmpy") / "schema" / "fmi3" / f"{name}.xsd")))
-    if name == "fmi3BuildDescription":
-        document = etree.fromstring(build_description(3, EVAPORATOR).encode())
-    else:
-        resource = files("fmus") / "resources" / "terminalsAndIcons.xml"
-        document = etree.fromstring(resource.read_bytes())
-    assert schema.validate(document), schema.error_log
 
 
 def test_every_initial_unknown_has_explicit_dependencies(description) -> None:

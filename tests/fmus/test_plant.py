@@ -53,7 +53,7 @@ def test_the_table_has_what_the_layer_adds() -> None:
 
 @needs_compiler
 @pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("disturbances", [0, 1, 3])
+@pytest.mark.parametrize("disturbances", [0, 3])
 def test_any_number_of_disturbances(tmp_path: Path, version, disturbances: int) -> None:
     """The step response is exact to the integrator's order; draws of odd numbers fit."""
     fmu = build_plant(model(disturbances), EQUATIONS, tmp_path / "lag.fmu", version)

@@ -10,11 +10,63 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.converged import Ocp
+from controllers.model import discretise
 from controllers.problem import Problem
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
 
 Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Ocp:
+    """Symbols and expressions of paper.tex eq. param_nmpc with x_0 = s put in.
+
+    `s` (n,) is the measured state, `x` (n, N) are the states x_1 … x_N, absolute, `u` (m, N) the
+    controls; `cost` is all but the penalty of the predicted states; `defects` (n, N) are
+    f_θ(x_k, u_k) − x_{k+1}. `symbols` are those of θ, `problem` is what it was written for.
+    """
+
+    s: ca.SX
+    x: ca.SX
+    u: ca.SX
+    symbols: SymbolicTheta
+    cost: ca.SX
+    defects: ca.SX
+    problem: Problem
+
+    @classmethod
+    def of(cls, problem: Problem, blocks: ThetaBlocks) -> Ocp:
+        """Write the programme for a problem and the blocks of θ."""
+        model = problem.model
+        f = discretise(model, problem.sampling_time, problem.substeps)
+        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        symbols = SymbolicTheta.of(problem, blocks)
+        s = ca.SX.sym("s", n)
+        x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
+        x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
+        states = ca.horzcat(s, x)
+        cost = problem.symbolic_penalty(s) + symbols["c_lambda"]
+        cost += ca.bilin(symbols["B_lambda"], s - x_s) + ca.dot(symbols["b_lambda"], s - x_s)
+        defects = []
+        for k in range(horizon):
+            w = ca.vertcat(states[:, k] - x_s, u[:, k] - u_s)
+            stage = ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w)
+            cost += problem.discount**k * stage
+            x_next = f(states[:, k], u[:, k], model.nominal_disturbance, symbols.model_parameters)
+            defects.append(x_next + symbols["c_f"] - states[:, k + 1])
+        end = states[:, horizon] - x_s
+        terminal = ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
+        cost += problem.discount**horizon * terminal
+        return cls(s, x, u, symbols, cost, ca.horzcat(*defects), problem)
+
+    def penalty_of(self, slack: ca.SX) -> ca.SX:
+        """Discounted penalty of the slack (n, N) of stages 1 … N."""
+        total = ca.SX(0)
+        for k in range(self.problem.horizon):
+            weight = self.problem.discount ** (k + 1)
+            total += weight * ca.dot(self.symbols["w_sigma"], slack[:, k])
+            total += weight * ca.dot(self.symbols["W_sigma"], slack[:, k] ** 2)
+        return total
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
@@ -12,92 +11,50 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.dynamics import sampled_jacobian
 from controllers.errors import QpError
-from controllers.functions import StackedFunction, stacked
+from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp.backends import QpBackend
 from controllers.qp.problem import NOT_CONVEX, QpSolution, SoftQp
 from controllers.rti import RtiNmpc
-from controllers.rti.preparation import Exact
 from controllers.rti.solution import LinearisationPoint, RtiSolution
 from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
 
 Vector = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Ocp:
-    """Symbols and expressions of paper.tex eq. param_nmpc with x_0 = s put in.
-
-    `s` (n,) is the measured state, `x` (n, N) are the states x_1 … x_N, absolute, `u` (m, N) the
-    controls; `cost` is all but the penalty of the predicted states; `defects` (n, N) are
-    f_θ(x_k, u_k) − x_{k+1}; `outside` (n, N) is max(x_l − x_k, x_k − x_u), whose positive part is
-    the least slack. `symbols` are those of θ, `problem` is what the programme was written for.
-    """
-
-    s: ca.SX
-    x: ca.SX
-    u: ca.SX
-    symbols: SymbolicTheta
-    cost: ca.SX
-    defects: ca.SX
-    problem: Problem
-
-    @classmethod
-    def of(cls, problem: Problem, blocks: ThetaBlocks) -> Ocp:
-        """Write the programme for a problem and the blocks of θ."""
-        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        symbols = SymbolicTheta.of(problem, blocks)
-        s = ca.SX.sym("s", n)
-        x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
-        x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
-        states = ca.horzcat(s, x)
-        cost = problem.symbolic_penalty(s) + symbols["c_lambda"]
-        cost += ca.bilin(symbols["B_lambda"], s - x_s) + ca.dot(symbols["b_lambda"], s - x_s)
-        defects = []
-        for k in range(horizon):
-            w = ca.vertcat(states[:, k] - x_s, u[:, k] - u_s)
-            stage = ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w)
-            cost += problem.discount**k * stage
-            x_next, _ = sampled_jacobian(problem, states[:, k], u[:, k], symbols.model_parameters)
-            defects.append(x_next + symbols["c_f"] - states[:, k + 1])
-        end = states[:, horizon] - x_s
-        terminal = ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end)
-        cost += problem.discount**horizon * terminal
-        return cls(s, x, u, symbols, cost, ca.horzcat(*defects), problem)
-
-    def penalty_of(self, slack: ca.SX) -> ca.SX:
-        """Discounted penalty of the slack (n, N) of stages 1 … N."""
-        total = ca.SX(0)
-        for k in range(self.problem.horizon):
-            weight = self.problem.discount ** (k + 1)
-            total += weight * ca.dot(self.symbols["w_sigma"], slack[:, k])
-            total += weight * ca.dot(self.symbols["W_sigma"], slack[:, k] ** 2)
-        return total
-
-    @property
-    def outside(self) -> ca.SX:
-        """Distance of each predicted state beyond its learned bounds, negative inside."""
-        count = self.problem.horizon
-        lower = ca.repmat(self.symbols["x_l"], 1, count)
-        upper = ca.repmat(self.symbols["x_u"], 1, count)
-        return ca.fmax(lower - self.x, self.x - upper)
-
-
 def merit(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
-    """Cost, its gradient, penalty and defects at a point, for an ℓ1 merit function.
+    """The programme of paper.tex eq. param_nmpc with x_0 = s, for an ℓ1 merit function.
 
-    Inputs s, x, u, theta; results `cost`, `gradient` (N(n+m), states first), `penalty` and
-    `infeasibility` ‖defects‖₁.
+    Inputs: the state s (n), the states x_1 … x_N and controls u, absolute, (n, N), (m, N), theta.
+    Results: the `gradient` (N(n+m), states first) of `cost`, which is all but the `penalty` of the
+    predicted states, and `infeasibility` ‖f_θ(x_k, u_k) − x_{k+1}‖₁.
     """
-    ocp = Ocp.of(problem, blocks)
-    return stacked(
+    n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
+    symbols = SymbolicTheta.of(problem, blocks)
+    s, x, u = ca.SX.sym("s", n), ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
+    x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
+    states = ca.horzcat(s, x)
+    cost = problem.symbolic_penalty(s) + symbols["c_lambda"]
+    cost += ca.bilin(symbols["B_lambda"], s - x_s) + ca.dot(symbols["b_lambda"], s - x_s)
+    penalty, defects = ca.SX(0), []
+    for k in range(horizon):
+        w = ca.vertcat(states[:, k] - x_s, u[:, k] - u_s)
+        cost += gamma**k * (ca.bilin(symbols["B_l"], w) + ca.dot(symbols["b_l"], w))
+        x_next, _ = sampled_jacobian(problem, states[:, k], u[:, k], symbols.model_parameters)
+        defects.append(x_next + symbols["c_f"] - states[:, k + 1])
+        slack = ca.fmax(ca.fmax(symbols["x_l"] - x[:, k], x[:, k] - symbols["x_u"]), 0)
+        penalty += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], slack)
+        penalty += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], slack**2)
+    end = x[:, horizon - 1] - x_s
+    cost += gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
+    return StackedFunction(
         "merit",
-        {"s": ocp.s, "x": ocp.x, "u": ocp.u, "theta": ocp.symbols.theta},
+        {"s": s, "x": x, "u": u, "theta": symbols.theta},
         {
-            "gradient": ca.gradient(ocp.cost, ca.veccat(ocp.x, ocp.u)),
-            "cost": ocp.cost,
-            "penalty": ocp.penalty_of(ca.fmax(ocp.outside, 0)),
-            "infeasibility": ca.sum1(ca.fabs(ca.vec(ocp.defects))),
+            "gradient": ca.gradient(cost, ca.veccat(x, u)),
+            "cost": cost,
+            "penalty": penalty,
+            "infeasibility": ca.sum1(ca.fabs(ca.veccat(*defects))),
         },
     )
 
@@ -157,11 +114,6 @@ class ConvergedNmpc(RtiNmpc):
         self._merit = merit(problem, parameters.blocks)
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
-    @property
-    def _lifts(self) -> bool:
-        assert isinstance(self._hessian, Exact)
-        return self._hessian.lifts
-
     def _linearise(self) -> None:
         """Prepare the QP of the exact Hessian; the lifted one where a backend refuses that."""
         try:
@@ -172,7 +124,6 @@ class ConvergedNmpc(RtiNmpc):
             self._linearise_as(lifts=True)
 
     def _linearise_as(self, *, lifts: bool) -> None:
-        assert isinstance(self._hessian, Exact)
         self._hessian.lifts = lifts
         super()._linearise()
 
@@ -181,7 +132,7 @@ class ConvergedNmpc(RtiNmpc):
         try:
             return super()._solve_qp(s, a)
         except QpError as error:
-            if error.status != NOT_CONVEX or self._lifts:
+            if error.status != NOT_CONVEX or self._hessian.lifts:
                 raise
         self._linearise_as(lifts=True)
         return super()._solve_qp(s, a)
@@ -213,7 +164,7 @@ class ConvergedNmpc(RtiNmpc):
                 / (1 + float(np.abs(before).max())),
             )
             if change < self._tolerance:
-                return self._read_out(s, a, solution) if self._lifts else solution
+                return self._read_out(s, a, solution) if self._hessian.lifts else solution
         raise QpError(
             f"SQP did not converge in {self._patience} iterations at s = {at[0]}; "
             f"last change {change:.1e}",

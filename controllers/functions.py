@@ -35,11 +35,10 @@ class BufferedFunction:
 
     `inputs[name]` and `outputs[name]` are flat float64 arrays in CasADi's column-major order:
     write the inputs, call, read the outputs. A call allocates nothing. The inputs follow each other
-    in one array, `arguments`, but for the `shared` ones, which are read from somebody else's
-    memory, such as another function's output. Own inputs and outputs are one array, `memory`: a
-    given one, or one with `room` behind them for more, by name and size; `places` says by name
-    where all of it stands. Every input and output of the function must be dense. Raises ValueError
-    where a shared array has the wrong size.
+    in one array but for the `shared` ones, which are read from somebody else's memory, such as
+    another function's output. Own inputs and outputs are one array, `memory`: a given one, or one
+    with `room` behind them for more, by name and size; `places` says by name where all of it
+    stands. Every input and output of the function must be dense.
     """
 
     def __init__(
@@ -62,9 +61,7 @@ class BufferedFunction:
             name: slice(end - size, end)
             for (name, size), end in zip(all_sizes.items(), ends, strict=True)
         }
-        for name, array in shared.items():
-            if array.shape != (sizes[name],) or not array.flags.c_contiguous:
-                raise ValueError(f"{function.name()}: shared input {name} does not fit")
+        assert all(a.shape == (sizes[name],) and a.flags.c_contiguous for name, a in shared.items())
         self.inputs = {
             name: shared[name] if name in shared else self.memory[self.places[name]]
             for name in sizes
@@ -81,57 +78,41 @@ class BufferedFunction:
         self._evaluate()
 
 
-def stacked(
-    name: str,
-    arguments: Mapping[str, Expression],
-    results: Mapping[str, Expression],
-    shared: Mapping[str, Vector] | None = None,
-    *,
-    room: Mapping[str, int] | None = None,
-    memory: Vector | None = None,
-) -> StackedFunction:
-    """Buffered function whose results share one flat array, so that one copy keeps them all.
+class StackedFunction(BufferedFunction):
+    """A buffered function whose results share one flat array, so that one copy keeps them all.
 
     Its expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
     """
-    sizes = [result.numel() for result in results.values()]
-    ends = np.cumsum(sizes)
-    function = ca.Function(
-        name,
-        [ca.densify(argument) for argument in arguments.values()],
-        [ca.densify(ca.veccat(*results.values()))],
-        list(arguments),
-        ["stack"],
-        {"cse": True},
-    )
-    slices = {
-        key: slice(int(end) - size, int(end))
-        for key, size, end in zip(results, sizes, ends, strict=True)
-    }
-    shapes = {key: value.shape for key, value in results.items()}
-    return StackedFunction(function, slices, shapes, shared, room=room, memory=memory)
-
-
-class StackedFunction(BufferedFunction):
-    """A buffered function with one output array, cut into named parts."""
 
     def __init__(
         self,
-        function: ca.Function,
-        slices: dict[str, slice],
-        shapes: dict[str, tuple[int, int]],
+        name: str,
+        arguments: Mapping[str, Expression],
+        results: Mapping[str, Expression],
         shared: Mapping[str, Vector] | None = None,
         *,
         room: Mapping[str, int] | None = None,
         memory: Vector | None = None,
     ) -> None:
+        function = ca.Function(
+            name,
+            [ca.densify(argument) for argument in arguments.values()],
+            [ca.densify(ca.veccat(*results.values()))],
+            list(arguments),
+            ["stack"],
+            {"cse": True},
+        )
         super().__init__(function, shared, room=room, memory=memory)
-        self.slices = slices
-        self.shapes = shapes
+        ends = np.cumsum([result.numel() for result in results.values()]).tolist()
+        self.slices = {
+            key: slice(end - result.numel(), end)
+            for (key, result), end in zip(results.items(), ends, strict=True)
+        }
+        self.shapes = {key: result.shape for key, result in results.items()}
         self.stack: Vector = self.outputs["stack"]
         first = self.places["stack"].start
-        for name, part in slices.items():
-            self.places[name] = slice(first + part.start, first + part.stop)
+        for key, part in self.slices.items():
+            self.places[key] = slice(first + part.start, first + part.stop)
         self._zeros = np.zeros(self.stack.size)
 
     def finite(self) -> bool:
@@ -201,7 +182,10 @@ def library(sources: Mapping[str, str | bytes], entry: Sequence[str]) -> Path | 
     if switch() == "never" or compiler is None:
         return None
     files = {name: s.encode() if isinstance(s, str) else s for name, s in sources.items()}
-    content = hashlib.sha256("\0".join((identity(compiler), *FLAGS, *entry)).encode())
+    # It tells a compiler from others, and machines of unlike processors.
+    status = Path(compiler).resolve().stat()
+    identity = f"{compiler} {status.st_size} {status.st_mtime_ns} {platform.machine()}"
+    content = hashlib.sha256("\0".join((identity, *FLAGS, *entry)).encode())
     for name in sorted(files):
         content.update(f"\0{name}\0{len(files[name])}\0".encode() + files[name])
     try:
@@ -242,12 +226,6 @@ def find_compiler() -> str | None:
         answer = subprocess.run(["xcode-select", "-p"], capture_output=True, check=False)
         return found if answer.returncode == 0 else None
     return found
-
-
-def identity(compiler: str) -> str:
-    """One line that tells a compiler from others, and machines of unlike processors."""
-    status = Path(compiler).resolve().stat()
-    return f"{compiler} {status.st_size} {status.st_mtime_ns} {platform.machine()}"
 
 
 def description() -> str:

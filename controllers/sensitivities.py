@@ -8,14 +8,14 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.dynamics import stage_parameter_gradient
-from controllers.functions import StackedFunction, stacked
+from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp.problem import (
     LEAST_CONTROLS,
@@ -32,8 +32,7 @@ SOLUTION = ("xi", "t", "chi", "v", "lam")
 """First inputs of the sensitivities: a solution's parts."""
 
 
-@dataclass(frozen=True)
-class PrimalDual:
+class PrimalDual(NamedTuple):
     """Symbols of a solution: `xi`, `chi` (n, N+1), `v` (m, N), slack `t` and `lam` (n, N)."""
 
     xi: ca.SX
@@ -41,23 +40,6 @@ class PrimalDual:
     t: ca.SX
     lam: ca.SX
     chi: ca.SX
-
-    @classmethod
-    def symbols(cls, problem: Problem, prefix: str = "") -> PrimalDual:
-        """Fresh symbols, their names prefixed."""
-        n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        shapes = {
-            "xi": (n, horizon + 1),
-            "v": (m, horizon),
-            "t": (n, horizon),
-            "lam": (n, horizon),
-            "chi": (n, horizon + 1),
-        }
-        return cls(**{name: ca.SX.sym(prefix + name, *shape) for name, shape in shapes.items()})
-
-    def named(self, prefix: str = "") -> dict[str, ca.SX]:
-        """The symbols by name."""
-        return {prefix + name: getattr(self, name) for name in ("xi", "v", "t", "lam", "chi")}
 
 
 def _theta_part(
@@ -135,7 +117,8 @@ def sensitivities(
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
-    y = PrimalDual.symbols(problem)
+    columns = {"xi": horizon + 1, "v": horizon, "t": horizon, "lam": horizon, "chi": horizon + 1}
+    y = PrimalDual(*(ca.SX.sym(k, m if k == "v" else n, c) for k, c in columns.items()))
     x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
     M = ca.SX.sym("M", n + m, horizon * (n + m))
     guess = ca.SX.sym("guess", n, horizon)
@@ -148,7 +131,7 @@ def sensitivities(
         )
     solution = {name: getattr(y, name) for name in SOLUTION}
     inputs = {**solution, "x": x, "u": u, "theta": symbols.theta, **extra}
-    value = stacked("value_gradient", inputs, {"gradient": gradient})
+    value = StackedFunction("value_gradient", inputs, {"gradient": gradient})
 
     A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
     L, L_N = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("L_N", n, n)
@@ -156,7 +139,7 @@ def sensitivities(
         ca.SX.sym(name, rows * horizon, m) for name, rows in (("dv", m), ("dt", n), ("dlam", n))
     )
     dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
-    symbol = ca.veccat(*y.named().values(), *([M] if exact else []))
+    symbol = ca.veccat(*y, *([M] if exact else []))
     policy, state = [], []
     for i in range(m):
         v_i = ca.reshape(dv[:, i], m, horizon)
@@ -166,7 +149,7 @@ def sensitivities(
         policy.append(-ca.jtimes(gradient, symbol, direction))
         state.append(-chi_i[:, 0])
     moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
-    return value, stacked(
+    return value, StackedFunction(
         "policy_jacobian",
         {**inputs, **moved, **({"dM": dM} if exact else {})},
         {"policy": ca.horzcat(*policy), "state": ca.horzcat(*state)},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from controllers.functions import StackedFunction, stacked
+from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
@@ -31,7 +31,7 @@ def embedding(
     free = prior["Phi"].T @ (s - x_s) + prior["g"]
     lower = ca.repmat(symbols["x_l"] - x_s, horizon, 1) - free
     upper = ca.repmat(symbols["x_u"] - x_s, horizon, 1) - free
-    return stacked(
+    return StackedFunction(
         "embedding",
         {"s": s, "theta": symbols.theta, **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
@@ -91,7 +91,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             costate += lam[:, k - 1]
         chi.insert(0, costate)
     u_s = ca.DM(problem.reference_action)
-    return stacked(
+    return StackedFunction(
         "readout",
         {
             "s": s,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from controllers.dynamics import stage_curvature, stage_function, stage_linearisation
 from controllers.errors import ControllerError
-from controllers.functions import BufferedFunction, StackedFunction, stacked
+from controllers.functions import BufferedFunction, StackedFunction
 from controllers.problem import Problem
 from controllers.qp.problem import SoftQp
 from controllers.theta import Parameters, ThetaBlocks
@@ -65,7 +65,7 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
         rows.insert(0, row)
     row, response = ca.horzcat(*rows), ca.horzcat(*responses[1:])
     free = [following[:, width:] for following in responses[1:]]
-    return stacked(
+    return StackedFunction(
         "preparation",
         given,
         {
@@ -210,7 +210,7 @@ def riccati(problem: Problem, prepared: StackedFunction) -> StackedFunction:
         states.append(_rows(response, later))
     shared = {name: prepared.stack[prepared.slices[name]] for name in ("A", "B")}
     shared |= {name: prepared.inputs[name] for name in ("L", "L_N")}
-    return stacked("riccati", given, {"limits": ca.horzcat(*actions, *states)}, shared)
+    return StackedFunction("riccati", given, {"limits": ca.horzcat(*actions, *states)}, shared)
 
 
 def limits_of(function: StackedFunction) -> NDArray[np.float64]:
@@ -242,9 +242,6 @@ def _backwards(n: int, m: int) -> ca.Function:
     )
 
 
-RULES = ("gauss-newton", "exact", "exact-unlifted")
-
-
 @dataclass(frozen=True)
 class Spectrum:
     """Eigenvalues (N, s) and eigenvectors (N, s, s) of the blocks before they were lifted."""
@@ -258,11 +255,6 @@ class Spectrum:
         distance = np.abs(self.values - self.floor)
         return bool((distance < tolerance * np.maximum(1.0, np.abs(self.values))).any())
 
-    @property
-    def kept(self) -> NDArray[np.bool_]:
-        """Which eigenvalues were not lifted, (N, s)."""
-        return self.values > self.floor
-
     def contract(self, seed: Vector) -> Vector:
         """Adjoint of the derivative of L = P(·): M with ⟨seed, dL⟩ = ⟨M, dX⟩, shapes (N, s, s).
 
@@ -272,7 +264,7 @@ class Spectrum:
         lifted = np.maximum(self.values, self.floor)
         gap = self.values[:, :, None] - self.values[:, None, :]
         rise = lifted[:, :, None] - lifted[:, None, :]
-        kept = self.kept.astype(float)
+        kept = (self.values > self.floor).astype(float)
         same = np.abs(gap) < 1e-12 * np.maximum(1.0, np.abs(self.values).max())
         divided = np.where(same, kept[:, :, None] * kept[:, None, :], rise / np.where(same, 1, gap))
         transposed = self.vectors.transpose(0, 2, 1)
@@ -281,8 +273,6 @@ class Spectrum:
 
 class Unlifted:
     """In place of `Spectrum` where the blocks are left as they are: P is the identity."""
-
-    kept: NDArray[np.bool_] = np.ones(0, dtype=np.bool_)
 
     def undecided(self) -> bool:
         """No: nothing is lifted."""
@@ -304,6 +294,7 @@ class GaussNewton:
     the CasADi functions that it calls.
     """
 
+    lifts = False
     spectrum: Lift | None = None
     functions: Sequence[BufferedFunction] = ()
 
@@ -338,16 +329,9 @@ class Exact(GaussNewton):
 
     FLOOR = 1e-3
 
-    def __init__(
-        self,
-        problem: Problem,
-        blocks: ThetaBlocks,
-        prepared: BufferedFunction,
-        *,
-        lifts: bool = True,
-    ) -> None:
+    def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: BufferedFunction) -> None:
         super().__init__(problem, prepared)
-        self.lifts = lifts
+        self.lifts = True
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = np.concatenate([problem.reference_state, problem.reference_action])
         given = {
@@ -358,7 +342,7 @@ class Exact(GaussNewton):
         }
         *point, theta = given.values()
         D = stage_curvature(problem, blocks).map(horizon)(*point, ca.repmat(theta, 1, horizon))
-        self._curvature = stacked("curvature", given, {"D": D})
+        self._curvature = StackedFunction("curvature", given, {"D": D})
         self.functions = (self._curvature,)
 
     def set_parameters(self, parameters: Parameters) -> None:
@@ -398,15 +382,9 @@ class Exact(GaussNewton):
 def make_hessian(
     name: str, problem: Problem, blocks: ThetaBlocks, prepared: BufferedFunction
 ) -> GaussNewton:
-    """Rule by name; raises ControllerError on an unknown one.
-
-    `exact-unlifted` leaves an indefinite Hessian as it is: right for the sensitivities of a
-    converged programme, not for a QP that is still to be solved.
-    """
+    """Rule by name; raises ControllerError on an unknown one."""
     if name == "gauss-newton":
         return GaussNewton(problem, prepared)
     if name == "exact":
         return Exact(problem, blocks, prepared)
-    if name == "exact-unlifted":
-        return Exact(problem, blocks, prepared, lifts=False)
-    raise ControllerError(f"there is no Hessian '{name}'; choose {' or '.join(RULES)}")
+    raise ControllerError(f"there is no Hessian '{name}'; choose gauss-newton or exact")

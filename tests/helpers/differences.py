@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from controllers import LinearisationPoint, Parameters, RtiNmpc, RtiSolution
+from controllers.rti.preparation import Spectrum
 
 STEPS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 SOLVER = 1e-11  # of an action; DAQP is good to its primal tolerance, 1e-10
@@ -32,8 +33,8 @@ def activity(solution: RtiSolution) -> bytes:
     problem, s = solution.prepared.functions.problem, solution.predicted_states[0]
     masks = [*solution.multipliers.active(solution.qp), s < problem.state_lower]
     spectrum = solution.prepared.spectrum
-    if spectrum is not None:
-        masks.append(spectrum.kept)
+    if isinstance(spectrum, Spectrum):
+        masks.append(spectrum.values > spectrum.floor)
     return b"".join(mask.tobytes() for mask in (*masks, s > problem.state_upper))
 
 

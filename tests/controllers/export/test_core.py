@@ -136,7 +136,7 @@ def test_an_ill_posed_theta_is_a_failure_with_the_reference_action(small) -> Non
 def test_an_unknown_hessian_and_too_long_a_horizon_are_refused() -> None:
     problem = evaporator_problem()
     with pytest.raises(ControllerError):
-        core(problem, Parameters.naive(problem), "exact-unlifted")
+        core(problem, Parameters.naive(problem), "unknown")
     problem = evaporator_problem(horizon=60)
     with pytest.raises(ControllerError):
         core(problem, Parameters.naive(problem))

@@ -22,7 +22,8 @@ def prepared(blocks):
 
 
 def filled(name, prepared, blocks, problem, parameters, point):
-    rule = make_hessian(name, problem, blocks, prepared)
+    rule = make_hessian(name.removesuffix("-unlifted"), problem, blocks, prepared)
+    rule.lifts = not name.endswith("-unlifted")
     rule.set_parameters(parameters)
     constant = rule.fill(*point)
     L, q = (prepared.inputs[part].reshape(N, n + m, -1).copy() for part in ("L", "q"))

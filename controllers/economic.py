@@ -15,7 +15,7 @@ from controllers import sdp
 from controllers.errors import TuningError
 from controllers.model import discretise
 from controllers.problem import Problem
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
 
 Array = NDArray[np.float64]
 
@@ -247,23 +247,14 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     # Variables: α, δP, F, β, t with t ≥ ‖F‖.
     n_F = n_c * (n_c + 1) // 2
     zeros = np.zeros((triangle, 1))
-    norm = np.zeros((1 + n_F, count + 2))
-    norm[0, -1] = -1.0
+    nonnegative, norm = np.zeros((1, count + 2)), np.zeros((1 + n_F, count + 2))
+    nonnegative[0, 0] = norm[0, -1] = -1.0
     for k, e in enumerate(_symmetric_basis(n_c)):
         norm[1 + k, count - n_F + k] = -np.linalg.norm(e)
-    nonnegative = np.zeros((1, count + 2))
-    nonnegative[0, 0] = -1.0
-    constraints = np.vstack(
-        [
-            nonnegative,
-            norm,
-            np.hstack([-columns, zeros, zeros]),
-            np.hstack([columns, -identity, zeros]),
-        ]
-    )
+    above, below = np.hstack([-columns, zeros, zeros]), np.hstack([columns, -identity, zeros])
+    constraints = np.vstack([nonnegative, norm, above, below])
     offset = np.concatenate([np.zeros(2 + n_F), -identity[:, 0], np.zeros(triangle)])
-    cones = [sdp.nonnegative(1), sdp.second_order(1 + n_F)]
-    cones += [sdp.semidefinite(size), sdp.semidefinite(size)]
+    cones = [sdp.nonnegative(1), sdp.second_order(1 + n_F), *2 * [sdp.semidefinite(size)]]
     objective = np.zeros(count + 2)
     objective[-2:] = 1.0, weight
     z, status = sdp.solve(
@@ -276,8 +267,8 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
             "steady state is not optimal"
         )
     alpha = float(z[0])
-    delta_P = sum_of(z[1 : count - n_F], n) / alpha
-    F = sum_of(z[count - n_F : count], n_c) / alpha
+    delta_P = symmetric_matrix(z[1 : count - n_F], n) / alpha
+    F = symmetric_matrix(z[count - n_F : count], n_c) / alpha
     hessian = H + rotation(A, B, delta_P) + C.T @ F @ C
     found = Convexification(0.5 * (hessian + hessian.T), delta_P, F, alpha, float(z[-2]))
     if not found.eigenvalues[0] > 0:
@@ -290,20 +281,7 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
 
 def _symmetric_basis(size: int) -> list[Array]:
     """Basis of the symmetric matrices: e_ij + e_ji, upper triangle row by row."""
-    basis = []
-    for i, j in zip(*np.triu_indices(size), strict=True):
-        matrix = np.zeros((size, size))
-        matrix[i, j] = matrix[j, i] = 1.0
-        basis.append(matrix)
-    return basis
-
-
-def sum_of(weights: Array, size: int) -> Array:
-    """Symmetric matrix (size, size) with the given upper triangle, row by row."""
-    matrix = np.zeros((size, size))
-    for weight, element in zip(weights, _symmetric_basis(size), strict=True):
-        matrix += weight * element
-    return matrix
+    return [symmetric_matrix(unit, size) for unit in np.eye(size * (size + 1) // 2)]
 
 
 @dataclass(frozen=True)

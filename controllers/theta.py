@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -30,51 +30,40 @@ def upper_triangle(dimension: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return rows, columns
 
 
+def symmetric_matrix(packed: Vector, dimension: int) -> Vector:
+    """Symmetric matrix (d, d) from the packed entries of its upper triangle."""
+    matrix = np.empty((dimension, dimension))
+    rows, columns = upper_triangle(dimension)
+    matrix[rows, columns] = matrix[columns, rows] = packed
+    return matrix
+
+
 @dataclass(frozen=True)
 class ThetaBlock:
-    """A named part of θ: a scalar, a vector or a symmetric matrix of the given dimension.
+    """A named part of θ, by its `shape` a scalar (), a vector (d,) or a symmetric matrix (d, d).
 
-    `kind` says which of these it is. A symmetric matrix is packed as its upper triangle row by row,
-    each entry once. `scale` is the typical size of a change worth making, in the block's own units,
-    `meaning` a few words, and `labels` name the entries where they have names of their own. `least`
-    are the smallest values that entries may have where there are such, and `unit` (d, d) are those
-    in which a matrix has no unit, ones if not given.
+    A symmetric matrix is packed as its upper triangle row by row, each entry once. `scale` is the
+    typical size of a change worth making, by packed entry in the block's own units, `meaning` a few
+    words, and `labels` name the entries where they have names of their own. `least` are the
+    smallest values that entries may have where there are such.
     """
 
     name: str
-    kind: Literal["scalar", "vector", "symmetric"]
-    dimension: int
+    shape: tuple[int, ...]
     scale: tuple[float, ...]
     meaning: str = ""
     labels: tuple[str, ...] = ()
     least: tuple[float, ...] = ()
-    unit: tuple[tuple[float, ...], ...] = ()
 
     @property
     def size(self) -> int:
         """Number of entries in θ."""
-        return self.dimension * (self.dimension + 1) // 2 if self.symmetric else self.dimension
+        return len(self.scale)
 
     @property
     def symmetric(self) -> bool:
         """Whether the block is a symmetric matrix."""
-        return self.kind == "symmetric"
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the unpacked block."""
-        return {
-            "scalar": (),
-            "vector": (self.dimension,),
-            "symmetric": (self.dimension, self.dimension),
-        }[self.kind]
-
-    @cached_property
-    def packed_unit(self) -> Vector:
-        """Unit of each packed entry, ones where none is given."""
-        if not self.unit:
-            return np.ones(self.size)
-        return np.array(self.unit)[upper_triangle(self.dimension)]
+        return len(self.shape) == 2
 
     def pack(self, value: ArrayLike) -> Vector:
         """Flatten an unpacked value; raises ParameterError on a wrong shape, NaN or asymmetry."""
@@ -95,16 +84,13 @@ class ThetaBlock:
             return array.reshape(-1)
         if not np.array_equal(array, array.T):
             raise ParameterError(f"θ block {self.name} must be symmetric: {array.tolist()}")
-        return array[upper_triangle(self.dimension)]
+        return array[upper_triangle(len(array))]
 
     def unpack(self, packed: Vector) -> Vector:
         """Value of the block in its own shape from its packed entries."""
-        if not self.symmetric:
-            return packed.reshape(self.shape).copy()
-        matrix = np.empty(self.shape)
-        rows, columns = upper_triangle(self.dimension)
-        matrix[rows, columns] = matrix[columns, rows] = packed
-        return matrix
+        if self.symmetric:
+            return symmetric_matrix(packed, self.shape[0])
+        return packed.reshape(self.shape).copy()
 
 
 @dataclass(frozen=True)
@@ -116,20 +102,13 @@ class ThetaBlocks:
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Slice of each block in θ."""
-        ends = np.cumsum([block.size for block in self.blocks])
-        return {
-            block.name: slice(int(end) - block.size, int(end))
-            for block, end in zip(self.blocks, ends, strict=True)
-        }
+        ends = np.cumsum([block.size for block in self.blocks]).tolist()
+        return {b.name: slice(end - b.size, end) for b, end in zip(self.blocks, ends, strict=True)}
 
     @cached_property
     def size(self) -> int:
         """Length of θ."""
         return sum(block.size for block in self.blocks)
-
-    @cached_property
-    def _by_name(self) -> dict[str, ThetaBlock]:
-        return {block.name: block for block in self.blocks}
 
     @cached_property
     def scale(self) -> Vector:
@@ -141,16 +120,11 @@ class ThetaBlocks:
         """A name for each entry of θ, such as `B_l[0,2]`."""
         names: list[str] = []
         for block in self.blocks:
+            entries: Iterable[object] = block.labels or range(block.size)
             if block.symmetric:
-                rows, columns = upper_triangle(block.dimension)
-                names += [f"{block.name}[{i},{j}]" for i, j in zip(rows, columns, strict=True)]
-            elif block.kind == "scalar":
-                names.append(block.name)
-            else:
-                names += [
-                    f"{block.name}[{block.labels[i] if block.labels else i}]"
-                    for i in range(block.dimension)
-                ]
+                pairs = zip(*upper_triangle(block.shape[0]), strict=True)
+                entries = (f"{i},{j}" for i, j in pairs)
+            names += [f"{block.name}[{entry}]" if block.shape else block.name for entry in entries]
         return tuple(names)
 
     def __iter__(self) -> Iterator[ThetaBlock]:
@@ -163,9 +137,10 @@ class ThetaBlocks:
 
     def block(self, name: str) -> ThetaBlock:
         """Block of this name; raises ParameterError where there is none."""
-        if name not in self._by_name:
-            raise ParameterError(f"θ has no block '{name}'; it has {', '.join(self.slices)}")
-        return self._by_name[name]
+        for block in self.blocks:
+            if block.name == name:
+                return block
+        raise ParameterError(f"θ has no block '{name}'; it has {', '.join(self.slices)}")
 
     @classmethod
     def of(
@@ -188,21 +163,17 @@ class ThetaBlocks:
         both = np.concatenate([states, units.action])
 
         def symmetric(name: str, sizes: Vector, meaning: str) -> ThetaBlock:
-            unit = kappa / np.outer(sizes, sizes)
-            scale = tuple(unit[upper_triangle(sizes.size)].tolist())
-            rows = tuple(tuple(row) for row in unit.tolist())
-            return ThetaBlock(name, "symmetric", sizes.size, scale, meaning, unit=rows)
+            scale = (kappa / np.outer(sizes, sizes))[upper_triangle(sizes.size)]
+            return ThetaBlock(name, (sizes.size,) * 2, tuple(scale.tolist()), meaning)
 
-        def vector(
-            name: str, scale: Vector, meaning: str, least: tuple[float, ...] = ()
-        ) -> ThetaBlock:
-            entries = tuple(scale.tolist())
-            return ThetaBlock(name, "vector", scale.size, entries, meaning, least=least)
+        def vector(name: str, scale: Vector, meaning: str, least: ArrayLike = ()) -> ThetaBlock:
+            smallest = tuple(np.asarray(least).tolist())
+            return ThetaBlock(name, scale.shape, tuple(scale.tolist()), meaning, least=smallest)
 
         blocks = [
             symmetric("B_lambda", states, "initial cost, quadratic"),
             vector("b_lambda", 0.1 * kappa / states, "initial cost, linear"),
-            ThetaBlock("c_lambda", "scalar", 1, (0.1 * kappa,), "initial cost, constant"),
+            ThetaBlock("c_lambda", (), (0.1 * kappa,), "initial cost, constant"),
             symmetric("B_Vf", states, "terminal cost, quadratic"),
             vector("b_Vf", 0.1 * kappa / states, "terminal cost, linear"),
             symmetric("B_l", both, "stage cost, quadratic"),
@@ -212,29 +183,16 @@ class ThetaBlocks:
             vector("x_u", 0.01 * states, "upper state bound"),
         ]
         if slack_weights:
-            quadratic = kappa / states**2
+            linear, quadratic, meaning = kappa / states, kappa / states**2, "slack of stages 1…N"
             blocks += [
-                vector(
-                    "w_sigma",
-                    kappa / states,
-                    "slack of stages 1…N, linear weight",
-                    tuple(units.exact().tolist()),
-                ),
-                vector(
-                    "W_sigma",
-                    1e3 * quadratic,
-                    "slack of stages 1…N, quadratic weight",
-                    tuple(quadratic.tolist()),
-                ),
+                vector("w_sigma", linear, f"{meaning}, linear weight", units.exact()),
+                vector("W_sigma", 1e3 * quadratic, f"{meaning}, quadratic weight", quadratic),
             ]
         if model_parameters:
             indices = problem.model.parameter_indices(model_parameters)
             scale = tuple(0.1 * abs(problem.model.parameters[i].nominal) for i in indices)
-            blocks.append(
-                ThetaBlock(
-                    "p", "vector", len(indices), scale, "model parameters", tuple(model_parameters)
-                )
-            )
+            shape = (len(indices),)
+            blocks.append(ThetaBlock("p", shape, scale, "model parameters", model_parameters))
         return cls(tuple(blocks))
 
 
@@ -281,9 +239,8 @@ class Parameters(Shown):
         """Copy with the named blocks set to new values."""
         theta = self.theta.copy()
         for name, value in blocks.items():
-            theta[self.blocks.slices[self.blocks.block(name).name]] = self.blocks.block(name).pack(
-                value
-            )
+            packed = self.blocks.block(name).pack(value)
+            theta[self.blocks.slices[name]] = packed
         return Parameters(self.blocks, theta)
 
     def with_theta(self, theta: ArrayLike) -> Parameters:
@@ -409,17 +366,6 @@ def _read_document(path: Path) -> dict[str, Any]:
     return document
 
 
-def symmetric(packed: ca.SX, dimension: int) -> ca.SX:
-    """Symmetric matrix from its upper triangle, row by row."""
-    matrix = ca.SX(dimension, dimension)
-    position = 0
-    for i in range(dimension):
-        for j in range(i, dimension):
-            matrix[i, j] = matrix[j, i] = packed[position]
-            position += 1
-    return matrix
-
-
 @dataclass(frozen=True)
 class SymbolicTheta:
     """θ as one symbol; `symbols["B_l"]` is a whole block, or the problem's constant without one.
@@ -443,7 +389,10 @@ class SymbolicTheta:
         unpacked = {}
         for block in blocks:
             part = theta[blocks.slices[block.name]]
-            unpacked[block.name] = symmetric(part, block.dimension) if block.symmetric else part
+            if block.symmetric:
+                place = block.unpack(np.arange(float(block.size))).astype(int)
+                part = ca.reshape(part[place.reshape(-1).tolist()], *block.shape)
+            unpacked[block.name] = part
         unpacked.setdefault("w_sigma", ca.SX(ca.DM(problem.penalty_linear)))
         unpacked.setdefault("W_sigma", ca.SX(ca.DM(problem.penalty_quadratic)))
         parameters = ca.SX(ca.DM(problem.model.nominal_parameters))

@@ -125,8 +125,8 @@ def certificate(
 
 def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
     """Symmetric block `name` of θ, in its own unit."""
-    block = blocks.block(name)
-    return block.unpack(theta[blocks.slices[name]] / block.packed_unit)
+    where = blocks.slices[name]
+    return blocks.block(name).unpack(theta[where] / blocks.scale[where])
 
 
 def definite(
@@ -145,14 +145,13 @@ def definite(
     matrices, offsets, cones = [], [], []
     for name in HESSIANS:
         block, where = blocks.block(name), blocks.slices[name]
-        order, weight = sdp.svec_order(block.dimension)
-        shifted = matrix_of(blocks, theta, name) - smallest * np.eye(block.dimension)
-        scale = blocks.scale[where] / block.packed_unit
+        order, weight = sdp.svec_order(block.shape[0])
+        shifted = matrix_of(blocks, theta, name) - smallest * np.eye(block.shape[0])
         rows = np.zeros((block.size, blocks.size))
-        rows[np.arange(block.size), where.start + order] = -weight * scale[order]
+        rows[np.arange(block.size), where.start + order] = -weight
         matrices.append(rows)
         offsets.append(weight * block.pack(shifted)[order])
-        cones.append(sdp.semidefinite(block.dimension))
+        cones.append(sdp.semidefinite(block.shape[0]))
     # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
     metric = fit.metric()
     unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
@@ -180,8 +179,8 @@ def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vec
             # Rounding of the product must not take the last digits back.
             values = np.maximum(values, smallest * (1 + 1e-9))
             matrix = (vectors * values) @ vectors.T
-            block = blocks.block(name)
-            theta[blocks.slices[name]] = block.packed_unit * block.pack((matrix + matrix.T) / 2)
+            where, packed = blocks.slices[name], blocks.block(name).pack((matrix + matrix.T) / 2)
+            theta[where] = blocks.scale[where] * packed
     return theta
 
 

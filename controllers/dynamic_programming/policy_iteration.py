@@ -428,8 +428,7 @@ class Certificate:
     def objection(self) -> str | None:
         """Why the solution is not to be called J*; None where there is nothing against it."""
         agreeing = [figure for name in AGREEING if (figure := self[name])]
-        if len(agreeing) < len(AGREEING):
-            missing = [name for name in AGREEING if self[name] is None]
+        if missing := [name for name in AGREEING if self[name] is None]:
             return f"not made: {', '.join(missing)}"
         values = [figure.value for figure in agreeing]
         spread = (max(values) - min(values)) / abs(min(values))
@@ -515,7 +514,7 @@ def solve(
             iterate = _transfer(draft, iterate, grid)
             howard.level = level
     # One round that looks for better actions in the whole action box.
-    iterate = howard(draft, howard.approach(draft, iterate), 9, enough=lambda *_: True, rounds=1)
+    iterate = howard(draft, howard.approach(draft, iterate), 9, enough=lambda *_: True)
     return _optimum(howard.converge(operator, iterate), accuracy)
 
 
@@ -555,11 +554,10 @@ class _Howard:
         start: Iterate,
         scan_points: int,
         enough: Callable[[Iterate, Iterate], bool],
-        rounds: int | None = None,
     ) -> Iterate:
-        """Improve and evaluate until `enough(before, after)`, at most `rounds` rounds."""
+        """Improve and evaluate until `enough(before, after)`, or the settings' rounds are over."""
         iterate, anchor = start, start.grid.nearest(operator.problem.reference_state)
-        for k in range(rounds or self.settings.rounds):
+        for k in range(self.settings.rounds):
             before = iterate
             better = improve(operator, before, scan_points)
             W, gain, distribution = evaluate(operator, better.grid, better.actions, anchor)
@@ -646,9 +644,8 @@ def simulate_policy(
         if k >= burn_in:
             total += cost(x, u, d, plant.parameters)[0]
             violations = problem.penalty.violation(np.stack(x, axis=1)).T
-            for v, linear, quadratic in zip(
-                violations, problem.penalty_linear, problem.penalty_quadratic, strict=True
-            ):
+            weights = zip(problem.penalty_linear, problem.penalty_quadratic, strict=True)
+            for v, (linear, quadratic) in zip(violations, weights, strict=True):
                 total += (linear + quadratic * v) * v
         x = [np.broadcast_to(entry, paths) for entry in step(x, u, d, plant.parameters)]
     means = total / steps
@@ -725,14 +722,12 @@ def certify(
     It is what is kept, since it is nearer to J* than the solution that the study began with. The
     simulation is that of its policy, by `simulate_policy`.
     """
-    solution, refinement = rows[0].optimum, rows[1].optimum
-    mean, half_width = simulate_policy(plant, refinement, paths=paths, steps=steps)
-    figures = (
-        Figure("solution", solution.gain, solution.lower, solution.upper),
-        Figure("refinement", refinement.gain, refinement.lower, refinement.upper),
-        Figure("simulation", mean, mean - half_width, mean + half_width),
-    )
-    return replace(refinement, certificate=Certificate(figures))
+    found = [row.optimum for row in rows[:2]]
+    mean, half_width = simulate_policy(plant, found[1], paths=paths, steps=steps)
+    bounds = [(each.gain, each.lower, each.upper) for each in found]
+    bounds.append((mean, mean - half_width, mean + half_width))
+    figures = (Figure(name, *numbers) for name, numbers in zip(AGREEING, bounds, strict=True))
+    return replace(found[1], certificate=Certificate(tuple(figures)))
 
 
 def _change(before: Optimum, after: Optimum) -> float:

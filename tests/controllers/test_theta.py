@@ -8,7 +8,7 @@ from controllers.errors import ParameterError
 from controllers.theta import ThetaBlock
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-MATRIX = ThetaBlock("B", "symmetric", 3, (1.0,) * 6)
+MATRIX = ThetaBlock("B", (3, 3), (1.0,) * 6)
 
 
 def test_the_papers_theta_has_its_blocks_in_order(problem):

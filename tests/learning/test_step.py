@@ -79,7 +79,7 @@ def projected_gradient(blocks, theta, fit, rounds=2000):
     """The constrained fit by Frobenius projections: slow, and nothing in common with Clarabel."""
     weight = 1.0 / blocks.scale
     for name in ("B_l", "B_Vf"):
-        size = blocks.block(name).dimension
+        size = blocks.block(name).shape[0]
         rows, columns = np.triu_indices(size)
         weight[blocks.slices[name]] = np.where(rows == columns, 1.0, np.sqrt(2.0))
     # In y = weight · scale · d a block's norm is Frobenius's, so clipping is the projection.

@@ -79,13 +79,10 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         "error_on_fail": False,
     }
     solver = ca.nlpsol("steady_state", "ipopt", {"x": w, "f": cost, "g": x_next - x}, options)
-    found = solver(
-        x0=np.concatenate([problem.reference_state, problem.reference_action]),
-        lbx=np.concatenate([problem.state_lower, problem.action_lower]),
-        ubx=np.concatenate([problem.state_upper, problem.action_upper]),
-        lbg=0.0,
-        ubg=0.0,
-    )
+    lower = np.concatenate([problem.state_lower, problem.action_lower])
+    upper = np.concatenate([problem.state_upper, problem.action_upper])
+    start = np.concatenate([problem.reference_state, problem.reference_action])
+    found = solver(x0=start, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
     stats = solver.stats()
     if not stats["success"]:
         raise TuningError(
@@ -107,6 +104,11 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
                 f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
                 f"{abs(multipliers[i]):g}"
             )
+    active = []
+    for i in strict:
+        quantity = (*model.states, *model.actions)[i]
+        relation, bound = ("≥", lower[i]) if multipliers[i] > 0 else ("≤", upper[i])
+        active.append(f"{quantity.name} {relation} {bound:g} {quantity.unit}".rstrip())
     return SteadyState(
         x=point[:n],
         u=point[n:],
@@ -118,16 +120,8 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         hessian=hessian,
         gradient=gradient.reshape(-1),
         C=np.eye(len(point))[strict],
-        active=tuple(_describe(problem, int(i), bool(multipliers[i] > 0)) for i in strict),
+        active=tuple(active),
     )
-
-
-def _describe(problem: Problem, index: int, at_lower: bool) -> str:
-    lower = np.concatenate([problem.state_lower, problem.action_lower])
-    upper = np.concatenate([problem.state_upper, problem.action_upper])
-    quantity = (*problem.model.states, *problem.model.actions)[index]
-    relation, bound = ("≥", lower[index]) if at_lower else ("≤", upper[index])
-    return f"{quantity.name} {relation} {bound:g} {quantity.unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -368,23 +362,18 @@ def tune(
         [problem.reference_state - steady.x, problem.reference_action - steady.u]
     )
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
+    values = {
+        "B_l": _symmetric(0.5 * M),
+        "b_l": q + M @ shift,
+        "B_Vf": _symmetric(0.5 * P),
+        "b_Vf": q[:n] + P @ shift[:n],
+        "B_lambda": _symmetric(0.5 * initial),
+        "b_lambda": steady.costate + initial @ shift[:n],
+    }
     parameters = Parameters.naive(problem, blocks, value_offset=value_offset).replace(
-        {
-            "B_l": _rounded(_symmetric(0.5 * M)),
-            "b_l": _rounded(q + M @ shift),
-            "B_Vf": _rounded(_symmetric(0.5 * P)),
-            "b_Vf": _rounded(q[:n] + P @ shift[:n]),
-            "B_lambda": _rounded(_symmetric(0.5 * initial)),
-            "b_lambda": _rounded(steady.costate + initial @ shift[:n]),
-        }
+        {name: _rounded(value) for name, value in values.items()}
     )
-    return EconomicTuning(
-        parameters=parameters,
-        steady_state=steady,
-        convexification=convex,
-        economic=economic,
-        tuned=tuned,
-    )
+    return EconomicTuning(parameters, steady, convex, economic, tuned)
 
 
 def accurate_substeps(problem: Problem, accuracy: float) -> int:
@@ -395,12 +384,8 @@ def accurate_substeps(problem: Problem, accuracy: float) -> int:
     TuningError where that does not come about in 1024 steps.
     """
     model, substeps = problem.model, problem.substeps
-    point = (
-        problem.reference_state,
-        problem.reference_action,
-        model.nominal_disturbance,
-        model.nominal_parameters,
-    )
+    at = (problem.reference_state, problem.reference_action)
+    point = (*at, model.nominal_disturbance, model.nominal_parameters)
 
     def end(steps: int) -> Array:
         x, u, d, p = model.symbols()

@@ -34,7 +34,7 @@ from controllers.dynamic_programming.policy_iteration import (
 )
 from controllers.errors import ModelError, OptimumError, QpError
 from controllers.model import Model
-from controllers.problem import load_model
+from controllers.problem import VECTORS, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
 from cosim.scenario import Scenario
 
@@ -73,11 +73,7 @@ def optimum_key(plant: PlantProblem, settings: Settings) -> str:
         "law": [law.kind, law.nominal.tolist(), law.ranges.tolist()],
         "settings": asdict(settings) | {"criterion": "average"},
     }
-    for name in (
-        *("state_lower", "state_upper", "action_lower", "action_upper"),
-        *("penalty_linear", "penalty_quadratic", "reference_state", "reference_action"),
-    ):
-        content[name] = getattr(problem, name).tolist()
+    content |= {name: getattr(problem, name).tolist() for name in VECTORS}
     text = json.dumps(content, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -131,23 +127,21 @@ def read_optimum(path: Path, key: str) -> Optimum:
     try:
         arrays = read_arrays(path)
         document = json.loads(str(arrays.pop("document")))
-        axes = [arrays[f"axis_{i}"] for i in range(sum(e.startswith("axis_") for e in arrays))]
+        axes = tuple(arrays[f"axis_{i}"] for i in range(sum(e.startswith("axis_") for e in arrays)))
         smooth, figures, accuracy = (document[k] for k in ("smooth", "certificate", "accuracy"))
+        gain, lower, upper = (float(document[k]) for k in ("gain", "lower", "upper"))
+        nodes, penalty_nodes = (tuple(accuracy[k]) for k in ("nodes", "penalty_nodes"))
         if document["key"] != key:
             raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
         return Optimum(
-            Grid(tuple(axes), smooth and tuple((float(a), float(b)) for a, b in smooth)),
+            Grid(axes, smooth and tuple((float(a), float(b)) for a, b in smooth)),
             arrays["actions"],
             arrays["W"],
-            float(document["gain"]),
-            float(document["lower"]),
-            float(document["upper"]),
+            gain,
+            lower,
+            upper,
             arrays["distribution"],
-            Accuracy(
-                int(accuracy["substeps"]),
-                tuple(accuracy["nodes"]),
-                tuple(accuracy["penalty_nodes"]),
-            ),
+            Accuracy(int(accuracy["substeps"]), nodes, penalty_nodes),
             None if figures is None else Certificate.from_list(figures),
         )
     except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:

@@ -21,6 +21,11 @@ Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+VECTORS = (
+    *("state_lower", "state_upper", "action_lower", "action_upper"),
+    *("penalty_linear", "penalty_quadratic", "reference_state", "reference_action"),
+)
+"""A problem's vectors, by state but for the actions'."""
 ACTIVE = 1e-6
 """Share of a bound's width within which the reference counts as at the bound."""
 
@@ -56,14 +61,12 @@ class Units:
         below, above = reference <= lower + near, reference >= upper - near
         found = multipliers(gradient * both, rates * both, below, above)
         dearest = float(found[:n].max())
-        sizes = (
-            dearest,
-            float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max()),
-            abs(cost),
-        )
+        curved = float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max())
+        sizes = (dearest, curved, abs(cost))
         # What rounding leaves of a zero is none.
         least = np.finfo(np.float64).eps ** 0.5 * max(sizes)
-        unit = next((_above(size) for size in sizes if size > least), 1.0)
+        above = (float(10.0 ** (np.floor(_power(size)) + 1)) for size in sizes if size > least)
+        unit = next(above, 1.0)
         return cls(both[:n], both[n:], unit, dearest if dearest > least else 0.0)
 
     def exact(self) -> Vector:
@@ -128,11 +131,6 @@ def _power(size: ArrayLike) -> Vector:
     return power
 
 
-def _above(size: float) -> float:
-    """Power of ten above a positive size."""
-    return float(10.0 ** (np.floor(_power(size)) + 1))
-
-
 def _frozen(name: str, values: ArrayLike, size: int) -> Vector:
     try:
         array = np.array(values, dtype=np.float64)
@@ -173,17 +171,8 @@ class Problem:
 
     def __post_init__(self) -> None:
         """Freeze the arrays and check every size and sign once."""
-        n, m = self.n_states, self.n_actions
-        for name, size in (
-            ("state_lower", n),
-            ("state_upper", n),
-            ("action_lower", m),
-            ("action_upper", m),
-            ("penalty_linear", n),
-            ("penalty_quadratic", n),
-            ("reference_state", n),
-            ("reference_action", m),
-        ):
+        for name in VECTORS:
+            size = self.n_actions if "action" in name else self.n_states
             object.__setattr__(self, name, _frozen(name, getattr(self, name), size))
         for kind in ("state", "action"):
             if not (getattr(self, f"{kind}_lower") < getattr(self, f"{kind}_upper")).all():
@@ -253,14 +242,7 @@ class Problem:
             sampling_time=scenario.sampling_time,
             horizon=settings.horizon,
             discount=scenario.discount,
-            state_lower=scenario.state_lower,
-            state_upper=scenario.state_upper,
-            action_lower=scenario.action_lower,
-            action_upper=scenario.action_upper,
-            penalty_linear=scenario.penalty_linear,
-            penalty_quadratic=scenario.penalty_quadratic,
-            reference_state=np.array(settings.reference_state),
-            reference_action=np.array(settings.reference_action),
+            **{name: getattr(scenario, name) for name in VECTORS},
             reference_cost=settings.reference_cost,
             substeps=settings.substeps,
         )

@@ -106,9 +106,8 @@ class Refinement:
 
     def __init__(self, coarse: ProductRule, fine: ProductRule) -> None:
         self.weights = fine.weights
-        self._matrices: list[Array] = []
-        for nodes, targets in zip(coarse.axis_nodes, fine.axis_nodes, strict=True):
-            self._matrices.append(lagrange_matrix(nodes, targets))
+        axes = zip(coarse.axis_nodes, fine.axis_nodes, strict=True)
+        self._matrices = [lagrange_matrix(nodes, targets) for nodes, targets in axes]
         # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
         while len(self._matrices) > 1 and self._matrices[-1].shape[1] < 4:
             last = self._matrices.pop()
@@ -175,30 +174,24 @@ class PlantProblem:
 
 def plant_law(scenario: Scenario, problem: Problem) -> DisturbanceLaw:
     """The scenario's disturbance law in the order of the model's disturbances."""
-    table = scenario.disturbance
-    model = problem.model
-    names = tuple(quantity.name for quantity in model.disturbances)
-    for kind, ours, theirs in (
-        ("states", tuple(q.name for q in model.states), tuple(scenario.plant.states)),
-        ("actions", tuple(q.name for q in model.actions), tuple(scenario.plant.actions)),
-        ("disturbances", names, tuple(scenario.plant.disturbances)),
-    ):
-        if ours != theirs:
+    table, model = scenario.disturbance, problem.model
+    for kind in ("states", "actions", "disturbances"):
+        ours = [quantity.name for quantity in getattr(model, kind)]
+        if ours != (theirs := list(getattr(scenario.plant, kind))):
             raise OptimumError(
                 f"the optimum needs a model of the plant: model '{model.name}' has the {kind} "
                 f"{', '.join(ours)}, the plant {', '.join(theirs)}; {MEND}"
             )
     nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
-    ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(names)))
+    ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
     return DisturbanceLaw(table.law, nominal, ranges)
 
 
 def plant_parameters(given: Mapping[str, float], problem: Problem) -> Vector:
     """Physical parameters (n_p,): the model's nominal ones with those that the plant is given."""
     model = problem.model
-    parameters = model.nominal_parameters
-    known = [quantity.name for quantity in model.parameters]
-    for name, value in given.items():
+    known = {quantity.name: quantity.nominal for quantity in model.parameters}
+    for name in given:
         if name not in known:
             raise OptimumError(
                 f"the optimum needs a model of the plant: plant.parameters sets '{name}', which "
@@ -206,8 +199,7 @@ def plant_parameters(given: Mapping[str, float], problem: Problem) -> Vector:
                 "where it only shapes the noise, name it in plant.mapping.ranges and set "
                 "disturbance.ranges"
             )
-        parameters[known.index(name)] = value
-    return parameters
+    return np.array([*(known | dict(given)).values()], dtype=np.float64)
 
 
 _OPERATIONS: dict[int, Callable[..., Any]] = {

@@ -11,12 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ControllerError, ParameterError, QpError
 from controllers.export.core import STATUSES
-from controllers.functions import (
-    COMPILED,
-    INTERPRETED,
-    LONG,
-    switch,
-)
+from controllers.functions import COMPILED, INTERPRETED, LONG, switch
 from controllers.problem import Problem
 from controllers.qp.backends import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
@@ -93,21 +88,17 @@ class RtiNmpc:
         self._functions = Functions(
             problem, self._prepare, self._embed, self._readout, gradient, policy
         )
-        self._riccati = riccati(problem, self._prepare) if horizon * m >= LEAST_CONTROLS else None
         before, after = self._prepare.memory, self._readout.memory
         self._qp = qp_of(self._prepare, self._readout, before, after)
         self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
         self._qp.upper[:] = np.tile(problem.action_upper - problem.reference_action, horizon)
+        if horizon * m >= LEAST_CONTROLS:
+            self._qp.factor = partial(limits_of, riccati(problem, self._prepare))
         self._engine: Engine | None = None
         self._prepared: Prepared | None = None
-        if self._riccati is not None:
-            self._qp.factor = partial(limits_of, self._riccati)
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)
-        self._action_lower, self._action_upper = (
-            self._qp.lower[:m].copy(),
-            self._qp.upper[:m].copy(),
-        )
         self._first_lower, self._first_upper = self._qp.lower[:m], self._qp.upper[:m]
+        self._action_lower, self._action_upper = self._first_lower.copy(), self._first_upper.copy()
         self._enforced = False
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
         self._u = self._prepare.inputs["u"].reshape(horizon, m)
@@ -229,10 +220,8 @@ class RtiNmpc:
         memory, places = self._prepare.memory, self._prepare.places
         # New views: a backend sees by them that the weights are others.
         self._qp.w, self._qp.W = memory[places["w"]], memory[places["W"]]
-        self._qp.w[:], self._qp.W[:] = (
-            discounts * np.tile(w, horizon),
-            discounts * np.tile(W, horizon),
-        )
+        self._qp.w[:] = discounts * np.tile(w, horizon)
+        self._qp.W[:] = discounts * np.tile(W, horizon)
 
     def _linearise(self) -> None:
         prepare = self._prepare

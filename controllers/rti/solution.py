@@ -78,19 +78,18 @@ class Prepared:
     def point(self) -> LinearisationPoint:
         """Where the QP is linearised."""
         horizon = self.functions.problem.horizon
-        x, u, costates = (self.part(name) for name in ("x", "u", "costates"))
-        return LinearisationPoint(*(part.reshape(horizon, -1).copy() for part in (x, u, costates)))
+        parts = (self.part(name) for name in LinearisationPoint._fields)
+        return LinearisationPoint(*(part.reshape(horizon, -1).copy() for part in parts))
 
 
 @dataclass(eq=False)
 class RtiSolution:
     """The solution of one QP, read as V(s) and π(s), or as Q(s, a) where u_0 = a was enforced.
 
-    `action` (m,) is u_0; `value` is V or Q; `multipliers` is the primal-dual solution of
-    the condensed QP `qp`. All derivatives are those of the QP that was solved, at the point where
-    it was linearised (paper.tex, RTI Sensitivities); they are one-sided where `weakly_active`.
-    `enforced` says which of the two it is; `status` is `solved`. What derivatives are computed from
-    when they are asked for: `prepared`, and a copy of the read-out's `memory`.
+    `action` (m,) is u_0; `value` is V or Q; `enforced` says which; `status` is `solved`. All
+    derivatives are those of the QP that was solved, at the point where it was linearised
+    (paper.tex, RTI Sensitivities); they are one-sided where `weakly_active`, and computed when they
+    are asked for from `prepared` and a copy of the read-out's `memory`.
     """
 
     action: Vector
@@ -126,13 +125,6 @@ class RtiSolution:
         reference = self.prepared.functions.problem.reference_action
         actions: Matrix = self.multipliers.v.reshape(-1, reference.size) + reference
         return actions
-
-    @property
-    def shifted(self) -> LinearisationPoint:
-        """The solution with its first stage dropped and its last control repeated."""
-        return LinearisationPoint(
-            self._part("next_x"), self._part("next_u"), self._part("next_chi")
-        )
 
     @property
     def unshifted(self) -> LinearisationPoint:
@@ -238,27 +230,21 @@ class RtiSolution:
         inputs = function.inputs
         for name in ("A", "B", "L", "L_N"):
             inputs[name][:] = prepared.part(name)
-        inputs["dv"][:], inputs["dt"][:] = dv.reshape(-1), dt.reshape(-1)
-        inputs["dlam"][:] = dlam.reshape(-1)
+        for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
+            inputs[name][:] = direction.reshape(-1)
         if (spectrum := prepared.spectrum) is not None:
             moved = curvature_directions(
                 self.qp.rows, dv, self._step_from_point(), spectrum.contract
             )
             inputs["dM"][:] = moved.reshape(-1)
         function()
-        return (
-            function.part("policy").reshape(m, -1).copy(),
-            function.part("state").reshape(m, -1).copy(),
-        )
+        by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))
+        return by_theta.copy(), by_state.copy()
 
     def _stages(self) -> StageMatrices:
         part, n, m = self.prepared.part, self.costates.shape[1], self.action.size
-        return StageMatrices(
-            A=part("A").reshape(-1, n, n),
-            B=part("B").reshape(-1, n, m),
-            L=part("L").reshape(-1, n + m, n + m),
-            L_N=part("L_N").reshape(n, n),
-        )
+        A, B, L = part("A"), part("B"), part("L").reshape(-1, n + m, n + m)
+        return StageMatrices(A.reshape(-1, n, n), B.reshape(-1, n, m), L, part("L_N").reshape(n, n))
 
     def _write_solution(self, function: StackedFunction) -> None:
         """Give a read-out function the solution and the point of linearisation."""

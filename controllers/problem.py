@@ -65,8 +65,8 @@ class Units:
         sizes = (dearest, curved, abs(cost))
         # What rounding leaves of a zero is none.
         least = np.finfo(np.float64).eps ** 0.5 * max(sizes)
-        above = (float(10.0 ** (np.floor(_power(size)) + 1)) for size in sizes if size > least)
-        unit = next(above, 1.0)
+        powers = (float(10.0 ** (np.floor(_power(size)) + 1)) for size in sizes if size > least)
+        unit = next(powers, 1.0)
         return cls(both[:n], both[n:], unit, dearest if dearest > least else 0.0)
 
     def exact(self) -> Vector:

@@ -43,32 +43,26 @@ class PrimalDual(NamedTuple):
 
 
 def _theta_part(
-    problem: Problem,
-    symbols: SymbolicTheta,
-    y: PrimalDual,
-    x: ca.SX,
-    u: ca.SX,
-    exact: ca.SX | None,
+    problem: Problem, symbols: SymbolicTheta, y: PrimalDual, at: ca.SX, M: ca.SX | None
 ) -> ca.SX:
     """All terms of the QP's Lagrangian in which θ appears, but for the model's own parameters.
 
-    `exact` is M where the QP has the exact Hessian: M_k stands for the derivative of the stage's
-    second-order term with respect to L_k.
+    `at` (n+m, N) are the points of linearisation; where the QP has the exact Hessian, M_k stands
+    for the derivative of the stage's second-order term with respect to L_k.
     """
-    n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
-    x_s, u_s = ca.DM(problem.reference_state), ca.DM(problem.reference_action)
+    horizon, gamma, size = problem.horizon, problem.discount, at.size1()
+    reference = np.concatenate([problem.reference_state, problem.reference_action])
     part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
     part += symbols["c_lambda"]
     for k in range(horizon):
         w = ca.vertcat(y.xi[:, k], y.v[:, k])
         stage = ca.dot(symbols["b_l"], w)
-        if exact is None:
+        if M is None:
             stage += ca.bilin(symbols["B_l"], w)
         else:
-            at = ca.vertcat(x[:, k] - x_s, u[:, k] - u_s)
-            columns = slice(k * (n + m), (k + 1) * (n + m))
-            M = exact[:, columns]
-            stage += ca.bilin(symbols["B_l"], at, 2 * w - at) + 2 * ca.dot(M, symbols["B_l"])
+            point, M_k = at[:, k] - reference, M[:, k * size : (k + 1) * size]
+            stage += ca.bilin(symbols["B_l"], point, 2 * w - point)
+            stage += 2 * ca.dot(M_k, symbols["B_l"])
         part += gamma**k * stage + ca.dot(y.chi[:, k + 1], symbols["c_f"])
         part += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], y.t[:, k])
         part += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], y.t[:, k] ** 2)
@@ -123,7 +117,7 @@ def sensitivities(
     M = ca.SX.sym("M", n + m, horizon * (n + m))
     guess = ca.SX.sym("guess", n, horizon)
     extra = {"M": M, "guess": guess} if exact else {}
-    part = _theta_part(problem, symbols, y, x, u, M if exact else None)
+    part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
     gradient = ca.gradient(part, symbols.theta)
     if "p" in blocks:
         gradient[blocks.slices["p"]] = _parameter_gradient(

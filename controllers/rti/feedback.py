@@ -56,11 +56,21 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     n, m, horizon, gamma = problem.n_states, problem.n_actions, problem.horizon, problem.discount
     symbols = SymbolicTheta.of(problem, blocks)
     x_s = ca.DM(problem.reference_state)
-    s, v, lam = ca.SX.sym("s", n), ca.SX.sym("v", m, horizon), ca.SX.sym("lam", n, horizon)
-    A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
-    r = ca.SX.sym("r", n, horizon)
-    L, q = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("q", n + m, horizon)
-    L_N, q_N, constant = ca.SX.sym("L_N", n, n), ca.SX.sym("q_N", n), ca.SX.sym("constant")
+    shapes = {
+        "s": (n, 1),
+        "v": (m, horizon),
+        "lam": (n, horizon),
+        "A": (n, n * horizon),
+        "B": (m, n * horizon),
+        "r": (n, horizon),
+        "L": (n + m, horizon * (n + m)),
+        "q": (n + m, horizon),
+        "L_N": (n, n),
+        "q_N": (n, 1),
+        "constant": (1, 1),
+    }
+    given = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
+    s, v, lam, A, B, r, L, q, L_N, q_N, constant = given.values()
 
     known = problem.symbolic_penalty(s)
     xi = [s - x_s]
@@ -93,20 +103,7 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     u_s = ca.DM(problem.reference_action)
     return StackedFunction(
         "readout",
-        {
-            "s": s,
-            "v": v,
-            "lam": lam,
-            "A": A,
-            "B": B,
-            "r": r,
-            "L": L,
-            "q": q,
-            "L_N": L_N,
-            "q_N": q_N,
-            "constant": constant,
-            "theta": symbols.theta,
-        },
+        {**given, "theta": symbols.theta},
         {
             "xi": ca.horzcat(*xi),
             "t": ca.horzcat(*t),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from math import isfinite
 
@@ -85,9 +86,8 @@ class RtiNmpc:
         self._embed = embedding(problem, blocks, self._prepare, self._readout)
         self._hessian = make_hessian(hessian, problem, blocks, self._prepare)
         gradient, policy = sensitivities(problem, blocks, exact=hessian != "gauss-newton")
-        self._functions = Functions(
-            problem, self._prepare, self._embed, self._readout, gradient, policy
-        )
+        made = (self._prepare, self._embed, self._readout, gradient, policy)
+        self._functions = Functions(problem, *made)
         before, after = self._prepare.memory, self._readout.memory
         self._qp = qp_of(self._prepare, self._readout, before, after)
         self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
@@ -241,15 +241,13 @@ class RtiNmpc:
                 status="QP not finite",
                 qp=self._qp.copy(),
             )
+        jacobians = None
         if self._engine is None:
             self._backend.load(self._qp)
-        self._prepared = Prepared(
-            prepare.memory.copy(),
-            self._parameters,
-            self._hessian.spectrum,
-            self._functions,
-            None if self._engine is None else self._engine.policy,
-        )
+        else:
+            jacobians = self._engine.policy
+        memory, spectrum = prepare.memory.copy(), self._hessian.spectrum
+        self._prepared = Prepared(memory, self._parameters, spectrum, self._functions, jacobians)
 
     @property
     def linearisation_point(self) -> LinearisationPoint:
@@ -332,15 +330,13 @@ class RtiNmpc:
         self._enforced = a is not None
         if not known:
             raise self._not_finite(s, a)
-        multipliers = self._backend.solve(qp)
+        found = self._backend.solve(qp)
         if a is not None:
-            multipliers = multipliers_at_kink(
-                qp, multipliers, self._action_lower, self._action_upper
-            )
+            found = multipliers_at_kink(qp, found, self._action_lower, self._action_upper)
         inputs = read.inputs
         inputs["constant"][0] = self._prepare.memory[-1]
-        inputs["v"][:], inputs["lam"][:] = multipliers.v, multipliers.lam
-        read.memory[read.places["nu"]] = multipliers.nu
+        inputs["v"][:], inputs["lam"][:] = found.v, found.lam
+        read.memory[read.places["nu"]] = found.nu
         read()
 
     def _not_finite(self, s: Vector, a: Vector | None) -> QpError:
@@ -389,16 +385,13 @@ class RtiNmpc:
             self.prepare()
         if self._engine is not None and self.iterations == 1 and not self._status:
             return self._engine.batch(rows)
-        actions, values = np.full((len(rows), self.problem.n_actions), np.nan), []
-        for action, s in zip(actions, rows, strict=True):
-            try:
+        actions = np.full((len(rows), self.problem.n_actions), np.nan)
+        values = np.full(len(rows), np.nan)
+        for k, s in enumerate(rows):
+            with suppress(QpError):
                 solution = self._solve(s, None)
-            except QpError:
-                values.append(np.nan)
-                continue
-            action[:] = solution.action
-            values.append(solution.value)
-        return actions, np.array(values)
+                actions[k], values[k] = solution.action, solution.value
+        return actions, values
 
     def value_batch(self, states: ArrayLike) -> Vector:
         """V (K,) of the prepared QP at states (K, n); see `feedback_batch`."""

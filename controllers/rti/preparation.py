@@ -135,10 +135,7 @@ def _gathered(source: ca.MX, positions: NDArray[np.int64]) -> ca.MX:
 def _hessian_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     """Where H's entries, (Nm, Nm), stand in the rows of all stages; its upper triangle mirrors."""
     first, second = np.indices((horizon * m, horizon * m))
-    (k, a), (j, b) = (
-        np.divmod(np.maximum(first, second), m),
-        np.divmod(np.minimum(first, second), m),
-    )
+    (k, a), (j, b) = (np.divmod(pick(first, second), m) for pick in (np.maximum, np.minimum))
     column: NDArray[np.int64] = k * (horizon * m + n + 1) + (k - j) * m + b
     return column * m + a
 
@@ -188,18 +185,13 @@ def riccati(problem: Problem, prepared: StackedFunction) -> StackedFunction:
     shapes = {"A": (n, n), "B": (m, n), "L": (n + m, n + m)}
     given = {name: ca.MX.sym(name, r, c * horizon) for name, (r, c) in shapes.items()}
     given["L_N"] = ca.MX.sym("L_N", n, n)
-    stages = [
-        dict(zip(shapes, parts, strict=True))
-        for parts in zip(
-            *(ca.horzsplit(given[name], columns) for name, (_, columns) in shapes.items()),
-            strict=True,
-        )
-    ]
+    parts = (ca.horzsplit(given[name], columns) for name, (_, columns) in shapes.items())
+    stages = list(zip(*parts, strict=True))
     backwards = _backwards(n, m)
     P = given["L_N"]
     gains: list[tuple[ca.MX, ...]] = []
     for stage in reversed(stages):
-        *gain, P = backwards(stage["A"], stage["B"], stage["L"], P)
+        *gain, P = backwards(*stage, P)
         gains.insert(0, tuple(gain))
     # By columns: each of the transposed rows is one of the result's columns.
     response, actions, states = ca.MX(n, 0), [], []

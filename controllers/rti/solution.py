@@ -233,9 +233,8 @@ class RtiSolution:
         for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
             inputs[name][:] = direction.reshape(-1)
         if (spectrum := prepared.spectrum) is not None:
-            moved = curvature_directions(
-                self.qp.rows, dv, self._step_from_point(), spectrum.contract
-            )
+            step = self._step_from_point()
+            moved = curvature_directions(self.qp.rows, dv, step, spectrum.contract)
             inputs["dM"][:] = moved.reshape(-1)
         function()
         by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))

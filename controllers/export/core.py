@@ -79,7 +79,7 @@ def controller_sources(
     problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, BufferedFunction]
 ) -> dict[str, bytes]:
     """C files by name of a controller made of `functions`, by the prefix of their constants."""
-    wanted = ("core.h", "rti.h", *QP_SOURCES, "costs.h", RULES[hessian])
+    wanted = ("core.h", "rti.h", *QP_SOURCES, "costs.h", "rotation.h", RULES[hessian])
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
     sources["functions.h"] = _functions(list(functions.values())).encode()
     sources["problem.h"] = _constants(problem, blocks, hessian, functions).encode()

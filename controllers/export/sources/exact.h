@@ -5,6 +5,7 @@
 #include <math.h>
 
 #include "costs.h"
+#include "rotation.h"
 
 /* Eigenvalues on the diagonal of `matrix`, eigenvectors as columns: cyclic Jacobi rotations. */
 static void eigen(double matrix[N_W][N_W], double vectors[N_W][N_W]) {
@@ -21,24 +22,10 @@ static void eigen(double matrix[N_W][N_W], double vectors[N_W][N_W]) {
         for (int p = 0; p < N_W; p++)
             for (int r = p + 1; r < N_W; r++) {
                 if (matrix[p][r] == 0.0) continue;
-                const double ratio = (matrix[r][r] - matrix[p][p]) / (2.0 * matrix[p][r]);
-                const double t = copysign(1.0, ratio) / (fabs(ratio) + sqrt(1.0 + ratio * ratio));
-                const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
-                for (int i = 0; i < N_W; i++) {
-                    const double a = matrix[i][p], b = matrix[i][r];
-                    matrix[i][p] = c * a - s * b;
-                    matrix[i][r] = s * a + c * b;
-                }
-                for (int i = 0; i < N_W; i++) {
-                    const double a = matrix[p][i], b = matrix[r][i];
-                    matrix[p][i] = c * a - s * b;
-                    matrix[r][i] = s * a + c * b;
-                }
-                for (int i = 0; i < N_W; i++) {
-                    const double a = vectors[i][p], b = vectors[i][r];
-                    vectors[i][p] = c * a - s * b;
-                    vectors[i][r] = s * a + c * b;
-                }
+                const Rotation by = rotation_of(matrix[p][p], matrix[r][r], matrix[p][r]);
+                for (int i = 0; i < N_W; i++) rotate(by, &matrix[i][p], &matrix[i][r]);
+                for (int i = 0; i < N_W; i++) rotate(by, &matrix[p][i], &matrix[r][i]);
+                for (int i = 0; i < N_W; i++) rotate(by, &vectors[i][p], &vectors[i][r]);
             }
     }
 }

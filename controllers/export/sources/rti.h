@@ -10,6 +10,7 @@
 #define QP_N (HORIZON * N_U)
 #define QP_ROWS (HORIZON * N_X)
 #include "qp.h"
+#include "rotation.h"
 
 enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE };
 
@@ -157,19 +158,9 @@ static void rti_kink(const RtiPrepared *prepared, RtiSolved *solved) {
                     cd += G[c][j] * G[d][j];
                 }
                 if (!(fabs(cd) > 1e-16 * sqrt(cc * dd))) continue;
-                const double ratio = (dd - cc) / (2.0 * cd);
-                const double t = copysign(1.0, ratio) / (fabs(ratio) + sqrt(1.0 + ratio * ratio));
-                const double cosine = 1.0 / sqrt(1.0 + t * t), sine = cosine * t;
-                for (int j = 0; j < N_U; j++) {
-                    const double a = G[c][j], b = G[d][j];
-                    G[c][j] = cosine * a - sine * b;
-                    G[d][j] = sine * a + cosine * b;
-                }
-                for (int j = 0; j < count; j++) {
-                    const double a = V[c][j], b = V[d][j];
-                    V[c][j] = cosine * a - sine * b;
-                    V[d][j] = sine * a + cosine * b;
-                }
+                const Rotation by = rotation_of(cc, dd, cd);
+                for (int j = 0; j < N_U; j++) rotate(by, &G[c][j], &G[d][j]);
+                for (int j = 0; j < count; j++) rotate(by, &V[c][j], &V[d][j]);
                 turned = 1;
             }
     }

@@ -11,7 +11,7 @@ import pandas as pd
 from cosim.errors import StudyError
 from cosim.files import read_json
 from cosim.studies import theta
-from cosim.studies.plan import EVALUATION, GREEDY, Plan, Run
+from cosim.studies.plan import EVALUATION, GREEDY, NAIVE, Plan, Run
 from cosim.studies.report import commit
 from cosim.studies.store import INDICATORS, LOG, RUN, accompanied, measured
 from cosim.studies.tables import CURVE, KEYS, STATE, read_table
@@ -70,7 +70,7 @@ def document(plan: Plan) -> dict[str, Any]:
         ],
         "file": Path(definition.file).name if definition.file else None,
         "optimum": definition.optima,
-        "naive": dict.fromkeys(scenarios, definition.naive),
+        "naive": dict.fromkeys(scenarios, definition.named(NAIVE)),
         "curves": {name: [len(noise.seeds), noise.steps] for name, noise in curves.items()},
         "online": None if definition.table.online is None else definition.table.online.model_dump(),
         "runs": len(plan.runs),
@@ -101,12 +101,11 @@ def frames(plan: Plan, out: Path) -> list[pd.DataFrame]:
     Raises StudyError where a file of a run is damaged.
     """
     found = [one for run in ordered(plan) if (one := _collected(run, out)) is not None]
-    columns = (STATE, [*KEYS, "seed", "steps", *INDICATORS], [*KEYS, *CURVE])
+    headers = (STATE, [*KEYS, "seed", "steps", *INDICATORS], [*KEYS, *CURVE])
+    parts = [[one[i] for one in found if len(one[i])] for i in range(len(headers))]
     return [
-        pd.concat([one[i] for one in found if len(one[i])], ignore_index=True)
-        if any(len(one[i]) for one in found)
-        else pd.DataFrame(columns=header)
-        for i, header in enumerate(columns)
+        pd.concat(own, ignore_index=True) if own else pd.DataFrame(columns=header)
+        for own, header in zip(parts, headers, strict=True)
     ]
 
 
@@ -137,13 +136,11 @@ def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.Data
         greedy = found[GREEDY].loc[list(run.noise[GREEDY].seeds)]
         curve = pd.DataFrame([{"greedy_J": float(greedy.J.mean())}], columns=CURVE)
     one, other, third = (frame.assign(**key) for frame in (pd.DataFrame([state]), own, curve))
-    types = {"training_seed": "Int64"}
+    curves = {"samples": "Int64"} | dict.fromkeys(CURVE[1:], float)
     return (
-        one[STATE].astype(types),
-        other[[*KEYS, "seed", "steps", *INDICATORS]].astype(
-            types | dict.fromkeys(INDICATORS, float)
-        ),
-        third[[*KEYS, *CURVE]].astype(types | dict.fromkeys(CURVE, float) | {"samples": "Int64"}),
+        one[STATE].astype({"training_seed": "Int64"}),
+        other[[*KEYS, "seed", "steps", *INDICATORS]].astype({"training_seed": "Int64"}),
+        third[[*KEYS, *CURVE]].astype({"training_seed": "Int64"} | curves),
     )
 
 

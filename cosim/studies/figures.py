@@ -189,17 +189,16 @@ def online_figure(
     for name in names:
         if name not in known:
             raise StudyError(f"online.signals: no log has a column '{name}'{instead(name, known)}")
-    shown_cases = {case: course for case, course in courses.items() if case != optimum}
+    courses = {case: course for case, course in courses.items() if case != optimum}
     blocks = {
         case: np.mean([100 * regret_terms(a, b) for a, b in zip(own, best, strict=True)], axis=0)
-        for case, (_, own, best) in shown_cases.items()
+        for case, (_, own, best) in courses.items()
     }
     so_far = {c: np.cumsum(v) / np.arange(1, len(v) + 1) for c, v in blocks.items()}
     with figure(1.25 * (len(names) + 2) + 1.2) as drawn:
         ratios = [1.0] * len(names) + [1.7, 1.7]
-        grid = drawn.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)
-        panels = [axes for (axes,) in grid]
-        end = max(float(samples[-1]) for samples, *_ in shown_cases.values())
+        panels = drawn.subplots(len(ratios), 1, sharex=True, height_ratios=ratios)
+        end = max(float(samples[-1]) for samples, *_ in courses.values())
         for axes in panels:
             for edge in np.arange(settings["period"], end, settings["period"]):
                 axes.axvline(edge, color=REFERENCE, linewidth=0.6, linestyle=(0, (1, 2)))
@@ -209,7 +208,7 @@ def online_figure(
         for axes, means, title in zip(panels[-2:], (blocks, so_far), titles, strict=True):
             for case, values in means.items():
                 color, line = looks[case]
-                axes.plot(shown_cases[case][0], values, color=color, linestyle=line, linewidth=1.2)
+                axes.plot(courses[case][0], values, color=color, linestyle=line, linewidth=1.2)
             regret_axis(axes, "y", np.concatenate([[0.0], *means.values()]), 0.1)
             axes.set_ylabel(title)
         samples_axis(panels[-1], end, "samples of the run")

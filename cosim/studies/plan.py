@@ -325,7 +325,7 @@ class Study:
     def optima(self) -> dict[str, str]:
         """Names of the cases whose J is J*, by scenario; scenarios without one are not there."""
         return {
-            name: self._named(optimum)
+            name: self.named(optimum)
             for name, scenario in self.scenarios.items()
             if (optimum := stored_optimum(scenario)) is not None
         }
@@ -350,14 +350,9 @@ class Study:
         """References and cases, in the order of the tables."""
         return [*self.references, *self.cases]
 
-    def _named(self, controller: str) -> str:
+    def named(self, controller: str) -> str:
         """A case's name for a controller: the study's, if it has one for it."""
         return next((c.name for c in self.cases if c.controller == controller), controller)
-
-    @cached_property
-    def naive(self) -> str:
-        """Name of the case that the gap closed starts from."""
-        return self._named(NAIVE)
 
     def relative(self, path: str) -> str:
         """A parameters file's path as the study names it: results depend on no checkout's place."""

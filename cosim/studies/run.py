@@ -396,8 +396,7 @@ def study(
     """
     if isinstance(source, Mapping):
         source = Study.from_dict(source)
-    definition = source if isinstance(source, Study) else Study.load(source)
-    folder = Path(out)
+    definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     planned = planned or plan(definition)
     runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)

@@ -35,7 +35,7 @@ def library(version):
     stubs = [f"int {name}(void) {{ return 3; }}" for name in functions if f"{name}(" not in own]
     (folder / "kinds.c").write_text(text + "\n".join(stubs) + "\n")
     command = ["cc", "-shared", "-fPIC", "-O1", "-w", f"-DVERSION={version}", f"-I{headers}"]
-    subprocess.run([*command, "kinds.c", "-o", "kinds.so", "-lpthread"], cwd=folder, check=True)
+    subprocess.run([*command, "kinds.c", "-o", "kinds.so"], cwd=folder, check=True)
     return (folder / "kinds.so").read_bytes()
 
 

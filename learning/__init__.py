@@ -31,26 +31,20 @@ if TYPE_CHECKING:
 
 # Imported on first use: a command that trains nothing must not pay for SciPy.
 _HOMES = {
-    "actor_critic": ("ActorCritic",),
-    "algorithm": ("Algorithm", "LearnableController", "Transition", "Update", "algorithms"),
-    "batch_q_learning": ("BatchQLearning",),
-    "checkpoint": ("arrays_of", "take_up"),
-    "configuration": ("Configuration", "Strategy"),
-    "errors": (
-        "AlgorithmLookupError",
-        "CheckpointError",
-        "ConfigurationError",
-        "DivergenceError",
-        "LearningError",
-        "PrivilegeError",
-    ),
-    "q_learning": ("QLearning",),
-    "search": ("Search",),
-    "step": ("ConstrainedStep", "td_step"),
-    "training": ("Training", "train"),
-    "training_run": ("TrainingRun",),
+    "actor_critic": "ActorCritic",
+    "algorithm": "Algorithm LearnableController Transition Update algorithms",
+    "batch_q_learning": "BatchQLearning",
+    "checkpoint": "arrays_of take_up",
+    "configuration": "Configuration Strategy",
+    "errors": "AlgorithmLookupError CheckpointError ConfigurationError DivergenceError "
+    "LearningError PrivilegeError",
+    "q_learning": "QLearning",
+    "search": "Search",
+    "step": "ConstrainedStep td_step",
+    "training": "Training train",
+    "training_run": "TrainingRun",
 }
-_HOME = {name: module for module, names in _HOMES.items() for name in names}
+_HOME = {name: module for module, names in _HOMES.items() for name in names.split()}
 __all__ = sorted(_HOME)  # noqa: PLE0605 - a list all the same
 
 

@@ -150,15 +150,12 @@ class BackOff(Algorithm):
         """Seed of the noise of a stretch's episode; None in operation, which simply goes on."""
         return search.seed if self.asks_for == "simulator" else None
 
-    def observe(self, transition: Transition) -> Update | None:
-        """Take one sample of the estimation or of the search."""
-        return self._advance(transition)
-
     def failed(self, cost: float) -> Update | None:
         """Take a sample at which the controller failed: it counts, and says nothing."""
-        return self._advance(None)
+        return self.observe(None)
 
-    def _advance(self, transition: Transition | None) -> Update | None:
+    def observe(self, transition: Transition | None) -> Update | None:
+        """Take one sample of the estimation or of the search."""
         self._count += 1
         search = self._search
         if search is not None and self._count > self._estimation:

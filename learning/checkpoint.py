@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -47,10 +47,8 @@ def save(path: Path, checkpoint: Checkpoint) -> Path:
     return write_atomically(path, stream.getvalue())
 
 
-def load(
-    path: Path, run: Mapping[str, Any] | None = None, *, but: Collection[str] = ()
-) -> Checkpoint:
-    """Read a checkpoint; with `run`, refuse one of a run that differs in more than `but` says.
+def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
+    """Read a checkpoint; with `run`, refuse one of a run that differs in more than `samples`.
 
     Raises CheckpointError where the file is missing, damaged, of another schema or another run.
     """
@@ -79,7 +77,7 @@ def load(
     if run is not None:
         # Both sides through JSON, where tuples are lists.
         there, here = _flat(found), _flat(json.loads(json.dumps(dict(run))))
-        for key in sorted((there.keys() | here.keys()) - set(but)):
+        for key in sorted((there.keys() | here.keys()) - {"samples"}):
             if there.get(key) != here.get(key):
                 raise CheckpointError(
                     f"{path}: the checkpoint is of another run: {key} is {there.get(key)!r} there "

@@ -30,17 +30,6 @@ Matrix = NDArray[np.float64]
 Values = TypeVar("Values", float, NDArray[np.float64])
 OUTLIER = 25.0
 """Squares of innovations beyond this many variances count as this many."""
-AS_PRINTED: dict[str, Any] = {
-    "rule": "fit",
-    "step_size": 1e-3,
-    "scaled": False,
-    "exploration": "additive",
-    "exploration_probability": 0.1,
-    "exploration_deviation": [3.1622776601683795],
-    "value_offset": "stage-cost",
-    "parametrisation": "paper",
-}
-"""Hyperparameters of the rule as the paper prints it (paper.tex, Simulations)."""
 
 
 class ValueConfiguration(Configuration):
@@ -84,7 +73,7 @@ class ValueConfiguration(Configuration):
 
 
 class QLearningConfiguration(ValueConfiguration):
-    """Hyperparameters of online Q-learning; `AS_PRINTED` has those of the paper's rule."""
+    """Hyperparameters of online Q-learning."""
 
     rule: Literal["kalman", "td", "fit"] = Field(
         "kalman",

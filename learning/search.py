@@ -29,7 +29,7 @@ from learning.step import certificate, clip_eigenvalues, moved, prior_deviation
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
-RULES: dict[str, Any] = {
+RULES: dict[str, type[Algorithm]] = {
     "q-learning": QLearning,
     "batch-q-learning": BatchQLearning,
     "actor-critic": ActorCritic,
@@ -148,7 +148,7 @@ class PairedComparison:
     A round's comparisons begin at one state of the plant, with the same noise to come. The
     `incumbent` is the best θ so far: it has won a comparison, or it is the start. Candidates are
     compared with `base`. That is the incumbent, but for a line search about a θ that has not won
-    yet (`set_base`). `scenario` gives bounds and penalty, `samples` the budget, a comparison has up
+    yet. `scenario` gives bounds and penalty, `samples` the budget, a comparison has up
     to `blocks` blocks of `block` samples.
     """
 
@@ -171,22 +171,9 @@ class PairedComparison:
         self.pooled = self._errors
         self.incumbent = Candidate(start.theta)
         self.base = self.incumbent
-        self.accepted = 0
-        """How often the incumbent's θ changed."""
 
-    def set_base(self, theta: Vector) -> None:
-        """Compare what follows with θ, which the incumbent stays apart from."""
-        self.base = Candidate(theta)
-
-    def settle(self, *, accept: bool) -> None:
-        """Make the base the incumbent, or the incumbent the base again."""
-        if accept:
-            self._accept(self.base)
-        self.base = self.incumbent
-
-    def _accept(self, candidate: Candidate) -> None:
-        if not np.array_equal(candidate.theta, self.incumbent.theta):
-            self.accepted += 1
+    def accept(self, candidate: Candidate) -> None:
+        """Make a candidate the incumbent."""
         self.base = self.incumbent = candidate
 
     @property
@@ -250,7 +237,7 @@ class PairedComparison:
         if candidate is None or not cheaper(candidate.costs - costs):
             return False
         if self.base is self.incumbent:
-            self._accept(candidate)
+            self.accept(candidate)
         self.base = candidate
         return True
 
@@ -289,7 +276,7 @@ class PairedComparison:
                     break
             else:
                 finalists.append(rival)
-                self._accept(self._winner(finalists))
+                self.accept(self._winner(finalists))
 
     def _winner(self, finalists: list[Candidate]) -> Candidate:
         """The cheapest; the start, where it is not dearer by a standard error."""
@@ -406,7 +393,7 @@ class LineSearch:
             kept, least = comparison.incumbent, comparison.least
             theta = self._weighted(10.0**decades)
             comparison.least = min(least, 0.5 * certificate(self._start.blocks, theta).smallest)
-            comparison.set_base(theta)
+            comparison.base = Candidate(theta)
             pays = False
             try:
                 for _ in range(len(kept.costs)):
@@ -414,7 +401,9 @@ class LineSearch:
                 yield from self.along(self.tightening(), 0.5)
                 pays = cheaper(comparison.base.costs - kept.costs)
             finally:
-                comparison.settle(accept=pays)
+                if pays:
+                    comparison.accept(comparison.base)
+                comparison.base = comparison.incumbent
             if not pays:
                 comparison.least = least
                 return decades if found else -0.7 * decades
@@ -662,32 +651,26 @@ class EpisodeData:
         """Whether all samples are done."""
         return self.done >= self.length
 
-    def end_with_this(self) -> None:
-        """Let the sample that is coming be the last one."""
-        self.length = self.done + 1
-
     def take(self, transition: Transition, theta: Vector | None = None) -> None:
         """Take a sample, and θ (n_θ,) after it, where that may be a candidate."""
         self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
-        if not self._learns:
-            self._judge(transition)
-        elif theta is not None and (self.done + 1) % max(self.length // CANDIDATES, 1) == 0:
-            self._candidates.append(theta.copy())
         self.done += 1
+        if self._learns:
+            if theta is not None and self.done % max(self.length // CANDIDATES, 1) == 0:
+                self._candidates.append(theta.copy())
+            return
+        self._stage_cost += transition.stage_cost
+        self._penalty += transition.next_penalty
+        if self._sensitive and (self.done - 1) % max(self.length // SENSITIVITIES, 1) == 0:
+            jacobian = transition.policy.policy_jacobian / self._deviation[:, None]
+            if np.isfinite(jacobian).all():
+                self._metric += jacobian.T @ jacobian
+                self._jacobians += 1
 
     def fail(self, cost: float) -> None:
         """Take a sample at which the controller failed, with its share of J."""
         self._stage_cost += cost
         self.done += 1
-
-    def _judge(self, transition: Transition) -> None:
-        self._stage_cost += transition.stage_cost
-        self._penalty += transition.next_penalty
-        if self._sensitive and self.done % max(self.length // SENSITIVITIES, 1) == 0:
-            jacobian = transition.policy.policy_jacobian / self._deviation[:, None]
-            if np.isfinite(jacobian).all():
-                self._metric += jacobian.T @ jacobian
-                self._jacobians += 1
 
     def result(self, model: OneStepModel) -> Result:
         """What came of the episode, its predictions by the controller's own `model`."""
@@ -761,10 +744,7 @@ class Search(Algorithm):
         # Comparisons decide on the mean cost; the rule inside has the scenario's discount.
         if getattr(chosen, "discount", 1.0) is None:
             chosen = chosen.model_copy(update={"discount": self.scenario.discount})
-        made: Algorithm = RULES[name](
-            self.controller, self.scenario, chosen, samples, self.strategy, self.rng
-        )
-        return made
+        return RULES[name](self.controller, self.scenario, chosen, samples, self.strategy, self.rng)
 
     @property
     def theta(self) -> Vector:
@@ -814,7 +794,7 @@ class Search(Algorithm):
             update = self._rule.observe(transition._replace(number=self._learnt))
         except DivergenceError:
             # The phase ends here; what it passed through before may still be good.
-            self._episode.end_with_this()
+            self._episode.length = self._episode.done + 1
             self._episode.take(transition)
             return None
         self._learnt += 1

@@ -586,7 +586,7 @@ class _Session:
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
         path = self.out / CHECKPOINT
-        found = checkpoint.load(path, self.identity, but=("samples",))
+        found = checkpoint.load(path, self.identity)
         try:
             self._require_same_beginning(path, int(found.run["samples"]))
             columns, arrays = found.state["columns"], found.arrays

@@ -7,9 +7,21 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import QLearning
 from learning.loop import TrainingLoop
-from learning.q_learning import AS_PRINTED, AverageCost, KalmanRegression
+from learning.q_learning import AverageCost, KalmanRegression
 from learning.step import Fit
 from learning.training_run import starting_parameters
+
+AS_PRINTED = {
+    "rule": "fit",
+    "step_size": 1e-3,
+    "scaled": False,
+    "exploration": "additive",
+    "exploration_probability": 0.1,
+    "exploration_deviation": [3.1622776601683795],
+    "value_offset": "stage-cost",
+    "parametrisation": "paper",
+}
+"""The rule as the paper prints it (paper.tex, Simulations)."""
 
 
 class Bench:

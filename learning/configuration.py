@@ -94,8 +94,7 @@ class Configuration(BaseModel):
         (), description="parameters of the controller's model that θ has, in its block p"
     )
     smallest_eigenvalue: Positive = Field(
-        1e-3,
-        description="least eigenvalue that B_l and B_Vf may have, in the problem's own units",
+        1e-3, description="least eigenvalue that B_l and B_Vf may have, in the problem's own units"
     )
     exploration: Literal["additive", "literal", "none"] = Field(
         "additive",
@@ -105,8 +104,7 @@ class Configuration(BaseModel):
     exploration_probability: ExplorationProbability = 1.0
     exploration_share: ExplorationShare = 1 / 60
     exploration_deviation: tuple[NonNegative, ...] | None = Field(
-        None,
-        description="the same in the units of u, one or one per action, in place of the share",
+        None, description="the same in the units of u, one or one per action, in place of the share"
     )
 
     @classmethod

@@ -13,13 +13,7 @@ from controllers.rti import LinearisationPoint
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
 from cosim.protocols import Step, recover
-from learning.algorithm import (
-    Algorithm,
-    LearnableController,
-    LearnableSolution,
-    Transition,
-    Update,
-)
+from learning.algorithm import Algorithm, LearnableController, LearnableSolution, Transition, Update
 from learning.checkpoint import arrays_of, group, prefixed, take_up
 from learning.configuration import Strategy
 from learning.errors import PrivilegeError

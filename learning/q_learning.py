@@ -76,8 +76,7 @@ class QLearningConfiguration(ValueConfiguration):
     """Hyperparameters of online Q-learning."""
 
     rule: Literal["kalman", "td", "fit"] = Field(
-        "kalman",
-        description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)",
+        "kalman", description="Kalman filter with a prior on θ; αδ∇Q; or the fit's αδ∇Q/(1+α‖∇Q‖²)"
     )
     prior_samples: Count = Field(
         500, description="first samples, at which θ rests: they give noise and widths"

@@ -17,10 +17,7 @@ class Solution:
 
 def algorithm(problem, scenario, **settings):
     configuration = ActorCritic.Configuration(
-        batch_size=400,
-        forgetting=0.0,
-        parametrisation="paper",
-        **settings,
+        batch_size=400, forgetting=0.0, parametrisation="paper", **settings
     )
     carrier = Carrier(Parameters.naive(problem))
     strategy = configuration.strategy(scenario)

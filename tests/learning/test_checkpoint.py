@@ -3,13 +3,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from learning.checkpoint import (
-    Checkpoint,
-    arrays_of,
-    load,
-    save,
-    take_up,
-)
+from learning.checkpoint import Checkpoint, arrays_of, load, save, take_up
 from learning.errors import CheckpointError
 
 RUN = {"algorithm": "actor-critic", "seed": 3, "deviation": (5.0,)}

@@ -114,12 +114,7 @@ def test_noise_leaves_online_q_learning_near_the_riccati_gain(linear_quadratic):
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=0.03)
 
 
-ACTOR = {
-    "forgetting": 0.0,
-    "step_size": 0.2,
-    "exploration_deviation": (1.0,),
-    "radius": 0.3,
-}
+ACTOR = {"forgetting": 0.0, "step_size": 0.2, "exploration_deviation": (1.0,), "radius": 0.3}
 
 
 def test_actor_critic_nears_the_riccati_gain_of_the_mean_cost(linear_quadratic):

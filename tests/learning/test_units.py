@@ -11,15 +11,7 @@ from learning.loop import TrainingLoop
 from learning.step import ConstrainedStep, Fit, least_eigenvalue
 from learning.training_run import starting_parameters
 from tests.helpers.carrier import Carrier
-from tests.helpers.other_units import (
-    ACTION,
-    COST,
-    STATE,
-    NoisyModel,
-    factors,
-    problems,
-    recounted,
-)
+from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
 
 SAMPLES = 240
 SETTINGS = {

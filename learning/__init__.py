@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from learning.actor_critic import ActorCritic as ActorCritic
     from learning.algorithm import Algorithm as Algorithm
-    from learning.algorithm import LearnableController as LearnableController
     from learning.algorithm import Transition as Transition
     from learning.algorithm import Update as Update
     from learning.algorithm import algorithms as algorithms
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 # Imported on first use: a command that trains nothing must not pay for SciPy.
 _HOMES = {
     "actor_critic": "ActorCritic",
-    "algorithm": "Algorithm LearnableController Transition Update algorithms",
+    "algorithm": "Algorithm Transition Update algorithms",
     "batch_q_learning": "BatchQLearning",
     "checkpoint": "arrays_of take_up",
     "configuration": "Configuration Strategy",

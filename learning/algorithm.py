@@ -1,4 +1,4 @@
-"""What a training asks of an algorithm and of a learnable controller; algorithms by name.
+"""What a training asks of an algorithm; algorithms by name.
 
 An own rule inherits `Algorithm`, is given a `Transition` and returns an `Update`.
 """
@@ -6,15 +6,13 @@ An own rule inherits `Algorithm`, is given a `Transition` and returns an `Update
 from __future__ import annotations
 
 from importlib.metadata import entry_points
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.rti import LinearisationPoint
-from controllers.theta import Parameters
+from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from cosim.plugins import ALGORITHMS, load_plugin
-from cosim.protocols import Controller, Solution
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 from learning.checkpoint import arrays_of, take_up
@@ -22,53 +20,7 @@ from learning.configuration import Configuration, Strategy
 from learning.errors import AlgorithmLookupError
 
 Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Privilege = Literal["operation", "simulator"]
-
-
-class LearnableSolution(Solution, Protocol):
-    """V or Q with its sensitivities to θ; `controllers.rti.RtiSolution` is one."""
-
-    @property
-    def value_gradient(self) -> Vector:
-        """dV/dθ or dQ/dθ, (n_θ,)."""
-
-    @property
-    def policy_jacobian(self) -> Matrix:
-        """dπ/dθ, (m, n_θ)."""
-
-    @property
-    def weakly_active(self) -> bool:
-        """Whether a constraint is about to change its activity: derivatives are one-sided."""
-
-    @property
-    def licq(self) -> bool:
-        """Whether the active constraints' gradients are linearly independent."""
-
-
-class LearnableController(Controller, Protocol):
-    """A controller with parameters θ; `RtiNmpc` and `ConvergedNmpc` are.
-
-    `memoryless` says that a feedback depends, to the tolerance of its solver, on nothing but θ, the
-    point at which it was prepared, s and a; so what was solved for once need not be again.
-    """
-
-    theta: Vector
-    memoryless: bool
-
-    @property
-    def parameters(self) -> Parameters:
-        """θ with its blocks."""
-
-    @property
-    def linearisation_point(self) -> LinearisationPoint:
-        """Where the QP was linearised, copies."""
-
-    def prepare_at(self, point: LinearisationPoint) -> None:
-        """Linearise at a point, at the present θ."""
-
-    def feedback(self, s: Vector, a: Vector | None = None) -> LearnableSolution:
-        """Solve for V and π, or with the first action fixed for Q."""
 
 
 class Transition(NamedTuple):
@@ -86,13 +38,13 @@ class Transition(NamedTuple):
     s: Vector
     a: Vector
     explored: bool
-    policy: LearnableSolution
-    action_value: LearnableSolution
+    policy: RtiSolution
+    action_value: RtiSolution
     stage_cost: float
     cost: float
     next_s: Vector
     next_penalty: float
-    next_policy: LearnableSolution
+    next_policy: RtiSolution
     point: LinearisationPoint | None
     next_point: LinearisationPoint | None
 
@@ -154,7 +106,7 @@ class Algorithm:
 
     def __init__(
         self,
-        controller: LearnableController,
+        controller: RtiNmpc,
         scenario: Scenario,
         configuration: Any,
         samples: int,

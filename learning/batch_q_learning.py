@@ -12,8 +12,8 @@ from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
 from controllers.errors import QpError
-from controllers.rti import LinearisationPoint
-from learning.algorithm import LearnableController, LearnableSolution, Transition, Update
+from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
+from learning.algorithm import Transition, Update
 from learning.configuration import Count
 from learning.errors import DivergenceError
 from learning.q_learning import OUTLIER, AverageCost, ValueConfiguration, ValueRule
@@ -184,7 +184,7 @@ class ReplayBuffer:
 
     KEPT = ("_count", "_columns", "_theta", "_action_value", "_next_value", "_gradient")
 
-    def __init__(self, controller: LearnableController, capacity: int) -> None:
+    def __init__(self, controller: RtiNmpc, capacity: int) -> None:
         self._controller, self._capacity, self._count = controller, capacity, 0
         self._columns: dict[str, NDArray[Any]] = {}
         self._theta = controller.theta
@@ -256,7 +256,7 @@ class ReplayBuffer:
         """
         controller, columns = self._controller, self._columns
         at: int | None = None
-        value: LearnableSolution | None = None
+        value: RtiSolution | None = None
         # Plain numbers: reading them one by one out of arrays costs as much as a gradient.
         numbers, explored = (columns[name][rows].tolist() for name in ("number", "explored"))
         points, next_points = ([columns[name] for name in names] for names in (POINT, NEXT_POINT))

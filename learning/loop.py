@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.rti import LinearisationPoint
+from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
 from cosim.protocols import Step, recover
-from learning.algorithm import Algorithm, LearnableController, LearnableSolution, Transition, Update
+from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import arrays_of, group, prefixed, take_up
 from learning.configuration import Strategy
 from learning.errors import PrivilegeError
@@ -73,7 +73,7 @@ class TrainingLoop:
     def __init__(
         self,
         plant: FmuPlant,
-        controller: LearnableController,
+        controller: RtiNmpc,
         algorithm: Algorithm,
         strategy: Strategy,
         rng: np.random.Generator,
@@ -94,7 +94,7 @@ class TrainingLoop:
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
         self._penalty = scenario.state_penalty
         self._applied = scenario.reference_action
-        self._policy: LearnableSolution | None = None
+        self._policy: RtiSolution | None = None
         self._point: LinearisationPoint | None = None
         self._marked: tuple[Any, Vector, LinearisationPoint | None] | None = None
         self.s: Vector = scenario.initial_state
@@ -221,7 +221,7 @@ class TrainingLoop:
 
     def _solve(
         self, s: Vector, a: Vector | None = None, *, prepare: bool = False
-    ) -> LearnableSolution | None:
+    ) -> RtiSolution | None:
         """V(s) and π(s), or Q(s, a); None where the controller fails, which is counted."""
         try:
             if prepare:

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from controllers import sdp
+from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
-from learning.algorithm import LearnableController, Update
+from learning.algorithm import Update
 from learning.configuration import Configuration
 from learning.errors import DivergenceError
 
@@ -194,7 +195,7 @@ class ConstrainedStep:
 
     def __init__(
         self,
-        controller: LearnableController,
+        controller: RtiNmpc,
         configuration: Configuration,
         scale: Vector | None = None,
     ) -> None:

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers import compile_functions
+from controllers.factories import nmpc
 from controllers.optimum import QuasiStaticPolicy, change_of, yardstick
 from controllers.problem import Problem
+from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
@@ -31,12 +33,12 @@ from cosim.shown import Shown
 from cosim.statistics import gap_closed, regret, shown
 from cosim.text_tables import csv_text
 from learning import checkpoint
-from learning.algorithm import Algorithm, LearnableController, Privilege, Update, load_algorithm
+from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.step import certificate
-from learning.training_run import Options, TrainingRun, begin, learnable, prepare
+from learning.training_run import Options, TrainingRun, begin, prepare
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -174,7 +176,7 @@ class Judge:
         self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
     ) -> None:
         self._run, self._plant, self._start, self._optimum = run, plant, start, optimum
-        self._controller = learnable(run.controller, run.scenario, start)
+        self._controller = nmpc(run.scenario, start, run.controller)
 
     def verdict(self, theta: Array) -> dict[str, Any]:
         """The greedy policy at θ (n_θ,): means of `FIGURES`, `regret`, `gap_closed`.
@@ -226,7 +228,7 @@ class Judge:
     def _naive_cost(self) -> Array:
         run = self._run
         naive = Parameters.naive(Problem.from_scenario(run.scenario))
-        return self._costs(learnable(run.controller, run.scenario, naive))["J"]
+        return self._costs(nmpc(run.scenario, naive, run.controller))["J"]
 
     @cached_property
     def _optimal_cost(self) -> Array:
@@ -294,9 +296,9 @@ class Training(Shown):
         found = self.evaluation["regret"]
         return float("nan") if found is None else float(found)
 
-    def controller(self) -> LearnableController:
+    def controller(self) -> RtiNmpc:
         """A fresh controller that has this θ."""
-        return learnable(self.run.controller, self.run.scenario, self.parameters)
+        return nmpc(self.run.scenario, self.parameters, self.run.controller)
 
     def log(self) -> dict[str, Array]:
         """The columns of the training's log, (K,) each, NaN where not measured."""

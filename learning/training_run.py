@@ -20,14 +20,13 @@ from cosim.plugins import OURS, depends_on
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 from cosim.validation import suggestion
-from learning.algorithm import Algorithm, LearnableController, load_algorithm
+from learning.algorithm import Algorithm, load_algorithm
 from learning.commissioning import back_off
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError, PrivilegeError
 from learning.loop import TrainingLoop
 
 Vector = NDArray[np.float64]
-CONTROLLERS = ("rti", "converged")
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
 LEAST = {
@@ -146,7 +145,7 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
 
     All random numbers come from the run's seed.
     """
-    controller = learnable(run.controller, run.scenario, run.starting_parameters())
+    controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
     strategy = run.configuration.strategy(run.scenario)
     plant_seed, rng = spawn_seeds(run.seed)
     # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
@@ -202,12 +201,3 @@ def starting_parameters(
     if given:
         values["p"] = np.concatenate([values["p"], found["p"][len(given) :]])
     return found.replace(values)
-
-
-def learnable(kind: str, scenario: Scenario, parameters: Parameters) -> LearnableController:
-    """`rti` or `converged`; raises ConfigurationError on another kind."""
-    if kind not in CONTROLLERS:
-        raise ConfigurationError(
-            f"there is no learnable controller '{kind}'; there are {', '.join(CONTROLLERS)}"
-        )
-    return nmpc(scenario, parameters, kind)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Self, TypeVar, get_args, get_origin
 
 import numpy as np
 
+from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.errors import StudyError
@@ -34,7 +35,7 @@ from cosim.validation import instead
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.training import stored_optimum
-from learning.training_run import TrainingRun, learnable, prepare
+from learning.training_run import TrainingRun, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
 EVALUATION, GREEDY = "evaluation.csv", "greedy.csv"
@@ -97,7 +98,7 @@ class Training:
             path.write_text(parameters, "utf-8")
             found = Parameters.load(path, problem)
         found = found.with_theta(np.array(theta)) if theta else found
-        return learnable(self.options["controller"], self.scenario, found)
+        return nmpc(self.scenario, found, self.options["controller"])
 
 
 class Noise(NamedTuple):

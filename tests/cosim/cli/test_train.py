@@ -76,7 +76,7 @@ def test_explain_lists_every_hyperparameter(cosim):
         (("-a", "q-learning", "--set", "prior_widht=1"), "did you mean 'prior_width'"),
         (("-a", "q-learning", "--set", "prior_width=-2"), "prior_width"),
         (("-a", "q-learning", "--resume"), "there is no checkpoint to resume from"),
-        (("-a", "q-learning", "--controller", "mpc"), "no learnable controller 'mpc'"),
+        (("-a", "q-learning", "--controller", "mpc"), "there is no NMPC 'mpc'"),
         (("-a", "q-learning", "--evaluate-every", "70"), "multiple of log_every"),
     ],
 )

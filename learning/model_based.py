@@ -9,9 +9,8 @@ smallest is taken.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +66,6 @@ THINNED = 10
 class ModelBasedConfiguration(Configuration):
     """Hyperparameters of `model-based`."""
 
-    theta: Literal["back-offs"] = Field("back-offs", description="what of θ is searched")
     first_update: Count = Field(30, description="samples before the first update of θ")
     longest_interval: Count = Field(
         1440, description="most samples between updates, which double with the model's data"
@@ -76,26 +74,6 @@ class ModelBasedConfiguration(Configuration):
     exploration_samples: Count = Field(
         480, description="samples that explore after the start and after a change of the plant"
     )
-
-
-@dataclass
-class Progress:
-    """How far a run is: what a checkpoint has beside θ and the model.
-
-    `rows` (memory, 2n+m+1) has the transitions (s, a, s₊, ℓ), a ring; `count` samples so far, of
-    which the present plant's begin at `era`; the last update was at `updated`, the next is `due`.
-    `back_off` (2n,) is that of θ; `pool` has the residuals from before the last change.
-    `model_samples` counts the samples of rollouts.
-    """
-
-    rows: Array
-    back_off: Array
-    pool: Array
-    due: int
-    count: int = 0
-    era: int = 0
-    updated: int = 0
-    model_samples: int = 0
 
 
 class ModelBased(Algorithm):
@@ -108,7 +86,7 @@ class ModelBased(Algorithm):
     """
 
     Configuration = ModelBasedConfiguration
-    KEPT = ("_progress",)
+    KEPT = ("_rows", "back_off", "_pool", "_due", "_count", "_era", "_updated", "model_samples")
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
 
@@ -121,43 +99,37 @@ class ModelBased(Algorithm):
         self._rollout = Rollout(problem, start, self._features)
         self._model: EmpiricalModel | None = None
         n = problem.n_states
-        self._progress = Progress(
-            rows=np.zeros((settings.memory, self._features.inputs + n + 1)),
-            back_off=np.maximum(
-                np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]]), 0.0
-            ),
-            pool=np.zeros((0, n + 1)),
-            due=settings.first_update,
-        )
+        # A ring of transitions (s, a, s₊, ℓ), and the residuals from before the last change.
+        self._rows = np.zeros((settings.memory, self._features.inputs + n + 1))
+        self._pool = np.zeros((0, n + 1))
+        backed = np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]])
+        self.back_off: Array = np.maximum(backed, 0.0)
+        """Back-offs of θ, of lower then upper bounds, (2n,)."""
+        # Samples so far, at the last update, at the next one, and before the present plant's.
+        self._count, self._updated, self._due, self._era = 0, 0, settings.first_update, 0
+        self.model_samples = 0
+        """Samples of the model that its rollouts have taken so far."""
 
     @property
     def explores(self) -> bool:
         """Whether the samples explore now."""
-        now = self._progress
-        return now.count - now.era < self.configuration.exploration_samples
-
-    @property
-    def model_samples(self) -> int:
-        """Samples of the model that its rollouts have taken so far."""
-        return self._progress.model_samples
+        return self._count - self._era < self.configuration.exploration_samples
 
     def observe(self, transition: Transition) -> Update | None:
         """Keep a transition; move θ where it is time."""
-        now = self._progress
         row = (transition.s, transition.a, transition.next_s, [transition.stage_cost])
-        now.rows[now.count % len(now.rows)] = np.concatenate(row)
-        now.count += 1
-        if self._model is not None and (now.count - now.updated) % WINDOWS[0] == 0:
+        self._rows[self._count % len(self._rows)] = np.concatenate(row)
+        self._count += 1
+        if self._model is not None and (self._count - self._updated) % WINDOWS[0] == 0:
             window = self._changed(self._model)
             if window:
-                now.era, now.due = now.count - window, now.count
-                now.pool = self._model.residuals[-POOL:]
-        return self._update() if now.count >= now.due else None
+                self._era, self._due = self._count - window, self._count
+                self._pool = self._model.residuals[-POOL:]
+        return self._update() if self._count >= self._due else None
 
     def _latest(self, count: int) -> tuple[Array, Array]:
         """Inputs (s, a) and outputs (s₊, ℓ) of the latest samples, oldest first."""
-        now = self._progress
-        rows = now.rows[np.arange(now.count - count, now.count) % len(now.rows)]
+        rows = self._rows[np.arange(self._count - count, self._count) % len(self._rows)]
         return rows[:, : self._features.inputs], rows[:, self._features.inputs :]
 
     def _changed(self, model: EmpiricalModel) -> int:
@@ -166,7 +138,7 @@ class ModelBased(Algorithm):
         if M < CAUTION:
             return 0
         for window in WINDOWS:
-            if window > self._progress.count - self._progress.updated:
+            if window > self._count - self._updated:
                 return 0
             mean, design = model.mean_error(*self._latest(window))
             covariance = noise / window + design @ model.covariance @ design.T
@@ -181,7 +153,7 @@ class ModelBased(Algorithm):
         A present one shrinks little beyond the state that came closest to its bound: what lies
         behind it the model only extrapolates. Of few samples none shrinks.
         """
-        present, problem = self._progress.back_off, self._problem
+        present, problem = self.back_off, self._problem
         if len(inputs) < CAUTION:
             return present
         states = inputs[:, : problem.n_states]
@@ -190,27 +162,26 @@ class ModelBased(Algorithm):
         return least
 
     def _update(self) -> Update:
-        now = self._progress
-        age = now.count - now.era
-        inputs, outputs = self._latest(min(age, len(now.rows)))
+        age = self._count - self._era
+        inputs, outputs = self._latest(min(age, len(self._rows)))
         self._model = EmpiricalModel.fit(
-            self._features, inputs, outputs, now.pool[: max(POOL - age, 0)]
+            self._features, inputs, outputs, self._pool[: max(POOL - age, 0)]
         )
-        now.updated = now.count
+        self._updated = self._count
         interval = max(age, self.configuration.first_update)
-        now.due = now.count + min(interval, self.configuration.longest_interval)
+        self._due = self._count + min(interval, self.configuration.longest_interval)
         search = BackOffs(
             self._problem, self._rollout, self._base, self._model, inputs[-RECENT:], self.rng
         )
-        found = search.best(now.back_off, self._least(inputs))
+        found = search.best(self.back_off, self._least(inputs))
         present = self.controller.parameters
         new = search.theta(found)
         search.draw(FINE)
         better = search.excess(search.promise(new), search.promise(present.theta)) <= 0
         if better:
-            now.back_off = found
+            self.back_off = found
             self.controller.theta = new
-        now.model_samples += search.samples
+        self.model_samples += search.samples
         end = self.controller.theta
         return moved(present.blocks, present.theta, end, refused=not better)
 

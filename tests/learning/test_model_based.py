@@ -117,7 +117,7 @@ def test_back_offs_shrink_little_further_than_the_plant_has_been(scenario, base,
     run = make_run("model-based", scenario)
     controller = SimpleNamespace(parameters=base, theta=base.theta)
     rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
-    rule._progress.back_off = np.array([2.0, 0.0, 0.0, 5.0])
+    rule.back_off = np.array([2.0, 0.0, 0.0, 5.0])
     inputs = np.tile([26.0, 77.0, 220.0, 230.0], (200, 1))
     assert rule._least(inputs) == pytest.approx([0.7, 0.0, 0.0, 2.1])
     assert rule._least(inputs[:50]) == pytest.approx([2.0, 0.0, 0.0, 5.0])
@@ -131,8 +131,8 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, featu
     error[0] = -0.2
     for offset, window in ((0.0, 0), (0.3, 15)):
         inputs, outputs = plant_data(features, rng, 240, error, offset)
-        rule._progress.rows[:240] = np.column_stack([inputs, outputs])
-        rule._progress.count = 240
+        rule._rows[:240] = np.column_stack([inputs, outputs])
+        rule._count = 240
         assert rule._changed(fitted) == window
 
 

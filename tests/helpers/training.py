@@ -1,4 +1,4 @@
-"""Short trainings, whole, and killed and resumed."""
+"""Short trainings, whole, and killed and resumed; a rule in its loop."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from controllers.rti import RtiNmpc
 from cosim import Scenario
 from learning.algorithm import Algorithm, load_algorithm
+from learning.loop import TrainingLoop
 from learning.training import LogRow, Training, run_training
 from learning.training_run import TrainingRun
 
@@ -63,3 +66,22 @@ def killed_and_resumed(
     with pytest.raises(Killed):
         train(run, out, rule=rule, progress=die)
     return train(run, out, rule=rule, resume=True)
+
+
+def looped(
+    rule: type[Algorithm],
+    plant: Any,
+    controller: RtiNmpc,
+    configuration: Any,
+    samples: int = 1000,
+    *,
+    exploration: int = 0,
+    seed: int,
+) -> TrainingLoop:
+    """A rule in its loop, at the start of the plant's noise `seed`."""
+    strategy, own = configuration.strategy(plant.scenario), np.random.default_rng(0)
+    algorithm = rule(controller, plant.scenario, configuration, samples, strategy, own)
+    rng = np.random.default_rng(exploration)
+    loop = TrainingLoop(plant, controller, algorithm, strategy, rng)
+    loop.start(plant.reset(seed))
+    return loop

@@ -9,9 +9,9 @@ from cosim import FmuPlant
 from learning import BatchQLearning, QLearning
 from learning.batch_q_learning import ReplayBuffer
 from learning.checkpoint import arrays_of, take_up
-from learning.loop import TrainingLoop
 from learning.q_learning import AverageCost
 from learning.training_run import TrainingRun, begin, starting_parameters
+from tests.helpers.training import looped
 
 
 class Bench:
@@ -28,15 +28,10 @@ class Bench:
             }
         )
         self.controller = controller or RtiNmpc(task.problem, task.wrong())
-        strategy = configuration.strategy(task.scenario)
-        self.algorithm = BatchQLearning(
-            self.controller, task.scenario, configuration, 1000, strategy, np.random.default_rng(0)
+        self.interaction = looped(
+            BatchQLearning, task.plant(noise), self.controller, configuration, exploration=2, seed=3
         )
-        plant = task.plant(noise)
-        self.interaction = TrainingLoop(
-            plant, self.controller, self.algorithm, strategy, np.random.default_rng(2)
-        )
-        self.interaction.start(plant.reset(3))
+        self.algorithm = self.interaction.algorithm
 
     def update(self):
         """Samples until θ moves."""
@@ -88,14 +83,9 @@ def collected(scenario, problem):
     """Samples of a run at one θ, with their points, and the controller."""
     configuration = QLearning.Configuration(rule="fit", exploration_probability=0.4)
     controller = RtiNmpc(problem, starting_parameters(problem, configuration))
-    strategy = configuration.strategy(scenario)
-    algorithm = QLearning(
-        controller, scenario, configuration, 100, strategy, np.random.default_rng(0)
-    )
-    algorithm.needs_points = True
     with FmuPlant(scenario) as plant:
-        interaction = TrainingLoop(plant, controller, algorithm, strategy, np.random.default_rng(0))
-        interaction.start(plant.reset(5))
+        interaction = looped(QLearning, plant, controller, configuration, 100, seed=5)
+        interaction.algorithm.needs_points = True
         samples = [interaction.next()[0] for _ in range(60)]
     return controller, samples
 

@@ -6,8 +6,8 @@ import pytest
 from controllers.converged import ConvergedNmpc
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
-from learning.loop import TrainingLoop
 from tests.helpers.linear_quadratic import DISCOUNT
+from tests.helpers.training import looped
 
 
 def learn(*arguments, **settings):
@@ -21,13 +21,9 @@ def train(task, cls, samples, noise, controller=None, **settings):
         {"parametrisation": "paper", "value_offset": "stage-cost", **settings}
     )
     controller = controller or RtiNmpc(task.problem, task.wrong())
-    strategy = configuration.strategy(task.scenario)
-    algorithm = cls(
-        controller, task.scenario, configuration, samples, strategy, np.random.default_rng(0)
-    )
     plant = task.plant(noise)
-    interaction = TrainingLoop(plant, controller, algorithm, strategy, np.random.default_rng(1))
-    interaction.start(plant.reset(7))
+    interaction = looped(cls, plant, controller, configuration, samples, exploration=1, seed=7)
+    algorithm = interaction.algorithm
     for _ in range(samples):
         sample, _ = interaction.next()
         if algorithm.observe(sample) is not None:

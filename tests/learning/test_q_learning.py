@@ -6,10 +6,10 @@ import pytest
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant
 from learning import QLearning
-from learning.loop import TrainingLoop
 from learning.q_learning import AverageCost, KalmanRegression
 from learning.step import Fit
 from learning.training_run import starting_parameters
+from tests.helpers.training import looped
 
 AS_PRINTED = {
     "rule": "fit",
@@ -31,22 +31,8 @@ class Bench:
         self.scenario = plant.scenario
         configuration = QLearning.Configuration.from_dict(settings)
         self.controller = RtiNmpc(problem, starting_parameters(problem, configuration))
-        strategy = configuration.strategy(self.scenario)
-        self.algorithm = QLearning(
-            self.controller, self.scenario, configuration, 1000, strategy, np.random.default_rng(0)
-        )
-        self.interaction = TrainingLoop(
-            plant, self.controller, self.algorithm, strategy, np.random.default_rng(0)
-        )
-        self.interaction.start(plant.reset(11))
-
-    def td_error(self, sample, target=None):
-        """δ of a sample at the present θ, by its own linearisation point; and its target."""
-        controller = self.controller
-        if target is None:
-            target = sample.cost + self.scenario.discount * sample.next_policy.value
-        controller.prepare_at(sample.point)
-        return target - controller.feedback(sample.s, sample.a).value, target
+        self.interaction = looped(QLearning, plant, self.controller, configuration, seed=11)
+        self.algorithm = self.interaction.algorithm
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
 from learning.configuration import Configuration
-from learning.loop import TrainingLoop
 from learning.step import ConstrainedStep, Fit, least_eigenvalue
 from learning.training_run import starting_parameters
 from tests.helpers.carrier import Carrier
 from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
+from tests.helpers.training import looped
 
 SAMPLES = 240
 SETTINGS = {
@@ -39,11 +39,9 @@ def learnt(scenario, cls, start, units):
     """θ and actions of a run of the rule alone."""
     configuration = cls.Configuration.from_dict(SETTINGS[cls])
     controller = RtiNmpc(Problem.from_scenario(scenario), start)
-    strategy = configuration.strategy(scenario)
-    rule = cls(controller, scenario, configuration, SAMPLES, strategy, np.random.default_rng(0))
     plant = NoisyModel(scenario, *units)
-    loop = TrainingLoop(plant, controller, rule, strategy, np.random.default_rng(1))
-    loop.start(plant.reset(3))
+    loop = looped(cls, plant, controller, configuration, SAMPLES, exploration=1, seed=3)
+    rule = loop.algorithm
     actions, corrected = [], 0
     for _ in range(SAMPLES):
         sample, _ = loop.next()

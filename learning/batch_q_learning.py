@@ -104,7 +104,11 @@ class BatchQLearning(ValueRule):
             failures += replayed.failures
             if not len(replayed.rows):
                 break
-            td_error = self._td_error(replayed)
+            # The next penalty's expectation stands in its place.
+            corrections = self._average_cost.discount * self._batch["corrections"][replayed.rows]
+            td_error = replayed.target - replayed.action_value + corrections
+            if not np.isfinite(td_error).all():
+                raise DivergenceError("TD errors are not finite")
             if self._variance == 0.0:
                 self._begin_filter(td_error)
                 information = self._information
@@ -114,9 +118,8 @@ class BatchQLearning(ValueRule):
             information = self._information + gradient.T @ gradient / self._variance
             slope = gradient.T @ innovation / self._variance
             slope -= self._information @ (self._present - self._mean)
-            fit = _newton(information, slope)
-            size = float(np.sqrt(np.mean(td_error**2)))
-            update = self._step.take(self._average_cost.take(fit), size)
+            fit = self._average_cost.take(_newton(information, slope))
+            update = self._step.take(fit, float(np.sqrt(np.mean(td_error**2))))
         if update is None:
             raise DivergenceError("no transition of a batch can be replayed")
         self._information, self._mean = information, self._present
@@ -124,14 +127,6 @@ class BatchQLearning(ValueRule):
         share = min(len(td_error) / settings.variance_memory, 1.0)
         self._variance += share * (float(squares.mean()) - self._variance)
         return update._replace(failures=failures)
-
-    def _td_error(self, replayed: Replayed) -> Vector:
-        """δ with the next penalty's expectation in its place, (K,)."""
-        corrections = self._average_cost.discount * self._batch["corrections"][replayed.rows]
-        td_error: Vector = replayed.td_error + corrections
-        if not np.isfinite(td_error).all():
-            raise DivergenceError("TD errors are not finite")
-        return td_error
 
     @property
     def _present(self) -> Vector:
@@ -166,11 +161,6 @@ class Replayed:
     target: Vector
     gradient: Matrix
     failures: int
-
-    @property
-    def td_error(self) -> Vector:
-        """δ = ℓ + γV(s₊) − Q(s, a), (K,)."""
-        return self.target - self.action_value
 
 
 class ReplayBuffer:

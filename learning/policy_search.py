@@ -36,13 +36,16 @@ class Coordinates:
 
     A Hessian B = LLᵀ becomes L exp(Z) Lᵀ, which is positive definite for every symmetric Z; its
     linear term b − 2B·δ, which moves the minimum by δ to first order; c_f, x_l and x_u move by δ.
-    δ is in units of the bounds' width, a tenth of that for c_f, which acts in each sample. The
-    initial cost λ_θ and the slack weights stay: the policy knows nothing of the first.
+    δ is in units of the bounds' width (of the reference where one is infinite), a tenth of that for
+    c_f, which acts in each sample. The initial cost λ_θ and the slack weights stay: the policy
+    knows nothing of the first.
     """
 
     def __init__(self, start: Parameters, scenario: Scenario, width: float) -> None:
         self._start = start
-        states = _unit(scenario.state_lower, scenario.state_upper, scenario.reference_state, width)
+        span = scenario.state_upper - scenario.state_lower
+        span = np.where(np.isfinite(span), span, np.abs(scenario.reference_state))
+        states = width * np.where(span > 0, span, 1.0)
         both = np.concatenate([states, scenario.action_upper - scenario.action_lower])
         both[states.size :] *= width
         self._factors = {name: np.linalg.cholesky(start[name]) for name in HESSIANS}
@@ -174,9 +177,3 @@ class PolicySearchSimulator(PolicySearch):
     """
 
     asks_for = "simulator"
-
-
-def _unit(lower: Vector, upper: Vector, reference: Vector, width: float) -> Vector:
-    """A share of the bounds' width, (n,), of the reference where a bound is infinite."""
-    span = np.where(np.isfinite(upper - lower), upper - lower, np.abs(reference))
-    return width * np.where(span > 0, span, 1.0)

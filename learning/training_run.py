@@ -29,16 +29,10 @@ from learning.loop import TrainingLoop
 Vector = NDArray[np.float64]
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
-LEAST = {
-    "samples": 1,
-    "seed": 0,
-    "log_every": 1,
-    "evaluate_every": 1,
-    "checkpoint_every": 1,
-    "evaluation_seeds": 1,
-    "evaluation_steps": 1,
-    "rest_after": 1,
-}
+EVERY = ("log_every", "evaluate_every", "checkpoint_every")
+LEAST = {"seed": 0} | dict.fromkeys(
+    ("samples", *EVERY, "evaluation_seeds", "evaluation_steps", "rest_after"), 1
+)
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,7 @@ class TrainingRun:
         for name, least in LEAST.items():
             if (value := getattr(self, name)) is not None and value < least:
                 raise ConfigurationError(f"{name} must be at least {least}, not {value}")
-        for name in ("evaluate_every", "checkpoint_every"):
+        for name in EVERY[1:]:
             if getattr(self, name) % self.log_every:
                 raise ConfigurationError(
                     f"{name} = {getattr(self, name)} must be a multiple of log_every = "

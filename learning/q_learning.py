@@ -110,6 +110,7 @@ class QLearningConfiguration(ValueConfiguration):
 class ValueRule(Algorithm):
     """What Q-learning has online and in batches: prediction errors, a mean cost, coordinates."""
 
+    # The scale first: it makes the mean cost that is taken up after it.
     KEPT: ClassVar[tuple[str, ...]] = ("scale", "_average_cost", "_errors")
 
     def __init__(self, *arguments: Any) -> None:

@@ -60,12 +60,11 @@ def test_a_search_explores_as_its_rule_does_and_takes_its_settings():
 
 
 @pytest.mark.parametrize("rule", SETTINGS)
-@pytest.mark.parametrize("at", [400])
-def test_a_restored_search_goes_on_as_the_first_one(scenario, rule, at):
-    """At 90 samples a phase of learning is open, at 400 a comparison."""
+def test_a_restored_search_goes_on_as_the_first_one(scenario, rule):
+    """At 400 samples a comparison is open."""
     with FmuPlant(scenario) as first, FmuPlant(scenario) as second:
         whole, resumed = learner(first, rule), learner(second, rule)
-        for _ in range(at):
+        for _ in range(400):
             whole.advance()
         whole.restart()
         second.restore(second.deserialise(first.serialise(first.snapshot())))

@@ -46,14 +46,6 @@ def train_start(run):
     return starting_parameters(Problem.from_scenario(run.scenario), run.configuration).theta
 
 
-def test_another_runs_checkpoint_is_refused(scenario, tmp_path):
-    run = make_run(scenario, "q-learning", samples=100)
-    train(run, tmp_path / "new" / "folder")
-    other = make_run(scenario, "q-learning", samples=100, seed=4)
-    with pytest.raises(CheckpointError, match="seed is 3 there and 4 here"):
-        train(other, tmp_path / "new" / "folder", resume=True)
-
-
 def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(scenario):
     run = make_run(scenario, "q-learning")
     result = train(run)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -84,6 +85,7 @@ class EmpiricalModel:
     `residuals` (M, K) are r, mean zero.
     """
 
+    KEPT: ClassVar = ("centre", "unit", "mean", "covariance", "residuals")
     features: Features
     centre: Array
     unit: Array
@@ -126,11 +128,6 @@ class EmpiricalModel:
             residuals = target - design @ mean
         residuals = np.concatenate([residuals - residuals.mean(axis=0), older])
         return cls(features, centre, unit, mean, covariance, residuals)
-
-    def arrays(self) -> dict[str, Array]:
-        """All but the features, by name."""
-        names = ("centre", "unit", "mean", "covariance", "residuals")
-        return {name: getattr(self, name) for name in names}
 
     def mean_error(self, inputs: Array, outputs: Array) -> tuple[Array, Array]:
         """Mean of the errors of prediction over h, (K,), and its derivative by `mean`, negative."""
@@ -192,33 +189,20 @@ class Rollout:
         shape, steps = (len(picks), self._features.outputs), len(picks)
         inputs = np.empty((steps, self._features.inputs))
         predicted, h = np.empty(shape), np.empty(shape)
-        if self.compiled is None:
-            steps = self._interpreted(theta, start, model, picks, inputs, predicted, h)
-        else:
+        if self.compiled is not None:
             given = (theta, start, *model.coefficients, model.residuals, picks)
             arrays = [np.ascontiguousarray(array) for array in given]
             where = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
             results = [array.ctypes.data_as(ctypes.c_void_p) for array in (inputs, predicted, h)]
             steps = self.compiled(*where, steps, *results)
-        return inputs[:steps], predicted[:steps], h[:steps]
-
-    def _interpreted(
-        self,
-        theta: Array,
-        start: Array,
-        model: EmpiricalModel,
-        picks: NDArray[np.int32],
-        inputs: Array,
-        predicted: Array,
-        h: Array,
-    ) -> int:
+            return inputs[:steps], predicted[:steps], h[:steps]
         problem, controller, s = self._problem, self._controller, start
         (c, W), a = model.coefficients, problem.reference_action
         controller.theta = theta
         controller.reset()
         for step, pick in enumerate(picks):
             if not np.isfinite(s).all():
-                return step
+                return inputs[:step], predicted[:step], h[:step]
             try:
                 controller.prepare()
                 a = np.clip(
@@ -231,7 +215,7 @@ class Rollout:
             predicted[step] = y[0] + G[0] @ c + W @ np.append(1.0, inputs[step])
             h[step] = size[0]
             s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
-        return len(picks)
+        return inputs, predicted, h
 
 
 def _design(G: Array, standardised: Array) -> Array:

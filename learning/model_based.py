@@ -23,7 +23,7 @@ from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.penalty import Penalty
 from learning.algorithm import Algorithm, Transition, Update
-from learning.checkpoint import group, prefixed
+from learning.checkpoint import group
 from learning.configuration import Configuration, Count
 from learning.empirical_model import EmpiricalModel, Features, Rollout
 from learning.prediction_errors import SortedErrors, expected_penalties
@@ -86,7 +86,10 @@ class ModelBased(Algorithm):
     """
 
     Configuration = ModelBasedConfiguration
-    KEPT = ("_rows", "back_off", "_pool", "_due", "_count", "_era", "_updated", "model_samples")
+    KEPT = (
+        *("_rows", "back_off", "_pool", "_due", "_count", "_era", "_updated", "model_samples"),
+        "_model",
+    )
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
 
@@ -185,15 +188,10 @@ class ModelBased(Algorithm):
         end = self.controller.theta
         return moved(present.blocks, present.theta, end, refused=not better)
 
-    def state(self) -> dict[str, NDArray[Any]]:
-        """The data, the model and how far the run is."""
-        model = {} if self._model is None else self._model.arrays()
-        return super().state() | prefixed("model ", model)
-
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
         super().restore(state)
-        if model := group(state, "model "):
+        if model := group(state, "_model "):
             self._model = EmpiricalModel(self._features, **model)
 
 

@@ -131,14 +131,11 @@ class PolicySearch(Algorithm):
         return self._coordinates.theta(self._search.mean).theta
 
     def observe(self, transition: Transition) -> Update | None:
-        """Count a sample's cost; the last of an episode brings the next candidate."""
-        return self._take(transition.cost)
+        """Count a sample's cost."""
+        return self.failed(transition.cost)
 
     def failed(self, cost: float) -> Update | None:
-        """Count the cost of a sample at which the controller failed."""
-        return self._take(cost)
-
-    def _take(self, cost: float) -> Update | None:
+        """Count a cost, the controller failed or not; the last of an episode brings a candidate."""
         self._sum += cost if self._step >= self._settling else 0.0
         self._step += 1
         if self._step < self.configuration.episode:

@@ -136,12 +136,6 @@ def write_archive(files: Mapping[str, bytes], target: Path) -> Path:
     return target
 
 
-def read_archive(path: Path) -> dict[str, bytes]:
-    """Every file in a zip archive by its path there."""
-    with zipfile.ZipFile(path) as container:
-        return {name: container.read(name) for name in container.namelist()}
-
-
 # No path, date or identification may enter the binary; no fused multiply-add may change a result.
 COMPILER_FLAGS = (
     "-std=c99",

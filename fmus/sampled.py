@@ -12,7 +12,7 @@ from fmus import BuildError
 from fmus.build import assemble, files_of, sources_of
 from fmus.description import render
 from fmus.evaporator import UNITS
-from fmus.model import C_IDENTIFIER, FmiVersion, Kind, Model, Unit, Variable
+from fmus.model import FmiVersion, Kind, Model, Unit, Variable
 
 _SAMPLES = 100
 
@@ -25,8 +25,7 @@ class SampledSystem:
     real variables: the inputs, then the outputs, then the tunable parameters; every output depends
     on every input and parameter. `sources` are C headers by name, of which ``core.h`` defines what
     ``sampled_sources/model_state.h`` lists; the arrays it is given and fills are ordered like the
-    signals. Raises BuildError on an identifier that is none in C, on names that are taken twice and
-    on a sampling time that is not positive.
+    signals. Raises BuildError on names that are taken twice.
     """
 
     name: str
@@ -38,10 +37,6 @@ class SampledSystem:
 
     def __post_init__(self) -> None:
         """Check what the model description and the C header rely on."""
-        if not C_IDENTIFIER.fullmatch(self.identifier):
-            raise BuildError(f"'{self.identifier}' is not a C identifier")
-        if not 0 < self.sampling_time < float("inf"):
-            raise BuildError(f"the sampling time must be positive, not {self.sampling_time}")
         variables = self.model.variables
         for names in ([v.name for v in variables], [v.identifier for v in variables]):
             if twice := next((name for name in names if names.count(name) > 1), None):

@@ -113,12 +113,7 @@ def build(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Folder for the FMUs; with FOLDER the .fmu file.",
-            show_default=False,
-        ),
+        typer.Option("--out", "-o", help="Folder for the FMUs; with FOLDER the .fmu file."),
     ] = None,
     platforms: Annotated[
         Platforms,

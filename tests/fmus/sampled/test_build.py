@@ -37,16 +37,9 @@ def test_a_rebuild_repeats_its_bytes(
     assert again.read_bytes() == built[1].read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"identifier": "no identifier"}, "not a C identifier"),
-        ({"sampling_time": 0.0}, "must be positive"),
-    ],
-)
-def test_a_wrong_table_is_refused(adder: SampledSystem, change: dict, message: str) -> None:
-    with pytest.raises(BuildError, match=message):
-        replace(adder, **change)
+def test_a_name_taken_twice_is_refused(adder: SampledSystem) -> None:
+    with pytest.raises(BuildError, match="two variables of adder are called 'u'"):
+        replace(adder, signals=(*adder.signals, adder.signals[0]))
 
 
 FULL_NAME = "#define fmi2FullName(name) name"

@@ -12,7 +12,6 @@ import pandas as pd
 
 from cosim.errors import EvaluationError, StudyError
 from cosim.files import replacing, temporary_folder
-from cosim.kpis import displaced
 from cosim.plant import FmuPlant
 from cosim.plugins import (
     OURS,
@@ -42,9 +41,9 @@ MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effor
 COMPARED = ("J", "economic_cost", "mean_violation", "violating_share")
 COLUMNS = [
     "controller", "scenario", "seed", "steps", "economic_cost", "mean_violation",
-    "violating_share", "J", "regret", "gap_closed", "gain_in_J", "input_effort", "settling_time",
-    "failures", "version", "versions", "code_hash", "scenario_hash", "fmu_sha256",
-    "parameters_hash", "command",
+    "violating_share", "J", "regret", "gap_closed", "gain_in_J", "input_effort", "failures",
+    "version", "versions", "code_hash", "scenario_hash", "fmu_sha256", "parameters_hash",
+    "command",
 ]  # fmt: skip
 
 
@@ -104,8 +103,6 @@ def evaluate(
         "command": command,
     } | ({"burn_in": burn_in} if burn_in else {})
     noise = {EVALUATION: Noise(numbers, steps, burn_in)}
-    # Under permanent disturbances nothing settles.
-    settles = scenario.disturbance.law == "none" and displaced(scenario) is not None
     runs, parameters = [], {}
     for name, item in named.items():
         controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
@@ -119,8 +116,8 @@ def evaluate(
             key = RunKey(scenario.name, name)
         except StudyError as error:
             raise EvaluationError(str(error)) from None
-        case, settle = Case(name, (scenario.name,), ""), settles and name in wanted
-        runs.append(Run(key, case, scenario, item, None, depends, noise, settle=settle))
+        case = Case(name, (scenario.name,), "")
+        runs.append(Run(key, case, scenario, item, None, depends, noise))
     check_folders(runs)
 
     tell = progress or (lambda samples, line: None)
@@ -140,8 +137,7 @@ def evaluate(
             }
             for file in (EVALUATION, TIMING)
         )
-        settling = {name: store.settling for name, store in stores.items()}
-    return Evaluation(wanted, numbers, columns, timing, settling, parameters, facts)
+    return Evaluation(wanted, numbers, columns, timing, parameters, facts)
 
 
 def _qualified(factory: Factory) -> str:
@@ -186,15 +182,13 @@ class Evaluation(Shown):
     """Indicators of controllers × seeds on common random numbers.
 
     `columns` and `timing` hold, by controller, what was measured: a frame with a row for each
-    seed. `settling` is the settling time in s, NaN where permanent disturbances let nothing
-    settle; `parameters` each controller's hash; `facts` are the columns that do not vary.
+    seed. `parameters` are each controller's hash; `facts` are the columns that do not vary.
     """
 
     controllers: Sequence[str]
     seeds: Sequence[int]
     columns: Mapping[str, pd.DataFrame]
     timing: Mapping[str, pd.DataFrame]
-    settling: Mapping[str, float]
     parameters: Mapping[str, str]
     facts: Mapping[str, Any]
 
@@ -253,7 +247,6 @@ class Evaluation(Shown):
                 **self.facts,
                 controller=name,
                 seed=self.seeds,
-                settling_time=self.settling[name],
                 parameters_hash=self.parameters[name],
                 regret=regrets(cost, self.optimal),
                 gap_closed=gaps_closed(cost, naive, self.optimal),
@@ -297,7 +290,7 @@ class Evaluation(Shown):
         """The evaluation as a JSON document: controllers, comparisons, provenance, timing.
 
         `controllers`: per controller the means over all seeds and samples, `failures` in total,
-        `settling_time` [s], `intervals` of each mean, where J* is known the `regret`
+        `intervals` of each mean, where J* is known the `regret`
         (J − J*)/|J*|, and where the naive controller is there too `gap_closed` =
         (J_naive − J)/(J_naive − J*). `comparisons`: for each pair, the paired difference
         controller − reference of each mean, and `gain_in_J`, (J_ref − J)/|J_ref|. Every interval
@@ -324,7 +317,6 @@ class Evaluation(Shown):
         document: dict[str, Any] = {key: one.pop("value") for key, one in estimates.items()}
         document |= {
             "failures": int(np.sum(self.column(name, "failures"))),
-            "settling_time": self.settling[name],
             "parameters_hash": self.parameters[name],
             "intervals": estimates,
         }

@@ -9,15 +9,8 @@ import numpy as np
 
 from cosim.penalty import VIOLATING
 from cosim.protocols import Array, Controller, Plant
-from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from cosim.trajectory import Trajectory
-
-DISPLACEMENT = 0.1
-BAND = 0.05
-LAST = 0.25
-ROUNDING = 1e-6
-"""Share of a state's value below which a way is none: a state that starts where it ends."""
 
 
 def indicators(run: Trajectory, burn_in: int = 0) -> dict[str, float]:
@@ -72,39 +65,3 @@ def input_effort(actions: Array, lower: Array, upper: Array) -> float:
     if len(actions) < 2:
         return 0.0
     return float(np.mean(np.sum(np.abs(np.diff(actions, axis=0)) / (upper - lower), axis=1)))
-
-
-def displaced(scenario: Scenario) -> Scenario | None:
-    """The scenario without disturbances, started away from x_s; None where that is impossible.
-
-    Every state starts `DISPLACEMENT` of its reference value above it, or below where the bounds
-    leave no room above; a state whose reference is zero starts there.
-    """
-    reference = scenario.reference_state
-    offset = DISPLACEMENT * np.abs(reference)
-    start = np.where(
-        reference + offset <= scenario.state_upper, reference + offset, reference - offset
-    )
-    if not np.any(offset) or not scenario.plant.mapping.initial_state:
-        return None
-    return scenario.replace(
-        {"plant": {"initial_state": start.tolist()}, "disturbance": {"law": "none"}}
-    )
-
-
-def settling_time(run: Trajectory) -> float:
-    """Time in s after which each state stays near its final value, within `BAND` of its way there.
-
-    The final value is the mean of the last `LAST` of the run, which must be one without
-    disturbances; NaN if a state still moves there by more than half its band: it has not settled.
-    """
-    states = run.states
-    tail = max(1, round(LAST * len(states)))
-    final = states[-tail:].mean(axis=0)
-    distance = np.abs(states - final)
-    band = np.maximum(BAND * distance[0], ROUNDING * np.abs(final))
-    if np.any(np.ptp(states[-tail:], axis=0) > band / 2):
-        return float("nan")
-    outside = np.any(distance > band, axis=1)
-    settled = int(np.flatnonzero(outside)[-1]) + 1 if np.any(outside) else 0
-    return float(run.time[settled])

@@ -153,10 +153,6 @@ def _show(summary: dict[str, Any], output: cli.Output) -> None:
         "regret %": [_interval(row.get("regret"), 100.0) for row in found.values()],
         "economic cost": [shown(row["economic_cost"], digits=6) for row in found.values()],
         "violating %": [f"{100 * row['violating_share']:.2f}" for row in found.values()],
-        "settling s": [
-            f"{row['settling_time']:.0f}" if isfinite(row["settling_time"]) else ""
-            for row in found.values()
-        ],
         "failures": [str(row["failures"]) for row in found.values()],
         "step µs": [
             f"{timing[name]['prepare_median_us'] + timing[name]['feedback_median_us']:.0f}"

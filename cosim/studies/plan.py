@@ -166,9 +166,9 @@ class Run:
     """One run: a controller, or a training and the θ that comes of it.
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `noise` is what it is measured on, by the file that keeps the indicators; `settle`
-    says whether its settling time is wanted; `traces` are runs kept sample by sample. `marks` are
-    the samples of operation at which θ, or the optimum, is judged.
+    training. `noise` is what it is measured on, by the file that keeps the indicators; `traces` are
+    runs kept sample by sample. `marks` are the samples of operation at which θ, or the optimum, is
+    judged.
     """
 
     key: RunKey
@@ -180,7 +180,6 @@ class Run:
     noise: Mapping[str, Noise]
     traces: tuple[TrajectoryTable, ...] = ()
     online: Online | None = None
-    settle: bool = False
     marks: tuple[int, ...] = ()
 
     @property

@@ -19,7 +19,7 @@ import loky
 from controllers import compile_functions
 from cosim.errors import EvaluationError, FailedRunsError
 from cosim.files import temporary_folder
-from cosim.kpis import displaced, measure, settling_time
+from cosim.kpis import measure
 from cosim.plant import FmuPlant
 from cosim.plant.archive import unpack
 from cosim.plugins import OURS, build_controller, code_hash, import_from
@@ -74,10 +74,10 @@ class Item:
     A `training` to its end, its checkpoint in `folder` where the workers share this disk. Else a
     controller for `steps` samples on each of the `seeds` after `burn_in`: its indicators for
     `file`; the run itself, where a `trace` is asked for; means over `block` samples, where that is
-    not 0; the time in which it comes to rest, where it shall `settle`. `samples` are those of all
-    the controller's items. The controller is a text for `build_controller`, a factory(scenario),
-    or the `training`'s with θ = `parameters`. A training in operation is judged at its `marks`; a
-    policy at the one that is its last, with the `theta` that it had then.
+    not 0. `samples` are those of all the controller's items. The controller is a text for
+    `build_controller`, a factory(scenario), or the `training`'s with θ = `parameters`. A training
+    in operation is judged at its `marks`; a policy at the one that is its last, with the `theta`
+    that it had then.
     """
 
     run: str
@@ -93,7 +93,6 @@ class Item:
     burn_in: int = 0
     trace: TrajectoryTable | None = None
     block: int = 0
-    settle: bool = False
     marks: tuple[int, ...] = ()
     theta: tuple[float, ...] = ()
     samples: int = 0
@@ -114,7 +113,7 @@ class Failure:
         return EvaluationError(self.message)
 
 
-Outcome = Trained | Measured | str | list[float] | float | Failure
+Outcome = Trained | Measured | str | list[float] | Failure
 
 
 def perform(item: Item) -> tuple[Item, Outcome]:
@@ -157,16 +156,13 @@ def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> T
     )
 
 
-def _simulate(item: Item) -> Measured | str | list[float] | float:
+def _simulate(item: Item) -> Measured | str | list[float]:
     controller = _controller(item)
     compile_functions(controller, item.samples)
-    scenario = displaced(item.scenario) if item.settle else item.scenario
-    assert scenario is not None
+    scenario = item.scenario
     if item.marks:
         scenario = operation.plant_at(scenario, item.marks[-1] * scenario.sampling_time)
     with FmuPlant(scenario) as plant:
-        if item.settle:
-            return settling_time(simulate(plant, controller, item.steps, 0, residuals=False))
         if item.trace is not None:
             return simulate(plant, controller, item.steps, item.seeds[0]).to_csv()
         if item.block:
@@ -287,8 +283,6 @@ class Runner:
                 self._done[name] += trace.steps
             else:
                 yield replace(base, trace=trace, seeds=(trace.seed,), steps=trace.steps)
-        if store.unsettled:
-            yield replace(base, settle=True, steps=run.noise[EVALUATION].steps)
         if (online := run.online) is not None:
             beside = store.missing_online()
             self._done[name] += online.steps * (len(online.seeds) - len(beside))
@@ -314,8 +308,6 @@ class Runner:
         if isinstance(outcome, str):
             assert item.trace is not None
             store.trace(item.trace, outcome)
-        elif isinstance(outcome, float):
-            store.settle(outcome)
         elif isinstance(outcome, list):
             store.accompany(item.seeds[0], outcome)
         else:

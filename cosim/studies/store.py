@@ -96,7 +96,7 @@ class RunStore:
         self.folder = out / run.key.folder
         self.remarks: list[str] = []
         """What was found changed or damaged, and is done anew."""
-        self._run, self._steps = run, str(run.noise[EVALUATION].steps)
+        self._run = run
         self._facts = json.loads(json.dumps(run.facts))
         self._known: dict[str, dict[int, Figures]] = {}
         self._unwritten: set[str] = set()
@@ -246,20 +246,6 @@ class RunStore:
         table = pd.DataFrame(rows).sort_values("seed", kind="stable")
         write_atomically(self.folder / ONLINE, to_csv(table))
 
-    @property
-    def settling(self) -> float:
-        """Settling time in s in a run as long as the plan's, NaN where it is not known."""
-        return float(self._about.get("settling", {}).get(self._steps, "nan"))
-
-    def settle(self, seconds: float) -> None:
-        """Store the settling time, as text since NaN is no JSON."""
-        self.note(settling=self._about.get("settling", {}) | {self._steps: repr(seconds)})
-
-    @property
-    def unsettled(self) -> bool:
-        """Whether the settling time is wanted and has not been measured."""
-        return self._run.settle and self._steps not in self._about.get("settling", {})
-
     def trace(self, trace: TrajectoryTable, trajectory: str) -> None:
         """Store a trajectory."""
         write_atomically(self.folder / trace.file, trajectory)
@@ -275,7 +261,6 @@ class RunStore:
             (self._run.training is None or bool(self.status))
             and not any(self.missing(file) for file in self._run.noise)
             and not self.missing_online()
-            and not self.unsettled
             and all((self.folder / trace.file).is_file() for trace in self._run.traces)
         )
 

@@ -88,13 +88,6 @@ def test_more_seeds_run_only_what_is_new(paper, tmp_path, ledger):
     assert len(ledger()) == 4
 
 
-def test_settling_is_measured_where_the_plant_comes_to_rest(paper):
-    noisy = evaluate(paper, {"naive": naive}, 1, 20)
-    assert np.isnan(noisy.settling["naive"])
-    quiet = evaluate("nominal", {"naive": naive}, 1, 400)
-    assert 0 < quiet.settling["naive"] < 400 * 60.0
-
-
 @pytest.mark.slow
 def test_a_killed_worker_loses_nothing(paper, tmp_path, ledger):
     broken = evaluate(paper, {"mortal": mortal}, 5, 20, folder=tmp_path / "out", jobs=2)

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.kpis import displaced, indicators, input_effort, settling_time
+from cosim.kpis import indicators, input_effort
 from cosim.plugins import build_controller
 from cosim.signals import signal_names
 from cosim.trajectory import Signal, Trajectory
-from tests.helpers.loop import Hold, Proportional
+from tests.helpers.loop import Proportional
 
 
 def run_with_states(scenario, time, states):
@@ -21,38 +21,6 @@ def test_input_effort_is_the_share_of_the_range_moved_per_sample():
     actions = np.array([[100.0, 200.0], [130.0, 200.0], [130.0, 170.0]])
     effort = input_effort(actions, np.array([100.0, 100.0]), np.array([400.0, 400.0]))
     assert effort == pytest.approx((0.1 + 0.1) / 2)
-
-
-def test_a_first_order_lag_settles_into_five_per_cent_after_three_time_constants(paper):
-    time = np.arange(2000) * 1.0
-    states = np.exp(-time / 50.0)[:, None] * np.array([2.0, -3.0]) + np.array([25.0, 50.0])
-    assert settling_time(run_with_states(paper, time, states)) == pytest.approx(
-        50.0 * np.log(20.0), abs=1.0
-    )
-
-
-def test_a_state_that_still_drifts_has_not_settled(paper):
-    time = np.arange(100) * 1.0
-    states = np.stack([np.exp(-time / 5.0), 1.0 - time / 100.0], axis=1)
-    assert np.isnan(settling_time(run_with_states(paper, time, states)))
-
-
-def test_a_state_that_never_moves_has_settled_from_the_start(paper):
-    time = np.arange(100) * 1.0
-    moving = np.exp(-time / 5.0)
-    constant = np.full(100, 0.1 + 0.2)
-    states = np.stack([moving, constant], axis=1)
-    assert settling_time(run_with_states(paper, time, states)) == pytest.approx(15.0, abs=1.0)
-    states = np.stack([constant, constant], axis=1)
-    assert settling_time(run_with_states(paper, time, states)) == 0.0
-
-
-def test_the_displaced_plant_starts_off_the_operating_point_and_is_not_disturbed(paper):
-    away = displaced(paper)
-    np.testing.assert_allclose(away.initial_state, 1.1 * paper.reference_state)
-    with FmuPlant(away) as plant:
-        run = simulate(plant, Hold(paper.reference_action), 5, 0)
-    np.testing.assert_array_equal(run.disturbances, np.tile([5.0, 10.0, 40.0, 25.0], (5, 1)))
 
 
 def test_indicators_are_the_definitions_applied_to_the_signals(paper):

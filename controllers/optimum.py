@@ -26,10 +26,11 @@ from controllers.dynamic_programming.bellman import (
 )
 from controllers.dynamic_programming.grid import Grid
 from controllers.dynamic_programming.policy_iteration import (
-    Certificate,
+    Figure,
     Optimum,
     Progress,
     Settings,
+    objection,
     solve,
 )
 from controllers.errors import ModelError, OptimumError, QpError
@@ -104,7 +105,6 @@ def keep(key: str, optimum: Optimum) -> Path:
 
 def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
     """Write a solved problem as a compressed .npz; equal content gives equal bytes."""
-    certificate = optimum.certificate
     document = {
         "key": key,
         "gain": optimum.gain,
@@ -112,7 +112,7 @@ def write_optimum(path: Path, optimum: Optimum, key: str) -> Path:
         "upper": optimum.upper,
         "accuracy": asdict(optimum.accuracy),
         "smooth": optimum.grid.smooth,
-        "certificate": None if certificate is None else certificate.to_list(),
+        "certificate": [figure._asdict() for figure in optimum.certificate] or None,
     }
     arrays: dict[str, Any] = {f"axis_{i}": axis for i, axis in enumerate(optimum.grid.axes)}
     arrays |= {name: getattr(optimum, name) for name in ("actions", "W", "distribution")}
@@ -135,14 +135,12 @@ def read_optimum(path: Path, key: str) -> Optimum:
             raise OptimumError(f"it holds the policy of problem {document['key']}, not of {key}")
         return Optimum(
             Grid(axes, smooth and tuple((float(a), float(b)) for a, b in smooth)),
-            arrays["actions"],
-            arrays["W"],
-            gain,
-            lower,
-            upper,
-            arrays["distribution"],
-            Accuracy(int(accuracy["substeps"]), nodes, penalty_nodes),
-            None if figures is None else Certificate.from_list(figures),
+            **{name: arrays[name] for name in ("actions", "W", "distribution")},
+            gain=gain,
+            accuracy=Accuracy(int(accuracy["substeps"]), nodes, penalty_nodes),
+            lower=lower,
+            upper=upper,
+            certificate=tuple(Figure(**figure) for figure in figures or ()),
         )
     except (OSError, KeyError, TypeError, ValueError, AttributeError, OptimumError) as error:
         raise OptimumError(
@@ -205,12 +203,8 @@ class OptimalPolicy:
         """
         plant = PlantProblem.from_scenario(scenario, overrides)
         key = optimum_key(plant, Settings())
-        path = stored_file(key)
-        if path is not None:
-            return cls(plant, read_optimum(path, key))
-        optimum = solve(plant, progress=progress)
-        keep(key, optimum)
-        return cls(plant, optimum)
+        path = stored_file(key) or keep(key, solve(plant, progress=progress))
+        return cls(plant, read_optimum(path, key))
 
     @classmethod
     def stored(
@@ -536,7 +530,5 @@ def yardstick(scenario: Scenario) -> Yardstick | None:
     if policy is None:
         return None
     certificate = policy.optimum.certificate
-    objection = "not certified" if certificate is None else certificate.objection()
-    if objection is None:
-        return Yardstick(policy.gain, "optimum", policy)
-    return Yardstick(policy.gain, "reference", policy, objection)
+    doubt = objection(certificate) if certificate else "not certified"
+    return Yardstick(policy.gain, "reference" if doubt else "optimum", policy, doubt or "")

@@ -173,11 +173,8 @@ class Grid:
         return [axis_interpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
 
     def resample(self, values: Array, other: Grid) -> Array:
-        """Values (G,) or (G, k), interpolated multilinearly at the states of another grid."""
-        x = list(other.points.T)
-        linear = Grid(self.axes)
-        if values.ndim == 1:
-            return linear.interpolate(values, x)
+        """Values (G, k), interpolated multilinearly at the states of another grid."""
+        x, linear = list(other.points.T), Grid(self.axes)
         return np.stack([linear.interpolate(column, x) for column in values.T], axis=1)
 
 

@@ -84,10 +84,10 @@ def _solve(
     from controllers import optimum as store
     from controllers.dynamic_programming.bellman import PlantProblem
     from controllers.dynamic_programming.policy_iteration import (
-        Certificate,
         Row,
         Settings,
         certify,
+        objection,
         solve,
         study,
     )
@@ -106,13 +106,11 @@ def _solve(
             found = certify(plant, rows)
             if against is not None:
                 searched = _search_figure(against, found, plant, task)
-                assert found.certificate is not None
-                figures = (*found.certificate.figures, searched)
-                found = replace(found, certificate=Certificate(figures))
+                found = replace(found, certificate=(*found.certificate, searched))
         path = path or store.keep(key, found)
     certificate = found.certificate
-    objection = certificate.objection() if certificate else "no certificate; make one with --refine"
-    kind = "reference" if objection else "optimum"
+    why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
+    kind = "reference" if why_not else "optimum"
     shown = [
         (
             row.name,
@@ -124,22 +122,22 @@ def _solve(
     ]
     header = ("", "J", "J* ≥", "J* ≤", "states", "nodes", "penalty nodes", "change")
     out_.table(f"{kind} of {task.name}", header, shown)
-    if certificate is not None:
-        shown = [(f.name, *(f"{x:.2f}" for x in f[1:])) for f in certificate.figures]
+    if certificate:
+        shown = [(f.name, *(f"{x:.2f}" for x in f[1:])) for f in certificate]
         out_.table("certificate", ("", "J", "from", "to"), shown)
-    if objection is not None:
-        out_.note(f"not called J*: {objection}")
+    if why_not is not None:
+        out_.note(f"not called J*: {why_not}")
     return {
         "scenario": task.name,
         "kind": kind,
-        "objection": objection,
+        "objection": why_not,
         "J": found.gain,
         "lower": found.lower,
         "upper": found.upper,
         "edge_mass": found.edge_mass,
         "file": str(path),
-        "stable": objection is None and all(row.stable for row in rows[-2:]),
-        "certificate": certificate.to_list() if certificate else None,
+        "stable": why_not is None and all(row.stable for row in rows[-2:]),
+        "certificate": [figure._asdict() for figure in certificate] or None,
         "rows": [row.to_dict() for row in rows],
     }
 
@@ -160,9 +158,8 @@ def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) 
             for each in (factories.from_file(scenario, theta), OptimalPolicy(plant, found))
         ]
     difference = mean(np.array(J[0]) - np.array(J[1]))
-    assert found.certificate is not None and difference.t is not None
-    base = found.certificate["simulation"]
-    assert base is not None
+    assert difference.t is not None
+    base = next(figure for figure in found.certificate if figure.name == "simulation")
     value = base.value + difference.value
     half_width = 0.5 * np.hypot(difference.t[1] - difference.t[0], base.upper - base.lower)
     return Figure(SEARCH, value, value - float(half_width), value + float(half_width))

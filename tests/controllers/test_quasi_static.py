@@ -132,7 +132,7 @@ def test_without_its_certificate_an_optimum_is_a_reference(tmp_path, monkeypatch
     known = OptimalPolicy.stored(Scenario.load("paper"))
     key = store.optimum_key(known._plant, Settings())
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    store.keep(key, replace(known.optimum, certificate=None))
+    store.keep(key, replace(known.optimum, certificate=()))
     monkeypatch.setattr(store, "SHIPPED", tmp_path / "none")
     found = yardstick(Scenario.load("paper"))
     assert (found.kind, found.note) == ("reference", "not certified")

@@ -7,12 +7,7 @@ import pytest
 
 from controllers import optimum as store
 from controllers.dynamic_programming.bellman import DisturbanceLaw, PlantProblem
-from controllers.dynamic_programming.policy_iteration import (
-    Certificate,
-    Figure,
-    Settings,
-    solve,
-)
+from controllers.dynamic_programming.policy_iteration import Figure, Settings, solve
 from controllers.errors import OptimumError
 from controllers.problem import Problem
 from cosim import Scenario
@@ -25,7 +20,7 @@ P = PROBLEM.model.nominal_parameters
 
 @pytest.fixture(scope="module")
 def optimum():
-    certificate = Certificate((Figure("solution", 1.0, 0.9, 1.1),))
+    certificate = (Figure("solution", 1.0, 0.9, 1.1),)
     return replace(solve(SCALAR.plant, Settings(level=0)), certificate=certificate)
 
 

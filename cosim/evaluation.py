@@ -232,12 +232,6 @@ class Evaluation(Shown):
             return np.full(len(self.seeds), np.nan)
         return self.column(controller, "J")
 
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """The rows of `to_pandas` as mappings."""
-        found: list[dict[str, Any]] = self.to_pandas().to_dict("records")
-        return found
-
     def to_pandas(self) -> pd.DataFrame:
         """A row for each controller, as given, and seed; NaN where an indicator is undefined."""
         naive, frames = self._cost(self.naive), []

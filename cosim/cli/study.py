@@ -104,23 +104,24 @@ def _execute(
 
 @app.command("plan")
 def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
-    """Show what a study will do, and about how long: nothing is trained or written."""
+    """Show the runs of a study and the plant samples that they take: nothing is run or written."""
     with cli.output(json) as out_:
-        from cosim.studies.estimate import estimate
+        import pandas as pd
+
         from cosim.studies.plan import Study, plan
 
         planned = plan(Study.load(file))
-        rows = estimate(planned)
-        seconds = float(rows.seconds.sum())
-        rows["minutes"] = [f"{value / 60:.1f}" for value in rows.pop("seconds")]
+        runs = pd.DataFrame(
+            [(run.key.scenario, run.key.case, 1, run.samples) for run in planned.runs],
+            columns=["scenario", "case", "runs", "plant samples"],
+        )
+        rows = runs.groupby(["scenario", "case"], sort=False, as_index=False).sum()
         out_.table(
             f"{planned.definition.name}: {len(planned.runs)} runs, {planned.samples} plant samples",
-            ("scenario", "case", "runs", "training samples", "evaluation samples", "CPU minutes"),
+            tuple(rows),
             rows.astype(str).to_numpy().tolist(),
         )
-        out_.note(f"about {seconds / 3600:.2f} h of one core, as fast as this one is now")
-        timing = {"estimated_seconds": seconds}
-        out_.json({"runs": len(planned.runs), "samples": planned.samples, "timing": timing})
+        out_.json({"runs": len(planned.runs), "samples": planned.samples})
 
 
 @app.command()
@@ -232,7 +233,7 @@ def check(
 
         local = Path("results")
         folder = folder or (local if local.is_dir() else stored.stored_results())
-        tolerances, studies = stored.load_tolerances(folder), stored.stored_studies(folder)
+        studies, tolerances = stored.stored_studies(folder), stored.load_tolerances(folder)
         quick = names or [name for name, table in studies.items() if table.check]
         quick = stored.chosen(studies, quick)
         for name in quick:

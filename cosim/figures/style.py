@@ -31,6 +31,7 @@ SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BOUND = "#B2182B"
 REFERENCE = "#5A6570"
 INK = "#222222"
+END_SIZE = 6.5
 DASHED: Any = (0, (4, 2))
 _KNOWN = {
     "naive": "#7F7F7F",
@@ -228,22 +229,34 @@ def dot_rows(axes: Axes, rows: Sequence[Dots], looks: Mapping[str, Look]) -> Arr
     return np.concatenate([dots.values for dots in rows])
 
 
-def cost_axis(axes: Axes, values: Array, *, relative: bool) -> None:
-    """Scale the ordinate for costs: `regret_axis` where they are `relative`, else linear."""
-    if relative:
-        regret_axis(axes, "y", values)
-        return
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
-    margin = 0.05 * (high - low) or 1.0
-    axes.set_ylim(low - margin, high + margin)
-
-
 class EndLabel(NamedTuple):
     """A line's name as it is to be set, the ordinate at its end (data), and its colour."""
 
     text: str
     y: float
     color: str
+
+
+def cost_lines(
+    axes: Axes,
+    lines: Iterable[tuple[str, Array, Array, Mapping[str, Any]]],
+    levels: Mapping[str, float],
+    *,
+    relative: bool,
+) -> list[EndLabel]:
+    """Draw costs over samples, and levels as dashed lines; their names for `label_ends`.
+
+    A line is (name, samples (K,), costs (K,), style); `relative` costs are regrets in %.
+    """
+    labels = [EndLabel(plain(name), level, REFERENCE) for name, level in levels.items()]
+    for name, samples, costs, style in lines:
+        axes.plot(samples, costs, **style)
+        labels.append(EndLabel(plain(name), float(costs[-1]), style["color"]))
+    for level in levels.values():
+        axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
+    if relative:
+        regret_axis(axes, "y", np.concatenate([line.get_ydata() for line in axes.lines]))
+    return labels
 
 
 def samples_axis(axes: Axes, end: float, text: str = "") -> None:
@@ -260,28 +273,23 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
     """
     drawn.draw_without_rendering()
     for axes, own in labels:
-        if own:
-            _label_ends(axes, own)
-
-
-def _label_ends(axes: Axes, labels: Sequence[EndLabel], size: float = 6.5) -> None:
-    height = axes.get_window_extent().height * 72 / axes.figure.dpi
-    low, high = (axes.transData.transform((0, y))[1] for y in axes.get_ylim())
-    ends = np.array([axes.transData.transform((0, item.y))[1] for item in labels])
-    wanted = np.clip((ends - low) / (high - low), 0.0, 1.0)
-    order = np.argsort(-wanted, kind="stable")
-    placed = spread(wanted[order], 1.25 * size / height)
-    for position, index in zip(placed, order, strict=True):
-        item = labels[index]
-        arrow: Mapping[str, Any] = {
-            "arrowstyle": "-", "color": item.color, "linewidth": 0.5, "shrinkB": 0.0,
-            "shrinkA": 0.5, "relpos": (0.0, 0.5),
-        }  # fmt: skip
-        axes.annotate(
-            item.text, xy=(1.0, float(wanted[index])), xytext=(1.035, position),
-            xycoords="axes fraction", textcoords="axes fraction", fontsize=size, color=item.color,
-            va="center", ha="left", annotation_clip=False, arrowprops=dict(arrow),
-        )  # fmt: skip
+        height = axes.get_window_extent().height * 72 / axes.figure.dpi
+        low, high = (axes.transData.transform((0, y))[1] for y in axes.get_ylim())
+        ends = np.array([axes.transData.transform((0, item.y))[1] for item in own])
+        wanted = np.clip((ends - low) / (high - low), 0.0, 1.0)
+        order = np.argsort(-wanted, kind="stable")
+        placed = spread(wanted[order], 1.25 * END_SIZE / height) if own else ()
+        for position, index in zip(placed, order, strict=True):
+            item = own[index]
+            arrow: Any = {
+                "arrowstyle": "-", "color": item.color, "linewidth": 0.5, "shrinkB": 0.0,
+                "shrinkA": 0.5, "relpos": (0.0, 0.5),
+            }  # fmt: skip
+            axes.annotate(
+                item.text, xy=(1.0, float(wanted[index])), xytext=(1.035, position),
+                xycoords="axes fraction", textcoords="axes fraction", fontsize=END_SIZE,
+                color=item.color, va="center", ha="left", annotation_clip=False, arrowprops=arrow,
+            )  # fmt: skip
 
 
 def spread(positions: Array, gap: float) -> Array:

@@ -13,11 +13,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FuncFormatter
 
 from cosim.figures.style import (
-    DASHED,
-    REFERENCE,
     SERIES,
     EndLabel,
-    cost_axis,
+    cost_lines,
     figure,
     label_ends,
     percent,
@@ -108,22 +106,16 @@ def _cost(
         values = np.asarray(cost, dtype=np.float64)
         return values if best is None else 100 * regrets(values, best)
 
-    labels, everything = [], [shown(level) for level in baselines.values()]
+    lines = []
     for name, color, text in (("J", TRAINING, "training"), ("greedy_J", GREEDY, "greedy")):
         samples, cost = _known(log, name)
         if name == "greedy_J" and np.isfinite(start):
             samples, cost = np.append(0.0, samples), np.append(start, cost)
         if cost.size:
             marker = "o" if name == "greedy_J" else ""
-            axes.plot(samples, shown(cost), marker=marker, color=color, **_LINE)
-            labels.append(EndLabel(text, float(shown(cost)[-1]), color))
-            everything.append(shown(cost))
-    for name, level in baselines.items():
-        axes.axhline(float(shown(level)), color=REFERENCE, linewidth=0.8, linestyle=DASHED)
-        labels.append(EndLabel(plain(name), float(shown(level)), REFERENCE))
-    values = np.concatenate([np.ravel(values) for values in everything])
-    cost_axis(axes, values, relative=best is not None)
-    return labels
+            lines.append((text, samples, shown(cost), _LINE | {"marker": marker, "color": color}))
+    levels = {name: float(shown(level)) for name, level in baselines.items()}
+    return cost_lines(axes, lines, levels, relative=best is not None)
 
 
 def _course(axes: Axes, samples: Array, values: Array, color: str, least: float) -> None:

@@ -19,7 +19,7 @@ from cosim.figures.style import (
     Dots,
     EndLabel,
     Look,
-    cost_axis,
+    cost_lines,
     dot_rows,
     figure,
     label,
@@ -102,8 +102,7 @@ def curves_figure(
         grid = drawn.subplots(2, 1, sharex=True)
         ends: list[list[EndLabel]] = []
         for axes, kind in zip(grid, ("training", "greedy"), strict=True):
-            labels = [EndLabel(plain(name), level, REFERENCE) for name, level in levels.items()]
-            reached = [np.array(list(levels.values()))]
+            lines = []
             for name, curve in curves.items():
                 values: Array = getattr(curve, kind)
                 color, line = looks[name]
@@ -112,16 +111,12 @@ def curves_figure(
                 if not values.size:
                     continue
                 low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
-                axes.plot(samples, middle, color=color, linestyle=line, linewidth=1.3)
+                style = {"color": color, "linestyle": line, "linewidth": 1.3}
+                lines.append((name, samples, middle, style))
                 if len(values) > 1 and len(curves) <= BANDED:
                     axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
-                labels.append(EndLabel(plain(name), float(middle[-1]), color))
-                reached.append(middle)
-            for level in levels.values():
-                axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
-            cost_axis(axes, np.concatenate(reached), relative=relative)
-            axes.set_ylabel(f"{unit} of the {'training samples' if not ends else 'greedy policy'}")
-            ends.append(labels)
+            ends.append(cost_lines(axes, lines, levels, relative=relative))
+            axes.set_ylabel(f"{unit} of the {'greedy policy' if ends[1:] else 'training samples'}")
         end = max(float(curve.samples[-1]) for curve in curves.values())
         samples_axis(grid[1], end, "training samples")
         label_ends(drawn, zip(grid, ends, strict=True))

@@ -9,6 +9,7 @@ import shlex
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -245,12 +246,10 @@ def image(path: Path) -> dict[str, str]:
 
 def tables_html(tables: Sequence[Table]) -> str:
     """Tables as HTML, for notebooks."""
-    template = (
-        "{% for title, header, rows in tables %}<h4>{{ title }}</h4><table><tr>"
-        "{% for name in header %}<th>{{ name }}</th>{% endfor %}</tr>{% for row in rows %}<tr>"
-        "{% for text in row %}<td>{{ text }}</td>{% endfor %}</tr>{% endfor %}</table>{% endfor %}"
+    return "".join(
+        f"<h4>{escape(title)}</h4>" + pd.DataFrame(rows, columns=list(header)).to_html(index=False)
+        for title, header, rows in tables
     )
-    return Environment(autoescape=True).from_string(template).render(tables=tables)
 
 
 def date(path: Path) -> str:

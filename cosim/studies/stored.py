@@ -131,10 +131,6 @@ class _Tolerances(Table):
 def load_tolerances(folder: Path) -> dict[str, Tolerance]:
     """Tolerances by signal of a folder of stored studies; raises ResultsError."""
     path = folder / TOLERANCES
-    if not path.exists():
-        raise ResultsError(
-            f"'{path}' does not exist; name the folder of the results with --results"
-        )
     document = read_toml(path, f"'{path}'", ResultsError)
     try:
         return _Tolerances.model_validate(document).tolerance

@@ -136,11 +136,6 @@ class Candidate:
         """
         return np.maximum(self.realised, self.expected)
 
-    @property
-    def cost(self) -> float:
-        """Mean over the blocks."""
-        return float(self.costs.mean())
-
 
 class PairedComparison:
     """Decides which of two θ is cheaper, and counts the samples that this takes.
@@ -152,7 +147,7 @@ class PairedComparison:
     to `blocks` blocks of `block` samples.
     """
 
-    KEPT = ("_errors", "pooled")
+    KEPT = ("_errors", "_pooled")
     MEMORY = 6000
     """Prediction errors over which a penalty is expected: the tail is what counts."""
 
@@ -168,22 +163,14 @@ class PairedComparison:
         self.expected = float("nan")
         """Penalty expected of the latest block."""
         self._errors: Matrix = np.zeros((0, scenario.state_lower.size))
-        self.pooled = self._errors
+        self._pooled = self._errors
+        """The errors that the penalties of this round's blocks are expected with."""
         self.incumbent = Candidate(start.theta)
         self.base = self.incumbent
 
     def accept(self, candidate: Candidate) -> None:
         """Make a candidate the incumbent."""
         self.base = self.incumbent = candidate
-
-    @property
-    def pooled(self) -> Matrix:
-        """The prediction errors that the penalties of this round's blocks are expected with."""
-        return self._pooled
-
-    @pooled.setter
-    def pooled(self, errors: Matrix) -> None:
-        self._pooled, self._pool = errors, SortedErrors(errors)
 
     def spend(self, samples: int) -> None:
         """Count samples that are asked for; raises Spent where the limit leaves fewer."""
@@ -209,9 +196,9 @@ class PairedComparison:
         """Penalty expected of a block's predictions, its own where there is no pool yet."""
         if block.expected is not None:
             return block.expected
-        if len(block.predictions) and len(self._pool):
-            found = expected_penalties(self._penalty, block.predictions, self._pool)
-            return float(found.cumsum()[-1])
+        if len(block.predictions) and len(self._pooled):
+            pool = SortedErrors(self._pooled)
+            return float(expected_penalties(self._penalty, block.predictions, pool).cumsum()[-1])
         return block.penalty
 
     def renew(self, blocks: int, episode: int | None = None) -> Generator[Request, Result, None]:
@@ -219,7 +206,7 @@ class PairedComparison:
         self.spend(self.block)
         yield Settle(self.incumbent.theta, episode)
         # One pool for the whole round, or two θ would not be judged alike.
-        self.pooled = self._errors
+        self._pooled = self._errors
         self.base = self.incumbent = Candidate(self.incumbent.theta)
         for _ in range(blocks):
             yield from self.run(self.incumbent)
@@ -280,7 +267,7 @@ class PairedComparison:
 
     def _winner(self, finalists: list[Candidate]) -> Candidate:
         """The cheapest; the start, where it is not dearer by a standard error."""
-        best = min(finalists, key=lambda candidate: candidate.cost)
+        best = min(finalists, key=lambda candidate: float(candidate.costs.mean()))
         for candidate in finalists:
             start = np.array_equal(candidate.theta, self._start)
             if start and not cheaper(best.costs - candidate.costs):
@@ -315,112 +302,6 @@ def _patience(costs: Vector) -> float:
     return float(costs.std()) * len(costs)
 
 
-class LineSearch:
-    """Moves the base of a paired comparison along lines in θ, in steps that win.
-
-    `scale` (n_θ,) are the coordinates, the prior's standard deviations; `start` gives θ's blocks,
-    `inputs` is m.
-    """
-
-    DIRECTIONS = 4
-    CAP = 1.5
-    """Longest first step, in the prior's standard deviations."""
-
-    def __init__(
-        self, comparison: PairedComparison, start: Parameters, inputs: int, rng: np.random.Generator
-    ) -> None:
-        self._comparison, self._start, self._inputs, self._rng = comparison, start, inputs, rng
-        self.scale: Vector = np.ones(start.theta.size)
-
-    def along(self, direction: Vector, reach: float) -> Generator[Request, Result, float]:
-        """Line search both ways along a direction in scaled θ, (n_θ,), from a first step `reach`.
-
-        Steps that win over a quarter of the blocks are doubled, the longest that did is compared
-        over all. Returns the first step of the next time.
-        """
-        comparison = self._comparison
-        longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
-        origin, quarter = comparison.base.theta, max(len(comparison.base.realised) // 4, 1)
-        for sign in (1.0, -1.0):
-            step, best, costs = sign * min(reach, longest), 0.0, comparison.base.costs[:quarter]
-            while abs(step) <= 4.0 * longest:
-                found = yield from comparison.screen(
-                    origin + self.scale * (step * direction), costs
-                )
-                if found is None:
-                    break
-                best, costs = step, found.costs
-                step *= 2.0
-            while abs(best) >= min(reach, longest):
-                if (yield from comparison.compare(origin + self.scale * (best * direction))):
-                    return abs(best)
-                best *= 0.5
-        return 0.5 * reach
-
-    def tightening(self, state: int | None = None) -> Vector:
-        """All state bounds, or one state's, moved inwards by half their deviation, (n_θ,)."""
-        direction = np.zeros_like(self.scale)
-        for name, inwards in (("x_l", 0.5), ("x_u", -0.5)):
-            where = np.arange(direction.size)[self._start.blocks.slices[name]]
-            direction[where if state is None else where[state]] = inwards
-        return direction
-
-    def directions(self, *, turned: bool) -> Generator[Request, Result, Matrix]:
-        """Directions in scaled θ that change the policy by the exploration's σ, (n_θ, K)."""
-        comparison = self._comparison
-        comparison.spend(comparison.block)
-        block = yield Trial(comparison.base.theta, True, sensitive=True)
-        assert isinstance(block, Block) and block.metric is not None
-        values, vectors = np.linalg.eigh(block.metric * np.outer(self.scale, self.scale))
-        values, vectors = values[::-1][: self.DIRECTIONS], vectors[:, ::-1][:, : self.DIRECTIONS]
-        directions = vectors / np.sqrt(np.maximum(values, 1e-12))
-        if turned:
-            draw = self._rng.standard_normal((directions.shape[1],) * 2)
-            directions = directions @ np.linalg.qr(draw)[0]
-        found: Matrix = directions
-        return found
-
-    def rescale(self, decades: float) -> Generator[Request, Result, float]:
-        """Search over the inputs' weights in the stage cost; returns the next time's step.
-
-        With other weights the policy has another gain, and so another best back-off: each is given
-        its own, apart from the incumbent, before it is compared with it. Where that did not pay, a
-        shorter step the other way comes next.
-        """
-        comparison = self._comparison
-        found = False
-        while True:
-            kept, least = comparison.incumbent, comparison.least
-            theta = self._weighted(10.0**decades)
-            comparison.least = min(least, 0.5 * certificate(self._start.blocks, theta).smallest)
-            comparison.base = Candidate(theta)
-            pays = False
-            try:
-                for _ in range(len(kept.costs)):
-                    yield from comparison.run(comparison.base)
-                yield from self.along(self.tightening(), 0.5)
-                pays = cheaper(comparison.base.costs - kept.costs)
-            finally:
-                if pays:
-                    comparison.accept(comparison.base)
-                comparison.base = comparison.incumbent
-            if not pays:
-                comparison.least = least
-                return decades if found else -0.7 * decades
-            found = True
-
-    def _weighted(self, factor: float) -> Vector:
-        """The incumbent with its input weights multiplied, their minimum where it was, (n_θ,)."""
-        comparison = self._comparison
-        parameters = self._start.with_theta(comparison.base.theta)
-        hessian, gradient = parameters["B_l"], parameters["b_l"]
-        scale = np.ones(len(gradient))
-        scale[-self._inputs :] = factor**0.5
-        minimiser = np.linalg.solve(hessian, gradient)
-        hessian = hessian * np.outer(scale, scale)
-        return parameters.replace({"B_l": hessian, "b_l": hessian @ minimiser}).theta
-
-
 class SearchPlan:
     """Phases of learning, each followed by line searches on common noise.
 
@@ -446,6 +327,9 @@ class SearchPlan:
     """Share of the samples for the last comparison."""
     FINALISTS = 3.2
     """Runs over all blocks of the last comparison that its samples suffice for."""
+    DIRECTIONS = 4
+    CAP = 1.5
+    """Longest first step of a line search, in the prior's standard deviations."""
 
     def __init__(
         self,
@@ -467,7 +351,7 @@ class SearchPlan:
         self._rng = np.random.default_rng(seed)
         self.comparison = PairedComparison(scenario, start, samples, block=block, blocks=blocks)
         self._longer = 2 * blocks
-        self._lines = LineSearch(self.comparison, start, action_deviation.size, self._rng)
+        self._scale: Vector = np.ones(start.theta.size)
         self._past = [start.theta]
 
     def plan(self) -> Plan:
@@ -482,10 +366,8 @@ class SearchPlan:
         last = len(self._past) - 1
         order = dict.fromkeys([0, last, last // 2, *range(last - 1, 0, -1)])
         # The best of many moves is partly luck, and a round too short for what is rare.
-        rivals = [self._past[k] for k in order]
-        rivals = [
-            theta for theta in rivals if not np.array_equal(theta, self.comparison.incumbent.theta)
-        ]
+        incumbent = comparison.incumbent.theta
+        rivals = [self._past[k] for k in order if not np.array_equal(self._past[k], incumbent)]
         try:
             yield from comparison.final(rivals, blocks, int(self._rng.integers(2**31)))
         except Spent:
@@ -493,8 +375,8 @@ class SearchPlan:
 
     def _rounds(self) -> Plan:
         """Rounds without end; the samples are what ends them."""
-        comparison, lines = self.comparison, self._lines
-        back_off, weights, reach = 1.0, -1.0, np.full(lines.DIRECTIONS, 0.5)
+        comparison = self.comparison
+        back_off, weights, reach = 1.0, -1.0, np.full(self.DIRECTIONS, 0.5)
         bounds = [0.5] * self._states
         width, number, better, rescaled, failed, rest = 1.0, 0, True, False, 0, 0
         while True:
@@ -514,21 +396,21 @@ class SearchPlan:
             if not better:
                 comparison.blocks = self._longer
             rest = max(rest - 1, 0)
-            back_off = yield from lines.along(lines.tightening(), min(back_off, 1.0))
+            back_off = yield from self._along(self._tightening(), min(back_off, 1.0))
             unscaled = comparison.incumbent
-            weights = yield from lines.rescale(weights)
+            weights = yield from self._rescale(weights)
             rescaled = comparison.incumbent is not unscaled
             # While learning pays, searching would only cost samples.
             if not better:
                 for state in range(self._states):
-                    tightening = lines.tightening(state)
-                    bounds[state] = yield from lines.along(tightening, min(bounds[state], 1.0))
-                directions = yield from lines.directions(turned=number > 0)
+                    tightening = self._tightening(state)
+                    bounds[state] = yield from self._along(tightening, min(bounds[state], 1.0))
+                directions = yield from self._directions(turned=number > 0)
                 for j, direction in enumerate(directions.T):
-                    reach[j] = yield from lines.along(direction, float(np.clip(reach[j], 0.05, 1)))
-                way = (comparison.incumbent.theta - before) / lines.scale
+                    reach[j] = yield from self._along(direction, float(np.clip(reach[j], 0.05, 1)))
+                way = (comparison.incumbent.theta - before) / self._scale
                 if way.any():
-                    yield from lines.along(way, 0.5)
+                    yield from self._along(way, 0.5)
                 number += 1
             if not np.array_equal(before, self._past[-1]):
                 self._past.append(before)
@@ -560,7 +442,7 @@ class SearchPlan:
     def _measure(self, learned: Learned) -> None:
         """Take the coordinates of the searches from the latest data about the incumbent."""
         start = self._start.with_theta(self.comparison.incumbent.theta)
-        self._lines.scale = prior_deviation(
+        self._scale = prior_deviation(
             start,
             learned.state_deviation,
             learned.error_deviation,
@@ -569,6 +451,93 @@ class SearchPlan:
             PRIOR_WIDTH,
         )
         self.comparison.remember(learned.errors)
+
+    def _along(self, direction: Vector, reach: float) -> Generator[Request, Result, float]:
+        """Line search both ways along a direction in scaled θ, (n_θ,), from a first step `reach`.
+
+        Steps that win over a quarter of the blocks are doubled, the longest that did is compared
+        over all. Returns the first step of the next time.
+        """
+        comparison = self.comparison
+        longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
+        origin, quarter = comparison.base.theta, max(len(comparison.base.realised) // 4, 1)
+        for sign in (1.0, -1.0):
+            step, best, costs = sign * min(reach, longest), 0.0, comparison.base.costs[:quarter]
+            while abs(step) <= 4.0 * longest:
+                found = yield from comparison.screen(
+                    origin + self._scale * (step * direction), costs
+                )
+                if found is None:
+                    break
+                best, costs = step, found.costs
+                step *= 2.0
+            while abs(best) >= min(reach, longest):
+                if (yield from comparison.compare(origin + self._scale * (best * direction))):
+                    return abs(best)
+                best *= 0.5
+        return 0.5 * reach
+
+    def _tightening(self, state: int | None = None) -> Vector:
+        """All state bounds, or one state's, moved inwards by half their deviation, (n_θ,)."""
+        direction = np.zeros_like(self._scale)
+        for name, inwards in (("x_l", 0.5), ("x_u", -0.5)):
+            where = np.arange(direction.size)[self._start.blocks.slices[name]]
+            direction[where if state is None else where[state]] = inwards
+        return direction
+
+    def _directions(self, *, turned: bool) -> Generator[Request, Result, Matrix]:
+        """Directions in scaled θ that change the policy by the exploration's σ, (n_θ, K)."""
+        comparison = self.comparison
+        comparison.spend(comparison.block)
+        block = yield Trial(comparison.base.theta, True, sensitive=True)
+        assert isinstance(block, Block) and block.metric is not None
+        values, vectors = np.linalg.eigh(block.metric * np.outer(self._scale, self._scale))
+        values, vectors = values[::-1][: self.DIRECTIONS], vectors[:, ::-1][:, : self.DIRECTIONS]
+        directions = vectors / np.sqrt(np.maximum(values, 1e-12))
+        if turned:
+            draw = self._rng.standard_normal((directions.shape[1],) * 2)
+            directions = directions @ np.linalg.qr(draw)[0]
+        return np.asarray(directions)
+
+    def _rescale(self, decades: float) -> Generator[Request, Result, float]:
+        """Search over the inputs' weights in the stage cost; returns the next time's step.
+
+        With other weights the policy has another gain, and so another best back-off: each is given
+        its own, apart from the incumbent, before it is compared with it. Where that did not pay, a
+        shorter step the other way comes next.
+        """
+        comparison = self.comparison
+        found = False
+        while True:
+            kept, least = comparison.incumbent, comparison.least
+            theta = self._weighted(10.0**decades)
+            comparison.least = min(least, 0.5 * certificate(self._start.blocks, theta).smallest)
+            comparison.base = Candidate(theta)
+            pays = False
+            try:
+                for _ in range(len(kept.costs)):
+                    yield from comparison.run(comparison.base)
+                yield from self._along(self._tightening(), 0.5)
+                pays = cheaper(comparison.base.costs - kept.costs)
+            finally:
+                if pays:
+                    comparison.accept(comparison.base)
+                comparison.base = comparison.incumbent
+            if not pays:
+                comparison.least = least
+                return decades if found else -0.7 * decades
+            found = True
+
+    def _weighted(self, factor: float) -> Vector:
+        """The incumbent with its input weights multiplied, their minimum where it was, (n_θ,)."""
+        comparison = self.comparison
+        parameters = self._start.with_theta(comparison.base.theta)
+        hessian, gradient = parameters["B_l"], parameters["b_l"]
+        scale = np.ones(len(gradient))
+        scale[-self._action_deviation.size :] = factor**0.5
+        minimiser = np.linalg.solve(hessian, gradient)
+        hessian = hessian * np.outer(scale, scale)
+        return parameters.replace({"B_l": hessian, "b_l": hessian @ minimiser}).theta
 
 
 class SearchConfiguration(Configuration):
@@ -645,11 +614,6 @@ class EpisodeData:
         self._candidates: list[Vector] = []
         self._metric: Matrix = np.zeros((size, size))
         self._jacobians = 0
-
-    @property
-    def over(self) -> bool:
-        """Whether all samples are done."""
-        return self.done >= self.length
 
     def take(self, transition: Transition, theta: Vector | None = None) -> None:
         """Take a sample, and θ (n_θ,) after it, where that may be a candidate."""
@@ -760,14 +724,14 @@ class Search(Algorithm):
             update = self._learn(transition)
         else:
             self._episode.take(transition)
-        return self._next() if self._episode.over else update
+        return self._next() if self._episode.done >= self._episode.length else update
 
     def failed(self, cost: float) -> Update | None:
         """Count a sample at which the controller failed; its cost is the episode's."""
         if self._request is None:
             return None
         self._episode.fail(cost)
-        return self._next() if self._episode.over else None
+        return self._next() if self._episode.done >= self._episode.length else None
 
     def _open(self) -> None:
         """Make ready for the request that the plan has put."""

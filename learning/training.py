@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
 from importlib.metadata import version
 from itertools import islice
 from math import inf, isfinite, isnan
@@ -175,15 +174,30 @@ class Judge:
     def __init__(
         self, run: TrainingRun, plant: Plant, start: Parameters, optimum: Controller | None
     ) -> None:
-        self._run, self._plant, self._start, self._optimum = run, plant, start, optimum
+        self._run, self._plant = run, plant
         self._controller = nmpc(run.scenario, start, run.controller)
+        naive = Parameters.naive(Problem.from_scenario(run.scenario))
+        self._naive_cost = self._costs(nmpc(run.scenario, naive, run.controller))["J"]
+        self._optimal_cost = np.full(run.evaluation_seeds, np.nan)
+        self.start_J = float(self._costs(self._controller)["J"].mean())
+        """J of θ where the run starts."""
+        self.baselines = {"naive": float(self._naive_cost.mean())}
+        """J of naive and, where it is known, optimal."""
+        if optimum is not None:
+            self._optimal_cost = self._costs(optimum)["J"]
+            self.baselines["optimal"] = float(self._optimal_cost.mean())
+        # A cost may be negative, a profit say: the margin counts in its magnitude.
+        worst = max(self.baselines["naive"], self.start_J)
+        self.limit = worst + (run.divergence - 1) * abs(worst)
+        """Greedy J above which a run has diverged."""
 
     def verdict(self, theta: Array) -> dict[str, Any]:
         """The greedy policy at θ (n_θ,): means of `FIGURES`, `regret`, `gap_closed`.
 
         `regret_interval` is its 95 % interval over the runs; `failures` is a sum; None is unknown.
         """
-        costs = self._costs(theta)
+        self._controller.theta = theta
+        costs = self._costs(self._controller)
         means: dict[str, Any] = {name: float(costs[name].mean()) for name in FIGURES}
         beyond = regret(costs["J"], self._optimal_cost)
         gap = gap_closed(costs["J"], self._naive_cost, self._optimal_cost).value
@@ -195,46 +209,11 @@ class Judge:
             "gap_closed": gap if known else None,
         }
 
-    @property
-    def baselines(self) -> dict[str, float]:
-        """J on the held-out runs of naive and, where it is known, optimal."""
-        found = {"naive": float(self._naive_cost.mean())}
-        if self._optimum is not None:
-            found["optimal"] = float(self._optimal_cost.mean())
-        return found
-
-    @cached_property
-    def start_J(self) -> float:
-        """J on the held-out runs of θ where the run starts."""
-        return float(self._costs(self._start.theta)["J"].mean())
-
-    @property
-    def limit(self) -> float:
-        """Greedy J above which a run has diverged."""
-        # A cost may be negative, a profit say: the margin counts in its magnitude.
-        worst = max(float(self._naive_cost.mean()), self.start_J)
-        return worst + (self._run.divergence - 1) * abs(worst)
-
-    def _costs(self, policy: Array | Controller) -> dict[str, Array]:
-        """Indicators on the held-out seeds of the greedy policy at θ, or of a controller."""
-        if isinstance(policy, np.ndarray):
-            self._controller.theta = policy
-            policy = self._controller
+    def _costs(self, policy: Controller) -> dict[str, Array]:
+        """Indicators of a controller on the held-out seeds."""
         seeds = range(HELD_OUT, HELD_OUT + self._run.evaluation_seeds)
         compile_functions(policy, self._run.evaluation_steps * len(seeds))
         return indicators_of(self._plant, policy, seeds, self._run.evaluation_steps)
-
-    @cached_property
-    def _naive_cost(self) -> Array:
-        run = self._run
-        naive = Parameters.naive(Problem.from_scenario(run.scenario))
-        return self._costs(nmpc(run.scenario, naive, run.controller))["J"]
-
-    @cached_property
-    def _optimal_cost(self) -> Array:
-        if self._optimum is None:
-            return np.full(self._run.evaluation_seeds, np.nan)
-        return self._costs(self._optimum)["J"]
 
 
 @dataclass(frozen=True, repr=False)
@@ -456,11 +435,11 @@ def run_training(
     with FmuPlant(run.scenario) as plant, FmuPlant(run.scenario) as evaluation_plant:
         session = _Session(run, rule or load_algorithm(run.algorithm), plant, folder)
         compile_functions(session.loop.controller, run.samples)
-        judge = Judge(run, evaluation_plant, session.start, best)
         if resume:
             session.load()
         else:
             session.checkpoint()
+        judge = Judge(run, evaluation_plant, session.start, best)
         status = session.run_to_the_end(judge, progress)
         parameters = session.loop.parameters
         return Training(

@@ -8,7 +8,6 @@ from learning.search import (
     Block,
     Learn,
     Learned,
-    LineSearch,
     PairedComparison,
     SearchPlan,
     Settle,
@@ -153,9 +152,8 @@ def far(problem):
 
 @pytest.fixture
 def lines(scenario, far):
-    comparison = PairedComparison(scenario, far, 100_000, block=100, blocks=BLOCKS)
-    lines = LineSearch(comparison, far, 2, np.random.default_rng(0))
-    return comparison, lines
+    deviation = np.array([10.0, 10.0])
+    return SearchPlan(scenario, far, deviation, 100_000, 0, phase=800, block=100, blocks=BLOCKS)
 
 
 def minimiser(parameters):
@@ -164,12 +162,12 @@ def minimiser(parameters):
 
 def test_the_inputs_weights_are_found_each_with_its_own_back_off(lines, far):
     """With the back-off of before, a tenth of the weight would cost more: 30 > 0."""
-    comparison, lines = lines
+    comparison = lines.comparison
     plant = Bowl(far, 1e-2)
     same = lines._weighted(0.1)
     assert plant.cost(same) > plant.cost(far.theta)
     plant.drive(comparison.renew(BLOCKS))
-    assert plant.drive(lines.rescale(-1.0)) == -1.0
+    assert plant.drive(lines._rescale(-1.0)) == -1.0
     found = far.with_theta(comparison.incumbent.theta)
     assert np.diag(found["B_l"]) == pytest.approx([1.0, 1.0, 1e-2, 1e-2])
     assert found["x_l"][0] == pytest.approx(25.5, abs=0.5)
@@ -178,13 +176,13 @@ def test_the_inputs_weights_are_found_each_with_its_own_back_off(lines, far):
 
 
 def test_a_line_is_searched_both_ways_in_steps_that_double(lines, far):
-    comparison, lines = lines
+    comparison = lines.comparison
     plant = Bowl(far.replace({}), 1.0)
     # From 2.5 too high: the first way is the wrong one.
     high = far.replace({"x_l": far["x_l"] + [2.5, 0.0]})
     comparison.incumbent.theta = high.theta
     plant.drive(comparison.renew(BLOCKS))
-    reach = plant.drive(lines.along(lines.tightening(), 1.0))
+    reach = plant.drive(lines._along(lines._tightening(), 1.0))
     assert reach > 1.0
     assert plant.cost(comparison.incumbent.theta) < 0.4 * (plant.cost(high.theta) - 6300.0) + 6300.0
 

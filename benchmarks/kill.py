@@ -103,7 +103,7 @@ JOBS = (
     Job(
         "demo",
         "demo --samples 1000 --steps 20 --out out",
-        ("out/demo.csv", "out/learning.csv", "out/parameters.toml"),
+        ("out/evaluation.csv", "out/learning.csv", "out/parameters.toml"),
     ),
     Job("update", "results update --results out --jobs 2", ("out/runs/summary.csv",), _stored),
     Job("view", "view recorded/run.rrd --png out.png", (), _recording),

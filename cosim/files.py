@@ -160,6 +160,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 LARGEST = 1 << 24
 """Bytes of the largest document that is read."""
+DEEPEST = 100
+"""Tables within tables of the deepest one."""
 
 
 def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
@@ -186,7 +188,14 @@ def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str
 def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
     """Document of a TOML text; raises `error` where it is none."""
     try:
-        return tomllib.loads(text)
+        document = tomllib.loads(text)
+        deepest: list[Any] = [document]
+        for _ in range(DEEPEST):
+            tables = [t.values() if isinstance(t, dict) else t for t in deepest]
+            deepest = [value for t in tables for value in t if isinstance(value, dict | list)]
+        if deepest:
+            raise ValueError(f"it is nested more than {DEEPEST} deep")
+        return document
     # Nesting without end exhausts the parser's stack, a number without end Python's patience.
     except (ValueError, RecursionError) as cause:
         raise error(f"{origin} is not valid TOML: {cause}") from None

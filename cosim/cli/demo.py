@@ -28,25 +28,22 @@ def demo(
 ) -> None:
     """Let a controller whose model is wrong learn from its plant, and compare it.
 
-    The condenser of the evaporator is fouled and no controller is told. Writes demo.csv,
-    before-after.png, demo.rrd, summary.json, and of the training learning.csv, learning.png,
-    training.rrd, parameters.toml and scenario.toml.
+    The condenser of the evaporator is fouled and no controller is told. Writes
+    evaluation.csv, evaluation.png, timing.csv, summary.json, before-after.png, demo.rrd, and of the
+    training learning.csv, learning.png, training.rrd, parameters.toml and scenario.toml.
     """
     with cli.output(json) as out_:
-        import pandas
-
+        from cosim.cli.evaluate import show
         from cosim.cli.train import record_training
         from cosim.comparison import RunSignals
         from cosim.evaluation import evaluate
         from cosim.figures import overlay_figure, save
-        from cosim.files import temporary_folder, write_atomically
+        from cosim.files import temporary_folder
         from cosim.plant import FmuPlant
         from cosim.plugins import build_controller
         from cosim.recording import record_overlay
         from cosim.scenario import Scenario
         from cosim.simulation import simulate
-        from cosim.statistics import shown
-        from cosim.text_tables import markdown_table
         from learning.training import HELD_OUT
 
         scenario = Scenario.load(SCENARIO)
@@ -69,55 +66,24 @@ def demo(
                 name: simulate(plant, build_controller(named[name], scenario), steps, first)
                 for name in (NAIVE, LEARNT, OPTIMAL)
             }
-        rows: list[dict[str, Any]] = [
-            {
-                "controller": name,
-                "plant_samples": trained[name].plant_samples if name in trained else 0,
-                **{key: row[key] for key in ("J", "economic_cost", "violating_share", "failures")},
-                "regret": row["regret"]["value"],
-                "regret_interval": None if name == OPTIMAL else row["regret"]["t"],
-            }
-            for name, row in found.summary()["controllers"].items()
-        ]
-        title = f"{SCENARIO}, {RUNS} runs of {steps} samples, the same disturbances for all"
-        header = ("controller", "plant samples", "J", "regret %", "economic cost", "violating %")
-        cells = [
-            (
-                row["controller"],
-                str(row["plant_samples"]),
-                f"{row['J']:.1f}",
-                shown(row["regret"], row["regret_interval"], 100, 3),
-                f"{row['economic_cost']:.1f}",
-                f"{100 * row['violating_share']:.1f}",
-            )
-            for row in rows
-        ]
-        out_.table(title, header, cells)
+        summary = found.summary()
+        show(summary, out_)
+        found.write(folder)
         save(overlay_figure(runs), folder / "before-after.png")
         trained[LEARNT].save(folder)
-        about = f"# {title}\n\n{scenario.description}\n\n{markdown_table(header, cells)}"
         signals = {
             name: RunSignals(name, run.signals, run.status, scenario.limits)
             for name, run in runs.items()
         }
-        record_overlay(folder / "demo.rrd", signals, about)
+        record_overlay(folder / "demo.rrd", signals, scenario.description)
         record_training(folder / "training.rrd", trained[LEARNT])
-        flat = pandas.DataFrame(rows).drop(columns="regret_interval")
-        write_atomically(folder / "demo.csv", flat.to_csv(index=False, lineterminator="\n"))
         out_.note(
             f"pictures   {folder / 'before-after.png'}, {folder / 'learning.png'}\n"
             f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}   "
             f"(look at them with: cosim view {folder / 'demo.rrd'})\n"
             f"learnt θ   {folder / 'parameters.toml'}   (a controller's name in every command)"
         )
-        summary = {
-            "scenario": SCENARIO,
-            "steps": steps,
-            "seed": seed,
-            "controllers": rows,
-            "training": trained[LEARNT].summary(),
-        }
-        out_.json(summary, folder)
+        out_.json(summary | {"training": trained[LEARNT].summary()}, folder)
 
 
 def _train(

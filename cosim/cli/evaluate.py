@@ -90,7 +90,7 @@ def evaluate(
         summary = evaluation.summary()
         evaluation.write(folder)
         write_atomically(folder / "scenario.toml", task.to_toml())
-        _show(summary, out_)
+        show(summary, out_)
         out_.note(f"files are in {folder.resolve()}")
         out_.json(summary, folder)
 
@@ -140,7 +140,7 @@ def named_controllers(text: str) -> dict[str, str]:
     return named
 
 
-def _show(summary: dict[str, Any], output: cli.Output) -> None:
+def show(summary: dict[str, Any], output: cli.Output) -> None:
     """Print the table of controllers and the paired comparisons."""
     from cosim.statistics import shown
 

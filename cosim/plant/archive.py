@@ -7,7 +7,6 @@ import shutil
 import stat
 import threading
 import zipfile
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -137,13 +136,17 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     ends with this process. Raises OSError and what zipfile raises where the archive cannot be
     unpacked.
     """
+    from filelock import FileLock  # noqa: PLC0415 - `cosim --help` has no use for it
+
     cache = cache_folder("fmus")
     folder = cache / sha256
-    if _holds(folder, archive):
-        return folder
-    with temporary_folder(".partial-", cache) as partial:
-        archive.extractall(partial)
-        _publish(partial, folder, archive)
+    with FileLock(cache / f"{sha256}.lock"):
+        if not _holds(folder, archive):
+            # What runs from a damaged folder keeps its open files.
+            shutil.rmtree(folder, ignore_errors=True)
+            with temporary_folder(".partial-", cache) as partial:
+                archive.extractall(partial)
+                partial.rename(folder)
     return folder
 
 
@@ -158,21 +161,3 @@ def _holds(folder: Path, archive: zipfile.ZipFile) -> bool:
         )
     except OSError:
         return False
-
-
-def _publish(partial: Path, folder: Path, archive: zipfile.ZipFile) -> None:
-    """Rename a complete folder into its place, unless another process was first."""
-    damaged = partial.with_name(f"{partial.name}-damaged")
-    for _ in range(3):
-        try:
-            partial.rename(folder)
-        except OSError:
-            if _holds(folder, archive):
-                return
-            # What runs from a damaged folder keeps its open files.
-            with suppress(FileNotFoundError):
-                folder.rename(damaged)
-            shutil.rmtree(damaged, ignore_errors=True)
-        else:
-            return
-    raise OSError(f"folder '{folder}' cannot be replaced; delete it")

@@ -23,13 +23,6 @@ from cosim.recording.stream import (
     view,
 )
 
-_TOGETHER = {
-    "cost per sample": ("J", "greedy_J"),
-    "TD error": ("td_error",),
-    "regret": ("regret",),
-    "smallest eigenvalue": ("smallest_eigenvalue",),
-}
-
 
 def record_training(
     path: str | Path,
@@ -64,8 +57,16 @@ def record_training(
         ).see(values)
         for number, (name, values) in enumerate(log.items())
     }
-    last = int(samples[-1]) if len(samples) else 0
-    with Stream(path, title, _layout(blocks, columns, last)) as stream:
+    along = axis(samples=int(samples[-1]) if len(samples) else 0)
+    views = layout(
+        rrb.Tabs(
+            rrb.Grid(*(view(f"change of {n}", [b], along) for n, b in blocks.items()), name="θ"),
+            rrb.Grid(*(view(name, [c], along) for name, c in columns.items()), name="log"),
+            about_view("about this training"),
+        ),
+        SAMPLE,
+    )
+    with Stream(path, title, views) as stream:
         stream.properties(properties)
         stream.about(f"# {title}\n\n{table('training', properties)}\n")
         rows = times(samples.astype(np.int64))
@@ -73,30 +74,3 @@ def record_training(
             stream.send([block], rows, increments[name])
         for name, column in columns.items():
             stream.send([column], rows, log[name])
-
-
-def _layout(
-    blocks: Mapping[str, Channel], columns: Mapping[str, Channel], samples: int
-) -> rrb.Blueprint:
-    along = axis(samples=samples)
-    theta = [
-        view(f"change of {name}", [block], along, legend=len(block.labels) in (2, 3, 4))
-        for name, block in blocks.items()
-    ]
-    grouped = {
-        title: [columns[name] for name in names if name in columns]
-        for title, names in _TOGETHER.items()
-    }
-    shown = {channel.name for group in grouped.values() for channel in group}
-    figures = [view(title, group, along) for title, group in grouped.items() if group]
-    rest = [view(name, [column], along) for name, column in columns.items() if name not in shown]
-    more = rrb.Tabs(about_view("about this training"), rrb.Grid(*rest, name="the rest of the log"))
-    return layout(
-        rrb.Horizontal(
-            rrb.Grid(*theta, grid_columns=2),
-            rrb.Vertical(*figures),
-            more,
-            column_shares=[3, 3, 2],
-        ),
-        SAMPLE,
-    )

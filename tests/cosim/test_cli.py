@@ -11,24 +11,27 @@ def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_pat
     for folder in folders:
         code, out, err = cosim("demo", "--samples", 4000, "--steps", 100, "--out", folder, "--json")
         assert code == 0, err
-    rows = {row["controller"]: row for row in json.loads(out)["controllers"]}
+    summary = json.loads(out)
+    rows = summary["controllers"]
     assert list(rows) == ["naive", "tuned + back-off", "learnt", "optimal"]
     assert rows["optimal"]["J"] < rows["learnt"]["J"] < rows["naive"]["J"]
     assert rows["naive"]["violating_share"] > 0.3
-    assert rows["learnt"]["plant_samples"] == 4000
+    assert summary["training"]["plant_samples"] == 4000
     names = {path.name for path in folders[0].iterdir()}
     assert names == {
         "before-after.png",
-        "demo.csv",
         "demo.rrd",
+        "evaluation.csv",
+        "evaluation.png",
         "learning.csv",
         "learning.png",
         "parameters.toml",
         "scenario.toml",
         "summary.json",
+        "timing.csv",
         "training.rrd",
     }
-    for name in names - {"demo.rrd", "training.rrd"}:
+    for name in names - {"demo.rrd", "summary.json", "timing.csv", "training.rrd"}:
         assert (folders[0] / name).read_bytes() == (folders[1] / name).read_bytes(), name
 
 

@@ -30,7 +30,7 @@ def contents(folder):
 
 
 def entries(cache):
-    return list(cache.iterdir())
+    return [path for path in cache.iterdir() if path.suffix != ".lock"]
 
 
 def packed(archive):

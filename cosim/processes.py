@@ -196,14 +196,13 @@ def run_child(
     *,
     timeout: float,
     folder: Path | None = None,
-    env: Mapping[str, str] | None = None,
     log: IO[bytes] | int | None = None,
 ) -> int:
     """Exit code of a command that is run as `child_process` does.
 
     Raises subprocess.TimeoutExpired after `timeout` seconds, and OSError.
     """
-    with child_process(command, folder=folder, env=env, log=log) as child:
+    with child_process(command, folder=folder, log=log) as child:
         return child.wait(timeout)
 
 

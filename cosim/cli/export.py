@@ -51,7 +51,7 @@ def export(
     with output(json) as out_:
         from importlib.util import find_spec
 
-        from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
+        from cosim.cli import controller_fmu
         from cosim.errors import CosimError
         from cosim.plant import FmuPlant
         from cosim.scenario import Scenario
@@ -62,25 +62,23 @@ def export(
             if not target.parent.is_dir():
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
         loaded = Scenario.load(scenario)
-        rti = rti_controller(controller, loaded)
+        rti = controller_fmu.rti_controller(controller, loaded)
         if format_ is Format.C:
             if ssp is not None:
                 raise CosimError("--ssp connects FMUs: leave --format c out")
-            from cosim.cli.controller_fmu import write_c
-
-            summary = write_c(rti, loaded, out)
+            summary = controller_fmu.write_c(rti, loaded, out)
             out_.note(f"wrote {', '.join(summary['files'])} to {out}")
             out_.json(summary)
             return
         out_.announce(loaded.plant.fmu)
         with FmuPlant(loaded) as plant:
             units = plant.units
-        system = sampled_controller(rti, loaded, units)
+        system = controller_fmu.sampled_controller(rti, loaded, units)
         every_platform = not local and find_spec("ziglang") is not None
         version: FmiVersion = 3 if fmi == 3 else 2
         if ssp is not None and version != 2:
             raise CosimError("--ssp needs --fmi 2: SSP 1.0 connects FMUs of FMI 2.0")
-        path = write_fmu(system, rti, loaded, out, version, every_platform)
+        path = controller_fmu.write_fmu(system, rti, loaded, out, version, every_platform)
         platforms = [p.tuple for p in (PLATFORMS if every_platform else [present()])]
         out_.note(f"wrote {path}: FMI {version}.0 for {', '.join(platforms)}")
         document = {
@@ -93,8 +91,6 @@ def export(
             "sampling_time": loaded.sampling_time,
         }
         if ssp is not None:
-            from cosim.cli.controller_fmu import write_loop
-
-            document["ssp"] = str(write_loop(path, loaded, seed, ssp))
+            document["ssp"] = str(controller_fmu.write_loop(path, loaded, seed, ssp))
             out_.note(f"wrote {ssp}")
         out_.json(document)

@@ -11,8 +11,6 @@ import typer
 from cosim.cli.output import JsonOption, output, writable_folder
 
 DIFFERENT = 1
-SHOWN = 500
-"""Variables that a table shows."""
 
 app = typer.Typer(help="Look into an FMU, check it, build ours.")
 
@@ -66,12 +64,9 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
         rows = [
             (v["name"], v["causality"], v["unit"] or "",
              *(_short(v[key]) for key in ("start", "min", "max")))
-            for v in found["variables"][:SHOWN]
+            for v in found["variables"]
         ]  # fmt: skip
-        count = len(found["variables"])
-        out_.table(f"{count} variables", header, rows)
-        if count > SHOWN:
-            out_.note(f"the first {SHOWN} variables are shown; --json has all of them")
+        out_.table(f"{len(rows)} variables", header, rows)
         out_.json(found | {"refusals": refused})
 
 

@@ -213,12 +213,6 @@ def tuning(
             "active": dict(zip(steady.active, prices, strict=True)),
             "economic_eigenvalues": steady.eigenvalues.tolist(),
             "convexified_eigenvalues": convex.eigenvalues.tolist(),
-            "alpha": convex.alpha,
-            "beta": convex.beta,
-            "F": convex.F.tolist(),
-            "delta_P": convex.delta_P.tolist(),
-            "economic_gain": result.economic.gain.tolist(),
-            "tuned_gain": result.tuned.gain.tolist(),
             "gain_error": result.gain_error,
             "parameters": result.parameters.hash,
         }

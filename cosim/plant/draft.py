@@ -154,17 +154,12 @@ def _relative(path: Path, target: Path) -> str:
 def _comments(document: dict[str, Any], units: dict[str, str]) -> dict[str, str]:
     """Remark on each field and table by its dotted name."""
     plant, bounds = document["plant"], document["bounds"]
-    listed = {
-        field: ", ".join(f"{n} [{units[n]}]" if units.get(n) else n for n in plant[field])
-        for field in ("states", "actions", "disturbances")
-    }
     ranges = zip(plant["states"], bounds["state_lower"], bounds["state_upper"], strict=True)
     free = [name for name, low, high in ranges if not isfinite(low) and not isfinite(high)]
     comments = {
         "sampling_time": "s; CHECK",
-        **{f"plant.{field}": names or "none was found" for field, names in listed.items()},
+        "plant": "; ".join(f"{name} [{unit}]" for name, unit in units.items() if unit),
         "plant.stage_cost": "CHECK: a cost, not a profit",
-        "plant.initial_state": "the steady state below",
         "plant.mapping": "each reset writes these; what the FMU has no parameter for is left out",
         "bounds": "CHECK: states are bounded softly, by the penalty, actions hard; from min and max"
         + (f"; CHECK: the FMU states no bound of {', '.join(free)}" if free else ""),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterator, Sequence
 from math import ceil, inf
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,14 +79,6 @@ def has_start(variable: Any) -> bool:
     return variable.causality not in ("calculatedParameter", "independent")
 
 
-class SeedWord(NamedTuple):
-    """A variable that takes part of the seed: FMI type, value reference, width in bits."""
-
-    type: str
-    reference: int
-    bits: int
-
-
 class Wirer:
     """Looks up the variables of one FMU for one scenario; raises PlantError on any misfit."""
 
@@ -124,17 +116,16 @@ class Wirer:
                 values.append(value)
         return found
 
-    def seeds(self) -> list[SeedWord]:
-        """The variables that take the seed, low word first."""
+    def seeds(self) -> list[tuple[str, int]]:
+        """FMI type and value reference of the variables that take the seed, low word first."""
         words = []
         for name in self._scenario.plant.mapping.seed:
             variable = self._find(name, "plant.mapping.seed")
             if variable.type not in (*_WIDE, "Integer", "Int32", "UInt32"):
                 what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
                 raise self._misfit(name, "plant.mapping.seed", what)
-            bits = 64 if variable.type in _WIDE else 32
-            words.append(SeedWord(str(variable.type), int(variable.valueReference), bits))
-            if bits == 64:
+            words.append((str(variable.type), int(variable.valueReference)))
+            if variable.type in _WIDE:
                 break
         return words
 
@@ -175,7 +166,7 @@ class Wirer:
                 starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
         for name, value in scenario.plant.parameters.items():
             starts.append(self._start_value(name, float(value), "plant.parameters"))
-        return starts + [StartValue(word.reference, word.type, 0.0) for word in self.seeds()]
+        return starts + [StartValue(reference, kind, 0.0) for kind, reference in self.seeds()]
 
     def _start_value(self, name: str, value: float, table: str) -> StartValue:
         variable = self._find(name, table)
@@ -228,7 +219,7 @@ def _unit(variable: Any) -> str:
     return str(variable.unit or declared or "")
 
 
-def seed_words(seed: int, variables: Sequence[SeedWord]) -> list[tuple[str, int, int]]:
+def seed_words(seed: int, variables: Sequence[tuple[str, int]]) -> list[tuple[str, int, int]]:
     """A seed's words, each with type and value reference, for variables of `Wirer.seeds`.
 
     Raises PlantError for anything but an integer in [0, 2⁶⁴).
@@ -240,9 +231,10 @@ def seed_words(seed: int, variables: Sequence[SeedWord]) -> list[tuple[str, int,
     if not 0 <= number < 1 << 64:
         raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
     words, shift = [], 0
-    for word in variables:
-        words.append((word.type, word.reference, number >> shift & (1 << word.bits) - 1))
-        shift += word.bits
+    for kind, reference in variables:
+        bits = 64 if kind in _WIDE else 32
+        words.append((kind, reference, number >> shift & (1 << bits) - 1))
+        shift += bits
     return words
 
 

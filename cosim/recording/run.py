@@ -201,11 +201,6 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
 
 
 def _about(scenario: Scenario, properties: Mapping[str, object]) -> str:
-    linear, quadratic = scenario.penalty.linear, scenario.penalty.quadratic
-    weights = [
-        f"{b:g} v + {q:g} v² ({name})"
-        for name, b, q in zip(scenario.plant.states, linear, quadratic, strict=True)
-    ]
     return f"""# {scenario.name}
 
 {scenario.description}
@@ -214,7 +209,7 @@ def _about(scenario: Scenario, properties: Mapping[str, object]) -> str:
 
 **Time** is the plant's. Sample k of a state is what the controller measured; the input,
 disturbance and cost of sample k hold until sample k+1. The cost per sample is economic cost +
-penalty; the penalty of a violation v of the state bounds (red lines) is {", ".join(weights)}.
+penalty of violating the state bounds (red lines).
 
 **Predictions**: line +i is the QP's prediction, made at the cursor, of the sample i later.
 """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -104,9 +104,9 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
                 f"{problem.penalty_linear[i]:g} must exceed the bound's multiplier "
                 f"{abs(multipliers[i]):g}"
             )
-    active = []
+    active, quantities = [], (*model.states, *model.actions)
     for i in strict:
-        quantity = (*model.states, *model.actions)[i]
+        quantity = quantities[i]
         relation, bound = ("≥", lower[i]) if multipliers[i] > 0 else ("≤", upper[i])
         active.append(f"{quantity.name} {relation} {bound:g} {quantity.unit}".rstrip())
     return SteadyState(
@@ -124,8 +124,7 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     )
 
 
-@dataclass(frozen=True)
-class LocalFeedback:
+class LocalFeedback(NamedTuple):
     """Optimal u = K x of min Σ ½ wᵀHw, w = (x, u), x₊ = Ax + Bu, with value ½ xᵀPx.
 
     `gain` K (m, n); `value` P (n, n), symmetric; both for γ = 1.
@@ -158,7 +157,12 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
     if free.shape[1]:
         gain = gain + free @ _reduced_gain(A, B, H, gain, free)
     closed, stage = A + B @ gain, np.vstack([np.eye(n), gain])
-    return LocalFeedback(gain, _lyapunov(closed, stage.T @ H @ stage))
+    if np.abs(np.linalg.eigvals(closed)).max() >= 1:
+        raise TuningError("the active constraints, once kept, make the closed loop unstable")
+    # P = stage + closedᵀ P closed: the Riccati solver's P is accurate in the gain's part only.
+    system, cost = np.eye(n * n) - np.kron(closed.T, closed.T), stage.T @ H @ stage
+    P = np.linalg.solve(system, cost.reshape(-1)).reshape(n, n)
+    return LocalFeedback(gain, _symmetric(P))
 
 
 def _reduced_gain(A: Array, B: Array, H: Array, particular: Array, free: Array) -> Array:
@@ -179,20 +183,6 @@ def _reduced_gain(A: Array, B: Array, H: Array, particular: Array, free: Array) 
         raise TuningError("the steady state is no local minimum of the economic cost")
     gain: Array = -np.linalg.solve(curvature, b.T @ P @ a + s.T)
     return gain
-
-
-def _lyapunov(closed: Array, stage: Array) -> Array:
-    """P = stage + closedᵀ P closed; raises TuningError where the closed loop is unstable.
-
-    More accurate than the Riccati solver's P, of which only the gain's part is well conditioned.
-    """
-    n = len(closed)
-    if np.abs(np.linalg.eigvals(closed)).max() >= 1:
-        raise TuningError("the active constraints, once kept, make the closed loop unstable")
-    system = np.eye(n * n) - np.kron(closed.T, closed.T)
-    P = np.linalg.solve(system, stage.reshape(-1)).reshape(n, n)
-    symmetric: Array = 0.5 * (P + P.T)
-    return symmetric
 
 
 @dataclass(frozen=True)
@@ -264,7 +254,7 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     delta_P = symmetric_matrix(z[1 : count - n_F], n) / alpha
     F = symmetric_matrix(z[count - n_F : count], n_c) / alpha
     hessian = H + rotation(A, B, delta_P) + C.T @ F @ C
-    found = Convexification(0.5 * (hessian + hessian.T), delta_P, F, alpha, float(z[-2]))
+    found = Convexification(_symmetric(hessian), delta_P, F, alpha, float(z[-2]))
     if not found.eigenvalues[0] > 0:
         raise TuningError(
             f"the convexified cost is not positive definite (smallest eigenvalue "
@@ -319,20 +309,14 @@ class EconomicTuning:
 
 
 def tune(
-    problem: Problem,
-    blocks: ThetaBlocks | None = None,
-    *,
-    value_offset: float | None = None,
-    weight: float = 1e-3,
-    accuracy: float = 1e-8,
+    problem: Problem, blocks: ThetaBlocks | None = None, *, value_offset: float | None = None
 ) -> EconomicTuning:
     """Tune the NMPC so that its local feedback is that of the economic optimum.
 
     The economic cost is rotated by the costate λ of the optimal steady state, which leaves its
-    gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = `weight`,
-    published as 1e-3). For this the model is integrated in as many steps as bring the relative
-    error of a sample's A and B below `accuracy`, published as 1e-8; the controller's own model
-    keeps its `substeps`.
+    gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = 1e-3 as
+    published). For this the model is integrated in as many steps as bring the relative error of a
+    sample's A and B below 1e-8, as published; the controller's own model keeps its `substeps`.
     Then ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B], V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx with P
     the value of H̃ under γ = 1: the term in 1−γ, which the published procedure for γ = 1 does not
     need, makes P and its feedback those of the discounted problem as well, for any γ and horizon.
@@ -341,13 +325,11 @@ def tune(
     shall not be ℓ_s. θ is rounded to six digits. Raises TuningError where steady state, local
     optimum or convexification do not exist.
     """
-    steady = optimal_steady_state(
-        dataclasses.replace(problem, substeps=accurate_substeps(problem, accuracy))
-    )
+    steady = optimal_steady_state(dataclasses.replace(problem, substeps=accurate_substeps(problem)))
     n, A, B = problem.n_states, steady.A, steady.B
     try:
         economic = local_feedback(A, B, steady.hessian, steady.C)
-        convex = convexify(A, B, steady.hessian, steady.C, weight)
+        convex = convexify(A, B, steady.hessian, steady.C, 1e-3)
         tuned = local_feedback(A, B, convex.hessian, steady.C)
     except TuningError as error:
         raise TuningError(
@@ -376,8 +358,8 @@ def tune(
     return EconomicTuning(parameters, steady, convex, economic, tuned)
 
 
-def accurate_substeps(problem: Problem, accuracy: float) -> int:
-    """Runge–Kutta steps a sample with a relative error below `accuracy`, at the reference.
+def accurate_substeps(problem: Problem) -> int:
+    """Runge–Kutta steps a sample with a relative error below 1e-8, at the reference.
 
     The error is that of A and B: a steady state itself is integrated exactly by any number of
     steps. The problem's own number is doubled until doubling it once more changes less. Raises
@@ -397,11 +379,11 @@ def accurate_substeps(problem: Problem, accuracy: float) -> int:
     present = end(substeps)
     while substeps <= 1024:
         finer = end(2 * substeps)
-        if (np.abs(finer - present) <= accuracy * (1.0 + np.abs(present))).all():
+        if (np.abs(finer - present) <= 1e-8 * (1.0 + np.abs(present))).all():
             return substeps
         substeps, present = 2 * substeps, finer
     raise TuningError(
-        f"model '{model.name}' cannot be integrated to {accuracy:g} over a sample of "
+        f"model '{model.name}' cannot be integrated to 1e-08 over a sample of "
         f"{problem.sampling_time:g} s"
     )
 
@@ -413,10 +395,8 @@ def _rounded(block: Array) -> Array:
     return np.array(kept).reshape(block.shape)
 
 
-def _symmetric(matrix: Array) -> Array:
-    """Rounding made symmetric, as θ's packing demands."""
-    symmetric: Array = 0.5 * (matrix + matrix.T)
-    return symmetric
+def _symmetric(matrix: NDArray[np.floating[Any]]) -> Array:
+    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)
 
 
 def _short(array: Array) -> str:

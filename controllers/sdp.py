@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import clarabel
 import numpy as np
@@ -16,20 +16,14 @@ second_order = clarabel.SecondOrderConeT
 semidefinite = clarabel.PSDTriangleConeT
 
 
-class ConicSolution(NamedTuple):
-    """Minimiser `x`, None where there is none, and the solver's word for how it ended."""
-
-    x: Array | None
-    status: str
-
-
 def solve(
     P: Array, q: Array, A: Array, b: Array, cones: Sequence[Any], *, iterations: int = 200
-) -> ConicSolution:
+) -> tuple[Array | None, str]:
     """Solve min ½xᵀPx + qᵀx s.t. b − Ax in the product of the cones.
 
     P (d, d), of which the upper triangle is read, q (d,), A (c, d), b (c,). A cone of semidefinite
-    matrices takes the rows that `svec` gives.
+    matrices takes the rows that `svec` gives. Returns the minimiser, None where there is none, and
+    the solver's word for how it ended.
     """
     settings = clarabel.DefaultSettings()
     settings.verbose = False
@@ -38,9 +32,7 @@ def solve(
         sparse.csc_matrix(np.triu(P)), q, sparse.csc_matrix(A), b, list(cones), settings
     ).solve()
     status = str(solution.status)
-    return ConicSolution(
-        np.array(solution.x) if status in {"Solved", "AlmostSolved"} else None, status
-    )
+    return np.array(solution.x) if status in {"Solved", "AlmostSolved"} else None, status
 
 
 def svec(matrix: Array) -> Array:

@@ -45,11 +45,7 @@ class PrimalDual(NamedTuple):
 def _theta_part(
     problem: Problem, symbols: SymbolicTheta, y: PrimalDual, at: ca.SX, M: ca.SX | None
 ) -> ca.SX:
-    """All terms of the QP's Lagrangian in which θ appears, but for the model's own parameters.
-
-    `at` (n+m, N) are the points of linearisation; where the QP has the exact Hessian, M_k stands
-    for the derivative of the stage's second-order term with respect to L_k.
-    """
+    """Terms of the Lagrangian with θ but for p; `at` (n+m, N), M_k = ∂(second-order term)/∂L_k."""
     horizon, gamma, size = problem.horizon, problem.discount, at.size1()
     reference = np.concatenate([problem.reference_state, problem.reference_action])
     part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
@@ -81,10 +77,7 @@ def _parameter_gradient(
     u: ca.SX,
     exact: tuple[ca.SX, ca.SX] | None,
 ) -> ca.SX:
-    """∇_p of the QP's Lagrangian in the model parameters p, the sum of all stages' parts.
-
-    `exact` is (M, χ̄), where χ̄ are the costates at which the curvature D_k was taken.
-    """
+    """∇_p of the QP's Lagrangian; `exact` is (M, χ̄), χ̄ the costates where D_k was taken."""
     size = problem.n_states + problem.n_actions
     reference = ca.DM(np.concatenate([problem.reference_state, problem.reference_action]))
     of_stage = stage_parameter_gradient(problem, blocks, exact=exact is not None)

@@ -319,26 +319,36 @@ class Parameters(Shown):
         Raises ParameterError where the file is missing, is no TOML, has another schema, lacks or
         adds a key or a block, or where its values do not match its hash.
         """
-        document = _read_document(Path(path))
-        values = document["theta"]
+        document = read_toml(path, f"parameters file '{path}'", ParameterError)
+        if document.get("schema") != SCHEMA:
+            raise ParameterError(
+                f"{path}: schema is {document.get('schema')!r}; this version reads schema = "
+                f"{SCHEMA}"
+            )
+        if unknown := [repr(key) for key in document if key not in KEYS]:
+            raise ParameterError(
+                f"{path}: not known: {', '.join(unknown)}; a parameters file holds "
+                f"{', '.join(KEYS)}"
+            )
+        values, names = document.get("theta"), document.get("model_parameters", [])
+        if not isinstance(values, dict):
+            raise ParameterError(f"{path}: there is no table [theta]")
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ParameterError(f"{path}: model_parameters must be a list of names")
+        slack_weights = "w_sigma" in values or "W_sigma" in values
         try:
             blocks = ThetaBlocks.of(
-                problem,
-                slack_weights="w_sigma" in values or "W_sigma" in values,
-                model_parameters=tuple(document.get("model_parameters", ())),
+                problem, slack_weights=slack_weights, model_parameters=tuple(names)
             )
-        except ModelError as error:
-            raise ParameterError(f"{path}: {error}") from error
-        missing = [name for name in blocks.slices if name not in values]
-        unknown = [name for name in values if name not in blocks]
-        if missing or unknown:
-            raise ParameterError(
-                f"{path}: θ blocks missing: {', '.join(missing) or 'none'}; "
-                f"not known: {', '.join(unknown) or 'none'}"
-            )
-        try:
+            missing = [name for name in blocks.slices if name not in values]
+            unknown = [name for name in values if name not in blocks]
+            if missing or unknown:
+                raise ParameterError(
+                    f"θ blocks missing: {', '.join(missing) or 'none'}; "
+                    f"not known: {', '.join(unknown) or 'none'}"
+                )
             parameters = cls(blocks, np.zeros(blocks.size)).replace(values)
-        except ParameterError as error:
+        except (ModelError, ParameterError) as error:
             raise ParameterError(f"{path}: {error}") from error
         if document.get("hash", parameters.hash) != parameters.hash:
             raise ParameterError(
@@ -346,24 +356,6 @@ class Parameters(Shown):
                 f"{document['hash']}; delete its line `hash` if the values were edited on purpose"
             )
         return parameters
-
-
-def _read_document(path: Path) -> dict[str, Any]:
-    document = read_toml(path, f"parameters file '{path}'", ParameterError)
-    if document.get("schema") != SCHEMA:
-        raise ParameterError(
-            f"{path}: schema is {document.get('schema')!r}; this version reads schema = {SCHEMA}"
-        )
-    if unknown := [repr(key) for key in document if key not in KEYS]:
-        raise ParameterError(
-            f"{path}: not known: {', '.join(unknown)}; a parameters file holds {', '.join(KEYS)}"
-        )
-    if not isinstance(document.get("theta"), dict):
-        raise ParameterError(f"{path}: there is no table [theta]")
-    names = document.get("model_parameters", [])
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ParameterError(f"{path}: model_parameters must be a list of names")
-    return document
 
 
 @dataclass(frozen=True)

@@ -156,13 +156,13 @@ def definite(
     # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
     metric = fit.metric()
     unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
-    step = sdp.solve(
+    step, _ = sdp.solve(
         2 * metric / unit,
         -2 * fit.gradient / unit,
         np.vstack(matrices),
         np.concatenate(offsets),
         cones,
-    ).x
+    )
     if step is None:
         return theta, certificate(blocks, theta, corrected=True, refused=True)
     # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.

@@ -10,8 +10,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.errors import OptimumError
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
@@ -80,17 +78,6 @@ class Grid:
 
     axes: tuple[Array, ...]
     smooth: tuple[tuple[float, float], ...] | None = None
-
-    def __post_init__(self) -> None:
-        """Freeze and check the axes."""
-        axes = tuple(np.array(axis, dtype=np.float64) for axis in self.axes)
-        for axis in axes:
-            if axis.ndim != 1 or len(axis) < 2 or not (np.diff(axis) > 0).all():
-                raise OptimumError(
-                    f"grid: an axis needs at least two increasing points, not {axis}"
-                )
-            axis.flags.writeable = False
-        object.__setattr__(self, "axes", axes)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -163,10 +150,6 @@ class Grid:
 
         return function
 
-    def interpolate(self, values: Array, x: Sequence[Array]) -> Array:
-        """Interpolate `values` (G,) at states given as one array per entry of the state."""
-        return self.interpolant(values)(x)
-
     @cached_property
     def _interpolants(self) -> list[AxisInterpolant]:
         smooth = self.smooth or (None,) * len(self.axes)
@@ -175,7 +158,7 @@ class Grid:
     def resample(self, values: Array, other: Grid) -> Array:
         """Values (G, k), interpolated multilinearly at the states of another grid."""
         x, linear = list(other.points.T), Grid(self.axes)
-        return np.stack([linear.interpolate(column, x) for column in values.T], axis=1)
+        return np.stack([linear.interpolant(column)(x) for column in values.T], axis=1)
 
 
 def _polynomial(coefficients: Array, cell: Indices, offset: Array) -> Array:

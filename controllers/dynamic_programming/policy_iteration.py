@@ -93,12 +93,8 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     )
 
 
-class Feature(NamedTuple):
-    """An interval of an axis whose cells shall be no wider than `spacing`."""
-
-    first: float
-    last: float
-    spacing: float
+Feature = tuple[float, float, float]
+"""First and last point of an interval of an axis, and the width that its cells shall not exceed."""
 
 
 def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) -> Grid:
@@ -114,7 +110,7 @@ def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) 
     ):
         span = high - low
         spacing = max(0.5 * sigma, 1e-3 * span)
-        features = [Feature(x - spacing, x + spacing, spacing) for x in (low, centre, high)]
+        features = [(x - spacing, x + spacing, spacing) for x in (low, centre, high)]
         lower, upper = low - 0.1 * span, high + 0.1 * span
         marks = sorted({lower, low, centre, high, upper})
         axes.append(graded_axis(marks, features, settings.growth**2))
@@ -152,14 +148,14 @@ def finer_grid(
         ends = np.searchsorted(cumulative, (settings.tail, 1.0 - settings.tail))
         first, last = axis[max(ends[0] - 1, 0)], axis[min(ends[1] + 1, len(axis) - 1)]
         reference, width = problem.reference_state[i], last - first
-        features = [Feature(first, last, width / (settings.cells * 2**level))]
+        features = [(first, last, width / (settings.cells * 2**level))]
         bounds = [
             bound
             for bound in (problem.state_lower[i], problem.state_upper[i])
             if first - deviation[i] <= bound <= last + deviation[i]
         ]
         near = max(deviation[i], 1e-3 * span[i])
-        features += [Feature(b - near, b + near, near / 2**level) for b in bounds]
+        features += [(b - near, b + near, near / 2**level) for b in bounds]
         beyond = max(width, (1.0 if operator.deterministic else 0.05) * span[i])
         low = max(axis[0], min(first, reference) - beyond)
         high = min(axis[-1], max(last, reference) + beyond)
@@ -180,9 +176,9 @@ def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: flo
         fine = np.linspace(lower, upper, 4001)
         middle = 0.5 * (fine[1:] + fine[:-1])
         width = np.full(len(middle), upper - lower)
-        for feature in features:
-            distance = np.maximum(np.maximum(feature.first - middle, middle - feature.last), 0.0)
-            np.minimum(width, feature.spacing + (growth - 1.0) * distance, out=width)
+        for first, last, spacing in features:
+            distance = np.maximum(np.maximum(first - middle, middle - last), 0.0)
+            np.minimum(width, spacing + (growth - 1.0) * distance, out=width)
         count = np.append(0.0, np.cumsum(np.diff(fine) / width))
         cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
         inner = np.interp(np.arange(1, cells) * (count[-1] / cells), count, fine)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from string import Template
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,8 +14,7 @@ from numpy.typing import ArrayLike
 from controllers.errors import ControllerError
 from controllers.functions import BufferedFunction, StackedFunction, c_source
 from controllers.problem import Problem
-from controllers.rti.feedback import embedding, readout
-from controllers.rti.preparation import Exact, make_hessian, preparation
+from controllers.rti.preparation import Exact, embedding, make_hessian, preparation, readout
 from controllers.theta import Parameters, ThetaBlocks
 
 SOURCES = Path(__file__).parent / "sources"
@@ -105,18 +105,7 @@ def _functions(functions: Sequence[BufferedFunction]) -> str:
     own = re.compile(r"^casadi_real casadi_|^void casadi_|^casadi_int casadi_", re.MULTILINE)
     code = c_source([function.function for function in functions])
     code = own.sub(lambda found: f"static {found.group()}", code)
-    return (
-        "#define CASADI_SYMBOL_EXPORT static\n"
-        "#ifdef __GNUC__\n"
-        "#pragma GCC diagnostic push\n"
-        '#pragma GCC diagnostic ignored "-Wunused-function"\n'
-        '#pragma GCC diagnostic ignored "-Wunused-parameter"\n'
-        "#endif\n"
-        f"{code}"
-        "#ifdef __GNUC__\n"
-        "#pragma GCC diagnostic pop\n"
-        "#endif\n"
-    )
+    return _filled("functions.h.in", code=code)
 
 
 def _constants(
@@ -133,41 +122,27 @@ def _constants(
         work = {"ARG": of.sz_arg(), "RES": of.sz_res(), "IW": of.sz_iw(), "W": of.sz_w()}
         sizes |= {f"{prefix}_{name}": size for name, size in work.items()}
     sizes |= {f"THETA_{name}": part.start for name, part in blocks.slices.items()}
-    arrays: dict[str, ArrayLike] = {
-        "REFERENCE_STATE": problem.reference_state,
-        "REFERENCE_ACTION": problem.reference_action,
-        "ACTION_LOWER": problem.action_lower,
-        "ACTION_UPPER": problem.action_upper,
-        "PENALTY_LINEAR": problem.penalty_linear,
-        "PENALTY_QUADRATIC": problem.penalty_quadratic,
-        "DISCOUNTS": gamma ** np.arange(horizon),
-        "SLACK_DISCOUNTS": gamma ** np.arange(1, horizon + 1),
-    }
-    learned = "w_sigma" in blocks
-    linear = "((theta) + THETA_w_sigma)" if learned else "((void)(theta), PENALTY_LINEAR)"
-    quadratic = "((theta) + THETA_W_sigma)" if learned else "((void)(theta), PENALTY_QUADRATIC)"
-    if learned:
-        del arrays["PENALTY_LINEAR"], arrays["PENALTY_QUADRATIC"]
-    lines = [
-        "/* Generated: sizes and constants of the problem. */",
-        "#ifndef PROBLEM_H",
-        "#define PROBLEM_H",
-        "",
-        "enum {",
-        *(f"    {name} = {value}," for name, value in sizes.items()),
-        "};",
-        "",
-        *(_array(name, values) for name, values in arrays.items()),
-        "",
-        f"#define END_DISCOUNT {float(gamma**horizon)!r}",
-        f"#define FLOOR {Exact.FLOOR!r}",
-        f"#define SLACK_LINEAR(theta) {linear}",
-        f"#define SLACK_QUADRATIC(theta) {quadratic}",
-        f'#define HESSIAN_RULE "{RULES[hessian]}"',
-        "",
-        "#endif",
-    ]
-    return "\n".join(lines) + "\n"
+    vectors = ["reference_state", "reference_action", "action_lower", "action_upper"]
+    slack = {"linear": "((theta) + THETA_w_sigma)", "quadratic": "((theta) + THETA_W_sigma)"}
+    if "w_sigma" not in blocks:
+        vectors += ["penalty_linear", "penalty_quadratic"]
+        slack = {kind: f"((void)(theta), PENALTY_{kind.upper()})" for kind in slack}
+    arrays = {name.upper(): getattr(problem, name) for name in vectors}
+    arrays["DISCOUNTS"] = gamma ** np.arange(horizon)
+    arrays["SLACK_DISCOUNTS"] = gamma ** np.arange(1, horizon + 1)
+    return _filled(
+        "problem.h.in",
+        sizes="\n".join(f"    {name} = {value}," for name, value in sizes.items()),
+        arrays="\n".join(_array(name, values) for name, values in arrays.items()),
+        end_discount=repr(float(gamma**horizon)),
+        floor=repr(Exact.FLOOR),
+        rule=RULES[hessian],
+        **slack,
+    )
+
+
+def _filled(template: str, **values: str) -> str:
+    return Template((SOURCES / template).read_text(encoding="utf-8")).substitute(values)
 
 
 def _array(name: str, values: ArrayLike) -> str:

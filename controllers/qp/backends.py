@@ -195,7 +195,11 @@ class QpsolversBackend:
 
     def load(self, qp: SoftQp) -> None:
         """Raise QpError where the QP is not convex; it is built when it is solved."""
-        qp.require_convex()
+        try:
+            np.linalg.cholesky(qp.H)
+        except np.linalg.LinAlgError as error:
+            message = "the QP is not strictly convex"
+            raise QpError(message, status=NOT_CONVEX, qp=qp.copy()) from error
 
     def solve(self, qp: SoftQp) -> QpSolution:
         """Solve with the matrices and vectors of `qp`; raises QpError where the solver does not."""

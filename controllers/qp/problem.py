@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.errors import QpError
-
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,25 +52,6 @@ class SoftQp:
             name: value.copy() for name, value in vars(self).items() if name != "factor"
         }
         return SoftQp(**arrays)
-
-    def require_convex(self) -> None:
-        """Raise QpError where H is not positive definite; for backends that do not notice."""
-        try:
-            np.linalg.cholesky(self.H)
-        except np.linalg.LinAlgError as error:
-            raise QpError(
-                "the QP is not strictly convex", status=NOT_CONVEX, qp=self.copy()
-            ) from error
-
-    def slack(self, v: Vector) -> Vector:
-        """Least slack t ≥ 0 of each row at v."""
-        y = self.rows @ v
-        return np.maximum(np.maximum(self.row_lower - y, y - self.row_upper), 0.0)
-
-    def objective(self, v: Vector) -> float:
-        """Objective at v with the least slack."""
-        t = self.slack(v)
-        return float(0.5 * v @ self.H @ v + self.f @ v + self.w @ t + self.W @ (t * t))
 
 
 class Residuals(NamedTuple):
@@ -120,19 +99,12 @@ class QpSolution(NamedTuple):
         )
         sizes = np.abs(parts).max(axis=1).tolist()
         stationarity, bounds = sizes[0] / max(1.0, *sizes[2:]), sizes[1]
-        rows = float(np.abs(y - _proximal(y + lam, qp)).max())
+        # prox_φ(y + λ) of φ(y) = Σ w t + W t², t the violation of the row limits.
+        nearest = np.minimum(np.maximum(y + lam, qp.row_lower), qp.row_upper)
+        beyond = y + lam - nearest
+        shrunk = np.maximum(np.abs(beyond) - qp.w, 0.0) / (1 + 2 * qp.W)
+        rows = float(np.abs(y - (nearest + np.copysign(shrunk, beyond))).max())
         return Residuals(stationarity, bounds, rows)
-
-    def duality_gap(self, qp: SoftQp) -> float:
-        """Objective minus dual function, |·| relative to max(1, |objective|)."""
-        v, nu, lam = self
-        # The dual function at (ν, λ): minus the conjugates of the bounds and of the soft rows.
-        bound = np.where(nu > 0, nu * qp.upper, nu * qp.lower).sum()
-        over = np.maximum(np.abs(lam) - qp.w, 0.0)
-        soft = np.where(lam > 0, lam * qp.row_upper, lam * qp.row_lower).sum()
-        dual = -0.5 * float(v @ qp.H @ v) - bound - soft - float((over**2 / (4 * qp.W)).sum())
-        primal = qp.objective(v)
-        return abs(primal - float(dual)) / max(1.0, abs(primal))
 
     def weakly_active(self, qp: SoftQp, tolerance: float = 1e-6) -> bool:
         """Whether some bound or row is about to change its activity.
@@ -186,15 +158,6 @@ class QpSolution(NamedTuple):
             return 0.0
         norms = np.maximum(np.linalg.norm(gradients, axis=1, keepdims=True), 1e-300)
         return float(np.linalg.svd(gradients / norms, compute_uv=False)[-1])
-
-
-def _proximal(z: Vector, qp: SoftQp) -> Vector:
-    """prox_φ(z) of φ(y) = Σ w t + W t², t the violation of the row limits."""
-    nearest = np.minimum(np.maximum(z, qp.row_lower), qp.row_upper)
-    beyond = z - nearest
-    shrunk = np.maximum(np.abs(beyond) - qp.w, 0.0) / (1 + 2 * qp.W)
-    proximal: Vector = nearest + np.copysign(shrunk, beyond)
-    return proximal
 
 
 TOLERANCE = 1e-8
@@ -265,15 +228,14 @@ def kkt_solve(
     kkt[:size, size:], kkt[size:, :size] = equal.T, equal
     right[:size] = (seeds[:, free] if bound else seeds).T
     right[size:] = limits[:, at_limit].T
-    answer, singular = right, False
+    answer = right
     if len(kkt):  # every variable may be held
         # SciPy is imported where it is needed: it is a quarter of a short run.
         from scipy.linalg.lapack import dgesv  # noqa: PLC0415
 
         _, _, answer, status = dgesv(kkt, right)
-        singular = status != 0
-    if singular:
-        answer = np.asarray(np.linalg.lstsq(kkt, right)[0], dtype=np.float64)
+        if status != 0:
+            answer = np.asarray(np.linalg.lstsq(kkt, right)[0], dtype=np.float64)
     v, lam = np.zeros(seeds.shape), np.zeros(limits.shape)
     v[:, free], lam[:, at_limit] = answer[:size].T, answer[size:].T
     return v, lam

@@ -17,13 +17,14 @@ from controllers.problem import Problem
 from controllers.qp.backends import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
 from controllers.rti.engine import NOT_FINITE, Engine
-from controllers.rti.feedback import embedding, readout
 from controllers.rti.preparation import (
     LEAST_CONTROLS,
+    embedding,
     limits_of,
     make_hessian,
     preparation,
     qp_of,
+    readout,
     riccati,
 )
 from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
@@ -392,10 +393,6 @@ class RtiNmpc:
                 solution = self._solve(s, None)
                 actions[k], values[k] = solution.action, solution.value
         return actions, values
-
-    def value_batch(self, states: ArrayLike) -> Vector:
-        """V (K,) of the prepared QP at states (K, n); see `feedback_batch`."""
-        return self.feedback_batch(states)[1]
 
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q(s, a) of the prepared QP."""

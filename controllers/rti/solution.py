@@ -123,8 +123,7 @@ class RtiSolution:
     def predicted_actions(self) -> Matrix:
         """Predicted actions u_0 … u_{N−1}, shape (N, m)."""
         reference = self.prepared.functions.problem.reference_action
-        actions: Matrix = self.multipliers.v.reshape(-1, reference.size) + reference
-        return actions
+        return np.asarray(self.multipliers.v.reshape(-1, reference.size) + reference)
 
     @property
     def unshifted(self) -> LinearisationPoint:
@@ -149,26 +148,19 @@ class RtiSolution:
 
         At a true bound the penalty of s itself has a kink, and half of its slope is taken.
         """
-        gradient: Vector = self.costates[0]
-        return gradient
+        return np.asarray(self.costates[0])
 
     @property
     def action_gradient(self) -> Vector:
         """dQ/da, shape (m,): zero where the action was not enforced."""
         if not self.enforced:
             return np.zeros(self.action.size)
-        gradient: Vector = -self.multipliers.nu[: self.action.size]
-        return gradient
+        return np.asarray(-self.multipliers.nu[: self.action.size])
 
     @cached_property
     def residuals(self) -> Residuals:
         """KKT residuals of the QP's solution."""
         return self.multipliers.residuals(self.qp)
-
-    @property
-    def duality_gap(self) -> float:
-        """Relative duality gap of the QP's solution."""
-        return self.multipliers.duality_gap(self.qp)
 
     @property
     def residual(self) -> float:

@@ -76,7 +76,7 @@ def test_feedback_on_a_grid_state_is_the_table(policy):
 def test_feedback_between_grid_states_is_multilinear(policy):
     optimum = policy.optimum
     s = np.random.default_rng(1).uniform([20, 40], [35, 70], (50, 2))
-    W = Grid(optimum.grid.axes).interpolate(optimum.W, list(s.T))
+    W = Grid(optimum.grid.axes).interpolant(optimum.W)(list(s.T))
     for state, value in zip(s, W, strict=True):
         assert policy.value(state) == pytest.approx(value + policy.problem.penalty(state), rel=1e-9)
 

@@ -42,8 +42,9 @@ def value_error(solution: RtiSolution) -> float:
     """Rounding, and what the slack's slope w makes of rows not quite at their limit."""
     qp, v = solution.qp, solution.multipliers.v
     _, at_limit, _ = solution.multipliers.active(qp)
+    slack = np.maximum(np.maximum(qp.row_lower - qp.rows @ v, qp.rows @ v - qp.row_upper), 0.0)
     rounding = 64 * np.finfo(float).eps * abs(solution.value)
-    return rounding + float((qp.w * qp.slack(v))[at_limit].sum())
+    return rounding + float((qp.w * slack)[at_limit].sum())
 
 
 def derivative(

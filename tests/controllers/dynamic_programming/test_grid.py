@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 
 from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import Feature, graded_axis
+from controllers.dynamic_programming.policy_iteration import graded_axis
 
 GRID = Grid((np.array([0.0, 0.5, 2.0]), np.array([-1.0, 1.0, 1.5, 4.0]), np.array([0.0, 1.0])))
 
@@ -24,7 +24,7 @@ def test_multilinear_functions_are_interpolated_exactly():
 
     x = states()
     np.testing.assert_allclose(
-        GRID.interpolate(function(GRID.points), list(x.T)), function(x), rtol=1e-12, atol=1e-12
+        GRID.interpolant(function(GRID.points))(list(x.T)), function(x), rtol=1e-12, atol=1e-12
     )
 
 
@@ -42,7 +42,7 @@ def test_weights_are_a_row_of_a_stochastic_matrix_inside_and_outside():
 def test_states_outside_are_served_by_the_nearest_state_of_the_box():
     values = np.random.default_rng(1).normal(size=GRID.size)
     inside, outside = np.array([[2.0, -1.0, 0.3]]), np.array([[7.0, -3.0, 0.3]])
-    assert GRID.interpolate(values, list(outside.T)) == GRID.interpolate(values, list(inside.T))
+    assert GRID.interpolant(values)(list(outside.T)) == GRID.interpolant(values)(list(inside.T))
 
 
 SMOOTH = Grid(
@@ -61,7 +61,7 @@ def test_cubics_are_interpolated_exactly_within_the_smooth_intervals():
         return np.polynomial.polynomial.polyval2d(*x.T, coefficients)
 
     np.testing.assert_allclose(
-        SMOOTH.interpolate(function(SMOOTH.points), list(x.T)), function(x), rtol=1e-10, atol=1e-8
+        SMOOTH.interpolant(function(SMOOTH.points))(list(x.T)), function(x), rtol=1e-10, atol=1e-8
     )
 
 
@@ -73,14 +73,14 @@ def test_cubic_weights_are_what_interpolation_multiplies_with_and_sum_to_one():
     np.testing.assert_allclose(sum(weight for _, weight in weights), 1.0, rtol=1e-10)
     np.testing.assert_allclose(
         sum(weight * values[index] for index, weight in weights),
-        SMOOTH.interpolate(values, x),
+        SMOOTH.interpolant(values)(x),
         rtol=1e-9,
         atol=1e-9,
     )
 
 
 def test_graded_axis_is_dense_at_features_grows_outside_and_meets_its_marks():
-    features = [Feature(0.0, 2.0, 0.1), Feature(50.0, 50.0, 0.02)]
+    features = [(0.0, 2.0, 0.1), (50.0, 50.0, 0.02)]
     axis = graded_axis([-10.0, 50.0, 100.0], features, 1.3)
     cells = np.diff(axis)
     assert axis[[0, -1]].tolist() == [-10.0, 100.0]

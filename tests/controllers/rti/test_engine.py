@@ -26,6 +26,16 @@ BOUNDS = {
 entry; the actions' in their own unit."""
 
 
+def duality_gap(solution):
+    qp, (v, nu, lam) = solution.qp, solution.multipliers
+    slack = np.maximum(np.maximum(qp.row_lower - qp.rows @ v, qp.rows @ v - qp.row_upper), 0.0)
+    primal = 0.5 * v @ qp.H @ v + qp.f @ v + qp.w @ slack + qp.W @ slack**2
+    limits = np.where(nu > 0, nu * qp.upper, nu * qp.lower).sum()
+    limits += np.where(lam > 0, lam * qp.row_upper, lam * qp.row_lower).sum()
+    soft = (np.maximum(np.abs(lam) - qp.w, 0.0) ** 2 / (4 * qp.W)).sum()
+    return abs(primal + 0.5 * v @ qp.H @ v + limits + soft) / max(1.0, abs(primal))
+
+
 def both(problem, parameters):
     found = RtiNmpc(problem, parameters), RtiNmpc(problem, parameters)
     found[0].compile()
@@ -58,7 +68,7 @@ def test_it_gives_what_the_interpreter_gives(learnt):
             wanted.action + rng.normal(0, 10, 2), problem.action_lower, problem.action_upper
         )
         enforced, expected = ours.feedback(s, a), reference.feedback(s, a)
-        assert got.residual < 1e-9 and enforced.residual < 1e-9 and enforced.duality_gap < 1e-12
+        assert got.residual < 1e-9 and enforced.residual < 1e-9 and duality_gap(enforced) < 1e-12
         pairs = {name: (getattr(got, name), getattr(wanted, name)) for name in list(BOUNDS)[:6]}
         pairs["action value"] = enforced.value, expected.value
         pairs["action value's gradient"] = enforced.value_gradient, expected.value_gradient
@@ -99,7 +109,6 @@ def test_a_batch_is_the_feedback_of_each_state_and_moves_no_guess(learnt):
         controller.prepare()
         actions, values = controller.feedback_batch(states)
         assert np.isnan(values[7]) and np.isnan(actions[7]).all()
-        np.testing.assert_array_equal(controller.value_batch(states), values)
         for k in known:
             assert np.array_equal(controller.policy(states[k]), actions[k])
             assert controller.value(states[k]) == values[k]

@@ -7,8 +7,7 @@ import pytest
 from controllers import ThetaBlocks
 from controllers.dynamics import sampled_jacobian
 from controllers.model import discretise
-from controllers.rti.feedback import embedding, readout
-from controllers.rti.preparation import preparation
+from controllers.rti.preparation import embedding, preparation, readout
 from controllers.theta import SymbolicTheta
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 

@@ -155,7 +155,20 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
         gain = -np.linalg.pinv(rows[:, n:]) @ rows[:, :n]
         free = null_space(rows[:, n:])
     if free.shape[1]:
-        gain = gain + free @ _reduced_gain(A, B, H, gain, free)
+        # The Riccati equation of v.
+        change = np.block([[np.eye(n), np.zeros((n, free.shape[1]))], [gain, free]])
+        reduced, a, b = change.T @ H @ change, A + B @ gain, B @ free
+        q, r, s = reduced[:n, :n], reduced[n:, n:], reduced[:n, n:]
+        try:
+            P = solve_discrete_are(a, b, q, r, s=s)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise TuningError(
+                f"the steady state has no stabilising local feedback of finite cost ({error})"
+            ) from error
+        curvature = r + b.T @ P @ b
+        if np.linalg.eigvalsh(_symmetric(curvature)).min() <= 0:
+            raise TuningError("the steady state is no local minimum of the economic cost")
+        gain = gain + free @ -np.linalg.solve(curvature, b.T @ P @ a + s.T)
     closed, stage = A + B @ gain, np.vstack([np.eye(n), gain])
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
         raise TuningError("the active constraints, once kept, make the closed loop unstable")
@@ -163,26 +176,6 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
     system, cost = np.eye(n * n) - np.kron(closed.T, closed.T), stage.T @ H @ stage
     P = np.linalg.solve(system, cost.reshape(-1)).reshape(n, n)
     return LocalFeedback(gain, _symmetric(P))
-
-
-def _reduced_gain(A: Array, B: Array, H: Array, particular: Array, free: Array) -> Array:
-    """Gain of v in u = particular x + free v, from the Riccati equation."""
-    n = len(A)
-    change = np.block([[np.eye(n), np.zeros((n, free.shape[1]))], [particular, free]])
-    reduced = change.T @ H @ change
-    a, b = A + B @ particular, B @ free
-    q, r, s = reduced[:n, :n], reduced[n:, n:], reduced[:n, n:]
-    try:
-        P = solve_discrete_are(a, b, q, r, s=s)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise TuningError(
-            f"the steady state has no stabilising local feedback of finite cost ({error})"
-        ) from error
-    curvature = r + b.T @ P @ b
-    if np.linalg.eigvalsh(0.5 * (curvature + curvature.T)).min() <= 0:
-        raise TuningError("the steady state is no local minimum of the economic cost")
-    gain: Array = -np.linalg.solve(curvature, b.T @ P @ a + s.T)
-    return gain
 
 
 @dataclass(frozen=True)
@@ -373,8 +366,7 @@ def accurate_substeps(problem: Problem) -> int:
         x, u, d, p = model.symbols()
         following = discretise(model, problem.sampling_time, steps)(x, u, d, p)
         jacobian = ca.jacobian(following, ca.vertcat(x, u))
-        found: Array = ca.Function("AB", [x, u, d, p], [jacobian])(*point).full()
-        return found
+        return np.asarray(ca.Function("AB", [x, u, d, p], [jacobian])(*point).full())
 
     present = end(substeps)
     while substeps <= 1024:

@@ -56,7 +56,18 @@ class Units:
         n = len(model.states)
         widths = upper - lower
         both = np.array([10.0**power for power in np.rint(_power(widths))])
-        gradient, curvature, rates = _derivatives(model, reference)
+        x, u, d, p = model.symbols()
+        w = ca.vertcat(x, u)
+        hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
+        rates = ca.jacobian(model.ode(x, u, d, p), w)
+        function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
+        nominal = (model.nominal_disturbance, model.nominal_parameters)
+        values = (value.full() for value in function(reference[:n], reference[n:], *nominal))
+        gradient, curvature, rates = (
+            next(values).reshape(-1),
+            next(values).reshape(-1),
+            next(values),
+        )
         near = ACTIVE * widths
         below, above = reference <= lower + near, reference >= upper - near
         found = multipliers(gradient * both, rates * both, below, above)
@@ -77,22 +88,7 @@ class Units:
         if not self.dearest:
             return 1e-3 * self.cost / self.state
         digit = 10.0 ** (np.floor(_power(self.dearest)) - 1)
-        exact: Vector = (np.floor(self.dearest / digit) + 1) * digit / self.state
-        return exact
-
-
-def _derivatives(model: Model, reference: Vector) -> tuple[Vector, Vector, Vector]:
-    """∂ℓ/∂w (n+m,), ∂²ℓ/∂w_i² (n+m,) and ∂(x')/∂w (n, n+m) at the reference."""
-    x, u, d, p = model.symbols()
-    w = ca.vertcat(x, u)
-    hessian, gradient = ca.hessian(ca.SX(model.economic_cost(x, u, d, p)), w)
-    rates = ca.jacobian(model.ode(x, u, d, p), w)
-    function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
-    n = len(model.states)
-    disturbance, parameters = model.nominal_disturbance, model.nominal_parameters
-    values = function(reference[:n], reference[n:], disturbance, parameters)
-    first, second, jacobian = (value.full() for value in values)
-    return first.reshape(-1), second.reshape(-1), jacobian
+        return np.asarray((np.floor(self.dearest / digit) + 1) * digit / self.state)
 
 
 def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Vector:
@@ -121,14 +117,12 @@ def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Ve
             "problem: the multipliers of the bounds at the reference cannot be computed "
             f"({MEANING.get(flag, flag)}); look at the derivatives of cost and model there"
         )
-    found: Vector = np.abs(info["lam"][:inequalities]) * size
-    return found
+    return np.asarray(np.abs(info["lam"][:inequalities]) * size)
 
 
 def _power(size: ArrayLike) -> Vector:
     """log10 of positive sizes, kept where products of the units are finite."""
-    power: Vector = np.clip(np.log10(size), -50.0, 50.0)
-    return power
+    return np.asarray(np.clip(np.log10(size), -50.0, 50.0))
 
 
 def _frozen(name: str, values: ArrayLike, size: int) -> Vector:

@@ -6,9 +6,8 @@ import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -57,7 +56,7 @@ class DisturbanceLaw:
         Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one; a disturbance that
         does not vary takes one node. Exact for polynomials of degree 2·count−1 in each.
         """
-        points, weights = [], []
+        axes, weights = [], np.ones(1)
         for count, nominal, spread in zip(counts, self.nominal, self.ranges, strict=True):
             if self.kind == "none" or spread == 0:
                 x, w = np.zeros(1), np.ones(1)
@@ -65,36 +64,22 @@ class DisturbanceLaw:
                 x, w = np.polynomial.legendre.leggauss(count)
             else:
                 x, w = np.polynomial.hermite_e.hermegauss(count)
-            points.append(nominal + spread * x)
-            weights.append(w / w.sum())
-        return ProductRule(tuple(points), tuple(weights))
+            axes.append(nominal + spread * x)
+            weights = np.multiply.outer(weights, w / w.sum()).reshape(-1)
+        mesh = [axis.reshape(-1) for axis in np.meshgrid(*axes, indexing="ij")]
+        return ProductRule(axes, np.stack(mesh, axis=1) if mesh else np.zeros((1, 0)), weights)
 
 
-@dataclass(frozen=True)
-class ProductRule:
+class ProductRule(NamedTuple):
     """A product quadrature rule: E[g(d)] ≈ Σ_i weights_i g(nodes_i).
 
-    `axis_nodes` and `axis_weights` hold one array per disturbance.
+    `axes` holds the nodes of each disturbance; `nodes` (q, n_d) all of them, the last disturbance
+    running fastest, and `weights` (q,) have the sum 1.
     """
 
-    axis_nodes: tuple[Array, ...]
-    axis_weights: tuple[Array, ...]
-
-    @cached_property
-    def nodes(self) -> Array:
-        """All nodes, shape (q, n_d), the last disturbance running fastest."""
-        if not self.axis_nodes:
-            return np.zeros((1, 0))
-        mesh = np.meshgrid(*self.axis_nodes, indexing="ij")
-        return np.stack([axis.reshape(-1) for axis in mesh], axis=1)
-
-    @cached_property
-    def weights(self) -> Array:
-        """Weights of `nodes`, shape (q,), with sum 1."""
-        weights = np.ones(1)
-        for axis in self.axis_weights:
-            weights = np.multiply.outer(weights, axis).reshape(-1)
-        return weights
+    axes: list[Array]
+    nodes: Array
+    weights: Array
 
 
 class Refinement:
@@ -106,7 +91,7 @@ class Refinement:
 
     def __init__(self, coarse: ProductRule, fine: ProductRule) -> None:
         self.weights = fine.weights
-        axes = zip(coarse.axis_nodes, fine.axis_nodes, strict=True)
+        axes = zip(coarse.axes, fine.axes, strict=True)
         self._matrices = [lagrange_matrix(nodes, targets) for nodes, targets in axes]
         # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
         while len(self._matrices) > 1 and self._matrices[-1].shape[1] < 4:
@@ -163,43 +148,36 @@ class PlantProblem:
         scenario names one, else the controller's. Raises OptimumError where it does not fit the
         plant, ModelError where it cannot be loaded.
         """
-        named = scenario.plant.model
-        problem = Problem.from_scenario(scenario)
-        if named is not None:
-            problem = replace(problem, model=load_model(named))
-        merged = {**scenario.plant.parameters, **(overrides or {})}
-        given = {name: value for name, value in merged.items() if value is not None}
-        return cls(problem, plant_law(scenario, problem), plant_parameters(given, problem))
-
-
-def plant_law(scenario: Scenario, problem: Problem) -> DisturbanceLaw:
-    """The scenario's disturbance law in the order of the model's disturbances."""
-    table, model = scenario.disturbance, problem.model
-    for kind in ("states", "actions", "disturbances"):
-        ours = [quantity.name for quantity in getattr(model, kind)]
-        if ours != (theirs := list(getattr(scenario.plant, kind))):
-            raise OptimumError(
-                f"the optimum needs a model of the plant: model '{model.name}' has the {kind} "
-                f"{', '.join(ours)}, the plant {', '.join(theirs)}; {MEND}"
-            )
-    nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
-    ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
-    return DisturbanceLaw(table.law, nominal, ranges)
-
-
-def plant_parameters(given: Mapping[str, float], problem: Problem) -> Vector:
-    """Physical parameters (n_p,): the model's nominal ones with those that the plant is given."""
-    model = problem.model
-    known = {quantity.name: quantity.nominal for quantity in model.parameters}
-    for name in given:
-        if name not in known:
-            raise OptimumError(
-                f"the optimum needs a model of the plant: plant.parameters sets '{name}', which "
-                f"model '{model.name}' does not have: give the model that parameter, {MEND}, or, "
-                "where it only shapes the noise, name it in plant.mapping.ranges and set "
-                "disturbance.ranges"
-            )
-    return np.array([*(known | dict(given)).values()], dtype=np.float64)
+        problem, plant, table = (
+            Problem.from_scenario(scenario),
+            scenario.plant,
+            scenario.disturbance,
+        )
+        if plant.model is not None:
+            problem = replace(problem, model=load_model(plant.model))
+        model, needed = problem.model, "the optimum needs a model of the plant"
+        for kind in ("states", "actions", "disturbances"):
+            ours = [quantity.name for quantity in getattr(model, kind)]
+            if ours != (theirs := list(getattr(plant, kind))):
+                raise OptimumError(
+                    f"{needed}: model '{model.name}' has the {kind} {', '.join(ours)}, the plant "
+                    f"{', '.join(theirs)}; {MEND}"
+                )
+        nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
+        ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
+        parameters = {quantity.name: quantity.nominal for quantity in model.parameters}
+        for name, value in {**plant.parameters, **(overrides or {})}.items():
+            if value is None:
+                continue
+            if name not in parameters:
+                raise OptimumError(
+                    f"{needed}: plant.parameters sets '{name}', which model '{model.name}' does "
+                    f"not have: give the model that parameter, {MEND}, or, where it only shapes "
+                    "the noise, name it in plant.mapping.ranges and set disturbance.ranges"
+                )
+            parameters[name] = value
+        law = DisturbanceLaw(table.law, nominal, ranges)
+        return cls(problem, law, np.array([*parameters.values()], dtype=np.float64))
 
 
 _OPERATIONS: dict[int, Callable[..., Any]] = {
@@ -348,8 +326,7 @@ class BellmanOperator:
         _, x_next = self._expected_cost(state[None, :], action[None, :])
         x = np.concatenate(x_next)
         variance = (x * x) @ self._weights - (x @ self._weights) ** 2
-        deviation: Array = np.sqrt(np.maximum(variance, 0.0))
-        return deviation
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def values(self, states: Array, actions: Array, grid: Grid, W: Array) -> Array:
         """Q at states (B, n) and actions (B, m) for W (G,) on the grid; shape (B,)."""
@@ -426,5 +403,4 @@ class BellmanOperator:
 
 def _mean(values: Array, weights: Array) -> Array:
     """Weighted mean of each row, without BLAS, whose own threads would compete with the blocks'."""
-    mean: Array = np.einsum("bq,q->b", values, weights)
-    return mean
+    return np.asarray(np.einsum("bq,q->b", values, weights))

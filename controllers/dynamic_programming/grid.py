@@ -118,7 +118,7 @@ class Grid:
             points = interpolant.weights.shape[1]
             positions.append([stride * (start + j) for j in range(points)])
             factors.append(
-                [_polynomial(interpolant.weights[:, j], cell, offset) for j in range(points)]
+                [_horner(interpolant.weights[:, j], cell, [offset]) for j in range(points)]
             )
         result = []
         for stencil in itertools.product(*(range(len(row)) for row in positions)):
@@ -161,17 +161,9 @@ class Grid:
         return np.stack([linear.interpolant(column)(x) for column in values.T], axis=1)
 
 
-def _polynomial(coefficients: Array, cell: Indices, offset: Array) -> Array:
-    total: Array = coefficients[-1][cell]
-    for row in coefficients[-2::-1]:
-        total = total * offset + row[cell]
-    return total
-
-
 def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
     if not offsets:
-        values: Array = table[index]
-        return values
+        return np.asarray(table[index])
     first, *rest = offsets
     total = _horner(table[-1], index, rest)
     for part in table[-2::-1]:

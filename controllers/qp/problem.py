@@ -302,8 +302,7 @@ def _places(n: int, m: int, horizon: int) -> dict[str, Index]:
 
     def at(rows: Index, columns: Index) -> Index:
         # The storage's columns are 3·reach + 1 long.
-        place: Index = 2 * reach + rows - columns + columns * (3 * reach + 1)
-        return place
+        return np.asarray(2 * reach + rows - columns + columns * (3 * reach + 1))
 
     def block(rows: Index, columns: Index, on: int = 0) -> Index:
         """Places of a block that reaches `on` stages to the right, (stages, rows, columns)."""

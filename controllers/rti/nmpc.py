@@ -242,11 +242,9 @@ class RtiNmpc:
                 status="QP not finite",
                 qp=self._qp.copy(),
             )
-        jacobians = None
         if self._engine is None:
             self._backend.load(self._qp)
-        else:
-            jacobians = self._engine.policy
+        jacobians = None if self._engine is None else self._engine.policy
         memory, spectrum = prepare.memory.copy(), self._hessian.spectrum
         self._prepared = Prepared(memory, self._parameters, spectrum, self._functions, jacobians)
 
@@ -305,18 +303,16 @@ class RtiNmpc:
         )
 
     def _solve_compiled(self, s: Vector, a: Vector | None) -> None:
-        engine, status = self._engine, self._status
+        engine = self._engine
         assert engine is not None
         if a is not None:
             engine.action[:] = a
-        if not status:
-            status = engine.feedback(a is not None)
-        if not status:
-            return
+        status = self._status or engine.feedback(a is not None)
         if status == NOT_FINITE:
             raise self._not_finite(s, a)
-        reason = STATUSES[status]
-        raise QpError(f"the QP was not solved: {reason}", status=reason, qp=self._qp.copy())
+        if status:
+            reason = STATUSES[status]
+            raise QpError(f"the QP was not solved: {reason}", status=reason, qp=self._qp.copy())
 
     def _solve_interpreted(self, s: Vector, a: Vector | None) -> None:
         qp, read = self._qp, self._readout

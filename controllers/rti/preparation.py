@@ -138,8 +138,7 @@ def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
     first, second = np.indices((horizon * n, horizon * m))
     (k, i), (j, b) = np.divmod(first, n), np.divmod(second, m)
     column = k * (horizon * m + n + 1) + (k - j) * m + b
-    positions: NDArray[np.int64] = np.where(j <= k, column * n + i, -1)
-    return positions
+    return np.asarray(np.where(j <= k, column * n + i, -1))
 
 
 def embedding(

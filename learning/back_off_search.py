@@ -133,7 +133,11 @@ class BackOffSearch:
             cost = [float(segment.round), transition.stage_cost]
             self._rows.append(np.concatenate([cost, segment.kappa, transition.s]))
         if transition is not None and segment.round == 0:
-            self._watch(transition)
+            gradient, slices = transition.policy.value_gradient, self.start.blocks.slices
+            bounds = [gradient[slices[name]] for name in ("x_l", "x_u")]
+            self._binding += np.concatenate(bounds) != 0
+            if self._segment == 0:
+                self._first.append(np.concatenate([transition.s, transition.a, transition.next_s]))
         self._step += 1
         if self._step < segment.steps:
             return False
@@ -146,12 +150,6 @@ class BackOffSearch:
         elif self.done:
             self._end_round(segment.round)
         return not self.done
-
-    def _watch(self, transition: Transition) -> None:
-        gradient, slices = transition.policy.value_gradient, self.start.blocks.slices
-        self._binding += np.concatenate([gradient[slices[name]] for name in ("x_l", "x_u")]) != 0
-        if self._segment == 0:
-            self._first.append(np.concatenate([transition.s, transition.a, transition.next_s]))
 
     def _begin(self) -> None:
         """σ and the bound to begin with, from the first segment, at κ = 0."""
@@ -239,10 +237,7 @@ class BackOffSearch:
             centred = kappa[mine] - kappa[mine].mean()
             above += centred @ values[mine]
             below += float(centred @ centred)
-        slopes: Vector = above / below if below > 0 else above
-        return slopes
-
-    # for checkpoints
+        return np.asarray(above / below if below > 0 else above)
 
     @property
     def origin(self) -> Vector:

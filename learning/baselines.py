@@ -58,7 +58,7 @@ class GreedyConfiguration(Configuration):
 
 
 class BackOffConfiguration(GreedyConfiguration):
-    """Settings of the back-off search: none but where it starts."""
+    """Settings of the back-off search."""
 
     def depends_on_samples(self) -> list[str]:
         """The shares of the samples that each round has."""
@@ -300,7 +300,9 @@ class Identified(Estimate):
         start = self._reported
         if "p" not in start.blocks or not self._rows:
             return start
-        fitted = start.replace({"p": self._fit()})
+        n, rows = self._problem.n_states, np.array(self._rows)
+        transitions = rows[:, :n], rows[:, n:-n], rows[:, -n:]
+        fitted = start.replace({"p": self._fit(start, *transitions)})
         model = self._problem.model
         values = self._model.parameters(fitted)
         quantities = tuple(
@@ -315,16 +317,10 @@ class Identified(Estimate):
             raise DivergenceError(f"the fitted model cannot be tuned ({error})") from error
         kept = ("c_lambda", "c_f", "x_l", "x_u", "w_sigma", "W_sigma")
         tuned = tuned.replace({name: start[name] for name in kept if name in start.blocks})
-        return self.backed_off(tuned, self._model.errors(*self._transitions(), tuned))
+        return self.backed_off(tuned, self._model.errors(*transitions, tuned))
 
-    def _transitions(self) -> tuple[Matrix, Matrix, Matrix]:
-        """States, actions and next states of the rows."""
-        n, rows = self._problem.n_states, np.array(self._rows)
-        return rows[:, :n], rows[:, n:-n], rows[:, -n:]
-
-    def _fit(self) -> Vector:
-        """p̂, (n_p,), positive where its nominal value is."""
-        start, (states, actions, following) = self._reported, self._transitions()
+    def _fit(self, start: Parameters, states: Matrix, actions: Matrix, following: Matrix) -> Vector:
+        """p̂, (n_p,), from `start`."""
         indices = self._problem.model.parameter_indices(start.blocks.block("p").labels)
         values, nominal = self._model.parameters(start), self._problem.model.nominal_parameters
         unit = np.where(nominal[indices] != 0, np.abs(nominal[indices]), 1.0)
@@ -334,11 +330,9 @@ class Identified(Estimate):
         def residuals(scaled: Vector) -> Vector:
             values[indices] = scaled * unit
             predicted = self._model.predict(states, actions, values) + start["c_f"]
-            errors: Vector = ((following - predicted) / sigma).reshape(-1)
-            return errors
+            return np.asarray(((following - predicted) / sigma).reshape(-1))
 
-        found: Vector = least_squares(residuals, start["p"] / unit).x * unit
-        return found
+        return np.asarray(least_squares(residuals, start["p"] / unit).x * unit)
 
 
 class IdentifiedSimulator(Identified):

@@ -239,11 +239,9 @@ class ReplayBuffer:
         self._theta = theta
 
     def _solve(self, rows: NDArray[np.int64]) -> None:
-        """Solve for what is not known of these rows, which are in time's order.
-
-        A successor shares the linearisation, and where it was greedy the solution too: V(s₊) of one
-        transition is Q of the next. What a failing QP was to give stays NaN.
-        """
+        """Solve for what is not known of these rows, in time's order; a failing QP leaves NaN."""
+        # V(s₊) of one transition is Q of the next: a successor shares the linearisation, and where
+        # it was greedy the solution too.
         controller, columns = self._controller, self._columns
         at: int | None = None
         value: RtiSolution | None = None

@@ -35,7 +35,6 @@ class PlantInOperation:
         self.scenario = plant.scenario
 
         def step(a: Vector) -> Step:
-            """Hold an action (m,) for one sample."""
             return plant.step(a)
 
         self.step = step
@@ -127,11 +126,9 @@ class TrainingLoop:
         rests = self.rests
         transition, cost = self.next()
         update: Update | None = None
-        if rests:
-            return cost, None
-        if transition is not None:
+        if transition is not None and not rests:
             update = self.algorithm.observe(transition)
-        elif failed := getattr(self.algorithm, "failed", None):
+        elif not rests and (failed := getattr(self.algorithm, "failed", None)):
             update = failed(cost)
         if update is None:
             return cost, None
@@ -139,7 +136,12 @@ class TrainingLoop:
         if update.mark:
             self._marked = (self._asked("mark").snapshot(), self.s, self._point)
         if update.rewind:
-            self._rewind()
+            plant = self._asked("rewind")
+            if self._marked is None:
+                raise PrivilegeError(f"{type(self.algorithm).__name__}: 'rewind' before any 'mark'")
+            snapshot, self.s, self._point = self._marked
+            plant.restore(snapshot)
+            self.restart()
         elif update.episode is not None:
             self.start(self._asked("episode").reset(update.episode))
         else:
@@ -208,17 +210,6 @@ class TrainingLoop:
             )
         return self._simulator
 
-    def _rewind(self) -> None:
-        """Put plant and guess back to where they were marked, and solve there."""
-        plant = self._asked("rewind")
-        if self._marked is None:
-            raise PrivilegeError(f"{type(self.algorithm).__name__}: 'rewind' before any 'mark'")
-        snapshot, self.s, self._point = self._marked
-        plant.restore(snapshot)
-        self.restart()
-
-    # the controller -----------------------------------------------------------------------------
-
     def _solve(
         self, s: Vector, a: Vector | None = None, *, prepare: bool = False
     ) -> RtiSolution | None:
@@ -245,8 +236,6 @@ class TrainingLoop:
             self._policy = self._solve(self.s, prepare=True)
         else:
             self.renew()
-
-    # checkpoints --------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """JSON-ready values and arrays from which `restore` goes on; the plant's are the run's."""

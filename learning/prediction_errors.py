@@ -54,8 +54,7 @@ class OneStepModel:
     def predict(self, states: Matrix, actions: Matrix, parameters: Vector) -> Matrix:
         """f(s, a), (K, n), without offset, for K states and actions and one (n_p,) for all."""
         inputs = (np.atleast_2d(states).T, np.atleast_2d(actions).T, parameters)
-        predicted: Matrix = self._parametric(*inputs).full().T
-        return predicted
+        return np.asarray(self._parametric(*inputs).full().T)
 
     def errors(
         self, states: Matrix, actions: Matrix, next_states: Matrix, theta: Parameters
@@ -68,8 +67,8 @@ class OneStepModel:
 def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
     """Penalty of many states (…, n), shape (…)."""
     violation = penalty.violation(states)
-    found: Vector = (violation * (penalty.linear + penalty.quadratic * violation)).sum(axis=-1)
-    return found
+    due = violation * (penalty.linear + penalty.quadratic * violation)
+    return np.asarray(due.sum(axis=-1))
 
 
 class SortedErrors:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from controllers.theta import Parameters
-from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import (
     Configuration,
@@ -128,7 +127,10 @@ class ValueRule(Algorithm):
     def scale(self, scale: Vector) -> None:
         settings = self.configuration
         self._step = ConstrainedStep(self.controller, settings, scale)
-        self._average_cost = AverageCost.of(settings.criterion, self.scenario, self._step)
+        discount = self.scenario.discount if settings.criterion is None else settings.criterion
+        position, cost = self._step.blocks.slices["c_lambda"].start, self.scenario.controller
+        level = float(self._step.scale[position])
+        self._average_cost = AverageCost(discount, position, level, cost.reference_cost)
 
     def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
         """The prior's mean; its deviations become the coordinates.
@@ -305,17 +307,6 @@ class AverageCost:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
         self._position, self._scale = position, scale
-
-    @classmethod
-    def of(cls, discount: float | None, scenario: Scenario, step: ConstrainedStep) -> AverageCost:
-        """Target of a scenario's TD error; `discount` None is the scenario's own."""
-        position = step.blocks.slices["c_lambda"].start
-        return cls(
-            scenario.discount if discount is None else discount,
-            position,
-            float(step.scale[position]),
-            scenario.controller.reference_cost,
-        )
 
     def target(self, cost: Values, next_value: Values) -> Values:
         """What Q(s, a) is fitted to, of one sample or of several, (K,)."""

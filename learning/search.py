@@ -416,11 +416,7 @@ class SearchPlan:
                 self._past.append(before)
 
     def _renew(self) -> Plan:
-        """Run the incumbent on new noise, and compare the one before it with it once more.
-
-        That may have lost on a round's noise alone, or before a slow state showed what the new one
-        does to it.
-        """
+        """Run the incumbent on new noise, and compare the one before with it once more."""
         comparison, past = self.comparison, self._past[-1]
         yield from comparison.renew(comparison.blocks)
         if not np.array_equal(past, comparison.incumbent.theta):
@@ -453,15 +449,12 @@ class SearchPlan:
         self.comparison.remember(learned.errors)
 
     def _along(self, direction: Vector, reach: float) -> Generator[Request, Result, float]:
-        """Line search both ways along a direction in scaled θ, (n_θ,), from a first step `reach`.
-
-        Steps that win over a quarter of the blocks are doubled, the longest that did is compared
-        over all. Returns the first step of the next time.
-        """
+        """Line search both ways in scaled θ, (n_θ,); returns the first step of the next time."""
         comparison = self.comparison
         longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
         origin, quarter = comparison.base.theta, max(len(comparison.base.realised) // 4, 1)
         for sign in (1.0, -1.0):
+            # Steps that win over a quarter of the blocks are doubled; the longest runs all of them.
             step, best, costs = sign * min(reach, longest), 0.0, comparison.base.costs[:quarter]
             while abs(step) <= 4.0 * longest:
                 found = yield from comparison.screen(
@@ -500,12 +493,7 @@ class SearchPlan:
         return np.asarray(directions)
 
     def _rescale(self, decades: float) -> Generator[Request, Result, float]:
-        """Search over the inputs' weights in the stage cost; returns the next time's step.
-
-        With other weights the policy has another gain, and so another best back-off: each is given
-        its own, apart from the incumbent, before it is compared with it. Where that did not pay, a
-        shorter step the other way comes next.
-        """
+        """Search over the inputs' weights, each with its own back-off; the next time's step."""
         comparison = self.comparison
         found = False
         while True:
@@ -694,10 +682,7 @@ class Search(Algorithm):
         self._open()
 
     def _make_rule(self, samples: int, width: float) -> Algorithm | None:
-        """The rule for a phase of `samples` samples from the controller's present θ.
-
-        Its prior or trust region is `width` times as wide as in the first phase.
-        """
+        """The rule for a phase, its prior or trust region `width` times the configured one."""
         settings = self.configuration
         if settings.rule == "none":
             return None

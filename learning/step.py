@@ -54,8 +54,6 @@ class Fit:
 
     def shrunk(self, factor: float) -> Fit:
         """The fit whose minimiser is `factor` times this one's, with the same metric."""
-        if factor == 1.0:
-            return self
         return replace(self, gradient=factor * self.gradient, minimiser=factor * self.minimiser)
 
     def within(self, radius: float, size: Callable[[Vector], float]) -> Fit:
@@ -216,7 +214,11 @@ class ConstrainedStep:
         if not np.isfinite(fit.minimiser).all():
             raise DivergenceError("the step of θ is not finite")
         new, vouched = definite(self.blocks, theta, fit, self._smallest)
-        new = self._admissible(new)
+        new = new.copy()
+        for name, minimum in self._least.items():
+            where = self.blocks.slices[name]
+            # What exactness (linear) and convexity ask of learned slack weights.
+            new[where] = np.maximum(new[where], minimum)
         reach = 0.0 if fit.reach is None else fit.reach((new - theta) / self.scale)
         if reach > 1.0:
             new = theta + (new - theta) / reach
@@ -241,16 +243,6 @@ class ConstrainedStep:
         """
         step = (theta - self._controller.theta) / self.scale
         return self.take(Fit(step, step, lambda: np.eye(step.size)), td_error)
-
-    def _admissible(self, theta: Vector) -> Vector:
-        """Keep learned slack weights above what exactness (linear) and convexity ask for."""
-        if not self._least:
-            return theta
-        theta = theta.copy()
-        for name, minimum in self._least.items():
-            where = self.blocks.slices[name]
-            theta[where] = np.maximum(theta[where], minimum)
-        return theta
 
 
 def moved(blocks: ThetaBlocks, old: Vector, new: Vector, **said: Any) -> Update:

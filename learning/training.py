@@ -460,11 +460,7 @@ def run_training(
 
 
 class _Session:
-    """A run that goes on: its loop, its log so far, and its checkpoint.
-
-    The checkpoint needs a snapshot of the plant, which is the run's own right: what the algorithm
-    asks for bounds the algorithm alone.
-    """
+    """A run that goes on: its loop, its log so far, and its checkpoint."""
 
     def __init__(
         self, run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant, out: Path | None

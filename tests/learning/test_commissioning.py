@@ -7,6 +7,12 @@ from learning import commissioning
 from learning.training_run import prepare
 
 
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(commissioning, "SAMPLES", 1000)
+    monkeypatch.setattr(commissioning, "_found", {})
+
+
 def test_the_first_days_theta_is_tuned_and_backed_off_where_the_model_binds(scenario, problem):
     found, tuned = build_controller("commissioned", scenario).parameters, tune(problem).parameters
     assert 26.0 < found["x_l"][0] < 30.0
@@ -15,7 +21,7 @@ def test_the_first_days_theta_is_tuned_and_backed_off_where_the_model_binds(scen
         assert np.array_equal(found[name], tuned[name])
 
 
-def test_the_plant_says_nothing_of_it(scenario):
+def test_the_plant_says_nothing_of_it(scenario, short):
     other = scenario.replace(
         {"plant": {"parameters": {"UA2": 5.2}}, "disturbance": {"law": "normal"}}
     )
@@ -23,17 +29,14 @@ def test_the_plant_says_nothing_of_it(scenario):
     assert np.array_equal(one.theta, two.theta)
 
 
-def test_a_training_starts_with_it(scenario, monkeypatch):
-    monkeypatch.setattr(commissioning, "SAMPLES", 1000)
-    monkeypatch.setattr(commissioning, "_found", {})
+def test_a_training_starts_with_it(scenario, short):
     run = prepare("q-learning", scenario, 1000, None, {"seed": 0, "start": "commissioned"})
     start = run.starting_parameters()
     assert start["x_l"][0] > 25.0 and "w_sigma" in start.blocks
     assert np.array_equal(start.theta, run.starting_parameters().theta)
 
 
-def test_without_noise_nothing_is_backed_off(scenario, monkeypatch):
+def test_without_noise_nothing_is_backed_off(scenario, short, monkeypatch):
     monkeypatch.setattr(commissioning, "GUESS", 0.0)
-    monkeypatch.setattr(commissioning, "_found", {})
     found = build_controller("commissioned", scenario).parameters
     assert found["x_l"].tolist() == pytest.approx([25.0, 40.0])

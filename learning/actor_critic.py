@@ -97,16 +97,20 @@ class ActorCritic(Algorithm):
         self._filled = 0
         return self._update(transition.number)
 
+    def _deviation(self) -> Vector:
+        """a − π(s) of the batch, (K, m), less its mean under saturation; zero in greedy samples."""
+        batch = self._batch
+        explored = batch["explored"]
+        bias = self.strategy.bias(batch["policy"][explored])
+        deviation: Matrix = np.zeros_like(batch["deviation"])
+        deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
+        return deviation / self._unit
+
     def _update(self, number: int) -> Update:
         settings, batch = self.configuration, self._batch
         errors = lstdv(batch["states"], batch["next_states"], batch["reward"])
         jacobian = batch["jacobian"] * self._step.scale / self._unit[:, None]
-        # a − π(s), less its mean under saturation; zero in greedy samples.
-        explored = batch["explored"]
-        bias = self.strategy.bias(batch["policy"][explored])
-        deviation = np.zeros_like(batch["deviation"])
-        deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
-        advantage = np.einsum("kmi,km->ki", jacobian, deviation / self._unit)
+        advantage = np.einsum("kmi,km->ki", jacobian, self._deviation())
         self._advantage.add(advantage, errors)
         weights = self._advantage.weights()
         fisher = np.einsum("kmi,kmj->ij", jacobian, jacobian) / len(errors)
@@ -143,7 +147,8 @@ def lstdv(states: Matrix, next_states: Matrix, reward: Vector) -> Vector:
     change = features - quadratic_features(next_states, centre, spread)
     change[:, 0] = 1.0
     weights = np.linalg.lstsq(features.T @ change, features.T @ reward)[0]
-    return np.asarray(reward - change @ weights)
+    errors: Vector = reward - change @ weights
+    return errors
 
 
 class AdvantageRegression:
@@ -172,4 +177,5 @@ class AdvantageRegression:
         size = self.moment.size
         floor = max(float(np.trace(self.information)), np.finfo(float).tiny) / size
         factor = cho_factor(self.information + self._ridge * floor * np.eye(size))
-        return np.asarray(cho_solve(factor, self.moment))
+        weights: Vector = cho_solve(factor, self.moment)
+        return weights

@@ -12,7 +12,7 @@ import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
-from cosim.studies.plan import Plan, Run, Training
+from cosim.studies.plan import Plan, Run
 from cosim.studies.store import LOG
 from cosim.studies.tables import Table, read_table
 from cosim.validation import instead
@@ -26,20 +26,14 @@ SHARES = (0.0, 0.5, 0.8, 1.0)
 
 
 def scales(plan: Plan) -> dict[str, float]:
-    """Typical size of a change of each entry of θ, by name, over all trained cases."""
+    """Learning scale of each entry of θ, by its column of the log, over all trained cases."""
     found: dict[str, float] = {}
     for run in plan.runs:
         if run.training is not None:
-            found |= _scales(run.training)
+            blocks = run.training.prepare().starting_parameters().blocks
+            names = (f"{PREFIX}{label}" for label in blocks.labels)
+            found |= dict(zip(names, blocks.scale.tolist(), strict=True))
     return found
-
-
-def _scales(training: Training) -> dict[str, float]:
-    """Learning scale of each entry of a training's θ, by its column of the log."""
-    run = training.prepare()
-    blocks = run.starting_parameters().blocks
-    names = (f"{PREFIX}{label}" for label in blocks.labels)
-    return dict(zip(names, blocks.scale.tolist(), strict=True))
 
 
 def collected(runs: Sequence[Run], out: Path) -> pd.DataFrame:
@@ -50,16 +44,11 @@ def collected(runs: Sequence[Run], out: Path) -> pd.DataFrame:
             continue
         log = read_table(out / run.key.folder / LOG)
         for share in SHARES:
-            known = log[log.samples <= share * log.samples.iloc[-1] + 0.5].iloc[[-1]]
-            entries = known[[name for name in log if name.startswith(PREFIX)]].astype(float)
-            entries.insert(0, "samples", known.samples.astype(int))
-            for name, value in (
-                ("share", share), ("training_seed", run.key.seed), ("case", run.key.case),
-                ("scenario", run.key.scenario),
-            ):  # fmt: skip
-                entries.insert(0, name, value)
-            rows.append(entries)
-    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+            known = log[log.samples <= share * log.samples.iloc[-1] + 0.5].iloc[-1]
+            own = {"scenario": run.key.scenario, "case": run.key.case}
+            own |= {"training_seed": run.key.seed, "share": share, "samples": int(known.samples)}
+            rows.append(own | {name: known[name] for name in log if name.startswith(PREFIX)})
+    return pd.DataFrame(rows)
 
 
 def tables(
@@ -91,7 +80,15 @@ def tables(
     costs = runs.set_index(["scenario", "case", "training_seed"]).J.sort_index()
     title = "Where θ went, in scaled entries"
     title += f" without {', '.join(settings['without'])}" if settings["without"] else ""
-    pairs = _pairs(trained, settings["pairs"], list(names))
+    for name in (name for pair in settings["pairs"] for name in pair):
+        if name not in trained:
+            raise StudyError(
+                f"[theta], pairs: there is no trained case '{name}'{instead(name, trained)}"
+            )
+    pairs = [
+        (a, b) for first, second in settings["pairs"] for a in names for b in names
+        if a[1] == first and b[1] == second
+    ] if settings["pairs"] else list(combinations(names, 2))  # fmt: skip
     return [
         (title, *_course_table(scaled, names)),
         (
@@ -117,23 +114,6 @@ def _course_table(
         between = shown(float(np.median(apart)), None, 1, 3) if apart else ""
         rows.append([name, str(len(way)), shown(way.median(), None, 1, 3), between])
     return ("case", "runs", "way, median", "between seeds"), rows
-
-
-def _pairs(
-    trained: Sequence[str], wanted: Sequence[Sequence[str]], courses: Sequence[Where]
-) -> list[tuple[Where, Where]]:
-    """The wanted pairs, else all."""
-    for name in (name for pair in wanted for name in pair):
-        if name not in trained:
-            raise StudyError(
-                f"[theta], pairs: there is no trained case '{name}'{instead(name, trained)}"
-            )
-    if not wanted:
-        return list(combinations(courses, 2))
-    return [
-        (a, b) for first, second in wanted for a in courses for b in courses
-        if a[1] == first and b[1] == second
-    ]  # fmt: skip
 
 
 def _apart(

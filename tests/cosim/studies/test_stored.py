@@ -7,10 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli.main import app
-from cosim.comparison import load_run
-from cosim.studies.results import StudyResults
 from cosim.studies.stored import (
-    compared_tables,
     differences,
     load_tolerances,
     stored_studies,
@@ -77,20 +74,6 @@ def test_every_stored_study_is_a_valid_study_that_can_be_planned():
         "gate",
         "quick",
     ]
-
-
-def test_stored_tables_are_read_by_the_project_s_own_readers():
-    for name in ("closed-loop", "quick"):
-        folder = STORED / name
-        assert len(StudyResults.load(folder).runs)
-        tables = compared_tables(folder)
-        trajectories = [table for table in tables if table.startswith("trajectories/")]
-        assert trajectories
-        for table in trajectories:
-            assert len(load_run(folder / table)) > 100
-        for table in tables:
-            if table.startswith("logs/"):
-                assert read_table(folder / table).samples.iloc[-1] > 1000
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def wandering(folder, **theta):
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine, "_train", wander)
-        patch.setattr("cosim.studies.theta._scales", lambda _: {"theta g": 2.0, "theta h[0]": 1.0})
+        patch.setattr("cosim.studies.theta.scales", lambda _: {"theta g": 2.0, "theta h[0]": 1.0})
         return run_toy(folder, case=case, theta=theta)
 
 

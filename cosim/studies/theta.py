@@ -45,7 +45,7 @@ def collected(runs: Sequence[Run], out: Path) -> pd.DataFrame:
         log = read_table(out / run.key.folder / LOG)
         for share in SHARES:
             known = log[log.samples <= share * log.samples.iloc[-1] + 0.5].iloc[-1]
-            own = {"scenario": run.key.scenario, "case": run.key.case}
+            own: dict[str, Any] = {"scenario": run.key.scenario, "case": run.key.case}
             own |= {"training_seed": run.key.seed, "share": share, "samples": int(known.samples)}
             rows.append(own | {name: known[name] for name in log if name.startswith(PREFIX)})
     return pd.DataFrame(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib
 import json
@@ -15,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib.util import resolve_name
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -260,12 +262,24 @@ def _file_name(module: str) -> str:
     return "/".join(path.parts[-parts:])
 
 
-def _imports(module: str) -> Iterator[str]:
-    """Names of the modules that a user's module has, or has something from, at its top level."""
-    for value in list(vars(_sources[module][0]).values()):
-        name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", "")
-        if isinstance(name, str):
-            yield name
+def _imports(module: str) -> list[str]:
+    """Names that the import statements of a user's module may mean as modules."""
+    loaded = _sources[module][0]
+    try:
+        tree = ast.parse(Path(str(loaded.__file__)).read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return []
+    names: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                with suppress(ImportError):
+                    base = resolve_name("." * node.level + base, loaded.__package__)
+            names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
+    return names
 
 
 def _hash_foreign_modules() -> None:

@@ -140,7 +140,9 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
 
     cache = cache_folder("fmus")
     folder = cache / sha256
-    with FileLock(cache / f"{sha256}.lock"):
+    if _holds(folder, archive):
+        return folder
+    with FileLock(cache / f"{sha256}.lock", timeout=60):
         if not _holds(folder, archive):
             # What runs from a damaged folder keeps its open files.
             shutil.rmtree(folder, ignore_errors=True)

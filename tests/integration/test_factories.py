@@ -34,7 +34,7 @@ def test_backend_and_hessian_are_the_scenarios(paper):
     s = paper.reference_state + np.array([0.5, 1.0])
     first = naive(changed(paper, backend="proxqp", hessian="exact"))
     assert first.feedback(s).value == pytest.approx(naive(paper).feedback(s).value, rel=1e-6)
-    assert type(first._backend).__name__ == "ProxQpBackend"
+    assert type(first._backend).__name__ == "QpsolversBackend"
     assert first.feedback(s).prepared.spectrum is not None
 
 

@@ -303,7 +303,8 @@ class StudyResults(Shown):
             below = self.reference("optimum", scenario)
             below = other.mean(axis=0) if below is None else below
             alone = any(self._single(case, scenario) for case in (row["case"], leader))
-            interval = None if alone else paired_difference(cost, other, below)[1]
+            unpaired = alone or not len(cost)  # no training seed in common
+            interval = None if unpaired else paired_difference(cost, other, below)[1]
             if interval is not None and interval[0] > 0:
                 first = place
             row["rank"] = first + 1

@@ -236,7 +236,7 @@ def hold(folder: Path) -> None:
     since = datetime.now(UTC).isoformat(timespec="seconds")
     command = " ".join(["cosim", *sys.argv[1:]])
     holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
-    (folder / HOLDER).write_text(holder, "utf-8")
+    (folder / HOLDER).write_text(holder, "utf-8", "backslashreplace")
 
 
 def release() -> list[Path]:

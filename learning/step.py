@@ -129,15 +129,17 @@ def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
 
 
 def definite(
-    blocks: ThetaBlocks, theta: Vector, fit: Fit, smallest: float
+    blocks: ThetaBlocks, theta: Vector, fit: Fit, smallest: float, scale: Vector | None = None
 ) -> tuple[Vector, Certificate]:
     """The fit's own minimiser under B ⪰ εI, by Clarabel where the free minimiser violates it.
 
     min dᵀMd − 2bᵀd  s.t.  B_l(θ+Sd) ⪰ εI, B_Vf(θ+Sd) ⪰ εI with scaled steps d (S = diag scale):
     a quadratic programme over positive semidefinite cones (paper.tex, eq. q_solution, pg_solution).
+    S is `scale` (n_θ,), the layout's if not given; the matrices have their own units in any case.
     Returns the new θ; a failure of the solver refuses the step.
     """
-    free = theta + blocks.scale * fit.minimiser
+    scale = blocks.scale if scale is None else scale
+    free = theta + scale * fit.minimiser
     found = certificate(blocks, free)
     if found.smallest >= smallest:
         return free, found
@@ -147,7 +149,8 @@ def definite(
         order, weight = sdp.svec_order(block.shape[0])
         shifted = matrix_of(blocks, theta, name) - smallest * np.eye(block.shape[0])
         rows = np.zeros((block.size, blocks.size))
-        rows[np.arange(block.size), where.start + order] = -weight
+        ratio = (scale[where] / blocks.scale[where])[order]
+        rows[np.arange(block.size), where.start + order] = -weight * ratio
         matrices.append(rows)
         offsets.append(weight * block.pack(shifted)[order])
         cones.append(sdp.semidefinite(block.shape[0]))
@@ -164,7 +167,7 @@ def definite(
     if step is None:
         return theta, certificate(blocks, theta, corrected=True, refused=True)
     # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
-    theta = clip_eigenvalues(blocks, theta + blocks.scale * step, smallest)
+    theta = clip_eigenvalues(blocks, theta + scale * step, smallest)
     return theta, certificate(blocks, theta, corrected=True)
 
 
@@ -198,11 +201,10 @@ class ConstrainedStep:
         scale: Vector | None = None,
     ) -> None:
         self._controller = controller
-        blocks = controller.parameters.blocks
-        self.blocks = blocks if scale is None else rescaled(blocks, scale)
-        self.scale: Vector = self.blocks.scale
+        self.blocks = controller.parameters.blocks
+        self.scale: Vector = self.blocks.scale if scale is None else scale
         self._smallest = least_eigenvalue(configuration, controller.parameters)
-        self._least = {block.name: np.array(block.least) for block in blocks if block.least}
+        self._least = {block.name: np.array(block.least) for block in self.blocks if block.least}
 
     def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
         """The new θ that a fit leads to, and its certificate; the controller stays as it is.
@@ -213,7 +215,7 @@ class ConstrainedStep:
         theta = self._controller.theta
         if not np.isfinite(fit.minimiser).all():
             raise DivergenceError("the step of θ is not finite")
-        new, vouched = definite(self.blocks, theta, fit, self._smallest)
+        new, vouched = definite(self.blocks, theta, fit, self._smallest, self.scale)
         new = new.copy()
         for name, minimum in self._least.items():
             where = self.blocks.slices[name]
@@ -260,16 +262,6 @@ def least_eigenvalue(configuration: Configuration, start: Parameters) -> float:
     own = certificate(start.blocks, start.theta).smallest
     chosen = configuration.smallest_eigenvalue
     return min(chosen, own / 2) if own > 0 else chosen
-
-
-def rescaled(blocks: ThetaBlocks, scale: Vector) -> ThetaBlocks:
-    """The blocks with another learning scale, (n_θ,)."""
-    return ThetaBlocks(
-        tuple(
-            replace(block, scale=tuple(scale[blocks.slices[block.name]].tolist()))
-            for block in blocks
-        )
-    )
 
 
 def prior_deviation(

@@ -13,7 +13,7 @@ def test_demo_shows_what_learning_gains_with_the_same_bytes_again(cosim, tmp_pat
         assert code == 0, err
     summary = json.loads(out)
     rows = summary["controllers"]
-    assert list(rows) == ["naive", "tuned + back-off", "learnt", "optimal"]
+    assert set(rows) == {"naive", "tuned + back-off", "learnt", "optimal"}
     assert rows["optimal"]["J"] < rows["learnt"]["J"] < rows["naive"]["J"]
     assert rows["naive"]["violating_share"] > 0.3
     assert summary["training"]["plant_samples"] == 4000

@@ -155,6 +155,14 @@ def towards(blocks, **values):
     return Fit(d, d, lambda: np.eye(d.size))
 
 
+def test_a_hessian_keeps_its_units_in_other_coordinates(controller):
+    scale = np.linspace(0.1, 7.0, controller.theta.size)
+    step = ConstrainedStep(controller, Configuration(), scale)
+    update = step.take(towards(step.blocks, c_lambda=1.0), td_error=1.0)
+    parameters = controller.parameters
+    assert update.smallest_eigenvalue == certificate(parameters.blocks, parameters.theta).smallest
+
+
 def test_take_moves_theta_by_the_scaled_step(controller):
     step = ConstrainedStep(controller, Configuration())
     before = controller.theta.copy()

@@ -147,7 +147,7 @@ class PairedComparison:
     to `blocks` blocks of `block` samples.
     """
 
-    KEPT = ("_errors", "_pooled")
+    KEPT = ("_errors", "pooled")
     MEMORY = 6000
     """Prediction errors over which a penalty is expected: the tail is what counts."""
 
@@ -163,10 +163,19 @@ class PairedComparison:
         self.expected = float("nan")
         """Penalty expected of the latest block."""
         self._errors: Matrix = np.zeros((0, scenario.state_lower.size))
-        self._pooled = self._errors
-        """The errors that the penalties of this round's blocks are expected with."""
+        self.pooled = self._errors
         self.incumbent = Candidate(start.theta)
         self.base = self.incumbent
+
+    @property
+    def pooled(self) -> Matrix:
+        """The prediction errors that the penalties of this round's blocks are expected with."""
+        return self._pooled
+
+    @pooled.setter
+    def pooled(self, errors: Matrix) -> None:
+        # Sorted once a round: a block only looks up.
+        self._pooled, self._pool = errors, SortedErrors(errors)
 
     def accept(self, candidate: Candidate) -> None:
         """Make a candidate the incumbent."""
@@ -196,9 +205,9 @@ class PairedComparison:
         """Penalty expected of a block's predictions, its own where there is no pool yet."""
         if block.expected is not None:
             return block.expected
-        if len(block.predictions) and len(self._pooled):
-            pool = SortedErrors(self._pooled)
-            return float(expected_penalties(self._penalty, block.predictions, pool).cumsum()[-1])
+        if len(block.predictions) and len(self._pool):
+            found = expected_penalties(self._penalty, block.predictions, self._pool)
+            return float(found.cumsum()[-1])
         return block.penalty
 
     def renew(self, blocks: int, episode: int | None = None) -> Generator[Request, Result, None]:
@@ -206,7 +215,7 @@ class PairedComparison:
         self.spend(self.block)
         yield Settle(self.incumbent.theta, episode)
         # One pool for the whole round, or two θ would not be judged alike.
-        self._pooled = self._errors
+        self.pooled = self._errors
         self.base = self.incumbent = Candidate(self.incumbent.theta)
         for _ in range(blocks):
             yield from self.run(self.incumbent)

@@ -64,6 +64,8 @@ class _Commands(TyperGroup):
         except BrokenPipeError:
             raise CosimError("a pipe that the command, or a plug-in, writes to is closed") from None
         except SystemExit as error:
+            if isinstance(error.__context__, BrokenPipeError):  # the reader of our own output left
+                raise Finished(EXIT_CLOSED_PIPE) from None
             raise CosimError(f"a plug-in ended the command by exit({error.code})") from error
 
 
@@ -102,6 +104,7 @@ for panel, group, example in (
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70
 EXIT_INTERRUPTED = 130
+EXIT_CLOSED_PIPE = 141
 EXIT_TERMINATED = 143
 KNOWN = (
     "fmus.FmuError",

@@ -1,5 +1,8 @@
 import io
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 import rich.console
@@ -59,3 +62,12 @@ def test_only_numbers_stand_on_the_right(printed, cells, right):
     line = next(line for line in text.splitlines() if cells[0] in line)
     assert line.startswith(f"│ {cells[0]}") is not right
     assert line.endswith(f"{cells[0]} │") is right
+
+
+def test_a_reader_who_leaves_hears_nothing():
+    reading, writing = os.pipe()
+    os.close(reading)
+    words = [sys.executable, "-m", "cosim", "train", "--help"]
+    with os.fdopen(writing, "w") as closed:
+        ended = subprocess.run(words, stdout=closed, stderr=subprocess.PIPE, check=False)
+    assert (ended.returncode, ended.stderr) == (141, b"")

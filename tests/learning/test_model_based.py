@@ -10,6 +10,7 @@ from controllers.functions import find_compiler
 from learning import model_based
 from learning.empirical_model import EmpiricalModel, Features, Rollout
 from learning.model_based import BackOffs, ModelBased
+from learning.q_learning import QLearning
 from learning.training import to_csv
 from tests.helpers.training import killed_and_resumed, make_run, train
 
@@ -136,11 +137,31 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, featu
         assert rule._changed(fitted) == window
 
 
-def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch):
+def test_the_model_takes_over_from_the_rule_at_a_change_of_the_plant(
+    scenario, fitted, rng, monkeypatch
+):
+    run = make_run("model-based", scenario, {"then": "q-learning", "hand_over": 30})
+    rule = ModelBased(tuned(scenario), scenario, run.configuration, 1000, None, rng)
+    monkeypatch.setattr(rule, "_update", lambda: None)
+    monkeypatch.setattr(rule, "_changed", lambda _: 15)
+    seen = []
+    monkeypatch.setattr(QLearning, "observe", lambda _, transition: seen.append(transition))
+    zero = np.zeros(2)
+    sample = SimpleNamespace(s=zero, a=zero, next_s=zero, stage_cost=0.0)
+    for _ in range(32):
+        rule.observe(sample)
+    assert (len(seen), rule.needs_action_value, rule.explores) == (2, True, True)
+    rule._model, rule._updated = fitted, 18
+    rule.observe(sample)
+    assert (len(seen), rule.needs_action_value, rule._era) == (2, False, 18)
+
+
+@pytest.mark.parametrize("then", [{}, {"then": "q-learning", "hand_over": 30}])
+def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch, then):
     smaller = {"BURN": 5, "COARSE": 25, "FINE": 30, "LEVELS": (0.0, 3.0), "FACTORS": ((1.2,),)}
     for name, value in smaller.items():
         monkeypatch.setattr(model_based, name, value)
-    settings = {"first_update": 15}
+    settings = {"first_update": 15} | then
     every = {"samples": 80, "log_every": 20, "evaluate_every": 80, "checkpoint_every": 20}
     run = make_run("model-based", scenario, settings, start="tuned", **every)
     whole = train(run)

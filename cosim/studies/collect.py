@@ -13,7 +13,7 @@ from cosim.files import read_json
 from cosim.studies import theta
 from cosim.studies.plan import EVALUATION, GREEDY, NAIVE, Plan, Run
 from cosim.studies.report import commit
-from cosim.studies.store import INDICATORS, LOG, RUN, accompanied, measured
+from cosim.studies.store import INDICATORS, LOG, RUN, measured
 from cosim.studies.tables import CURVE, KEYS, STATE, read_table
 
 SCHEMA = 1
@@ -115,12 +115,11 @@ def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.Data
     if not (folder / RUN).is_file():
         return None
     document = read_json(folder / RUN, f"'{folder / RUN}'", StudyError)
-    found = {file: measured(folder, run, file) for file in run.noise}
+    kept = {file: noise for file, noise in run.noise.items() if not noise.whole}
+    found = {file: measured(folder, run, file) for file in kept}
     if run.training is not None and not document.get("status"):
         return None
-    if any(set(noise.seeds) - set(found[file].index) for file, noise in run.noise.items()):
-        return None
-    if (beside := run.online) and set(beside.seeds) - set(accompanied(folder, beside).seed):
+    if any(set(noise.seeds) - set(found[file].index) for file, noise in kept.items()):
         return None
     own = found[EVALUATION].loc[list(run.noise[EVALUATION].seeds)].reset_index()
     key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}

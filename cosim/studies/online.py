@@ -11,8 +11,8 @@ import pandas as pd
 
 from cosim.protocols import Array
 from cosim.statistics import regret, regrets, shown
-from cosim.studies.plan import Run
-from cosim.studies.store import accompanied
+from cosim.studies.plan import ONLINE, Run
+from cosim.studies.store import measured
 from cosim.studies.tables import Table
 
 Course = tuple[Array, Array, Array]
@@ -33,12 +33,12 @@ def collected(runs: Sequence[Run], curves: pd.DataFrame, out: Path) -> pd.DataFr
         if run.training is not None:
             own = (curves[list(key)] == key).all(axis=1) & (curves.training_seed == run.key.seed)
             found.append(curves[own].dropna(subset="J")[COLUMNS])
-        elif run.online is not None:
-            rows = accompanied(out / run.key.folder, run.online)
-            ends = run.online.block * (rows.groupby("seed").cumcount() + 1)
+        elif (beside := run.noise.get(ONLINE)) is not None:
+            rows = measured(out / run.key.folder, run, ONLINE).reset_index()
+            ends = beside.block * (rows.groupby("seed").cumcount() + 1)
             values = {
                 "training_seed": rows.seed.astype("Int64"),
-                "samples": np.minimum(ends, run.online.steps).astype("Int64"),
+                "samples": np.minimum(ends, beside.steps).astype("Int64"),
                 "J": rows.J,
             }
             found.append(pd.DataFrame(values).assign(**key)[COLUMNS])

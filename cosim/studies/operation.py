@@ -19,8 +19,8 @@ from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
 from cosim.statistics import paired_difference, shown
-from cosim.studies.plan import Run, greedy_file
-from cosim.studies.store import LOG, ONLINE
+from cosim.studies.plan import ONLINE, Run, greedy_file
+from cosim.studies.store import LOG, measured
 from cosim.studies.tables import KEYS, Table, read_table
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
@@ -138,10 +138,9 @@ def collected(runs: Sequence[Run], out: Path) -> tuple[pd.DataFrame, pd.DataFram
         if run.training is not None:
             rows = read_table(folder / LOG, types={"samples": int})
             lives.append(rows.assign(**names, training_seed=key.seed))
-        elif run.online is not None:
-            blocks = read_table(folder / ONLINE, types={"seed": int})
-            for seed, own in blocks.groupby("seed"):
-                ends = run.online.block * np.arange(1, len(own) + 1)
+        elif ONLINE in run.noise:
+            for seed, own in measured(folder, run, ONLINE).groupby("seed"):
+                ends = run.noise[ONLINE].block * np.arange(1, len(own) + 1)
                 so_far = own.J.expanding().mean().to_numpy()
                 rows = pd.DataFrame({"samples": ends, "J": so_far})
                 rows = rows[rows.samples.isin(run.marks)]

@@ -38,7 +38,7 @@ from learning.training import stored_optimum
 from learning.training_run import TrainingRun, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
-EVALUATION, GREEDY = "evaluation.csv", "greedy.csv"
+EVALUATION, GREEDY, ONLINE = "evaluation.csv", "greedy.csv", "online.csv"
 RUNS = "runs"
 HELD_OUT = 1_000_000
 """First of the held-out seeds of greedy evaluations during training."""
@@ -102,21 +102,23 @@ class Training:
 
 
 class Noise(NamedTuple):
-    """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`."""
+    """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`.
+
+    Indicators are kept; mean costs over `block` samples, where that is not 0; the run sample by
+    sample, if it is `whole`. A policy of a run in operation is that of the sample `mark`.
+    """
 
     seeds: tuple[int, ...]
     steps: int
     burn_in: int = 0
+    block: int = 0
+    whole: bool = False
+    mark: int = 0
 
-
-@dataclass(frozen=True)
-class Online:
-    """Noise of the trainings that a controller runs beside, for the longest one's `steps`; its
-    cost is kept as means over `block` samples."""
-
-    seeds: tuple[int, ...]
-    steps: int
-    block: int
+    @property
+    def samples(self) -> int:
+        """Plant samples on all seeds."""
+        return len(self.seeds) * (self.burn_in + self.steps)
 
 
 def greedy_file(mark: int) -> str:
@@ -166,9 +168,9 @@ class Run:
     """One run: a controller, or a training and the θ that comes of it.
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `noise` is what it is measured on, by the file that keeps the indicators; `traces` are
-    runs kept sample by sample. `marks` are the samples of operation at which θ, or the optimum, is
-    judged.
+    training. `noise` is what it is measured on, by the file that keeps what is found; `traces` are
+    the trajectories that it takes part in. `marks` are the samples of operation at which θ, or the
+    optimum, is judged.
     """
 
     key: RunKey
@@ -179,16 +181,13 @@ class Run:
     facts: Mapping[str, Any]
     noise: Mapping[str, Noise]
     traces: tuple[TrajectoryTable, ...] = ()
-    online: Online | None = None
     marks: tuple[int, ...] = ()
 
     @property
     def samples(self) -> int:
         """Plant samples of the run; those of greedy evaluations while training apart."""
         trained = 0 if self.training is None else self.training.samples
-        evaluated = sum(len(n.seeds) * (n.burn_in + n.steps) for n in self.noise.values())
-        beside = 0 if self.online is None else len(self.online.seeds) * self.online.steps
-        return trained + evaluated + beside + sum(trace.steps for trace in self.traces)
+        return trained + sum(noise.samples for noise in self.noise.values())
 
 
 class Study:
@@ -479,21 +478,14 @@ def plan(study: Study) -> Plan:
         if training is None and any(case.algorithm for case in _on(study, name)):
             noise[GREEDY] = study.held_out(name)
         at_mark = study.held_out(name)._replace(burn_in=own.burn_in)
-        noise |= {greedy_file(mark): at_mark for mark in marks}
-        runs.append(
-            Run(
-                RunKey(name, case.name, seed),
-                case,
-                scenario,
-                case.controller,
-                training,
-                facts,
-                noise,
-                _traces(study, case, name, seed),
-                None if training is not None else _online(study, case, name),
-                marks=marks,
-            )
-        )
+        noise |= {greedy_file(mark): at_mark._replace(mark=mark) for mark in marks}
+        traces = _traces(study, case, name, seed)
+        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in traces}
+        if training is None and (beside := _online(study, case, name)) is not None:
+            noise[ONLINE] = beside
+        key = RunKey(name, case.name, seed)
+        found = Run(key, case, scenario, case.controller, training, facts, noise, traces, marks)
+        runs.append(found)
     _check_names(study)
     check_folders(runs)
     about = {"versions": versions(), "code_hash": code_hash(OURS)}
@@ -527,16 +519,17 @@ def _traces(
     )
 
 
-def _online(study: Study, controller: Case, scenario: str) -> Online | None:
-    """The trainings that a controller of the study, or the optimum, runs beside."""
+def _online(study: Study, controller: Case, scenario: str) -> Noise | None:
+    """Noise of the trainings that a controller of the study, or the optimum, runs beside."""
     trained = [case for case in _on(study, scenario) if case.algorithm]
     best = controller.name == study.optima.get(scenario)
     seeds = tuple(sorted({seed for case in trained for seed in case.training_seeds}))
     if best and trained and (marks := study.marks(scenario)):
-        return Online(seeds, marks[-1], gcd(*marks))
+        return Noise(seeds, marks[-1], block=gcd(*marks))
     if study.table.online is None or not trained or not (best or controller in study.cases):
         return None
-    return Online(seeds, max(case.samples for case in trained), study.table.online.block)
+    longest = max(case.samples for case in trained)
+    return Noise(seeds, longest, block=study.table.online.block)
 
 
 def _check_names(study: Study) -> None:

@@ -29,9 +29,9 @@ from cosim.statistics import (
     two_way,
 )
 from cosim.studies import collect, figures, online, operation, pictures, report, theta
-from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, Plan, safe
+from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, ONLINE, Plan, safe
 from cosim.studies.report import COLUMNS, SHORT
-from cosim.studies.store import INDICATORS, ONLINE, TIMING
+from cosim.studies.store import INDICATORS, TIMING
 from cosim.studies.tables import CURVE, KEYS, STATE, WHERE, Table, read_table, to_csv
 from cosim.text_tables import markdown_table
 from cosim.validation import instead

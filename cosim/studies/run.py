@@ -18,7 +18,7 @@ import loky
 
 from controllers import compile_functions
 from cosim.errors import EvaluationError, FailedRunsError
-from cosim.files import temporary_folder
+from cosim.files import temporary_folder, write_atomically
 from cosim.kpis import measure
 from cosim.plant import FmuPlant
 from cosim.plant.archive import unpack
@@ -29,14 +29,14 @@ from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from cosim.studies import operation
 from cosim.studies.cluster import on_cluster
-from cosim.studies.document import TrajectoryTable
-from cosim.studies.plan import EVALUATION, Plan, Run, Study, Training, greedy_file, plan
+from cosim.studies.plan import EVALUATION, Noise, Plan, Run, Study, Training, plan
 from cosim.studies.results import StudyResults
 from cosim.studies.store import CHECKPOINT, Measured, RunStore, Trained
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 BLOCK = 20_000
 """Samples of an item of evaluation, about: a few seconds of work."""
+NONE = Noise((), 0)
 ROUNDS = 3
 """Times that workers may die without having finished one item."""
 
@@ -72,12 +72,10 @@ class Item:
     """Work that one process does in one go, the same wherever that is.
 
     A `training` to its end, its checkpoint in `folder` where the workers share this disk. Else a
-    controller for `steps` samples on each of the `seeds` after `burn_in`: its indicators for
-    `file`; the run itself, where a `trace` is asked for; means over `block` samples, where that is
-    not 0. `samples` are those of all the controller's items. The controller is a text for
-    `build_controller`, a factory(scenario), or the `training`'s with θ = `parameters`. A training
-    in operation is judged at its `marks`; a policy at the one that is its last, with the `theta`
-    that it had then.
+    controller on some `noise`, for `file`. `samples` are those of all the controller's items. The
+    controller is a text for `build_controller`, a factory(scenario), or the `training`'s with θ =
+    `parameters`. A training in operation is judged at its `marks`; a policy at the noise's, with
+    the `theta` that it had then.
     """
 
     run: str
@@ -88,11 +86,7 @@ class Item:
     parameters: str = ""
     controller: Any = None
     file: str = ""
-    seeds: tuple[int, ...] = ()
-    steps: int = 0
-    burn_in: int = 0
-    trace: TrajectoryTable | None = None
-    block: int = 0
+    noise: Noise = NONE
     marks: tuple[int, ...] = ()
     theta: tuple[float, ...] = ()
     samples: int = 0
@@ -113,7 +107,7 @@ class Failure:
         return EvaluationError(self.message)
 
 
-Outcome = Trained | Measured | str | list[float] | Failure
+Outcome = Trained | Measured | str | Failure
 
 
 def perform(item: Item) -> tuple[Item, Outcome]:
@@ -156,30 +150,28 @@ def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> T
     )
 
 
-def _simulate(item: Item) -> Measured | str | list[float]:
+def _simulate(item: Item) -> Measured | str:
     controller = _controller(item)
     compile_functions(controller, item.samples)
-    scenario = item.scenario
-    if item.marks:
-        scenario = operation.plant_at(scenario, item.marks[-1] * scenario.sampling_time)
+    scenario, (seeds, steps, burn_in, block, whole, mark) = item.scenario, item.noise
+    if mark:
+        scenario = operation.plant_at(scenario, mark * scenario.sampling_time)
     with FmuPlant(scenario) as plant:
-        if item.trace is not None:
-            return simulate(plant, controller, item.steps, item.seeds[0]).to_csv()
-        if item.block:
-            run = simulate(plant, controller, item.steps, item.seeds[0], residuals=False)
+        if whole:
+            return simulate(plant, controller, steps, seeds[0]).to_csv()
+        if block:
+            run = simulate(plant, controller, steps, seeds[0], residuals=False)
             cost = run["stage_cost"] + run["penalty"]
-            firsts = range(0, item.steps, item.block)
-            return [float(cost[first : first + item.block].mean()) for first in firsts]
-        return {
-            seed: measure(plant, controller, seed, item.steps, item.burn_in) for seed in item.seeds
-        }
+            firsts = range(0, steps, block)
+            return {seeds[0]: ({"J": [float(cost[k : k + block].mean()) for k in firsts]}, {})}
+        return {seed: measure(plant, controller, seed, steps, burn_in) for seed in seeds}
 
 
 def _controller(item: Item) -> Controller:
     if item.training is not None:
         return item.training.controller(item.parameters, item.theta)
-    if item.marks:
-        return operation.optimum_at(item.scenario, item.marks[-1])
+    if item.noise.mark:
+        return operation.optimum_at(item.scenario, item.noise.mark)
     if isinstance(item.controller, str):
         return build_controller(item.controller, item.scenario)
     controller: Controller = item.controller(item.scenario)
@@ -266,28 +258,16 @@ class Runner:
                 return
             base = replace(base, parameters=store.parameters)
             self._done[name] = trained
-        for file, (seeds, steps, burn_in) in run.noise.items():
-            missing = store.missing(file)
-            self._done[name] += (len(seeds) - len(missing)) * (burn_in + steps)
-            size = max(1, BLOCK // (burn_in + steps))
-            mark = next((mark for mark in run.marks if greedy_file(mark) == file), None)
-            at_mark = base
-            if mark is not None and missing:
-                theta = () if run.training is None else operation.theta_at(store.log, mark)
-                at_mark = replace(base, marks=(mark,), theta=theta)
-            for first in range(0, len(missing), size):
-                block = tuple(missing[first : first + size])
-                yield replace(at_mark, file=file, seeds=block, steps=steps, burn_in=burn_in)
-        for trace in run.traces:
-            if (store.folder / trace.file).is_file():
-                self._done[name] += trace.steps
-            else:
-                yield replace(base, trace=trace, seeds=(trace.seed,), steps=trace.steps)
-        if (online := run.online) is not None:
-            beside = store.missing_online()
-            self._done[name] += online.steps * (len(online.seeds) - len(beside))
-            for seed in beside:
-                yield replace(base, seeds=(seed,), steps=online.steps, block=online.block)
+        for file, noise in run.noise.items():
+            missing = noise._replace(seeds=store.missing(file))
+            self._done[name] += noise.samples - missing.samples
+            size = 1 if noise.block else max(1, BLOCK // (noise.burn_in + noise.steps))
+            theta: tuple[float, ...] = ()
+            if noise.mark and missing.seeds and run.training is not None:
+                theta = operation.theta_at(store.log, noise.mark)
+            for first in range(0, len(missing.seeds), size):
+                part = missing._replace(seeds=missing.seeds[first : first + size])
+                yield replace(base, file=file, noise=part, theta=theta)
 
     def _take(self, item: Item, outcome: Outcome) -> None:
         """Store what an item gave and say so."""
@@ -299,17 +279,14 @@ class Runner:
                 self._tell(f"failed: {name}: {outcome.message}")
             return
         store.unseal()
-        self._done[name] += len(item.seeds) * (item.burn_in + item.steps)
+        self._done[name] += item.noise.samples
         if isinstance(outcome, Trained):
             store.train(outcome)
             self._done[name] = outcome.samples
             self._tell("" if outcome.status == "finished" else f"{name}: {outcome.status}")
             return
         if isinstance(outcome, str):
-            assert item.trace is not None
-            store.trace(item.trace, outcome)
-        elif isinstance(outcome, list):
-            store.accompany(item.seeds[0], outcome)
+            write_atomically(store.folder / item.file, outcome)
         else:
             store.evaluate(item.file, outcome)
         self._tell(self._finish(name, self._runs[name]))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,25 +23,24 @@ import pandas as pd
 from cosim.errors import StudyError
 from cosim.files import read_json, write_atomically
 from cosim.plugins import changed
-from cosim.studies.document import TrajectoryTable
-from cosim.studies.plan import EVALUATION, GREEDY, Online, Run
+from cosim.studies.plan import EVALUATION, GREEDY, ONLINE, Run
 from cosim.studies.tables import read_table, to_csv
 
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
-FAILURE, ONLINE, TIMING = "failure.txt", "online.csv", "timing.csv"
+FAILURE, TIMING = "failure.txt", "timing.csv"
 OURS = (CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, ONLINE, TIMING)
 PATTERNS = ("trajectory-*.csv", "greedy-*.csv")
 INDICATORS = (
     "J", "economic_cost", "mean_violation", "violating_share", "input_effort", "failures",
 )  # fmt: skip
 KEY = ["seed", "steps", "burn_in"]
-BLOCKS = ["seed", "steps", "block", "J"]
+BLOCKS = ["seed", "steps", "block"]
 PAUSE = 20
 """Of the time that a table took to write, what passes at least until it is written again."""
-Figures = dict[str, float]
+Figures = dict[str, Any]
 Measured = dict[int, tuple[Figures, Figures]]
-"""Indicators and what the clock said, by noise seed."""
+"""Indicators, or the mean cost of each block as `J`, and what the clock said, by noise seed."""
 
 
 @dataclass(frozen=True)
@@ -62,26 +61,16 @@ class Trained:
 def measured(folder: Path, run: Run, file: str) -> pd.DataFrame:
     """What a file of a run holds, by noise seed, of runs as long as the plan's.
 
-    Raises StudyError where it is damaged.
+    A row for each seed, or for each of its blocks. Raises StudyError where it is damaged.
     """
+    noise = run.noise[EVALUATION if file == TIMING else file]
+    key, columns = (BLOCKS, ["J"]) if noise.block else (KEY, INDICATORS)
     if not (folder / file).is_file():
-        return pd.DataFrame(columns=[*KEY, *INDICATORS]).set_index("seed")
-    columns = () if file == TIMING else (*KEY, *INDICATORS)
-    rows = read_table(folder / file, columns, dict.fromkeys(KEY, int))
-    _, steps, burn_in = run.noise[EVALUATION if file == TIMING else file]
-    rows = rows[(rows.steps == steps) & (rows.burn_in == burn_in)]
-    return rows.drop_duplicates("seed").set_index("seed")
-
-
-def accompanied(folder: Path, online: Online) -> pd.DataFrame:
-    """Mean costs of a controller's blocks by training seed, as long as the plan's.
-
-    Raises StudyError where the file is damaged.
-    """
-    if not (folder / ONLINE).is_file():
-        return pd.DataFrame(columns=BLOCKS)
-    rows = read_table(folder / ONLINE, BLOCKS, dict.fromkeys(BLOCKS[:3], int))
-    return rows[(rows.steps == online.steps) & (rows.block == online.block)]
+        return pd.DataFrame(columns=[*key, *columns]).set_index("seed")
+    wanted = () if file == TIMING else (*key, *columns)
+    rows = read_table(folder / file, wanted, dict.fromkeys(key, int)).set_index("seed")
+    rows = rows[(rows.steps == noise.steps) & (rows[key[2]] == (noise.block or noise.burn_in))]
+    return rows if noise.block else rows[~rows.index.duplicated()]
 
 
 class RunStore:
@@ -181,27 +170,31 @@ class RunStore:
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
     def indicators(self, file: str) -> dict[int, Figures]:
-        """Indicators by noise seed that a file holds of runs as long as the plan's, read once."""
+        """What a file holds by noise seed of runs as long as the plan's, read once.
+
+        Nothing of a damaged file, which is named.
+        """
         if file not in self._known:
-            rows = self._whole(file, lambda: measured(self.folder, self._run, file))
-            self._known[file] = rows.drop(columns=KEY, errors="ignore").to_dict("index")
+            try:
+                rows = measured(self.folder, self._run, file)
+            except StudyError:
+                self.remarks.append(f"'{self.folder / file}' is damaged; made anew")
+                rows = pd.DataFrame()
+            rows = rows.drop(columns=[*KEY, *BLOCKS], errors="ignore")
+            if file == ONLINE and len(rows):
+                rows = rows.groupby("seed").agg(list)
+            self._known[file] = rows.to_dict("index")
         return self._known[file]
 
-    def _whole(self, file: str, read: Callable[[], pd.DataFrame]) -> pd.DataFrame:
-        """What is read of a file; nothing of a damaged one, which is named."""
-        try:
-            return read()
-        except StudyError:
-            self.remarks.append(f"'{self.folder / file}' is damaged; made anew")
-            return pd.DataFrame()
-
-    def missing(self, file: str) -> list[int]:
-        """Noise seeds without indicators in a file."""
-        known = self.indicators(file)
-        return [seed for seed in self._run.noise[file].seeds if seed not in known]
+    def missing(self, file: str) -> tuple[int, ...]:
+        """Noise seeds of which a file says nothing."""
+        noise = self._run.noise[file]
+        if noise.whole:
+            return () if (self.folder / file).is_file() else noise.seeds
+        return tuple(seed for seed in noise.seeds if seed not in self.indicators(file))
 
     def evaluate(self, file: str, found: Measured) -> None:
-        """Add indicators to a file, and what the clock said to timing.csv."""
+        """Add what was measured to a file, and what the clock said to timing.csv."""
         parts = [(file, 0), *([(TIMING, 1)] if file == EVALUATION else [])]
         for name, part in parts:
             self.indicators(name).update({seed: pair[part] for seed, pair in found.items()})
@@ -218,37 +211,17 @@ class RunStore:
         # The rows of many seeds are written again and again: the pause keeps that a small share.
         begin = time.monotonic()
         rows = pd.DataFrame.from_dict(self._known[file], "index").sort_index()
-        rows = rows if file == TIMING else rows[list(INDICATORS)]
-        _, *length = self._run.noise[EVALUATION if file == TIMING else file]
-        for place, value in enumerate((rows.index, *length)):
-            rows.insert(place, KEY[place], value)
+        noise = self._run.noise[EVALUATION if file == TIMING else file]
+        if noise.block:
+            rows = rows.explode("J").astype(float)
+        elif file != TIMING:
+            rows = rows[list(INDICATORS)]
+        key = BLOCKS if noise.block else KEY
+        for place, value in enumerate((rows.index, noise.steps, noise.block or noise.burn_in)):
+            rows.insert(place, key[place], value)
         write_atomically(self.folder / file, to_csv(rows))
         self._next[file] = time.monotonic() + PAUSE * (time.monotonic() - begin)
         self._unwritten.discard(file)
-
-    def _beside(self, online: Online) -> pd.DataFrame:
-        rows = self._whole(ONLINE, lambda: accompanied(self.folder, online))
-        return rows.reindex(columns=BLOCKS)
-
-    def missing_online(self) -> list[int]:
-        """Seeds of trainings that the controller has not run beside yet."""
-        if self._run.online is None:
-            return []
-        known = set(self._beside(self._run.online).seed)
-        return [seed for seed in self._run.online.seeds if seed not in known]
-
-    def accompany(self, seed: int, costs: Sequence[float]) -> None:
-        """Add the mean costs of a run's blocks."""
-        online = self._run.online
-        assert online is not None
-        own = {"seed": seed, "steps": online.steps, "block": online.block, "J": costs}
-        rows = [*self._beside(online).to_dict("records"), *pd.DataFrame(own).to_dict("records")]
-        table = pd.DataFrame(rows).sort_values("seed", kind="stable")
-        write_atomically(self.folder / ONLINE, to_csv(table))
-
-    def trace(self, trace: TrajectoryTable, trajectory: str) -> None:
-        """Store a trajectory."""
-        write_atomically(self.folder / trace.file, trajectory)
 
     def fail(self, trace: str) -> None:
         """Keep the traceback of what failed."""
@@ -257,12 +230,8 @@ class RunStore:
     @property
     def finished(self) -> bool:
         """Whether all that the plan asks of the run is there."""
-        return (
-            (self._run.training is None or bool(self.status))
-            and not any(self.missing(file) for file in self._run.noise)
-            and not self.missing_online()
-            and all((self.folder / trace.file).is_file() for trace in self._run.traces)
-        )
+        trained = self._run.training is None or bool(self.status)
+        return trained and not any(self.missing(file) for file in self._run.noise)
 
     def seal(self) -> None:
         """Note the hashes of a finished run's files, so that a torn or edited one is noticed."""

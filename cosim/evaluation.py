@@ -23,12 +23,11 @@ from cosim.plugins import (
 )
 from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
-from cosim.shown import Shown
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, check_folders
 from cosim.studies.run import Runner
-from cosim.studies.store import TIMING
-from cosim.studies.tables import to_csv
+from cosim.studies.store import TIMING, to_csv
+from cosim.text_tables import Shown
 from learning.training import stored_optimum
 
 if TYPE_CHECKING:

@@ -113,19 +113,13 @@ def out_of_reach_of_ctrl_c() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def follow_parent(number: int | None = None) -> None:
+def follow_parent(number: int) -> None:
     """End this worker process, without further ado, as soon as its parent has ended.
 
     To be called once in a worker, whose work is lost with its parent anyway. `number` is the
     parent's, which may have ended before the worker could ask for it.
     """
-    from multiprocessing import parent_process  # noqa: PLC0415
-
     import psutil  # noqa: PLC0415
-
-    if number is None:
-        parent = parent_process()
-        number = os.getppid() if parent is None else parent.pid
 
     def watch() -> None:
         with suppress(psutil.Error):

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from cosim.errors import ScenarioError
 from cosim.files import read_toml
 from cosim.penalty import Penalty
-from cosim.shown import Shown
+from cosim.text_tables import Shown
 from cosim.validation import describe, suggestion
 
 Number = Annotated[float, Field(allow_inf_nan=False)]

@@ -18,9 +18,8 @@ from cosim.errors import TrajectoryError
 from cosim.files import replacing, write_atomically
 from cosim.penalty import VIOLATING
 from cosim.scenario import Scenario
-from cosim.shown import Shown
 from cosim.signals import signal_names, whole
-from cosim.text_tables import csv_text
+from cosim.text_tables import Shown, csv_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -28,9 +28,8 @@ from cosim.plant.archive import SHIPPED
 from cosim.plugins import build_controller
 from cosim.protocols import Controller, Plant, functions_of
 from cosim.scenario import Scenario
-from cosim.shown import Shown
 from cosim.statistics import gap_closed, regret, shown
-from cosim.text_tables import csv_text
+from cosim.text_tables import Shown, csv_text
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up

@@ -146,8 +146,7 @@ def report(
 
 def _summary(found: StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is what timing.csv says of each run."""
-    from cosim.studies.store import TIMING
-    from cosim.studies.tables import read_table
+    from cosim.studies.store import TIMING, read_table
 
     timing = read_table(found.folder / TIMING, types={"run": str}).to_dict("records")
     return {

@@ -13,8 +13,7 @@ from cosim.files import read_json
 from cosim.studies import theta
 from cosim.studies.plan import EVALUATION, GREEDY, NAIVE, Plan, Run
 from cosim.studies.report import commit
-from cosim.studies.store import INDICATORS, LOG, RUN, measured
-from cosim.studies.tables import CURVE, KEYS, STATE, read_table
+from cosim.studies.store import CURVE, INDICATORS, KEYS, LOG, RUN, STATE, measured, read_table
 
 SCHEMA = 1
 EVALUATED = "evaluated"

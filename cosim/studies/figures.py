@@ -31,8 +31,7 @@ from cosim.figures.style import (
 )  # fmt: skip
 from cosim.protocols import Array
 from cosim.statistics import LEVEL, regret_terms, regrets
-from cosim.studies.online import Course
-from cosim.studies.operation import Judged
+from cosim.studies.operation import Course, Judged
 from cosim.validation import instead
 
 BANDED = 6

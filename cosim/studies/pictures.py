@@ -23,8 +23,7 @@ from cosim.statistics import TD_WINDOW, td_error_mean
 from cosim.studies.document import TrajectoryTable
 from cosim.studies.plan import Plan, Run, safe
 from cosim.studies.report import FOLDER
-from cosim.studies.store import LOG, PARAMETERS
-from cosim.studies.tables import read_table
+from cosim.studies.store import LOG, PARAMETERS, read_table
 from cosim.trajectory import Trajectory, read_csv
 
 Policy = Callable[[Array], Array]

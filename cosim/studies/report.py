@@ -20,8 +20,7 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 from cosim.files import write_atomically
 from cosim.protocols import Array
 from cosim.statistics import Estimate, gain, shown
-from cosim.studies.tables import Table
-from cosim.text_tables import markdown_table
+from cosim.text_tables import Table, markdown_table
 
 PAGE, TABLES, FOLDER = "report.html", "report.md", "figures"
 Rows = tuple[Sequence[str], list[list[str]]]

@@ -17,7 +17,6 @@ from cosim.errors import StudyError
 from cosim.figures.style import Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
-from cosim.shown import Shown
 from cosim.statistics import (
     Estimate,
     Interval,
@@ -28,12 +27,11 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import collect, figures, online, operation, pictures, report, theta
+from cosim.studies import collect, figures, operation, pictures, report, theta
 from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, ONLINE, Plan, safe
 from cosim.studies.report import COLUMNS, SHORT
-from cosim.studies.store import INDICATORS, TIMING
-from cosim.studies.tables import CURVE, KEYS, STATE, WHERE, Table, read_table, to_csv
-from cosim.text_tables import markdown_table
+from cosim.studies.store import CURVE, INDICATORS, KEYS, STATE, TIMING, WHERE, read_table, to_csv
+from cosim.text_tables import Shown, Table, markdown_table
 from cosim.validation import instead
 
 ABOUT = "study.json"
@@ -126,7 +124,7 @@ class StudyResults(Shown):
             TIMING: collect.timing(plan, out),
         }
         if self.about["online"] is not None:
-            tables[ONLINE] = online.collected(runs, self.curves, out)
+            tables[ONLINE] = operation.block_costs(runs, self.curves, out)
         if self.about.get("operation"):
             tables[OPERATION], tables[GREEDY] = operation.collected(runs, out)
         if "theta" in self.about:
@@ -395,7 +393,7 @@ class StudyResults(Shown):
             for scenario in self.scenarios:
                 optimum = self.about["optimum"].get(scenario, "")
                 own = self.online[self.online.scenario == scenario]
-                found.append(online.table(own, scenario, optimum, self.about["online"]))
+                found.append(operation.online_table(own, scenario, optimum, self.about["online"]))
         against = {name: case.get("against") for name, case in self.cases.items()}
         for scenario, about in (self.about.get("operation") or {}).items():
             judged, seconds = self._judged(scenario), self._seconds(scenario)
@@ -499,7 +497,7 @@ class StudyResults(Shown):
             return None
         own = self.online[self.online.scenario == scenario]
         optimum = self.about["optimum"].get(scenario, "")
-        courses = online.courses(own, optimum)
+        courses = operation.courses(own, optimum)
         if not courses:
             return None
         logs = {case: log for case in courses if (log := self.log(case, scenario)) is not None}

@@ -20,8 +20,7 @@ from cosim.studies.pictures import LOGS, TRAJECTORIES
 from cosim.studies.plan import EVALUATION, RUNS
 from cosim.studies.report import TABLES
 from cosim.studies.results import ABOUT, CURVES, StudyResults
-from cosim.studies.store import TIMING
-from cosim.studies.tables import KEYS, to_csv
+from cosim.studies.store import KEYS, TIMING, to_csv
 from cosim.trajectory import Signal
 from cosim.validation import describe, instead
 

@@ -13,8 +13,8 @@ import pandas as pd
 from cosim.errors import StudyError
 from cosim.statistics import Estimate, mean, shown
 from cosim.studies.plan import Plan, Run
-from cosim.studies.store import LOG
-from cosim.studies.tables import Table, read_table
+from cosim.studies.store import LOG, read_table
+from cosim.text_tables import Table
 from cosim.validation import instead
 
 Where = tuple[str, str]

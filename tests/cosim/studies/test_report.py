@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.studies.results import StudyResults
-from cosim.studies.tables import KEYS, to_csv
+from cosim.studies.store import KEYS, to_csv
 from tests.helpers.toy_study import GROW, run_toy
 
 ROOT = Path(__file__).parents[3]

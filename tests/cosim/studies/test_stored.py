@@ -7,12 +7,12 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli.main import app
+from cosim.studies.store import read_table
 from cosim.studies.stored import (
     differences,
     load_tolerances,
     stored_studies,
 )
-from cosim.studies.tables import read_table
 
 STORED = Path(__file__).parents[3] / "results"
 MINIMAL = """\

@@ -1,8 +1,8 @@
-"""Records runs over each other: the same plots, an entity for each run, and A − B of two."""
+"""Records what has ended: runs over each other, and A − B of two; a training, by its samples."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import cycle
 from math import inf
@@ -14,6 +14,7 @@ import rerun.blueprint as rrb
 from cosim.comparison import RunSignals
 from cosim.protocols import Array
 from cosim.recording.stream import (
+    SAMPLE,
     SERIES,
     Channel,
     Stream,
@@ -21,6 +22,7 @@ from cosim.recording.stream import (
     axis,
     escaped,
     layout,
+    table,
     times,
     view,
 )
@@ -84,3 +86,55 @@ def _difference(signal: str, a: RunSignals, b: RunSignals) -> tuple[Channel, Arr
 
 def _time(run: RunSignals) -> Array:
     return run.signals["time"].values if "time" in run.signals else np.arange(float(len(run)))
+
+
+def record_training(
+    path: str | Path,
+    title: str,
+    log: Mapping[str, Array],
+    increments: Mapping[str, Array],
+    labels: Mapping[str, Sequence[str]],
+    properties: Mapping[str, object],
+) -> None:
+    """Write a recording of a training: the signals are the log's columns and `increment/<block>`.
+
+    `log` holds columns (K,), among them `samples`, NaN where not measured; `increments` the change
+    of each block of θ since the start, (K, size), and `labels` the names of its entries.
+
+    Raises
+    ------
+    RecordingError : the file cannot be written.
+    """
+    samples = log["samples"]
+    blocks = {
+        name: Channel(
+            f"increment/{escaped(name)}", f"increment/{name}", labels=list(labels[name])
+        ).see(values)
+        for name, values in increments.items()
+    }
+    columns = {
+        name: Channel(
+            f"log/{escaped(name)}",
+            name,
+            color=SERIES[number % len(SERIES)],
+            points=bool(np.isnan(values).any()),
+        ).see(values)
+        for number, (name, values) in enumerate(log.items())
+    }
+    along = axis(samples=int(samples[-1]) if len(samples) else 0)
+    views = layout(
+        rrb.Tabs(
+            rrb.Grid(*(view(f"change of {n}", [b], along) for n, b in blocks.items()), name="θ"),
+            rrb.Grid(*(view(name, [c], along) for name, c in columns.items()), name="log"),
+            about_view("about this training"),
+        ),
+        SAMPLE,
+    )
+    with Stream(path, title, views) as stream:
+        stream.properties(properties)
+        stream.about(f"# {title}\n\n{table('training', properties)}\n")
+        rows = times(samples.astype(np.int64))
+        for name, block in blocks.items():
+            stream.send([block], rows, increments[name])
+        for name, column in columns.items():
+            stream.send([column], rows, log[name])

@@ -18,12 +18,9 @@ from controllers.dynamics import stage_parameter_gradient
 from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp.problem import (
-    LEAST_CONTROLS,
     QpSolution,
     SoftQp,
-    StageMatrices,
     kkt_solve,
-    kkt_solve_by_stages,
 )
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
@@ -161,18 +158,15 @@ def _direction(
 
 
 def adjoint_directions(
-    qp: SoftQp, solution: QpSolution, n_actions: int, stages: Callable[[], StageMatrices]
+    qp: SoftQp, solution: QpSolution, n_actions: int
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Solutions dv, dt, dλ of the KKT system for unit right-hand sides in u_0, a row an action.
 
     The KKT matrix of the active set is symmetric, so these rows of its inverse are all that dπ/dθ
-    and dπ/ds need. `stages` gives those of the condensed `qp`; long horizons are solved by them.
+    and dπ/ds need.
     """
     active, seeds = solution.active(qp), np.eye(n_actions, qp.f.size)
-    solved = None
-    if qp.f.size >= LEAST_CONTROLS:
-        solved = kkt_solve_by_stages(stages(), qp.W, active, seeds)
-    dv, dlam = solved or kkt_solve(qp, active, seeds, np.zeros((n_actions, qp.w.size)))
+    dv, dlam = kkt_solve(qp, active, seeds, np.zeros((n_actions, qp.w.size)))
     violated, dt = active[2], np.zeros_like(dlam)
     if violated.any():
         moved = (dv @ qp.rows.T)[:, violated]

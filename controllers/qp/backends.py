@@ -69,26 +69,10 @@ class DaqpBackend:
     def __init__(self) -> None:
         self._model: Any = None
         self._factorised = 0
-        self._limits: Matrix | None = None
         self._failed = False
 
     def load(self, qp: SoftQp) -> None:
-        """Factorise H and transform the rows; the first call allocates the workspace.
-
-        Where the QP brings a factor T of H, DAQP gets the QP in y with v = T y: its own
-        factorisation costs O(N³), looking through the factor's rows O(N²).
-        """
-        if qp.factor is None:
-            self._limits = None
-            self._load(qp, qp.H, qp.rows)
-            return
-        self._limits = qp.factor()
-        if np.isfinite(self._limits[0]).all():
-            self._load(qp, None, self._limits)
-        else:
-            self._factorised = DAQP_NOT_CONVEX
-
-    def _load(self, qp: SoftQp, H: Matrix | None, A: Matrix) -> None:
+        """Factorise H and transform the rows; the first call allocates the workspace."""
         n, rows = qp.f.size, qp.w.size
         if self._model is None:
             self._lower, self._upper = np.zeros(n + rows), np.zeros(n + rows)
@@ -99,9 +83,8 @@ class DaqpBackend:
             self._model = daqp.Model()
             self._model.settings = SETTINGS
             self._write_limits(qp)
-            unit = np.eye(n) if H is None else H
             self._factorised, _ = self._model.setup(
-                unit, qp.f, A, self._upper, self._lower, self._sense
+                qp.H, qp.f, qp.rows, self._upper, self._lower, self._sense
             )
             self._weights(qp)
         else:
@@ -110,7 +93,7 @@ class DaqpBackend:
             if self._failed:  # an update is refused while the limits of a failed QP stand
                 self._write_limits(qp)
             self._factorised = self._model.update(
-                H=H, A=A, bupper=self._upper, blower=self._lower, sense=self._free
+                H=qp.H, A=qp.rows, bupper=self._upper, blower=self._lower, sense=self._free
             )
 
     def _weights(self, qp: SoftQp) -> None:
@@ -128,8 +111,6 @@ class DaqpBackend:
         """Solve with the vectors of `qp`; raises QpError where DAQP does not."""
         n, flag = qp.f.size, self._factorised
         self._failed = True
-        # Not by BLAS, which would start threads for a long horizon's product.
-        T = None if self._limits is None else self._limits[:n]
         if flag >= 0:
             self._write_limits(qp)
             fixed = qp.lower == qp.upper
@@ -137,18 +118,13 @@ class DaqpBackend:
                 self._fixed = told
                 np.multiply(fixed, FIXED, out=self._bounds_sense)
             flag = self._model.update(
-                f=qp.f if T is None else np.einsum("ij,i->j", T, qp.f),
-                bupper=self._upper,
-                blower=self._lower,
-                sense=self._sense,
+                f=qp.f, bupper=self._upper, blower=self._lower, sense=self._sense
             )
         if flag >= 0:
             v, _, flag, info = self._model.solve()
         if flag <= 0:
             status = MEANING.get(flag, f"exit flag {flag}")
             raise QpError(f"DAQP did not solve the QP: {status}", status=status, qp=qp.copy())
-        if T is not None:
-            v = np.einsum("ij,j->i", T, v)
         self._failed = False
         multipliers = info["lam"]
         return QpSolution(v, multipliers[:n], multipliers[n:])

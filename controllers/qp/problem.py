@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Index = NDArray[np.intp]
 
 
 NOT_CONVEX = "not convex"
@@ -29,10 +27,8 @@ class SoftQp:
 
     The stacked controls V = (v_0, …, v_{N−1}) are the variables, the predicted states Γ V the
     rows; paper.tex eq. param_nlp_qp with the dynamics eliminated. `lower = upper` fixes a variable,
-    which is how u_0 = a is enforced. `factor`, where given, makes [T; ΓT] (d + c, d) of a T with
-    TᵀHT = I from the data as they are, cheaper than H is factorised, its first row not finite where
-    H is not positive definite. Shapes for d variables and c rows: H (d, d), f, lower and upper
-    (d,), rows Γ (c, d), else w, W: (c,).
+    which is how u_0 = a is enforced. Shapes for d variables and c rows: H (d, d), f, lower and
+    upper (d,), rows Γ (c, d), else w, W: (c,).
     """
 
     H: Matrix
@@ -44,14 +40,10 @@ class SoftQp:
     row_upper: Vector
     w: Vector
     W: Vector
-    factor: Callable[[], Matrix] | None = None
 
     def copy(self) -> SoftQp:
-        """Deep copy, for a QP that is kept beyond the next sample; without `factor`."""
-        arrays: dict[str, Any] = {
-            name: value.copy() for name, value in vars(self).items() if name != "factor"
-        }
-        return SoftQp(**arrays)
+        """Deep copy, for a QP that is kept beyond the next sample."""
+        return copy.deepcopy(self)
 
 
 class Residuals(NamedTuple):
@@ -273,105 +265,3 @@ def _newton_step(qp: SoftQp, solution: QpSolution) -> QpSolution:
     multipliers = lam[0] + push + weight * (qp.rows @ v - limit)
     nu = np.where(held, -(qp.H @ v + qp.f + multipliers @ qp.rows), 0.0)
     return QpSolution(v, nu, multipliers)
-
-
-LEAST_CONTROLS = 150
-"""Number of controls N·m from which the banded system is solved faster than the dense one."""
-
-
-class StageMatrices(NamedTuple):
-    """What a QP's KKT matrix is made of: A (N, n, n), B (N, n, m), L (N, n+m, n+m), L_N (n, n)."""
-
-    A: Matrix
-    B: Matrix
-    L: Matrix
-    L_N: Matrix
-
-
-@cache
-def _places(n: int, m: int, horizon: int) -> dict[str, Index]:
-    """Where each block of every stage stands in LAPACK's band storage, by equation and unknown.
-
-    Unknowns of stage k are v_k, χ_{k+1}, ξ_{k+1} and λ_{k+1}; its equations stationarity in v_k,
-    the dynamics, stationarity in ξ_{k+1} and what the active set says of each row. They reach ξ_k
-    to the left and v_{k+1}, χ_{k+2} to the right, so the band is one stage wide on either side.
-    """
-    width = m + 3 * n
-    reach = width - 1
-    v, chi, xi, lam = np.split(np.arange(width), (m, m + n, m + 2 * n))
-
-    def at(rows: Index, columns: Index) -> Index:
-        # The storage's columns are 3·reach + 1 long.
-        return np.asarray(2 * reach + rows - columns + columns * (3 * reach + 1))
-
-    def block(rows: Index, columns: Index, on: int = 0) -> Index:
-        """Places of a block that reaches `on` stages to the right, (stages, rows, columns)."""
-        stages = np.arange(max(0, -on), horizon - max(0, on))[:, None, None] * width
-        return at(stages + rows[:, None], stages + on * width + columns)
-
-    def diagonal(rows: Index, columns: Index) -> Index:
-        stages = np.arange(horizon)[:, None] * width
-        return at(stages + rows, stages + columns)
-
-    return {
-        "v, v": block(v, v),
-        "v, xi": block(v, xi, -1),
-        "v, chi": block(v, chi),
-        "chi, v": block(chi, v),
-        "chi, xi": block(chi, xi, -1),
-        "chi, next xi": diagonal(chi, xi),
-        "xi, xi": block(xi, xi),
-        "xi, v": block(xi, v, 1),
-        "xi, next chi": block(xi, chi, 1),
-        "xi, chi": diagonal(xi, chi),
-        "xi, lam": diagonal(xi, lam),
-        "lam, xi": diagonal(lam, xi),
-        "lam, lam": diagonal(lam, lam),
-    }
-
-
-def kkt_solve_by_stages(
-    stages: StageMatrices, W: Vector, active: tuple[Mask, Mask, Mask], seeds: Matrix
-) -> tuple[Matrix, Matrix] | None:
-    """What `kkt_solve` gives for limits of zero, at O(N); None where the system is singular.
-
-    W (Nn,) are the quadratic weights of the rows; `seeds` (k, Nm) the right-hand sides. Returns
-    variables (k, Nm) and multipliers of the rows at their limit (k, Nn), zero elsewhere.
-    """
-    from scipy.linalg.lapack import dgbsv  # noqa: PLC0415
-
-    A, B, L, L_N = stages
-    horizon, n, m = B.shape
-    held, limit, violated = (mask.reshape(horizon, -1) for mask in active)
-    free = ~held[:, :, None]
-    weight = np.where(violated, 2 * W.reshape(horizon, n), 0.0)
-    blocks: dict[str, Matrix | float] = {
-        "v, v": L[:, n:, n:] * free + held[:, :, None] * np.eye(m),
-        "v, xi": (L[:, n:, :n] * free)[1:],
-        "v, chi": B.transpose(0, 2, 1) * free,
-        "chi, v": B,
-        "chi, xi": A[1:],
-        "chi, next xi": -1.0,
-        "xi, xi": np.concatenate([L[1:, :n, :n], L_N[None]]),
-        "xi, v": L[1:, :n, n:],
-        "xi, next chi": A[1:].transpose(0, 2, 1),
-        "xi, chi": -1.0,
-        "xi, lam": 1.0,
-        "lam, xi": np.where(limit, 1.0, -weight),
-        "lam, lam": np.where(limit, 0.0, 1.0),
-    }
-    width = m + 3 * n
-    reach, size = width - 1, horizon * width
-    flat = np.zeros((3 * reach + 1) * size)
-    places = _places(n, m, horizon)
-    for name, values in blocks.items():
-        flat[places[name]] = values
-    band = flat.reshape(3 * reach + 1, size, order="F")
-    right = np.zeros((len(seeds), horizon, width))
-    right[:, :, :m] = np.where(active[0], 0.0, seeds).reshape(-1, horizon, m)
-    _, _, answer, status = dgbsv(reach, reach, band, right.reshape(-1, size).T, 1, 1)
-    if status != 0:
-        return None
-    found = answer.T.reshape(-1, horizon, width)
-    v, lam = (part.reshape(len(seeds), -1) for part in (found[:, :, :m], found[:, :, m + 2 * n :]))
-    return v, np.where(active[1], lam, 0.0)

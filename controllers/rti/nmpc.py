@@ -18,14 +18,11 @@ from controllers.qp.backends import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
 from controllers.rti.engine import NOT_FINITE, Engine
 from controllers.rti.preparation import (
-    LEAST_CONTROLS,
     embedding,
-    limits_of,
     make_hessian,
     preparation,
     qp_of,
     readout,
-    riccati,
 )
 from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 from controllers.sensitivities import sensitivities
@@ -93,8 +90,6 @@ class RtiNmpc:
         self._qp = qp_of(self._prepare, self._readout, before, after)
         self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
         self._qp.upper[:] = np.tile(problem.action_upper - problem.reference_action, horizon)
-        if horizon * m >= LEAST_CONTROLS:
-            self._qp.factor = partial(limits_of, riccati(problem, self._prepare))
         self._engine: Engine | None = None
         self._prepared: Prepared | None = None
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from controllers.errors import ControllerError
 from controllers.functions import StackedFunction
 from controllers.problem import Problem
-from controllers.qp.problem import QpSolution, Residuals, SoftQp, StageMatrices
+from controllers.qp.problem import QpSolution, Residuals, SoftQp
 from controllers.rti.preparation import Lift, qp_of
 from controllers.sensitivities import SOLUTION, adjoint_directions, curvature_directions
 from controllers.theta import Parameters
@@ -216,7 +216,7 @@ class RtiSolution:
             found = prepared.jacobians(prepared.memory, self.memory)
             if found is not None:
                 return found
-        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m, self._stages)
+        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
         function = prepared.functions.policy
         self._write_solution(function)
         inputs = function.inputs
@@ -231,11 +231,6 @@ class RtiSolution:
         function()
         by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))
         return by_theta.copy(), by_state.copy()
-
-    def _stages(self) -> StageMatrices:
-        part, n, m = self.prepared.part, self.costates.shape[1], self.action.size
-        A, B, L = part("A"), part("B"), part("L").reshape(-1, n + m, n + m)
-        return StageMatrices(A.reshape(-1, n, n), B.reshape(-1, n, m), L, part("L_N").reshape(n, n))
 
     def _write_solution(self, function: StackedFunction) -> None:
         """Give a read-out function the solution and the point of linearisation."""

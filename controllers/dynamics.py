@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import casadi as ca
 
+from controllers.model import runge_kutta
 from controllers.problem import Problem
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
@@ -27,19 +28,14 @@ def sampled_jacobian(
     )
     h = problem.sampling_time / model.time_unit / problem.substeps
 
-    def stage(point: ca.SX, sensitivity: ca.SX) -> tuple[ca.SX, ca.SX]:
-        value, by_state, by_action = slope(point, u, *free)
-        return value, by_state @ sensitivity + ca.horzcat(ca.SX(n, n), by_action)
+    def both(at: ca.SX) -> ca.SX:
+        value, by_state, by_action = slope(at[:, 0], u, *free)
+        moved = by_state @ at[:, 1:] + ca.horzcat(ca.SX(n, n), by_action)
+        return ca.horzcat(value, moved)
 
-    drift = ca.horzcat(ca.SX.eye(n), ca.SX(n, m))
-    for _ in range(problem.substeps):
-        k1, s1 = stage(x, drift)
-        k2, s2 = stage(x + h / 2 * k1, drift + h / 2 * s1)
-        k3, s3 = stage(x + h / 2 * k2, drift + h / 2 * s2)
-        k4, s4 = stage(x + h * k3, drift + h * s3)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        drift = drift + h / 6 * (s1 + 2 * s2 + 2 * s3 + s4)
-    return x, drift
+    start = ca.horzcat(x, ca.SX.eye(n), ca.SX(n, m))
+    end = runge_kutta(both, start, h, problem.substeps)
+    return end[:, 0], end[:, 1:]
 
 
 def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:

@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from math import isfinite
 from pathlib import Path
 from typing import TypeVar
 
@@ -25,63 +24,19 @@ from cosim.processes import run_child
 Vector = NDArray[np.float64]
 
 
-BLAS_STARTS_THREADS = 8192
-"""Entries from which a product of vectors may be cut up."""
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 
 
-class BufferedFunction:
-    """A CasADi function whose arguments and results live in fixed NumPy arrays.
+class StackedFunction:
+    """A CasADi function of expressions whose arguments and results live in fixed NumPy arrays.
 
-    `inputs[name]` and `outputs[name]` are flat float64 arrays in CasADi's column-major order:
-    write the inputs, call, read the outputs. A call allocates nothing. The inputs follow each other
-    in one array but for the `shared` ones, which are read from somebody else's memory, such as
-    another function's output. Own inputs and outputs are one array, `memory`: a given one, or one
-    with `room` behind them for more, by name and size; `places` says by name where all of it
-    stands. Every input and output of the function must be dense.
-    """
-
-    def __init__(
-        self,
-        function: ca.Function,
-        shared: Mapping[str, Vector] | None = None,
-        *,
-        room: Mapping[str, int] | None = None,
-        memory: Vector | None = None,
-    ) -> None:
-        self.function = function
-        shared = shared or {}
-        sizes = {function.name_in(i): function.numel_in(i) for i in range(function.n_in())}
-        own = {name: size for name, size in sizes.items() if name not in shared}
-        results = {function.name_out(i): function.numel_out(i) for i in range(function.n_out())}
-        all_sizes = own | results | dict(room or {})
-        ends = np.cumsum(list(all_sizes.values())).tolist()
-        self.memory: Vector = np.zeros(ends[-1]) if memory is None else memory
-        self.places = {
-            name: slice(end - size, end)
-            for (name, size), end in zip(all_sizes.items(), ends, strict=True)
-        }
-        assert all(a.shape == (sizes[name],) and a.flags.c_contiguous for name, a in shared.items())
-        self.inputs = {
-            name: shared[name] if name in shared else self.memory[self.places[name]]
-            for name in sizes
-        }
-        self.outputs = {name: self.memory[self.places[name]] for name in results}
-        self._buffer, self._evaluate = function.buffer()
-        for i, array in enumerate(self.inputs.values()):
-            self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]
-        for i, array in enumerate(self.outputs.values()):
-            self._buffer.set_res(i, memoryview(array))  # type: ignore[arg-type,call-arg]
-
-    def __call__(self) -> None:
-        """Evaluate with what stands in `inputs`, into `outputs`."""
-        self._evaluate()
-
-
-class StackedFunction(BufferedFunction):
-    """A buffered function whose results share one flat array, so that one copy keeps them all.
-
-    Its expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
+    `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
+    read the results by `part`. A call allocates nothing. All results share one flat array, `stack`,
+    so that one copy keeps them all. The inputs follow each other in one array but for the `shared`
+    ones, which are read from somebody else's memory, such as another function's output. Own inputs
+    and results are one array, `memory`: a given one, or one with `room` behind them for more, by
+    name and size; `places` says by name where all of it stands. The expressions are scalar graphs
+    (SX) or, where stages repeat, graphs of calls (MX).
     """
 
     def __init__(
@@ -94,7 +49,7 @@ class StackedFunction(BufferedFunction):
         room: Mapping[str, int] | None = None,
         memory: Vector | None = None,
     ) -> None:
-        function = ca.Function(
+        self.function = function = ca.Function(
             name,
             [ca.densify(argument) for argument in arguments.values()],
             [ca.densify(ca.veccat(*results.values()))],
@@ -102,29 +57,43 @@ class StackedFunction(BufferedFunction):
             ["stack"],
             {"cse": True},
         )
-        super().__init__(function, shared, room=room, memory=memory)
+        shared = shared or {}
+        sizes = {name: argument.numel() for name, argument in arguments.items()}
+        own = {name: size for name, size in sizes.items() if name not in shared}
+        all_sizes = own | {"stack": function.numel_out(0)} | dict(room or {})
+        ends = np.cumsum(list(all_sizes.values())).tolist()
+        self.memory: Vector = np.zeros(ends[-1]) if memory is None else memory
+        self.places = {
+            name: slice(end - size, end)
+            for (name, size), end in zip(all_sizes.items(), ends, strict=True)
+        }
+        assert all(a.shape == (sizes[name],) and a.flags.c_contiguous for name, a in shared.items())
+        self.inputs = {
+            name: shared[name] if name in shared else self.memory[self.places[name]]
+            for name in sizes
+        }
+        self.stack: Vector = self.memory[self.places["stack"]]
+        self._buffer, self._evaluate = function.buffer()
+        for i, array in enumerate(self.inputs.values()):
+            self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]
+        self._buffer.set_res(0, memoryview(self.stack))  # type: ignore[arg-type,call-arg]
         ends = np.cumsum([result.numel() for result in results.values()]).tolist()
         self.slices = {
             key: slice(end - result.numel(), end)
             for (key, result), end in zip(results.items(), ends, strict=True)
         }
         self.shapes = {key: result.shape for key, result in results.items()}
-        self.stack: Vector = self.outputs["stack"]
         first = self.places["stack"].start
         for key, part in self.slices.items():
             self.places[key] = slice(first + part.start, first + part.stop)
-        self._zeros = np.zeros(self.stack.size)
+
+    def __call__(self) -> None:
+        """Evaluate with what stands in `inputs`, into `stack`."""
+        self._evaluate()
 
     def finite(self) -> bool:
-        """Whether all results are: 0ᵀx takes a third of the time of NumPy's isfinite.
-
-        By `vdot`, which does not warn of the 0·∞ that is looked for: `errstate` around `dot` costs
-        more than the product. Not where BLAS would start threads for it, which wait for each other
-        on a busy machine.
-        """
-        if self._zeros.size > BLAS_STARTS_THREADS:
-            return bool(np.isfinite(self.stack).all())
-        return isfinite(np.vdot(self.stack, self._zeros))
+        """Whether all results are."""
+        return bool(np.isfinite(self.stack).all())
 
     def part(self, name: str, memory: Vector | None = None) -> Vector:
         """View of a result, transposed to row-major: shape (columns, rows), or flat for a column.

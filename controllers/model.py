@@ -75,16 +75,13 @@ class Model:
         )
 
 
-def runge_kutta(
-    model: Model, x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX, sampling_time: float, substeps: int
-) -> ca.SX:
-    """State after one sample of `sampling_time` seconds by `substeps` classical RK4 steps."""
-    h = sampling_time / model.time_unit / substeps
+def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float, substeps: int) -> ca.SX:
+    """x after `substeps` classical RK4 steps of length h of x' = rate(x)."""
     for _ in range(substeps):
-        k1 = model.ode(x, u, d, p)
-        k2 = model.ode(x + h / 2 * k1, u, d, p)
-        k3 = model.ode(x + h / 2 * k2, u, d, p)
-        k4 = model.ode(x + h * k3, u, d, p)
+        k1 = rate(x)
+        k2 = rate(x + h / 2 * k1)
+        k3 = rate(x + h / 2 * k2)
+        k4 = rate(x + h * k3)
         x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     return x
 
@@ -100,7 +97,8 @@ def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function
             "both be positive"
         )
     x, u, d, p = model.symbols()
-    x_next = runge_kutta(model, x, u, d, p, sampling_time, substeps)
+    h = sampling_time / model.time_unit / substeps
+    x_next = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, substeps)
     return ca.Function("f", [x, u, d, p], [x_next], ["x", "u", "d", "p"], ["x_next"])
 
 

@@ -253,14 +253,6 @@ class OptimalPolicy:
         action = np.array(a, dtype=np.float64)
         return OptimalSolution(action, self.action_value(state, action), status)
 
-    def policy(self, s: ArrayLike) -> Vector:
-        """π*(s), (m,)."""
-        return self.feedback(s).action
-
-    def value(self, s: ArrayLike) -> float:
-        """V*(s)."""
-        return self.feedback(s).value
-
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q*(s, a) = penalty(s) + E[ℓ − J* + V*(s₊)]."""
         state = np.array(s, dtype=np.float64).reshape(1, -1)

@@ -62,12 +62,9 @@ class Units:
         rates = ca.jacobian(model.ode(x, u, d, p), w)
         function = ca.Function("d", [x, u, d, p], [gradient, ca.diag(hessian), rates])
         nominal = (model.nominal_disturbance, model.nominal_parameters)
-        values = (value.full() for value in function(reference[:n], reference[n:], *nominal))
-        gradient, curvature, rates = (
-            next(values).reshape(-1),
-            next(values).reshape(-1),
-            next(values),
-        )
+        values = function(reference[:n], reference[n:], *nominal)
+        gradient, curvature = (value.full().reshape(-1) for value in values[:2])
+        rates = values[2].full()
         near = ACTIVE * widths
         below, above = reference <= lower + near, reference >= upper - near
         found = multipliers(gradient * both, rates * both, below, above)

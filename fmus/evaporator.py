@@ -27,17 +27,9 @@ from fmus.description import (
     model_description,
     render,
 )
-from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable
+from fmus.model import FmiVersion, Model, Unit, read_variables
 
 _EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
-
-
-def _rows(file: str) -> list[dict[str, str]]:
-    return list(csv.DictReader((RESOURCES / file).read_text(encoding="utf-8").splitlines()))
-
-
-def _number(text: str) -> float | None:
-    return float(text) if text else None
 
 
 UNITS = tuple(
@@ -47,26 +39,10 @@ UNITS = tuple(
         float(row["offset"]),
         tuple((base, int(power)) for base, power in _EXPONENT.findall(row["exponents"])),
     )
-    for row in _rows("units.csv")
+    for row in csv.DictReader((RESOURCES / "units.csv").read_text(encoding="utf-8").splitlines())
 )
-DISTURBANCES = ("X1", "F1", "T1", "T200")
-STATES = ("X2", "P2")
 
-VARIABLES = tuple(
-    Variable(
-        row["name"],
-        Kind[row["kind"]],
-        Type[row["type"]],
-        row["unit"],
-        _number(row["start"]),
-        _number(row["min"]),
-        _number(row["max"]),
-        _number(row["nominal"]),
-        row["description"],
-        tuple(row["uses"].split()),
-    )
-    for row in _rows("evaporator.csv")
-)
+VARIABLES = tuple(read_variables(RESOURCES / "evaporator.csv"))
 
 EVAPORATOR = Model(
     name="Evaporator",
@@ -80,8 +56,6 @@ EVAPORATOR = Model(
     model_exchange=True,
     derivatives=True,
 )
-
-BY_NAME = EVAPORATOR.by_name
 
 
 FILE_NAMES: dict[FmiVersion, str] = {2: "evaporator.fmu", 3: "evaporator_fmi3.fmu"}

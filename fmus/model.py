@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Literal
 
 FmiVersion = Literal[2, 3]
@@ -63,6 +65,30 @@ class Variable:
     def identifier(self) -> str:
         """The name as a C identifier: ``der(X2)`` becomes ``der_X2``, ``p.x[0]`` ``p_x_0_``."""
         return re.sub(r"\W", "_", self.name.replace(")", ""))
+
+
+def read_variables(file: Path) -> list[Variable]:
+    """The table of variables in a CSV file with a column for each field of `Variable`."""
+
+    def number(text: str) -> float | None:
+        return float(text) if text else None
+
+    with file.open(encoding="utf-8", newline="") as lines:
+        return [
+            Variable(
+                row["name"],
+                Kind[row["kind"]],
+                Type[row["type"]],
+                row["unit"],
+                number(row["start"]),
+                number(row["min"]),
+                number(row["max"]),
+                number(row["nominal"]),
+                row["description"],
+                tuple(row["uses"].split()),
+            )
+            for row in csv.DictReader(lines)
+        ]
 
 
 @dataclass(frozen=True)

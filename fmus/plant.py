@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 
-from fmus.build import SOURCES, assemble, files_of, sources_of
+from fmus.build import RESOURCES, SOURCES, assemble, files_of, sources_of
 from fmus.description import render
-from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable
+from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable, read_variables
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (
@@ -70,7 +70,10 @@ def plant_model(
     disturbances are drawn anew, and ``saturate``, with which an input beyond its range acts at the
     bound.
     """
-    switches = _switches(sampling_time)
+    switches = [
+        replace(v, start=sampling_time, nominal=sampling_time) if v.name == "sampling_time" else v
+        for v in read_variables(RESOURCES / "switches.csv")
+    ]
     drawn = (*(each.name for each in switches if each.name != "saturate"), "time")
     known = tuple(s.name for s in (*states, *inputs, *disturbances, *parameters))
     table = [
@@ -154,23 +157,3 @@ def build_plant(
 
 def _nominal(value: float) -> float:
     return abs(value) or 1.0
-
-
-def _switches(sampling_time: float) -> list[Variable]:
-    fixed = Kind.FIXED
-    return [
-        Variable("stochastic", Kind.TUNABLE, Type.BOOLEAN, "", 1.0, 0.0, 1.0,
-                 description="draw the disturbances; false: their means"),
-        Variable("law", fixed, Type.LAW, "", 1.0, 1.0, 2.0, description="law of the disturbances"),
-        Variable("seed", fixed, Type.SEED, "", 0.0, description="seed of the disturbances"),
-        Variable("seedHigh", fixed, Type.SEED_HIGH, "", 0.0,
-                 description="upper 32 bits of the seed (FMI 2.0 Integers have 32)"),
-        Variable("sampling_time", fixed, Type.REAL, "s", sampling_time, 0.01, 86400.0,
-                 sampling_time, "the disturbances are redrawn at its multiples and held between"),
-        Variable("saturate", fixed, Type.BOOLEAN, "", 0.0, 0.0, 1.0,
-                 description="an input beyond its range acts at the bound, as an actuator at its "
-                 "stop; false: refused"),
-        Variable("law_number", fixed, Type.LAW_NUMBER, "", 0.0, 0.0, 2.0,
-                 description="law of the disturbances as an integer; 0: as the enumeration law "
-                 "says"),
-    ]  # fmt: skip

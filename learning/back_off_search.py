@@ -78,7 +78,7 @@ class BackOffSearch:
             raise ConfigurationError(
                 f"a search of the back-off needs at least {least} samples, it has {budget}"
             )
-        self.start, self._budget = start, budget
+        self.origin, self._parameters, self._budget = start.theta, start, budget
         self._penalty, self._model = scenario.state_penalty, OneStepModel(scenario)
         self._settling = problem.horizon
         n, self._actions = problem.n_states, problem.n_actions
@@ -94,6 +94,11 @@ class BackOffSearch:
         self._binding, self._share = np.zeros(2 * n), np.zeros(2 * n)
         self._first: list[Vector] = []
         self._rows: list[Vector] = []
+
+    @property
+    def start(self) -> Parameters:
+        """θ with no bound backed off."""
+        return self._parameters.with_theta(self.origin)
 
     @property
     def seed(self) -> int:
@@ -238,15 +243,6 @@ class BackOffSearch:
             above += centred @ values[mine]
             below += float(centred @ centred)
         return np.asarray(above / below if below > 0 else above)
-
-    @property
-    def origin(self) -> Vector:
-        """θ of the start."""
-        return self.start.theta
-
-    @origin.setter
-    def origin(self, theta: Vector) -> None:
-        self.start = self.start.with_theta(theta)
 
     @property
     def stretches(self) -> list[Vector]:

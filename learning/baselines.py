@@ -25,7 +25,7 @@ from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off_search import BackOffSearch
-from learning.configuration import Configuration, Count, Share
+from learning.configuration import Configuration, Count
 from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel
 from learning.step import moved
@@ -33,7 +33,8 @@ from learning.step import moved
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 BackOffToo = Annotated[bool, Field(description="search the back-off of the active bounds")]
-EstimationShare = Annotated[Share, Field(description="share of the samples for the estimate")]
+ESTIMATION = 0.25
+"""Share of the samples for the estimate that comes before a search."""
 SHIFT = 8 * 3600.0
 """Seconds between two identifications, unless told otherwise."""
 
@@ -78,8 +79,6 @@ class OffsetFreeConfiguration(GreedyConfiguration):
 class OffsetFreeSimulatorConfiguration(OffsetFreeConfiguration, BackOffConfiguration):
     """Settings of the offset-free baseline whose back-off is searched for."""
 
-    estimation_share: EstimationShare = 0.25
-
 
 class IdentifiedConfiguration(GreedyConfiguration):
     """Settings of the identified baseline in operation."""
@@ -101,8 +100,6 @@ class IdentifiedConfiguration(GreedyConfiguration):
 
 class IdentifiedSimulatorConfiguration(IdentifiedConfiguration, BackOffConfiguration):
     """Settings of the identified baseline whose back-off is searched for."""
-
-    estimation_share: EstimationShare = 0.25
 
 
 class BackOff(Algorithm):
@@ -173,7 +170,7 @@ class BackOff(Algorithm):
             return None
         self.theta = found.theta
         if search is not None and self._count == self._estimation:
-            search.start = found
+            search.origin = found.theta
             return self._move(search.candidate, self._episode(search))
         return self._move(found)
 
@@ -194,8 +191,7 @@ class Estimate(BackOff):
     def _estimation_samples(self) -> int:
         if self.asks_for == "operation" or not self.configuration.back_off:
             return self.samples
-        share: float = self.configuration.estimation_share
-        return max(round(share * self.samples), 1)
+        return max(round(ESTIMATION * self.samples), 1)
 
     def backed_off(self, parameters: Parameters, errors: Matrix) -> Parameters:
         """θ in operation, its bounds set back by the greatest of its prediction errors (K, n).

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from controllers.economic import tune
 from controllers.factories import nmpc, value_offset
-from controllers.functions import BufferedFunction
-from controllers.model import runge_kutta
+from controllers.functions import StackedFunction
+from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
@@ -53,9 +53,9 @@ def _search(start: Parameters, scenario: Scenario) -> Parameters:
     model, penalty = problem.model, scenario.state_penalty
     x, u, d, _ = model.symbols()
     p = ca.SX(ca.DM(model.nominal_parameters))
-    after = runge_kutta(model, x, u, d, p, problem.sampling_time, problem.substeps)
-    outputs = [ca.densify(after), ca.densify(ca.SX(model.economic_cost(x, u, d, p)))]
-    plant = BufferedFunction(ca.Function("f", [x, u, d], outputs, ["x", "u", "d"], ["y", "l"]))
+    after = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
+    results = {"y": after, "l": ca.SX(model.economic_cost(x, u, d, p))}
+    plant = StackedFunction("f", {"x": x, "u": u, "d": d}, results)
     controller, nominal = nmpc(scenario, start), model.nominal_disturbance
     search = BackOffSearch(start, problem, scenario, SAMPLES, np.random.default_rng(0))
 
@@ -66,7 +66,7 @@ def _search(start: Parameters, scenario: Scenario) -> Parameters:
         plant.inputs["x"][:], plant.inputs["u"][:] = s, a
         plant.inputs["d"][:] = nominal * (1.0 + GUESS * noise.standard_normal(nominal.size))
         plant()
-        after, cost = plant.outputs["y"].copy(), float(plant.outputs["l"][0])
+        after, cost = plant.part("y").copy(), float(plant.part("l")[0])
         due, next_due = penalty(s.tolist()), penalty(after.tolist())
         return Transition(
             0, s, a, False, policy, policy, cost, cost + due, after, next_due, policy, None, None

@@ -57,12 +57,8 @@ class Features:
         )
         at = ca.Function("size", [x, u], [size])
         reference = at(problem.reference_state, problem.reference_action).full()[:, 0]
-        h = ca.vertcat(
-            *(
-                ca.fmax(size[i], FLOOR * value) if value > 0 else 1.0
-                for i, value in enumerate(reference)
-            )
-        )
+        sizes = zip(ca.vertsplit(size), reference, strict=True)
+        h = ca.vertcat(*(ca.fmax(own, FLOOR * at) if at > 0 else 1.0 for own, at in sizes))
         results = [ca.densify(part) for part in (y, by_both, h)]
         self.function = ca.Function("nominal", [x, u], results, ["x", "u"], ["y", "G", "h"])
         self.outputs, self.count = by_both.shape

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.functions import BufferedFunction
+from controllers.functions import StackedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters
@@ -31,8 +31,7 @@ class OneStepModel:
         step = discretise(model, problem.sampling_time, problem.substeps)
         x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
         d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
-        function = ca.Function("f", [x, u], [ca.densify(step(x, u, d, p))], ["x", "u"], ["y"])
-        self._function = BufferedFunction(function)
+        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": step(x, u, d, p)})
         self._model = model
         free = ca.SX.sym("p", len(model.parameters))
         self._parametric = ca.Function("f", [x, u, free], [step(x, u, d, free)])
@@ -42,7 +41,7 @@ class OneStepModel:
         function = self._function
         function.inputs["x"][:], function.inputs["u"][:] = s, a
         function()
-        return function.outputs["y"].copy()
+        return function.stack.copy()
 
     def parameters(self, theta: Parameters) -> Vector:
         """All parameters of the model at θ, (n_p,): the nominal ones but for its block p."""

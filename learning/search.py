@@ -8,6 +8,7 @@ what the plant shall be run for (`Learn`, `Settle`, `Trial`) and is sent what ca
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Self
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from controllers.errors import ParameterError
 from controllers.theta import Parameters
 from cosim.scenario import Scenario
 from learning.actor_critic import ActorCritic
@@ -290,13 +292,10 @@ class PairedComparison:
             return None
         if certificate(blocks, theta).smallest < self.least:
             theta = clip_eigenvalues(blocks, theta, self.least)
-        slices = blocks.slices
-        if not (theta[slices["x_l"]] < theta[slices["x_u"]]).all():
-            return None
-        for name in ("w_sigma", "W_sigma"):
-            if name in blocks and not (theta[slices[name]] > 0).all():
-                return None
-        return theta
+        with suppress(ParameterError):
+            Parameters(blocks, theta).require_well_posed()
+            return theta
+        return None
 
 
 def cheaper(difference: Vector) -> bool:

@@ -148,11 +148,8 @@ class PlantProblem:
         scenario names one, else the controller's. Raises OptimumError where it does not fit the
         plant, ModelError where it cannot be loaded.
         """
-        problem, plant, table = (
-            Problem.from_scenario(scenario),
-            scenario.plant,
-            scenario.disturbance,
-        )
+        problem = Problem.from_scenario(scenario)
+        plant, table = scenario.plant, scenario.disturbance
         if plant.model is not None:
             problem = replace(problem, model=load_model(plant.model))
         model, needed = problem.model, "the optimum needs a model of the plant"

@@ -225,41 +225,30 @@ def nelder_mead(
         rows = np.flatnonzero(values[:, -1] - values[:, 0] > precision)
         if not len(rows):
             break
-        vertices[rows], values[rows] = _replace_worst(
-            objective, rows, vertices[rows], values[rows], lower, upper
-        )
+        centre, worst = vertices[rows, :-1].mean(axis=1), vertices[rows, -1]
+        candidate = np.clip(2.0 * centre - worst, lower, upper)
+        reflected = objective(rows, candidate)
+        best = reflected < values[rows, 0]
+        accepted = reflected < values[rows, -2]
+        # Expansion, outside contraction and inside contraction as multiples of centre − worst.
+        factor = np.where(best, 2.0, np.where(reflected < values[rows, -1], 0.5, -0.5))
+        trial = np.clip(centre + factor[:, None] * (centre - worst), lower, upper)
+        tried = np.flatnonzero(best | ~accepted)
+        outcome = np.full(len(rows), np.inf)
+        if len(tried):
+            outcome[tried] = objective(rows[tried], trial[tried])
+        candidate = np.where((outcome < reflected)[:, None], trial, candidate)
+        outcome = np.minimum(outcome, reflected)
+        improved = outcome < values[rows, -1]
+        vertices[rows[improved], -1] = candidate[improved]
+        values[rows[improved], -1] = outcome[improved]
+        shrinking = rows[~improved]
+        for i in range(1, m + 1):
+            if len(shrinking):
+                vertices[shrinking, i] = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
+                values[shrinking, i] = objective(shrinking, vertices[shrinking, i])
     best = values.argmin(axis=1)
     return vertices[everyone, best], values[everyone, best]
-
-
-def _replace_worst(
-    objective: Objective, rows: Rows, vertices: Array, values: Array, lower: Array, upper: Array
-) -> tuple[Array, Array]:
-    """One step of the simplex method on the sorted simplices of functions `rows`."""
-    centre = vertices[:, :-1].mean(axis=1)
-    worst = vertices[:, -1].copy()
-    candidate = np.clip(2.0 * centre - worst, lower, upper)
-    reflected = objective(rows, candidate)
-    best = reflected < values[:, 0]
-    accepted = reflected < values[:, -2]
-    # Expansion, outside contraction and inside contraction as multiples of centre − worst.
-    factor = np.where(best, 2.0, np.where(reflected < values[:, -1], 0.5, -0.5))
-    trial = np.clip(centre + factor[:, None] * (centre - worst), lower, upper)
-    tried = np.flatnonzero(best | ~accepted)
-    outcome = np.full(len(values), np.inf)
-    if len(tried):
-        outcome[tried] = objective(rows[tried], trial[tried])
-    candidate = np.where((outcome < reflected)[:, None], trial, candidate)
-    outcome = np.minimum(outcome, reflected)
-    improved = outcome < values[:, -1]
-    vertices[:, -1] = np.where(improved[:, None], candidate, worst)
-    values[:, -1] = np.where(improved, outcome, values[:, -1])
-    shrinking = np.flatnonzero(~improved)
-    for i in range(1, vertices.shape[1]):
-        if len(shrinking):
-            vertices[shrinking, i] = 0.5 * (vertices[shrinking, 0] + vertices[shrinking, i])
-            values[shrinking, i] = objective(rows[shrinking], vertices[shrinking, i])
-    return vertices, values
 
 
 def scan(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
-from controllers.functions import BufferedFunction, StackedFunction, c_source
+from controllers.functions import StackedFunction, c_source
 from controllers.problem import Problem
 from controllers.rti.preparation import Exact, embedding, make_hessian, preparation, readout
 from controllers.theta import Parameters, ThetaBlocks
@@ -60,7 +60,7 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     blocks = parameters.blocks
     prepared = preparation(problem, blocks)
     read = readout(problem, blocks, prepared)
-    functions: dict[str, BufferedFunction] = {
+    functions: dict[str, StackedFunction] = {
         "PREPARED": prepared,
         "EMBEDDED": embedding(problem, blocks, prepared, read),
         "READ": read,
@@ -76,7 +76,7 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
 
 
 def controller_sources(
-    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, BufferedFunction]
+    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, StackedFunction]
 ) -> dict[str, bytes]:
     """C files by name of a controller made of `functions`, by the prefix of their constants."""
     wanted = ("core.h", "rti.h", *QP_SOURCES, "costs.h", "rotation.h", RULES[hessian])
@@ -86,7 +86,7 @@ def controller_sources(
     return sources
 
 
-def stack_needed(problem: Problem, functions: Mapping[str, BufferedFunction]) -> int:
+def stack_needed(problem: Problem, functions: Mapping[str, StackedFunction]) -> int:
     """Bytes of stack of a sample, at least what compilers make of it.
 
     CasADi's work vectors and the QP solver's arrays share their place; gcc and clang add 4 to 18 %
@@ -100,7 +100,7 @@ def stack_needed(problem: Problem, functions: Mapping[str, BufferedFunction]) ->
     return 4000 + round(1.2 * 8 * (own + shared))
 
 
-def _functions(functions: Sequence[BufferedFunction]) -> str:
+def _functions(functions: Sequence[StackedFunction]) -> str:
     """CasADi's C with every function static and without the compiler's remarks on it."""
     own = re.compile(r"^casadi_real casadi_|^void casadi_|^casadi_int casadi_", re.MULTILINE)
     code = c_source([function.function for function in functions])
@@ -109,15 +109,14 @@ def _functions(functions: Sequence[BufferedFunction]) -> str:
 
 
 def _constants(
-    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, BufferedFunction]
+    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, StackedFunction]
 ) -> str:
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     gamma = problem.discount
     sizes = {"N_X": n, "N_U": m, "N_W": n + m, "HORIZON": horizon, "N_THETA": blocks.size}
     for prefix, call in functions.items():
-        if isinstance(call, StackedFunction):
-            sizes |= {f"{prefix}_{name}": part.start for name, part in call.slices.items()}
-            sizes[f"{prefix}_SIZE"] = call.stack.size
+        sizes |= {f"{prefix}_{name}": part.start for name, part in call.slices.items()}
+        sizes[f"{prefix}_SIZE"] = call.stack.size
         of = call.function
         work = {"ARG": of.sz_arg(), "RES": of.sz_res(), "IW": of.sz_iw(), "W": of.sz_w()}
         sizes |= {f"{prefix}_{name}": size for name, size in work.items()}

@@ -16,14 +16,13 @@ if TYPE_CHECKING:
 
 Matrix = NDArray[np.float64]
 SOFT, FIXED = 8, 5
-DAQP_NOT_CONVEX = -5
 SETTINGS = {"primal_tol": 1e-10, "dual_tol": 1e-12}
 MEANING = {
     -1: "infeasible",
     -2: "cycling",
     -3: "unbounded",
     -4: "iteration limit",
-    DAQP_NOT_CONVEX: NOT_CONVEX,
+    -5: NOT_CONVEX,
     -6: "overdetermined start",
     -7: "time limit",
 }
@@ -79,7 +78,7 @@ class DaqpBackend:
             self._parts = (self._lower[:n], self._upper[:n], self._lower[n:], self._upper[n:])
             self._free = np.repeat(np.array([0, SOFT], dtype=np.int32), [n, rows])
             self._sense = self._free.copy()
-            self._bounds_sense, self._fixed = self._sense[:n], bytes(n)
+            self._bounds_sense = self._sense[:n]
             self._model = daqp.Model()
             self._model.settings = SETTINGS
             self._write_limits(qp)
@@ -113,10 +112,7 @@ class DaqpBackend:
         self._failed = True
         if flag >= 0:
             self._write_limits(qp)
-            fixed = qp.lower == qp.upper
-            if (told := fixed.tobytes()) != self._fixed:
-                self._fixed = told
-                np.multiply(fixed, FIXED, out=self._bounds_sense)
+            np.multiply(qp.lower == qp.upper, FIXED, out=self._bounds_sense)
             flag = self._model.update(
                 f=qp.f, bupper=self._upper, blower=self._lower, sense=self._sense
             )

@@ -171,14 +171,10 @@ def multipliers_at_kink(
     m, n = lower.size, qp.w.size * lower.size // v.size
     first = qp.rows[:n, :m]
     y = first @ v[:m]
-    # Plain numbers: a few of them cost a third of what arrays do.
-    limits = zip(y.tolist(), qp.row_lower[:n].tolist(), qp.row_upper[:n].tolist(), strict=True)
-    if not any(
-        min(abs(e - low), abs(e - high)) < TOLERANCE * (1 + abs(e)) for e, low, high in limits
-    ):
-        return solution
     below, above = np.abs(y - qp.row_lower[:n]), np.abs(y - qp.row_upper[:n])
     near = np.minimum(below, above) < TOLERANCE * (1 + np.abs(y))
+    if not near.any():
+        return solution
     rows, action, width = first[near], v[:m], TOLERANCE * (1 + np.abs(v[:m]))
     inside = (action > lower + width) & (action < upper - width)
     total = nu[:m] + lam[:n][near] @ rows
@@ -205,11 +201,9 @@ def kkt_solve(
     the system is singular (LICQ fails) it is solved by least squares.
     """
     held, at_limit, violated = active
-    free, equal, outside = ~held, qp.rows[at_limit], qp.rows[violated]
-    bound = held.any()
-    H = qp.H
-    if bound:
-        H, equal, outside = H[free][:, free], equal[:, free], outside[:, free]
+    free = ~held
+    H, rows = qp.H[free][:, free], qp.rows[:, free]
+    equal, outside = rows[at_limit], rows[violated]
     size, count = len(H), len(equal)
     # Column-major, as LAPACK wants it.
     kkt = np.zeros((size + count, size + count), order="F")
@@ -218,7 +212,7 @@ def kkt_solve(
     if len(outside):
         kkt[:size, :size] += 2 * (outside.T * qp.W[violated]) @ outside
     kkt[:size, size:], kkt[size:, :size] = equal.T, equal
-    right[:size] = (seeds[:, free] if bound else seeds).T
+    right[:size] = seeds[:, free].T
     right[size:] = limits[:, at_limit].T
     answer = right
     if len(kkt):  # every variable may be held

@@ -95,7 +95,6 @@ class RtiNmpc:
         self._weigh(problem.penalty_linear, problem.penalty_quadratic)
         self._first_lower, self._first_upper = self._qp.lower[:m], self._qp.upper[:m]
         self._action_lower, self._action_upper = self._first_lower.copy(), self._first_upper.copy()
-        self._enforced = False
         self._x = self._prepare.inputs["x"].reshape(horizon, n)
         self._u = self._prepare.inputs["u"].reshape(horizon, m)
         self._costates = before[self._prepare.places["costates"]].reshape(horizon, n)
@@ -317,9 +316,8 @@ class RtiNmpc:
             enforced = a - self.problem.reference_action
             self._first_lower[:] = self._first_upper[:] = enforced
             known = known and all(map(isfinite, enforced.tolist()))
-        elif self._enforced:
+        else:
             self._first_lower[:], self._first_upper[:] = self._action_lower, self._action_upper
-        self._enforced = a is not None
         if not known:
             raise self._not_finite(s, a)
         found = self._backend.solve(qp)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from controllers.dynamics import stage_curvature, stage_function, stage_linearisation
 from controllers.errors import ControllerError
-from controllers.functions import BufferedFunction, StackedFunction
+from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp.problem import SoftQp
 from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
@@ -325,9 +325,9 @@ class GaussNewton:
 
     lifts = False
     spectrum: Lift | None = None
-    functions: Sequence[BufferedFunction] = ()
+    functions: Sequence[StackedFunction] = ()
 
-    def __init__(self, problem: Problem, prepared: BufferedFunction) -> None:
+    def __init__(self, problem: Problem, prepared: StackedFunction) -> None:
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self.discounts = problem.discount ** np.arange(horizon)
         self._end = problem.discount**horizon
@@ -358,7 +358,7 @@ class Exact(GaussNewton):
 
     FLOOR = 1e-3
 
-    def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: BufferedFunction) -> None:
+    def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:
         super().__init__(problem, prepared)
         self.lifts = True
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
@@ -409,7 +409,7 @@ class Exact(GaussNewton):
 
 
 def make_hessian(
-    name: str, problem: Problem, blocks: ThetaBlocks, prepared: BufferedFunction
+    name: str, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction
 ) -> GaussNewton:
     """Rule by name; raises ControllerError on an unknown one."""
     if name == "gauss-newton":

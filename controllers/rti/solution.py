@@ -139,16 +139,12 @@ class RtiSolution:
 
     @property
     def costates(self) -> Matrix:
-        """Multipliers χ_0 … χ_N of the initial value and the dynamics, shape (N+1, n)."""
-        return self._part("chi")
+        """Multipliers χ_0 … χ_N of the initial value and the dynamics, shape (N+1, n).
 
-    @property
-    def value_state_gradient(self) -> Vector:
-        """dV/ds or dQ/ds, shape (n,): the multiplier χ_0 of the initial value.
-
-        At a true bound the penalty of s itself has a kink, and half of its slope is taken.
+        χ_0 is dV/ds or dQ/ds. At a true bound the penalty of s itself has a kink, and half of its
+        slope is taken.
         """
-        return np.asarray(self.costates[0])
+        return self._part("chi")
 
     @property
     def action_gradient(self) -> Vector:

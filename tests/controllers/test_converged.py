@@ -107,7 +107,7 @@ def check_derivatives(number, converged, problem, blocks):
     by_state = derivative(lambda x: solved(converged, theta, x, a), s, np.ones(2))
     for gradient, jacobian, fd, parts in (
         (base.value_gradient, "policy_jacobian", by_theta, blocks.slices),
-        (base.value_state_gradient, "policy_state_jacobian", by_state, WHOLE),
+        (base.costates[0], "policy_state_jacobian", by_state, WHOLE),
     ):
         assert_close(gradient, fd["value"], parts, "dV or dQ", fd["value_noise"])
         if a is None:
@@ -136,7 +136,7 @@ def test_value_gradients_are_those_of_the_rti_in_the_limit(
         solution = rti.feedback(s, a)
     assert solution.value == pytest.approx(expected.value, rel=1e-9)
     assert_close(solution.value_gradient, expected.value_gradient, blocks.slices, "dV/dθ", 1e-8)
-    assert_close(solution.value_state_gradient, expected.value_state_gradient, WHOLE, "dV/ds", 1e-8)
+    assert_close(solution.costates[0], expected.costates[0], WHOLE, "dV/ds", 1e-8)
 
 
 def test_its_predictions_follow_the_nonlinear_model(converged, problem, blocks):

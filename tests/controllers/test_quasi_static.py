@@ -62,16 +62,18 @@ def test_the_policy_follows_the_clock_between_the_tables(policy):
     s = [28.0, 60.0]
     policy.reset()
     policy.prepare()
-    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[-1].policy(s))
+    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[-1].feedback(s).action)
     for _ in range(8639):
         policy.prepare()
-    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[0].policy(s), rtol=1e-3)
+    np.testing.assert_allclose(
+        policy.feedback(s).action, policy.policies[0].feedback(s).action, rtol=1e-3
+    )
     policy.prepare()
-    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[-1].policy(s))
+    np.testing.assert_allclose(policy.feedback(s).action, policy.policies[-1].feedback(s).action)
     policy.reset()
     for _ in range(2000):
         policy.prepare()
-    low, high = policy.policies[0].policy(s), policy.policies[-1].policy(s)
+    low, high = policy.policies[0].feedback(s).action, policy.policies[-1].feedback(s).action
     between = policy.feedback(s).action
     assert (between > np.minimum(low, high)).all()
     assert (between < np.maximum(low, high)).all()
@@ -108,9 +110,9 @@ def test_a_plant_that_jumps_has_the_optimum_of_the_plant_as_it_is():
     policy.reset()
     for _ in range(int(first / 60.0)):
         policy.prepare()
-    np.testing.assert_array_equal(policy.feedback(s).action, before.controller.policy(s))
+    np.testing.assert_array_equal(policy.feedback(s).action, before.controller.feedback(s).action)
     policy.prepare()
-    np.testing.assert_array_equal(policy.feedback(s).action, after.controller.policy(s))
+    np.testing.assert_array_equal(policy.feedback(s).action, after.controller.feedback(s).action)
 
 
 def test_a_plant_cannot_foul_and_jump():

@@ -74,7 +74,7 @@ def check_derivatives(blocks, hessian, numbers):
             by_state = derivative(lambda x, b=enforced, f=step: f(s=x, a=b), s, np.ones(2))
             for gradient, fd, parts in (
                 (solution.value_gradient, by_theta, slices),
-                (solution.value_state_gradient, by_state, WHOLE),
+                (solution.costates[0], by_state, WHOLE),
             ):
                 assert_close(gradient, fd["value"], parts, f"{label}: d{name}", fd["value_noise"])
             if enforced is None:
@@ -168,9 +168,7 @@ def test_value_and_action_value_have_the_same_gradients_at_the_policy(cases, bac
         assert_close(
             action_value.value_gradient, value.value_gradient, slices, "dQ/dθ, dV/dθ", 1e-8
         )
-        assert_close(
-            action_value.value_state_gradient, value.value_state_gradient, WHOLE, "dQ/ds, dV/ds"
-        )
+        assert_close(action_value.costates[0], value.costates[0], WHOLE, "dQ/ds, dV/ds")
         inside = (value.action > nmpc.problem.action_lower + 1e-6) & (
             value.action < nmpc.problem.action_upper - 1e-6
         )

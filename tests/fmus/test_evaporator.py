@@ -3,8 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmus.evaporator import BY_NAME, UNITS, VARIABLES
+from fmus.evaporator import EVAPORATOR, UNITS, VARIABLES
 from fmus.model import Kind, Type
+
+BY_NAME = EVAPORATOR.by_name
 
 
 @pytest.mark.parametrize("variable", VARIABLES, ids=lambda v: v.name)

@@ -14,7 +14,7 @@ import fmpy
 import numpy as np
 
 import fmus
-from fmus.evaporator import BY_NAME
+from fmus.evaporator import EVAPORATOR
 
 FOLDER = Path(fmus.__file__).parent / "reference"
 CASES = {
@@ -35,7 +35,9 @@ STEP_SIZE = 60.0  # s
 HOLD = 1200.0  # s between changes of the inputs
 P100 = (191.71322, 230.0, 175.0, 210.0, 191.71322)  # kPa
 F200 = (215.88844, 215.88844, 300.0, 150.0, 215.88844)  # kg/min
-NOT_USED = {f"{name}_in": BY_NAME[f"{name}_in"].start for name in ("X1", "F1", "T1", "T200")}
+NOT_USED = {
+    f"{name}_in": EVAPORATOR.by_name[f"{name}_in"].start for name in ("X1", "F1", "T1", "T200")
+}
 
 
 def input_signals() -> np.ndarray:

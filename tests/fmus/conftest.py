@@ -12,7 +12,7 @@ import pytest
 from fmpy import fmi2, fmi3
 
 import fmus
-from fmus.evaporator import BY_NAME, EVAPORATOR, VARIABLES
+from fmus.evaporator import EVAPORATOR, VARIABLES
 from fmus.model import Type
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
@@ -99,7 +99,7 @@ class Instance:
             Type.SEED_HIGH: ("Integer", "UInt64"),
             Type.LAW_NUMBER: ("Integer", "Int64"),
         }
-        return suffixes[BY_NAME[name].type][self.version - 2]
+        return suffixes[EVAPORATOR.by_name[name].type][self.version - 2]
 
     def step(self, time: float, size: float) -> None:
         self.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)

@@ -7,7 +7,7 @@ import pytest
 
 import fmus
 from fmus.description import model_description
-from fmus.evaporator import BY_NAME, EVAPORATOR, VARIABLES
+from fmus.evaporator import EVAPORATOR, VARIABLES
 from fmus.model import Kind, Type, continuous_dependencies, initial_dependencies
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
@@ -67,7 +67,7 @@ MODES = [{}, {"law": 2}, {"stochastic": False}, {"override": True}, {"fouling_ra
 
 
 def moved(name: str) -> float:
-    variable = BY_NAME[name]
+    variable = EVAPORATOR.by_name[name]
     if variable.type is Type.BOOLEAN:
         return not variable.start
     if variable.type is Type.LAW:
@@ -81,8 +81,8 @@ def affected(instance, name: str, mode: dict[str, float]) -> set[str]:
     before = instance.get(*UNKNOWNS)
     instance.set(**{name: moved(name)})
     after = instance.get(*UNKNOWNS)
-    start = mode.get(name, BY_NAME[name].start)
-    is_real = BY_NAME[name].type is Type.REAL
+    start = mode.get(name, EVAPORATOR.by_name[name].start)
+    is_real = EVAPORATOR.by_name[name].type is Type.REAL
     instance.set(**{name: start if is_real else int(start)})
     assert instance.get(*UNKNOWNS) == before
     return {u for u, x, y in zip(UNKNOWNS, before, after, strict=True) if x != y}

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from fmus.evaporator import BY_NAME, EVAPORATOR, VARIABLES
+from fmus.evaporator import EVAPORATOR, VARIABLES
 from fmus.model import Kind, Type
 
 DISCARD, ERROR = 2, 3
@@ -55,7 +55,7 @@ def test_a_saturating_plant_refuses_parameters_out_of_range_and_no_numbers(refus
 
 @pytest.mark.parametrize("name", REAL_SETTABLE)
 def test_range_of_the_model_description_is_enforced(refused, plant, name: str) -> None:
-    variable = BY_NAME[name]
+    variable = EVAPORATOR.by_name[name]
     plant.set(**{name: variable.min})
     plant.set(**{name: variable.max})
     for value in (math.nextafter(variable.min, -math.inf), math.nextafter(variable.max, math.inf)):

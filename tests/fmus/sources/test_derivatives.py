@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmus.evaporator import BY_NAME, VARIABLES
+from fmus.evaporator import EVAPORATOR, VARIABLES
 from fmus.model import Kind, Type
 
 REALS = [v for v in VARIABLES if v.type is Type.REAL]
@@ -29,7 +29,7 @@ def differences(instance, unknowns: list[str], known: str) -> np.ndarray:
     Central ones, but forward ones where the value is the least that the variable may have.
     """
     centre = instance.get(known)[0]
-    at_least = centre == BY_NAME[known].min
+    at_least = centre == EVAPORATOR.by_name[known].min
     h = 1e-2 if at_least else 1e-3 * max(1e-2, abs(centre))
     total = np.zeros(len(unknowns))
     for offset, weight in (FORWARD if at_least else CENTRAL).items():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from fmus.evaporator import BY_NAME
+from fmus.evaporator import EVAPORATOR
 
 DISTURBANCES = ("X1", "F1", "T1", "T200")
 PARAMETERS = [
@@ -45,7 +45,7 @@ def outputs(x, u, d, p) -> dict[str, float]:
 
 
 def defaults() -> dict[str, float]:
-    return {name: float(BY_NAME[name].start) for name in PARAMETERS}
+    return {name: float(EVAPORATOR.by_name[name].start) for name in PARAMETERS}
 
 
 def random_points(count: int, seed: int = 0) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

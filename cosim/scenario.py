@@ -17,13 +17,13 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosim.errors import ScenarioError
 from cosim.files import read_toml
 from cosim.penalty import Penalty
 from cosim.text_tables import Shown
-from cosim.validation import describe, suggestion
+from cosim.validation import suggestion, validated
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -281,10 +281,7 @@ class Scenario(Shown, Table):
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], origin: str = "scenario") -> Scenario:
         """Validate a document, structured like the TOML file; raises ScenarioError."""
-        try:
-            return cls.model_validate(document)
-        except ValidationError as error:
-            raise ScenarioError(f"{origin}: {describe(error, cls)}") from None
+        return validated(cls, document, origin, ScenarioError)
 
     def replace(self, changes: Mapping[str, Any]) -> Scenario:
         """Return the scenario with some fields changed, e.g. `{"plant": {"fmu": "my.fmu"}}`.

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
+
+Model = TypeVar("Model", bound=BaseModel)
 
 _EXPECTED = {
     "float_type": "must be a number",
@@ -21,6 +23,14 @@ _EXPECTED = {
     "string_too_short": "must not be empty",
     "too_short": "must not be empty",
 }
+
+
+def validated(model: type[Model], document: Any, origin: str, error: type[Exception]) -> Model:
+    """The document as a model; raises `error` that names its origin, field and allowed values."""
+    try:
+        return model.model_validate(document)
+    except ValidationError as cause:
+        raise error(f"{origin}: {describe(cause, model)}") from None
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

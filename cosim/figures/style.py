@@ -47,31 +47,7 @@ _OTHERS = (
     "#56B4E9", "#332288", "#999933", "#44AA99", "#AA4499", "#117733", "#661100", "#6699CC",
 )  # fmt: skip
 _LINES: Any = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
-
-_STYLE: Any = {
-    "font.family": "DejaVu Sans",
-    "font.size": 8.0,
-    "mathtext.fontset": "dejavusans",
-    "axes.titlesize": 8.5,
-    "axes.labelsize": 8.0,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E4E8EC",
-    "grid.linewidth": 0.6,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "legend.fontsize": 7.0,
-    "legend.frameon": False,
-    "lines.linewidth": 1.0,
-    "figure.dpi": 100,
-    "svg.hashsalt": "rti-cosim",
-    "svg.fonttype": "path",
-}
+_STYLE = Path(__file__).with_name("house.mplstyle")
 
 
 class Picture(Figure):
@@ -94,7 +70,7 @@ def figure(height: float, width: float = WIDTH) -> Iterator[Figure]:
 def _styled() -> Iterator[None]:
     with mpl.rc_context():
         mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE)
+        mpl.rc_file(_STYLE, use_default_template=False)
         yield
 
 

@@ -5,18 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from cosim.errors import StudyError
 from cosim.files import read_toml
-from cosim.validation import describe
+from cosim.validation import validated
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]
@@ -245,13 +238,4 @@ class StudyTable(Table):
 def read(path: str | Path) -> StudyTable:
     """Read and validate a study file; raises StudyError with file, field and allowed values."""
     origin = f"study file '{path}'"
-    document = read_toml(path, origin, StudyError)
-    return validate(document, origin)
-
-
-def validate(document: Any, origin: str) -> StudyTable:
-    """Validate a study's document; raises StudyError."""
-    try:
-        return StudyTable.model_validate(document)
-    except ValidationError as error:
-        raise StudyError(f"{origin}: {describe(error, StudyTable)}") from None
+    return validated(StudyTable, read_toml(path, origin, StudyError), origin, StudyError)

@@ -29,9 +29,8 @@ from cosim.studies.document import (
     StudyTable,
     TrajectoryTable,
     read,
-    validate,
 )
-from cosim.validation import instead
+from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.training import stored_optimum
@@ -212,7 +211,7 @@ class Study:
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], folder: str | Path = ".") -> Self:
         """Validate a document, structured like the TOML file; raises StudyError."""
-        return cls(validate(dict(document), "study"), Path(folder))
+        return cls(validated(StudyTable, dict(document), "study", StudyError), Path(folder))
 
     @property
     def name(self) -> str:

@@ -37,48 +37,6 @@ COLUMNS = {
 SHORT = ("case", "rank", "regret", "worst", "finished")
 """Columns that fit a terminal of 80 characters."""
 
-DEFINITIONS = {
-    "J": "mean of economic cost and penalty per sample; J* is J of the dynamic-programming "
-    "optimum on the same noise.",
-    "Regret": "(J − J*)/|J*|, paired over the noise seeds. It depends on the noise and on the "
-    "length of the runs, so regrets of a table and of a learning curve differ; each says below "
-    "what it was measured on.",
-    "Median": "regret of the middle training run (the mean of both, where their number is even). "
-    "Its interval of 95 % is over training seeds and noise together: a bootstrap that resamples "
-    "both. Worst: the run with the largest J.",
-    "Rank": "rows of one rank cannot be told apart from the first of them: the interval of their "
-    "paired difference, over training seeds and noise, does not lie above 0, or "
-    "one of both was trained once. Their order says nothing.",
-    "Difference": "median over training seeds of (J − J')/|J*|, J' that of the case that stands "
-    "under against, with its interval over training seeds and noise, and the p of the signed ranks "
-    "of the pairs, their signs permuted.",
-    "IQM": "interquartile mean over training runs; its interval is over training seeds, by a "
-    "bootstrap stratified by scenario.",
-    "Diverged runs": "count with the cost of the θ that they ended with; finished/runs says how "
-    "many did not diverge.",
-    "Plant samples": "those of training and of choosing θ.",
-}
-CAPTIONS = {
-    "parameters": "Increments of θ by block, and the TD error: root mean square over the updates "
-    "of the preceding 10 000 samples (the paper's figure). First training seed.",
-    "overlay": "All on the same disturbances; the area beyond a bound is shaded.",
-    "phase": "How often the state was where (density), and the policy there (arrows).",
-    "density": "Density of the first state against its lower bound.",
-    "regret": "Regret of every run. Dots are training runs, crosses runs that diverged; the bar is "
-    "the interquartile mean with its 95 % interval (bootstrap over runs; for a controller without "
-    "training over the noise seeds).",
-    "curves": "Learning: above the cost of the training samples themselves, below the greedy "
-    "policy's on held-out noise. Medians over training seeds; a run that diverged is held at its "
-    "last point. Dashed: baselines on the noise of the curves.",
-    "online": "Cost of the runs themselves, exploration included: regret against the optimum on "
-    "the same noise, mean over training seeds; above, from the log of the first training seed.",
-    "operation": "Learning in operation, on one trajectory without a reset: left the greedy policy "
-    "of the θ that the run would hand over, on held-out noise; right the run's own samples, "
-    "exploration included. Medians over training seeds, bands from the best run to the worst; "
-    "baselines are dashed.",
-    "profile": "Performance profile: the share of runs whose regret is at most so much.",
-}
-
 PAPER = {"naive": 21.0, "tuned": 15.0}
 """Gain of the paper's RL-tuned RTI-NMPC over (a) and (b), in per cent."""
 NEAR = 3.0
@@ -96,6 +54,13 @@ def write(page: Mapping[str, Any], folder: Path, study: Path) -> Path:
         paths = (where / FOLDER / f"{name}.svg" for where in (folder, study))
         return image(next(path for path in paths if path.is_file()))
 
+    for name in (TABLES, PAGE):
+        write_atomically(folder / name, rendered(name, **page, picture=figure))
+    return folder / PAGE
+
+
+def rendered(template: str, **context: Any) -> str:
+    """A template of this folder, filled in."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=select_autoescape(["html"]),
@@ -104,15 +69,10 @@ def write(page: Mapping[str, Any], folder: Path, study: Path) -> Path:
         keep_trailing_newline=True,
     )
     environment.filters |= {
-        "caption": lambda name: CAPTIONS.get(name.partition("-")[0], name),
-        "image": figure,
         "markdown": lambda table: markdown_table(table[1], table[2]),
         "command": shlex.join,
     }
-    context = dict(page) | {"definitions": DEFINITIONS}
-    for name in (TABLES, PAGE):
-        write_atomically(folder / name, environment.get_template(name).render(context))
-    return folder / PAGE
+    return environment.get_template(template).render(context)
 
 
 def texts(row: Mapping[str, Any]) -> dict[str, str]:

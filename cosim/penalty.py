@@ -31,16 +31,9 @@ class Penalty:
         self.upper = np.asarray(upper, dtype=float)
         self.linear = np.asarray(linear, dtype=float)
         self.quadratic = np.asarray(quadratic, dtype=float)
-        self._rows = tuple(
-            zip(
-                range(len(self.lower)),
-                self.lower.tolist(),
-                self.upper.tolist(),
-                self.linear.tolist(),
-                self.quadratic.tolist(),
-                strict=True,
-            )
-        )
+        columns = (self.lower, self.upper, self.linear, self.quadratic)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        self._rows = tuple((i, *row) for i, row in enumerate(rows))
 
     def __call__(self, state: Sequence[float] | NDArray[np.float64]) -> float:
         """Penalty of one state (n,), fastest for a list; a NaN state gives NaN."""

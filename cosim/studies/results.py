@@ -27,14 +27,14 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import collect, figures, operation, pictures, report, theta
-from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, ONLINE, Plan, safe
+from cosim.studies import figures, operation, pictures, report, store, theta
+from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, NAIVE, ONLINE, Plan, safe
 from cosim.studies.report import COLUMNS, SHORT
 from cosim.studies.store import CURVE, INDICATORS, KEYS, STATE, TIMING, WHERE, read_table, to_csv
 from cosim.text_tables import Shown, Table, markdown_table
 from cosim.validation import instead
 
-ABOUT = "study.json"
+ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
 THETA, LOGS, OPERATION = "theta.csv", "logs", "operation.csv"
 LEVELS = 4
@@ -83,10 +83,8 @@ class StudyResults(Shown):
                 f"'{folder}' holds no study ({ABOUT}); give the --out of a cosim study run"
             )
         about = read_json(path, f"'{path}'", StudyError)
-        if about.get("schema") != collect.SCHEMA:
-            raise StudyError(
-                f"'{path}' has schema {about.get('schema')!r}; this is {collect.SCHEMA}"
-            )
+        if about.get("schema") != SCHEMA:
+            raise StudyError(f"'{path}' has schema {about.get('schema')!r}; this is {SCHEMA}")
         return cls(
             folder,
             about,
@@ -105,7 +103,7 @@ class StudyResults(Shown):
 
         Raises StudyError where a file of a run is damaged.
         """
-        return cls(folder, collect.document(plan), *collect.frames(plan, folder))
+        return cls(folder, document(plan), *store.frames(plan, folder))
 
     def write(self, plan: Plan, *, figures: bool = True) -> StudyResults:
         """Write the study's tables and kept files; study.json last, so that its word is true.
@@ -115,13 +113,13 @@ class StudyResults(Shown):
         out = self.folder
         pictures.keep(plan, out)
         drawn = pictures.draw(plan, out) if figures else []
-        runs = collect.finished(plan, self.state)
+        runs = store.finished(plan, self.state)
         tables = {
             EVALUATION: self.evaluation,
             CURVES: self.curves,
             RUNS: self.runs,
             SUMMARY: self.summary,
-            TIMING: collect.timing(plan, out),
+            TIMING: store.timing(plan, out),
         }
         if self.about["online"] is not None:
             tables[ONLINE] = operation.block_costs(runs, self.curves, out)
@@ -590,3 +588,56 @@ class StudyResults(Shown):
 def _columns(name: str, value: float, interval: Interval) -> dict[str, float]:
     low, high = interval or (np.nan, np.nan)
     return {name: value, f"{name}_low": low, f"{name}_high": high}
+
+
+def document(plan: Plan) -> dict[str, Any]:
+    """The document study.json of a plan."""
+    definition = plan.definition
+    scenarios = list(definition.scenarios)
+    curves = {name: definition.held_out(name) for name in scenarios}
+    about = {
+        "schema": SCHEMA,
+        "name": definition.name,
+        "title": definition.table.title,
+        "description": definition.table.description,
+        "scenarios": scenarios,
+        "cases": [
+            {
+                "name": case.name,
+                "group": case.group,
+                "target": definition.relative(case.target),
+                "trained": case.algorithm is not None,
+                "samples": case.samples,
+                "start": definition.relative(case.start),
+                "nmpc": case.nmpc,
+                "settings": dict(case.settings),
+                "scenarios": list(case.scenarios),
+                "against": definition.counterpart(case),
+            }
+            for case in definition.all_cases
+        ],
+        "file": Path(definition.file).name if definition.file else None,
+        "optimum": definition.optima,
+        "naive": dict.fromkeys(scenarios, definition.named(NAIVE)),
+        "curves": {name: [len(noise.seeds), noise.steps] for name, noise in curves.items()},
+        "online": None if definition.table.online is None else definition.table.online.model_dump(),
+        "runs": len(plan.runs),
+        "tables": list(definition.table.tables),
+        "pictures": [],
+        "made_with": dict(plan.provenance) | {"commit": report.commit()},
+    }
+    if (table := definition.table.operation) is not None:
+        about["operation"] = {
+            name: {
+                "sampling_time": scenario.sampling_time,
+                "marks": (marks := definition.marks(name)),
+                "columns": [m for m in definition.samples_of(table.columns, name) if m in marks]
+                or marks,
+                "drawn": table.drawn,
+            }
+            for name, scenario in definition.scenarios.items()
+        }
+    if (settings := definition.table.theta) is not None:
+        about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
+    found: dict[str, Any] = json.loads(json.dumps(about))
+    return found

@@ -22,7 +22,7 @@ FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-ffp-co
 
 def built(folder, *flags):
     """The example program of the C in `folder`, built."""
-    program = folder / "example"
+    program = folder / "-".join(["example", *flags])
     names = sorted(path.name for path in folder.glob("*.c"))
     subprocess.run([CC, *FLAGS, *flags, *names, "-o", program, "-lm"], cwd=folder, check=True)
     return program
@@ -42,19 +42,26 @@ def exported(tmp_path_factory):
     return folder
 
 
-def test_the_program_gives_the_actions_of_the_python_controller(exported):
+@pytest.fixture(scope="module")
+def example(exported):
+    return built(exported)
+
+
+def test_the_program_gives_the_actions_of_the_python_controller(example):
     scenario = Scenario.load("paper")
     with FmuPlant(scenario) as plant:
         run = simulate(plant, tuned(scenario), 200, 4)
     states = np.stack([run[name] for name in scenario.plant.states], axis=1)
-    found = rows(built(exported), states)
+    found = rows(example, states)
     expected = np.stack([run[name] for name in scenario.plant.actions], axis=1)
     np.testing.assert_allclose(found[:, :2], expected, rtol=0, atol=1e-10)
     assert set(found[:, 2]) == {0}
 
 
-def test_a_failed_sensor_holds_the_last_action_and_the_iteration_cap_is_a_failure(exported):
-    first, failed, after = rows(built(exported), [(25, 50), (np.nan, 50), (25, 50)])
+def test_a_failed_sensor_holds_the_last_action_and_the_iteration_cap_is_a_failure(
+    exported, example
+):
+    first, failed, after = rows(example, [(25, 50), (np.nan, 50), (25, 50)])
     assert (failed[2], after[2]) == (3, 0)
     np.testing.assert_array_equal(failed[:2], first[:2])
     capped = rows(built(exported, "-DQP_ITERATIONS=1"), [(10, 30)])

@@ -1,7 +1,9 @@
 import json
+import sys
 
 import pytest
 
+from learning.training import Training
 from tests.helpers.command import run_cosim
 
 SHORT = (
@@ -11,37 +13,46 @@ SHORT = (
 )  # fmt: skip
 
 
-def test_train_writes_theta_log_and_summary(cosim, tmp_path):
-    code, out, _ = cosim(*SHORT, "--out", "run", "--seed", 5, "--json")
-    assert code == 0
-    summary = json.loads(out)
-    assert summary == json.loads((tmp_path / "run/summary.json").read_text())
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A short training with everything that it can write, and the JSON that it printed."""
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    ended = run_cosim(*SHORT, "--out", folder, "--seed", 5, "--record", "--json", check=True)
+    return folder, json.loads(ended.stdout)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """For trainings whose picture nobody looks at."""
+    monkeypatch.setattr(Training, "plot", lambda self, path: None)
+
+
+def test_train_writes_theta_log_summary_and_recording(trained):
+    folder, summary = trained
+    assert summary == json.loads((folder / "summary.json").read_text())
     assert {"economic_cost", "mean_violation", "violating_share", "J", "failures"} <= set(summary)
     assert summary["hyperparameters"]["prior_samples"] == 20
     assert (summary["status"], summary["samples"], summary["seed"]) == ("finished", 200, 5)
-    log = (tmp_path / "run/learning.csv").read_text().splitlines()
+    assert summary["regret"] is not None, "the optimum need not be named"
+    log = (folder / "learning.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in log] == ["samples", "50", "100", "150", "200"]
+    assert (folder / "training.rrd").stat().st_size > 10_000
 
 
-def test_what_was_learned_is_a_controller(cosim):
-    _, out, _ = cosim(*SHORT, "--out", "run", "--json")
-    learned = json.loads(out)["parameters_hash"]
-    code, out, _ = cosim("simulate", "-c", "run/parameters.toml", "-n", 20, "--json")
+def test_what_was_learned_is_a_controller(cosim, trained):
+    folder, summary = trained
+    code, out, _ = cosim("simulate", "-c", folder / "parameters.toml", "-n", 20, "--json")
     assert code == 0
-    assert json.loads(out)["parameters_hash"] == learned
+    assert json.loads(out)["parameters_hash"] == summary["parameters_hash"]
 
 
-def test_the_same_command_and_seed_give_the_same_bytes(cosim, tmp_path):
-    for folder in ("one", "two"):
-        assert cosim(*SHORT, "--out", folder)[0] == 0
+def test_the_same_command_and_seed_give_the_same_bytes(cosim, trained, tmp_path):
+    assert cosim(*SHORT, "--out", "again", "--seed", 5)[0] == 0
     for file in ("learning.csv", "learning.png", "parameters.toml"):
-        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+        assert (tmp_path / "again" / file).read_bytes() == (trained[0] / file).read_bytes()
 
 
-def test_the_regret_is_known_without_naming_the_optimum(cosim, tmp_path):
-    code, out, _ = cosim(*SHORT, "--out", "run", "--json")
-    assert code == 0
-    assert json.loads(out)["regret"] is not None
+def test_an_evaluation_knows_the_regret_without_naming_the_optimum(cosim):
     code, out, _ = cosim("evaluate", "-c", "tuned", "--seeds", 2, "-n", 20, "-j", 1, "--json")
     assert code == 0
     summary = json.loads(out)
@@ -49,18 +60,13 @@ def test_the_regret_is_known_without_naming_the_optimum(cosim, tmp_path):
     assert summary["controllers"]["tuned"]["regret"]["value"] is not None
 
 
-def test_training_starts_from_tuned_and_from_a_file(cosim, tmp_path):
+def test_training_starts_from_tuned_and_from_a_file(cosim, undrawn):
     slow = (*SHORT, "--set", "prior_width=1e-3")
     code, out, _ = cosim(*slow, "--start", "tuned", "--out", "one", "--json")
     assert code == 0 and json.loads(out)["start"] == "tuned"
     assert cosim(*slow, "--start", "one/parameters.toml", "--out", "two", "--json")[0] == 0
     code, _, err = cosim(*SHORT, "--start", "none.toml", "--out", "three")
     assert code == 2 and "does not exist" in err
-
-
-def test_a_recording_is_written(cosim, tmp_path):
-    assert cosim(*SHORT, "--out", "run", "--record")[0] == 0
-    assert (tmp_path / "run/training.rrd").stat().st_size > 10_000
 
 
 def test_explain_lists_every_hyperparameter(cosim):
@@ -87,7 +93,7 @@ def test_bad_input_is_one_line_and_exit_code_2(cosim, arguments, message):
     assert message in err
 
 
-def test_divergence_ends_with_exit_code_1_and_says_why(cosim, tmp_path):
+def test_divergence_ends_with_exit_code_1_and_says_why(cosim, undrawn, tmp_path):
     code, out, _ = cosim(
         "train", "-a", "q-learning", "-n", 6000, "--log-every", 500, "--evaluate-every", 1000,
         "--set", "rule=td", "--set", "step_size=1e-3", "--set", "scaled=false", "--out", "run",
@@ -107,7 +113,7 @@ class Mine(QLearning):
 """
 
 
-def test_a_run_whose_algorithm_was_edited_is_not_resumed(cosim, tmp_path):
+def test_a_run_whose_algorithm_was_edited_is_not_resumed(cosim, undrawn, monkeypatch, tmp_path):
     (tmp_path / "mine.py").write_text(OWN)
     (tmp_path / "helper_of_mine.py").write_text("X = 1\n")
     own = ("train", "-a", "mine:Mine", *SHORT[3:], "--out", "run")
@@ -115,6 +121,8 @@ def test_a_run_whose_algorithm_was_edited_is_not_resumed(cosim, tmp_path):
     assert json.loads((tmp_path / "run/summary.json").read_text())["asks_for"] == "operation"
     assert cosim(*own, "--resume")[0] == 0
     (tmp_path / "helper_of_mine.py").write_text("X = 2\n")
-    ended = run_cosim(*own, "--resume", folder=tmp_path)
-    assert ended.returncode == 2 and "helper_of_mine.py" in ended.stderr
-    assert len(ended.stderr.strip().splitlines()) == 1
+    for module in ("mine", "helper_of_mine"):  # as in another process
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    code, _, err = cosim(*own, "--resume")
+    assert code == 2 and "helper_of_mine.py" in err
+    assert len(err.strip().splitlines()) == 1

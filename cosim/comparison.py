@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -236,10 +236,8 @@ def _first(differs: Sequence[bool] | np.ndarray) -> int | None:
 
 def as_document(comparison: Comparison) -> dict[str, Any]:
     """Return the comparison as plain values, ready for JSON."""
-    signals = {d.name: asdict(d) for d in comparison.differences}
-    for row in signals.values():
-        for name in ("name", "a", "b"):
-            del row[name]
+    shown = ("unit", "tolerance", "maximum", "at", "first")
+    signals = {d.name: {key: getattr(d, key) for key in shown} for d in comparison.differences}
     return {
         "equal": comparison.equal,
         "first_difference": comparison.first,

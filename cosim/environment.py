@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from cosim.errors import PlantError
 from cosim.plant import FmuPlant
+from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 SHARE = 0.1
 """Share of the operating point that is one in normalised units."""

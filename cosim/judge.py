@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from cosim.errors import EvaluationError
 from cosim.kpis import indicators, measure
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
+from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from learning.training import stored_optimum
@@ -27,7 +27,7 @@ class _Recorded:
 
     name = "recorded"
 
-    def __init__(self, path: Path, states: pd.DataFrame, actions: NDArray[np.float64]) -> None:
+    def __init__(self, path: Path, states: pd.DataFrame, actions: Array) -> None:
         self._path, self._states, self._actions = path, states, actions
         self._k, self.action, self.status = -1, actions[0], "solved"
         self.value, self.residual = np.nan, np.nan
@@ -41,7 +41,7 @@ class _Recorded:
         """Go on to the next sample."""
         self._k += 1
 
-    def feedback(self, s: NDArray[np.float64], a: object = None) -> Any:
+    def feedback(self, s: Array, a: object = None) -> Any:
         """The sample's action; EvaluationError where its state is not that of the seed's noise."""
         for (name, column), expected in zip(self._states.items(), s.tolist(), strict=True):
             found = float(column.iloc[self._k])

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim import signals
 from cosim.errors import CosimError
 from cosim.protocols import (
+    Array,
     CompiledLoop,
     Controller,
     Plant,
@@ -24,7 +24,6 @@ from cosim.scenario import Scenario
 from cosim.signals import SignalColumns
 from cosim.trajectory import FALLBACK, Signal, Trajectory
 
-Array = NDArray[np.float64]
 BLOCK = 500
 
 

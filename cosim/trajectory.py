@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim import text_tables
 from cosim.errors import TrajectoryError
 from cosim.files import replacing, write_atomically
 from cosim.penalty import VIOLATING
+from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.signals import signal_names, whole
 from cosim.text_tables import Shown, csv_text
@@ -24,10 +24,8 @@ from cosim.text_tables import Shown, csv_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 STATUS = "status"
 PART = 10_000
-SOLVED = "solved"
 QUANTILES = {"median_us": 0.5, "p95_us": 0.95, "p99_us": 0.99, "max_us": 1.0}
 FALLBACK = "fallback"
 

@@ -57,7 +57,7 @@ def _complaint(detail: dict[str, Any], model: type[BaseModel]) -> str:
     kind, given = detail["type"], detail["input"]
     if kind == "value_error":
         return str(detail["ctx"]["error"])
-    path = [part for part in detail["loc"] if not _is_union_branch(part)]
+    path = [part for part in detail["loc"] if part not in ("float", "bool")]  # of a union
     field = _dotted(path)
     if kind == "missing":
         return f"{field}: is missing"
@@ -72,10 +72,6 @@ def _complaint(detail: dict[str, Any], model: type[BaseModel]) -> str:
         expected = f"must match {detail['ctx']['pattern']}"
     shown = repr(given)
     return f"{field}: {expected}, not {shown if len(shown) <= 60 else shown[:57] + '...'}"
-
-
-def _is_union_branch(part: object) -> bool:
-    return part in ("float", "bool")
 
 
 def _dotted(path: list[Any]) -> str:

@@ -148,14 +148,12 @@ def _summary(found: StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is what timing.csv says of each run."""
     from cosim.studies.store import TIMING, read_table
 
-    timing = read_table(found.folder / TIMING, types={"run": str}).to_dict("records")
+    timing = read_table(found.folder / TIMING, types={"run": str})
     return {
         **found.about,
         "summary": found.summary.to_dict("records"),
         "aggregate": found.aggregate.to_dict("records"),
-        "timing": {
-            row["run"]: {"training_seconds": float(row["training_seconds"])} for row in timing
-        },
+        "timing": timing.set_index("run").to_dict("index"),
     }
 
 

@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 import tomli_w
-from numpy.typing import NDArray
 
 from cosim.errors import PlantError
 from cosim.plant.archive import SHIPPED, UnpackedFmu, unpack
 from cosim.plant.fmu_plant import FmuPlant
 from cosim.plant.wiring import has_start
+from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
-Array = NDArray[np.float64]
 NO_NOISE = (
     "no noise was found (no output NAME with parameters NAME_nominal and NAME_range): the plant is "
     "taken as undisturbed"

@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import NoReturn, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim.errors import CapabilityError, PlantError
 from cosim.plant.archive import unpack
 from cosim.plant.fmi import NOT_FINITE, Fmi2Instance, Fmi3Instance, Instance
 from cosim.plant.wiring import Wirer, check_step, refusals, seed_words
-from cosim.protocols import CompiledLoop, Step
+from cosim.protocols import Array, CompiledLoop, Step
 from cosim.scenario import Scenario
 
-Array = NDArray[np.float64]
 _NOT_STARTED = -1
 _HEADER = struct.Struct("<8sq32s")
 _MAGIC = b"cosimfs1"
@@ -139,7 +137,8 @@ class FmuPlant:
         except TypeError:
             acceptable = False
         if not acceptable:
-            self._refuse(a)
+            names = ", ".join(self.scenario.plant.actions)
+            raise PlantError(f"action must be {self._m} finite numbers ({names}), not {a}")
         if self._k < 0:
             self._refuse_unstarted()
         self._inputs[:] = values
@@ -279,10 +278,6 @@ class FmuPlant:
         for reference, value in zip(self._initial, values.tolist(), strict=True):
             fmi.change_start(fmi.real, reference, value)
         self._elsewhere = state is not None
-
-    def _refuse(self, a: object) -> NoReturn:
-        names = ", ".join(self.scenario.plant.actions)
-        raise PlantError(f"action must be {self._m} finite numbers ({names}), not {a}")
 
     def _refuse_unstarted(self) -> NoReturn:
         if self._fmi is None:

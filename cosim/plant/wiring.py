@@ -8,15 +8,14 @@ from math import ceil, inf
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim.errors import PlantError
 from cosim.plant.archive import UnpackedFmu, unpack
 from cosim.plant.fmi import Fmi2Instance, Instance, StartValue, Wiring, library_path
+from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
-Array = NDArray[np.float64]
 _REAL = ("Real", "Float64")
 
 

@@ -60,6 +60,10 @@ class ValueConfiguration(Configuration):
     prediction_errors: Count = Field(
         1000, description="prediction errors over which the next penalty is expected"
     )
+    mean_cost_memory: Count | None = Field(
+        None,
+        description="samples over which the mean cost is measured; if not given, θ's fit has it",
+    )
 
     @property
     def criterion(self) -> float | None:
@@ -103,6 +107,7 @@ class QLearningConfiguration(ValueConfiguration):
         else:
             names = ["prior_width", "prior_samples", "measure_offset", "step_every"]
             names += ["innovation_clip", "variance_memory", "prediction_errors", "parameter_drift"]
+            names += ["mean_cost_memory"]
         return dict.fromkeys(names, f"the rule {self.rule}")
 
 
@@ -130,7 +135,9 @@ class ValueRule(Algorithm):
         discount = self.scenario.discount if settings.criterion is None else settings.criterion
         position, cost = self._step.blocks.slices["c_lambda"].start, self.scenario.controller
         level = float(self._step.scale[position])
-        self._average_cost = AverageCost(discount, position, level, cost.reference_cost)
+        self._average_cost = AverageCost(
+            discount, position, level, cost.reference_cost, settings.mean_cost_memory
+        )
 
     def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
         """The prior's mean; its deviations become the coordinates.
@@ -198,13 +205,14 @@ class QLearning(ValueRule):
         expected = self._errors.expected_penalty(prediction)
         value = transition.next_policy.value - transition.next_penalty + expected
         solution = transition.action_value
+        self._average_cost.measure(transition.stage_cost + expected)
         td_error = self._average_cost.target(transition.cost, value) - solution.value
         first, count, self._count = self._first, self._count, self._count + 1
         if count < len(first["states"]):
             first["states"][count], first["prediction_errors"][count] = transition.s, error
             first["td_errors"][count] = td_error
             return self._begin_filter() if self._count == len(first["states"]) else None
-        gradient = solution.value_gradient * self._step.scale
+        gradient = self._average_cost.fitted(solution.value_gradient * self._step.scale)
         innovation = self._regression.update(td_error, gradient)
         self._squares += innovation * innovation
         every = self.configuration.step_every
@@ -298,15 +306,37 @@ class AverageCost:
     c_lambda goes to g, and c_lambda stays. This is differential Q-learning; it serves the
     yardstick J itself, which a discounted optimum need not.
 
+    With a `memory` g is no part of the fit: it is the mean of the costs of so many samples. A
+    fitted g takes up what Q misjudges of the samples that explore, and leaves the opposite error to
+    those that do not.
+
     `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
     """
 
-    KEPT = ("mean_cost",)
+    KEPT = ("mean_cost", "count")
 
-    def __init__(self, discount: float, position: int, scale: float, start: float) -> None:
+    def __init__(
+        self, discount: float, position: int, scale: float, start: float, memory: int | None = None
+    ) -> None:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
         self._position, self._scale = position, scale
+        self._memory = memory if discount == 1.0 else None
+        self.count = 0
+
+    def measure(self, cost: float) -> None:
+        """Take a sample's cost into g, where that is measured."""
+        if self._memory is not None:
+            self.count += 1
+            self.mean_cost += (cost - self.mean_cost) / min(self.count, self._memory)
+
+    def fitted(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """∇Q (n,) or (K, n) of what is fitted: without c_lambda where g is measured."""
+        if self._memory is None:
+            return gradient
+        kept = gradient.copy()
+        kept[..., self._position] = 0.0
+        return kept
 
     def target(self, cost: Values, next_value: Values) -> Values:
         """What Q(s, a) is fitted to, of one sample or of several, (K,)."""

@@ -121,6 +121,17 @@ def test_discounted_target_and_untouched_fit():
     assert average_cost.take(same) is same
 
 
+def test_a_measured_mean_cost_is_that_of_the_latest_samples_and_no_part_of_the_fit():
+    average_cost = AverageCost(1.0, 1, 10.0, 6000.0, 4)
+    for cost in (8.0, 4.0, 3.0, 1.0, 8.0):
+        average_cost.measure(cost)
+    assert average_cost.mean_cost == 5.0  # (3/4) of 4, the mean of four, and (1/4) of 8
+    assert average_cost.fitted(np.ones((2, 3))).tolist() == [[1.0, 0.0, 1.0]] * 2
+    fitted = AverageCost(1.0, 1, 10.0, 6000.0)
+    fitted.measure(8.0)
+    assert (fitted.mean_cost, fitted.fitted(np.ones(3)).tolist()) == (6000.0, [1.0] * 3)
+
+
 def test_mean_cost_takes_the_step_of_c_lambda():
     average_cost = AverageCost(1.0, 1, 10.0, 6000.0)
     assert average_cost.target(6001.0, 100.0) == 101.0

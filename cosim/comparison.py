@@ -49,9 +49,8 @@ class RunSignals:
 def load_run(path: str | Path) -> RunSignals:
     """Load a run from a folder that holds trajectory.csv, from such a CSV, or from a `.rrd` file.
 
-    Raises
-    ------
-    ComparisonError : no run there; TrajectoryError, RecordingError : not readable.
+    Raises ComparisonError where there is no run, TrajectoryError or RecordingError where one is not
+    readable.
     """
     path = Path(path)
     if path.is_dir():
@@ -170,9 +169,7 @@ def compare(
     magnitude in A; without either every bit counts, so that −0.0 is not 0.0. The solver's
     `residual` is left out of `relative`: it counts with a tolerance of its own, or to the bit.
 
-    Raises
-    ------
-    ComparisonError : a tolerance for a signal that neither run has, or a negative one.
+    Raises ComparisonError on a tolerance for a signal that neither run has, or a negative one.
     """
     if not 0 <= relative < inf:
         raise ComparisonError(f"relative (--relative) must be finite and ≥ 0, not {relative}")

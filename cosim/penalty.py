@@ -18,10 +18,8 @@ class Penalty:
 
     Source: paper.tex, Simulations (b_σ = 10⁵·1, B_σ = I, at the true bounds).
 
-    Parameters
-    ----------
-    lower, upper : (n,) bounds x_l, x_u in the states' units.
-    linear, quadratic : (n,) weights b (cost per unit) and B (cost per unit²).
+    `lower` and `upper` (n,) are the bounds x_l, x_u in the states' units, `linear` and `quadratic`
+    (n,) the weights b (cost per unit) and B (cost per unit²).
     """
 
     def __init__(

@@ -131,21 +131,6 @@ def _cell(value: float) -> str:
     return "" if isnan(value) else repr(int(value) if value == int(value) else value)
 
 
-def late_movement(start: Parameters, rows: Sequence[LogRow]) -> float:
-    """‖θ_K − θ_0.8K‖/‖θ_K − θ_0‖ in scaled entries: the criterion of convergence, below 0.05.
-
-    θ_0.8K is that of the last row within the first four fifths of the samples. NaN where θ never
-    moved or the log has no such row.
-    """
-    early = [row for row in rows if row["samples"] <= 0.8 * rows[-1]["samples"]]
-    if not early:
-        return float("nan")
-    last, scale = rows[-1].parameters.theta, start.blocks.scale
-    way = float(np.linalg.norm((last - start.theta) / scale))
-    moved = float(np.linalg.norm((last - early[-1].parameters.theta) / scale))
-    return moved / way if way > 0 else float("nan")
-
-
 def drift(scenario: Scenario) -> Callable[[float], dict[str, float]] | None:
     """The parameters that change in a scenario's plant, and J*, by column, at a time in s.
 
@@ -346,7 +331,6 @@ class Training(Shown):
             **self.evaluation,
             "smallest_eigenvalue": last.get("smallest_eigenvalue"),
             "td_error": last.get("td_error"),
-            "late_movement": late_movement(self.start, self.rows) if self.rows else float("nan"),
             "training_failures": last.get("failures"),
             "weakly_active": last.get("weakly_active"),
             "licq_failed": last.get("licq_failed"),

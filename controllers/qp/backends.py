@@ -49,10 +49,8 @@ def make_backend(name: str) -> QpBackend:
     kind, _, solver = name.partition(":")
     if name == "daqp":
         return DaqpBackend()
-    if name == "proxqp":
-        return QpsolversBackend(name)
-    if kind == "qpsolvers" and solver:
-        return QpsolversBackend(solver)
+    if name == "proxqp" or (kind == "qpsolvers" and solver):
+        return QpsolversBackend(solver or name)
     raise ControllerError(
         f"there is no QP backend '{name}'; choose daqp, proxqp or qpsolvers:SOLVER"
     )
@@ -132,16 +130,6 @@ ATTEMPTS: dict[str, list[dict[str, Any]]] = {
     "proxqp": [
         {"eps_abs": 1e-9, "eps_rel": 0.0},
         {"eps_abs": 1e-9, "eps_rel": 0.0, "primal_infeasibility_solving": True},
-    ],
-    # Without the gap piqp stops at multipliers that do not fit the rows' slack.
-    "piqp": [
-        {
-            "eps_abs": 1e-10,
-            "eps_rel": 1e-12,
-            "check_duality_gap": True,
-            "eps_duality_gap_abs": 1e-9,
-            "eps_duality_gap_rel": 0.0,
-        }
     ],
     "clarabel": [{"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}],
     "daqp": [{"primal_tol": 1e-10, "dual_tol": 1e-12}],

@@ -53,10 +53,8 @@ class FmuPlant:
     platform or lacks a variable that the scenario names; CapabilityError when a capability that
     the FMU lacks is asked for, not before.
 
-    Parameters
-    ----------
-    scenario : a `Scenario`, or what `Scenario.load` takes.
-    fmu : FMU to use in place of the scenario's, a shipped one's name or a path.
+    `scenario` is a `Scenario` or what `Scenario.load` takes; `fmu`, a shipped one's name or a path,
+    takes the place of the scenario's.
     """
 
     def __init__(self, scenario: Scenario | str | Path, fmu: str | Path | None = None) -> None:

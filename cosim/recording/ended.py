@@ -101,9 +101,7 @@ def record_training(
     `log` holds columns (K,), among them `samples`, NaN where not measured; `increments` the change
     of each block of θ since the start, (K, size), and `labels` the names of its entries.
 
-    Raises
-    ------
-    RecordingError : the file cannot be written.
+    Raises RecordingError where the file cannot be written.
     """
     samples = log["samples"]
     blocks = {

@@ -44,9 +44,7 @@ class Recording:
 def read_recording(path: str | Path) -> Recording:
     """Read a `.rrd` file that this package wrote.
 
-    Raises
-    ------
-    RecordingError : no such file, not a recording, or not one of this package.
+    Raises RecordingError where there is no such file, or it is no recording of this package.
     """
     static: dict[str, dict[str, list[str]]] = {}
     rows: dict[str, list[pa.RecordBatch]] = defaultdict(list)

@@ -45,9 +45,7 @@ class RerunRecorder:
     Every signal keeps its name and float64 bits; `read_recording` gives them back. Predictions are
     the signals `prediction/<name>`, N+1 or N numbers a sample.
 
-    Raises
-    ------
-    RecordingError : the file cannot be written.
+    Raises RecordingError where the file cannot be written.
     """
 
     def __init__(self, path: str | Path) -> None:

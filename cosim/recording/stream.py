@@ -89,9 +89,7 @@ class Stream:
     file is written beside `path` under a hidden name and renamed by `close`, so that `path` never
     holds half a recording; `rerun rrd optimize` repairs what a killed process leaves.
 
-    Raises
-    ------
-    RecordingError : the folder does not exist or cannot be written.
+    Raises RecordingError where the folder does not exist or cannot be written.
     """
 
     def __init__(self, path: str | Path, name: str, layout: rrb.Blueprint) -> None:

@@ -30,9 +30,7 @@ _NO_DRIVER = ("No graphics adapter", "Failed to get render context")
 def open_viewer(path: str | Path) -> None:
     """Open a recording in a window and wait until it is closed; the viewer binds 127.0.0.1 only.
 
-    Raises
-    ------
-    RecordingError : no such file, or the viewer failed (no display, no graphics driver).
+    Raises RecordingError where there is no such file, no display or no graphics driver.
     """
     command = [*_viewer(), "--port", "auto", str(_existing(path))]
     if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
@@ -56,9 +54,8 @@ def render(
     `at` is in seconds of the run, or a sample's number where there is no time (a training); default
     is the worst violation of a run, or the end.
 
-    Raises
-    ------
-    RecordingError : no such file, no graphics driver, a view that failed, or `timeout` s passed.
+    Raises RecordingError where there is no such file or graphics driver, where a view failed or
+    `timeout` s have passed.
     """
     if at is not None and not isfinite(at):
         raise RecordingError(f"the time of the cursor (--at) must be finite, not {at}")

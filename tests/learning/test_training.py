@@ -11,7 +11,7 @@ from cosim.kpis import indicators_of
 from learning.algorithm import Update, load_algorithm
 from learning.errors import CheckpointError
 from learning.q_learning import QLearning
-from learning.training import HELD_OUT, LogRow, late_movement, to_csv
+from learning.training import HELD_OUT, to_csv
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed, train
 
@@ -191,15 +191,3 @@ def test_scenarios_that_differ_in_open_points_train_differently(scenario):
         other = dataclasses.replace(run, scenario=scenario.replace(stated))
         theta.add(train(other).parameters.hash)
     assert len(theta) == 3
-
-
-def test_the_late_movement_is_that_of_the_last_fifth(problem):
-    start = Parameters.naive(problem)
-
-    def row(samples, back_off):
-        return LogRow({"samples": samples}, start.replace({"x_l": [25.0 + back_off, 40.0]}))
-
-    rows = [row(20, 0.5), row(80, 1.5), row(90, 1.9), row(100, 2.0)]
-    assert late_movement(start, rows) == pytest.approx(0.25)
-    assert np.isnan(late_movement(start, [row(100, 2.0)]))
-    assert np.isnan(late_movement(start, [row(50, 0.0), row(100, 0.0)]))

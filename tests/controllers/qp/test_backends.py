@@ -10,7 +10,7 @@ from controllers.qp.backends import make_backend
 from tests.helpers.scalar import CASES, scalar_qp
 from tests.helpers.stored import qps, solve
 
-QPSOLVERS = ["proxqp", *(f"qpsolvers:{name}" for name in ("clarabel", "daqp", "quadprog", "piqp"))]
+QPSOLVERS = ["proxqp", *(f"qpsolvers:{name}" for name in ("clarabel", "daqp", "quadprog"))]
 EVERY = ["daqp", *QPSOLVERS]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from cosim import signals
 from cosim.protocols import Controller, SampleBlock, controller_name
 from cosim.recording.stream import (
     SERIES,
@@ -28,13 +29,11 @@ from cosim.recording.stream import (
     view,
 )
 from cosim.scenario import Scenario
-from cosim.signals import SIGNALS, SignalKind
+from cosim.signals import SignalKind
 
 ALONE = ("states", "actions", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
 HELD = ("actions", "disturbances")
-KINDS = [kind for kind in SIGNALS if kind.group is not None]
-"""The signals that are recorded."""
 _STATUS, _RESIDUAL = "solver/status", "solver/log_residual"
 _GOOD = "#3A9A5B"
 
@@ -63,7 +62,8 @@ class RerunRecorder:
         """Open the file and write what is known before the first sample."""
         name = controller_name(controller)
         self._seconds = steps * scenario.sampling_time
-        self._kinds = {kind: _channels(kind, scenario, units) for kind in KINDS}
+        recorded = [kind for kind in signals.SIGNALS if kind.group is not None]
+        self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
         self._predicted: dict[str, Channel] = {}
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
         self._status: str | None = None

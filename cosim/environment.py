@@ -111,16 +111,8 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         self._plant.close()
 
 
-def normalised(
-    scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None
-) -> NormalisedEnv:
-    """`PlantEnv` with observations, actions and rewards of the size of one, float32."""
-    env = PlantEnv(scenario, render_mode=render_mode)
-    return NormalisedEnv(env, env.scenario)
-
-
 class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
-    """A `PlantEnv` whose states, actions and rewards are numbers of the size of one.
+    """A `PlantEnv` whose states, actions and rewards are float32 numbers of the size of one.
 
     A state counts from the operating point in tenths of its magnitude (of its bounds' width where
     that is 0), an action from −1 to 1 across its range, a reward is minus the cost beyond the
@@ -128,18 +120,22 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
     physical units.
     """
 
-    def __init__(self, env: Any, scenario: Scenario) -> None:
+    def __init__(
+        self, scenario: Scenario | str | Path = "paper", *, render_mode: str | None = None
+    ) -> None:
+        env: Any = PlantEnv(scenario, render_mode=render_mode)
         super().__init__(env)
-        self._scenario = scenario
-        width = scenario.state_upper - scenario.state_lower
-        magnitude = np.abs(scenario.reference_state)
+        task: Scenario = env.scenario
+        self._scenario = task
+        width = task.state_upper - task.state_lower
+        magnitude = np.abs(task.reference_state)
         self.state_scale: Array = SHARE * np.where(magnitude > 0, magnitude, width)
-        cost = scenario.controller.reference_cost
+        cost = task.controller.reference_cost
         self.reference_cost, self.cost_scale = cost, SHARE * abs(cost) or 1.0
         seen = env.observation_space
         with np.errstate(over="ignore"):
             low, high = map(self._normalised, (seen.low, seen.high))
-        ones = np.ones(len(scenario.plant.actions), dtype=np.float32)
+        ones = np.ones(len(task.plant.actions), dtype=np.float32)
         self.observation_space = Box(low, high, dtype=np.float32)
         self.action_space = Box(-ones, ones, dtype=np.float32)
 
@@ -165,7 +161,7 @@ class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
         return self._normalised(s), scaled, terminated, truncated, info
 
 
-for _name, _entry_point in (("Evaporator", "PlantEnv"), ("EvaporatorNormalised", "normalised")):
+for _name, _entry_point in (("Evaporator", "PlantEnv"), ("EvaporatorNormalised", "NormalisedEnv")):
     if f"cosim/{_name}-v0" not in gymnasium.registry:
         gymnasium.register(
             f"cosim/{_name}-v0",

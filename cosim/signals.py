@@ -112,15 +112,6 @@ def signal_names(scenario: Scenario) -> list[str]:
     return [name for kind in SIGNALS if not kind.clock for name in kind.names(scenario)]
 
 
-def signal_units(scenario: Scenario, known: Mapping[str, str]) -> dict[str, str]:
-    """Unit of each signal by name; `known` maps FMU variables to theirs."""
-    return {
-        name: unit
-        for kind in SIGNALS
-        for name, unit in zip(kind.names(scenario), kind.units(scenario, known), strict=True)
-    }
-
-
 def clocked() -> frozenset[str]:
     """Names of the signals that a clock measured: two equal runs differ in them."""
     return frozenset(kind.name for kind in SIGNALS if kind.clock)

@@ -238,15 +238,15 @@ class _Run:
 
     def trajectory(self) -> Trajectory:
         scenario = self._scenario
-        units = signals.signal_units(scenario, self._plant.units)
         named, timing = {}, {}
         for kind in signals.SIGNALS:
             values = self._columns.columns[kind.name].reshape(self._steps, -1)
             if kind.clock:
                 timing[kind.name.removesuffix("_time")] = values[:, 0]
                 continue
-            for name, column in zip(kind.names(scenario), values.T, strict=True):
-                named[name] = Signal(name, units[name], np.ascontiguousarray(column))
+            units = kind.units(scenario, self._plant.units)
+            for name, unit, column in zip(kind.names(scenario), units, values.T, strict=True):
+                named[name] = Signal(name, unit, np.ascontiguousarray(column))
         return Trajectory(
             scenario=scenario,
             signals=named,

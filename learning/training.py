@@ -9,7 +9,7 @@ from importlib.metadata import version
 from itertools import islice
 from math import inf, isfinite, isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError
 from learning.step import certificate
-from learning.training_run import TrainingRun, begin, prepare
+from learning.training_run import Options, TrainingRun, begin, prepare
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -349,7 +349,7 @@ def train(
     resume: bool = False,
     optimum: str | None = None,
     progress: Callable[[int, LogRow], None] | None = None,
-    **options: Any,
+    **options: Unpack[Options],
 ) -> Training:
     """Train a controller's θ on a scenario's plant.
 
@@ -370,7 +370,7 @@ def train(
     resume : go on from the checkpoint in `out`.
     optimum : name of the controller whose J is J*; None is `optimal` where its solution is stored.
     progress : called with the samples done and the last row of the log.
-    options : further fields of `TrainingRun`, `evaluate_every=1000` say.
+    options : further fields of `TrainingRun`, `evaluate_every=1000` say; see `Options`.
     """
     if not isinstance(scenario, Scenario):
         scenario = Scenario.load(scenario)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,19 @@ class TrainingRun:
         if self.start != "commissioned":
             return starting_parameters(problem, self.configuration, self.start)
         return back_off(starting_parameters(problem, self.configuration, "tuned"), self.scenario)
+
+
+class Options(TypedDict, total=False):
+    """The fields of `TrainingRun` that `train` takes as further keywords."""
+
+    controller: str
+    log_every: int
+    evaluate_every: int
+    checkpoint_every: int
+    evaluation_seeds: int
+    evaluation_steps: int
+    divergence: float
+    rest_after: int | None
 
 
 def prepare(

@@ -8,8 +8,8 @@ from cosim.environment import NormalisedEnv, PlantEnv
 
 @pytest.fixture
 def env(paper):
-    with PlantEnv(paper) as plant:
-        yield NormalisedEnv(plant, paper)
+    with NormalisedEnv(paper) as env:
+        yield env
 
 
 @pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")

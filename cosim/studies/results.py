@@ -524,6 +524,8 @@ class StudyResults(Shown):
         if scenario not in (self.about.get("operation") or {}):
             return None
         about, judged = self.about["operation"][scenario], self._judged(scenario)
+        if judged.lives.samples.nunique() == 1:  # no course to draw
+            return None
         return figures.operation_figure(judged, about, self._looks, self.baselines)
 
     def _profile(self, scenario: str) -> Figure | None:

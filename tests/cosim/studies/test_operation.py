@@ -8,6 +8,7 @@ from controllers.optimum import change_of, yardstick
 from cosim import Scenario, Study, train
 from cosim.studies.operation import dearest, judged, plant_at
 from cosim.studies.plan import plan
+from cosim.studies.results import StudyResults
 from learning.errors import ConfigurationError
 from tests.helpers.toy_study import GROW, case, document, run_toy
 
@@ -54,6 +55,13 @@ def test_the_page_has_the_figure_and_a_table_of_each_kind(lived):
     titles = [title for title, _, _ in lived.further()]
     assert len(titles) == 4
     assert lived.figure("operation-paper").axes
+
+
+def test_a_study_judged_once_has_no_course_to_draw(lived, monkeypatch):
+    whole = lived._judged("paper")
+    last = whole._replace(lives=whole.lives[whole.lives.samples == 240])
+    monkeypatch.setattr(StudyResults, "_judged", lambda self, scenario: last)
+    assert lived._operation("paper") is None
 
 
 def test_the_dearest_samples_are_those_of_a_row():

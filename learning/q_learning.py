@@ -306,9 +306,8 @@ class AverageCost:
     c_lambda goes to g, and c_lambda stays. This is differential Q-learning; it serves the
     yardstick J itself, which a discounted optimum need not.
 
-    With a `memory` g is no part of the fit: it is the mean of the costs of so many samples. A
-    fitted g takes up what Q misjudges of the samples that explore, and leaves the opposite error to
-    those that do not.
+    With a `memory` g is no part of the fit: it is the mean of the costs of so many samples, so that
+    what Q misjudges of the samples that explore does not go into it.
 
     `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
     """

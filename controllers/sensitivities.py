@@ -8,6 +8,7 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import casadi as ca
@@ -17,11 +18,7 @@ from numpy.typing import NDArray
 from controllers.dynamics import stage_parameter_gradient
 from controllers.functions import StackedFunction
 from controllers.problem import Problem
-from controllers.qp.problem import (
-    QpSolution,
-    SoftQp,
-    kkt_solve,
-)
+from controllers.qp.problem import QpSolution, SoftQp, kkt_solve
 from controllers.theta import SymbolicTheta, ThetaBlocks
 
 Matrix = NDArray[np.float64]
@@ -90,14 +87,15 @@ def _parameter_gradient(
 
 def sensitivities(
     problem: Problem, blocks: ThetaBlocks, *, exact: bool
-) -> tuple[StackedFunction, StackedFunction]:
-    """Gradient of the value in θ, and its directional derivatives along the KKT adjoints.
+) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
+    """Gradient of the value in θ, and what makes its derivatives along the KKT adjoints.
 
     The first maps a solution (xi, v, t, lam, chi), the linearisation points x, u and theta to
-    `gradient` (n_θ). The second maps that, the QP's A, B, L, L_N and the columns of m adjoint
-    directions dv (mN, m), dt and dlam (nN, m) to `policy` (n_θ, m), which is dπ/dθ transposed, and
-    `state` (n, m), dπ/ds transposed. With `exact` both need M and χ̄ (see `_theta_part` and
-    `_parameter_gradient`), the second also dM, the directional derivative of M.
+    `gradient` (n_θ). The second, which takes the longest to make and is asked for by few, maps
+    that, the QP's A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam
+    (nN, m) to `policy` (n_θ, m), which is dπ/dθ transposed, and `state` (n, m), dπ/ds transposed.
+    With `exact` both need M and χ̄ (see `_theta_part` and `_parameter_gradient`), the second also
+    dM, the directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
@@ -117,27 +115,31 @@ def sensitivities(
     inputs = {**solution, "x": x, "u": u, "theta": symbols.theta, **extra}
     value = StackedFunction("value_gradient", inputs, {"gradient": gradient})
 
-    A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
-    L, L_N = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("L_N", n, n)
-    dv, dt, dlam = (
-        ca.SX.sym(name, rows * horizon, m) for name, rows in (("dv", m), ("dt", n), ("dlam", n))
-    )
-    dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
-    symbol = ca.veccat(*y, *([M] if exact else []))
-    policy, state = [], []
-    for i in range(m):
-        v_i = ca.reshape(dv[:, i], m, horizon)
-        lam_i = ca.reshape(dlam[:, i], n, horizon)
-        xi_i, chi_i = _direction(problem, A, B, L, L_N, v_i, lam_i)
-        direction = ca.veccat(xi_i, v_i, dt[:, i], lam_i, chi_i, *([dM[:, i]] if exact else []))
-        policy.append(-ca.jtimes(gradient, symbol, direction))
-        state.append(-chi_i[:, 0])
-    moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
-    return value, StackedFunction(
-        "policy_jacobian",
-        {**inputs, **moved, **({"dM": dM} if exact else {})},
-        {"policy": ca.horzcat(*policy), "state": ca.horzcat(*state)},
-    )
+    @cache
+    def policy_jacobian() -> StackedFunction:
+        A, B = ca.SX.sym("A", n, n * horizon), ca.SX.sym("B", m, n * horizon)
+        L, L_N = ca.SX.sym("L", n + m, horizon * (n + m)), ca.SX.sym("L_N", n, n)
+        dv, dt, dlam = (
+            ca.SX.sym(name, rows * horizon, m) for name, rows in (("dv", m), ("dt", n), ("dlam", n))
+        )
+        dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
+        symbol = ca.veccat(*y, *([M] if exact else []))
+        policy, state = [], []
+        for i in range(m):
+            v_i = ca.reshape(dv[:, i], m, horizon)
+            lam_i = ca.reshape(dlam[:, i], n, horizon)
+            xi_i, chi_i = _direction(problem, A, B, L, L_N, v_i, lam_i)
+            direction = ca.veccat(xi_i, v_i, dt[:, i], lam_i, chi_i, *([dM[:, i]] if exact else []))
+            policy.append(-ca.jtimes(gradient, symbol, direction))
+            state.append(-chi_i[:, 0])
+        moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
+        return StackedFunction(
+            "policy_jacobian",
+            {**inputs, **moved, **({"dM": dM} if exact else {})},
+            {"policy": ca.horzcat(*policy), "state": ca.horzcat(*state)},
+        )
+
+    return value, policy_jacobian
 
 
 def _direction(

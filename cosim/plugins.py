@@ -6,7 +6,6 @@ import ast
 import hashlib
 import importlib
 import json
-import os
 import platform
 import re
 import sys
@@ -15,10 +14,9 @@ import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache, partial
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib.metadata import PackageNotFoundError, entry_points, version
 from importlib.util import resolve_name
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from cosim.errors import ControllerLookupError
@@ -29,7 +27,7 @@ from cosim.validation import suggestion
 
 CONTROLLERS, FILES, ALGORITHMS = "cosim.controllers", "cosim.controller_files", "cosim.algorithms"
 """Groups of entry points: factory(scenario), factory(scenario, path) by suffix, algorithms."""
-PARAMETERS = EntryPoint("toml", "controllers.factories:from_file", FILES)
+PARAMETERS = {"toml": "controllers.factories:from_file"}
 """What a parameters file is read by, unless another package registers its own reader."""
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 OURS = ("fmus", "cosim", "controllers", "learning")
@@ -38,6 +36,12 @@ ROOT = Path(__file__).absolute().parents[1]
 """Folder that holds them."""
 
 _folders: list[str] = []
+
+
+@cache
+def registered(group: str) -> dict[str, str]:
+    """Targets, `module:Name`, of a group's entry points by name, as this process found them."""
+    return {point.name: point.value for point in entry_points(group=group)}
 
 
 def import_from(folder: str | Path) -> None:
@@ -113,13 +117,13 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     (TOML) or one whose suffix is an entry point, factory(scenario, path), of the group
     `cosim.controller_files`; or a `module:factory` with factory(scenario) -> Controller.
     """
-    known = {point.name: point for point in entry_points(group=CONTROLLERS)}
+    known = registered(CONTROLLERS)
     if name in known:
-        return _made(name, known[name].value, scenario)
+        return _made(name, known[name], scenario)
     suffix = Path(name).suffix.removeprefix(".")
-    files = {point.name: point for point in (PARAMETERS, *entry_points(group=FILES))}
+    files = PARAMETERS | registered(FILES)
     if suffix in files:
-        read = load_plugin(files[suffix].value, f"the reader of .{suffix}", ControllerLookupError)
+        read = load_plugin(files[suffix], f"the reader of .{suffix}", ControllerLookupError)
         controller: Controller = read(scenario, name)
         return _named(controller, Path(name).stem)
     if ":" in name:
@@ -179,8 +183,10 @@ ASIDE = {"cli", "figures", "recording", "__pycache__", "report.py", "pictures.py
 
 _brought: dict[str, set[str]] = {}
 """Modules that loading a plug-in, and calling its factory, imported, by the plug-in's module."""
-_sources: dict[str, tuple[ModuleType, str]] = {}
+_sources: dict[str, tuple[Any, str]] = {}
 """Users' modules with the hash of their source as it was when they were loaded."""
+_looked_at: dict[str, object] = {}
+"""Modules of whatever origin, by name, whose source need not be looked at again."""
 
 
 def depends_on(
@@ -228,10 +234,9 @@ def sources_of(part: Any) -> dict[str, str]:
     if not isinstance(part, str | Path):
         _hash_foreign_modules()
         return _closure(getattr(part, "__module__", None) or type(part).__module__)
-    for group in (CONTROLLERS, ALGORITHMS):
-        for point in entry_points(group=group):
-            if point.name == part:
-                return sources_of(point.value)
+    known = registered(ALGORITHMS) | registered(CONTROLLERS)
+    if part in known:
+        return sources_of(known[str(part)])
     if TARGET.fullmatch(str(part)):
         module = str(part).partition(":")[0]
         if module.partition(".")[0] in OURS:
@@ -285,12 +290,11 @@ def _imports(module: str) -> list[str]:
 def _hash_foreign_modules() -> None:
     """Note the source of users' modules, as soon as they have been loaded."""
     for name, module in list(sys.modules.items()):
+        if _looked_at.get(name) is module:
+            continue
+        _looked_at[name] = module
         file = getattr(module, "__file__", None)
-        if not isinstance(file, str) or not isinstance(module, ModuleType):
-            continue
-        if name in _sources and _sources[name][0] is module:
-            continue
-        if _is_foreign(os.path.dirname(file)):  # noqa: PTH120 (some thousand modules)
+        if isinstance(file, str) and _is_foreign(str(Path(file).parent)):
             with suppress(OSError):
                 _sources[name] = (module, _digest(Path(file).read_bytes()))
 

@@ -5,14 +5,13 @@ An own rule inherits `Algorithm`, is given a `Transition` and returns an `Update
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
-from cosim.plugins import ALGORITHMS, load_plugin
+from cosim.plugins import ALGORITHMS, load_plugin, registered
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 from learning.checkpoint import arrays_of, take_up
@@ -131,12 +130,12 @@ class Algorithm:
 
 def algorithms() -> list[str]:
     """Names of the algorithms that are registered."""
-    return sorted(point.name for point in entry_points(group=ALGORITHMS))
+    return sorted(registered(ALGORITHMS))
 
 
 def load_algorithm(name: str) -> type[Algorithm]:
     """Class of an algorithm by registered name or `module:Class`; raises AlgorithmLookupError."""
-    known = {point.name: point.value for point in entry_points(group=ALGORITHMS)}
+    known = registered(ALGORITHMS)
     if (target := known.get(name, name)) == name and ":" not in name:
         raise AlgorithmLookupError(
             f"unknown algorithm '{name}'{suggestion(name, known)}; registered are "

@@ -66,7 +66,7 @@ class Engine:
             "EMBEDDED": functions.embedding,
             "READ": functions.readout,
             "GRADIENT": functions.gradient,
-            "POLICY": functions.policy,
+            "POLICY": functions.policy(),
         }
         if stack_needed(functions.problem, named) > MOST:
             return None

@@ -17,13 +17,7 @@ from controllers.problem import Problem
 from controllers.qp.backends import QpBackend, make_backend
 from controllers.qp.problem import multipliers_at_kink
 from controllers.rti.engine import NOT_FINITE, Engine
-from controllers.rti.preparation import (
-    embedding,
-    make_hessian,
-    preparation,
-    qp_of,
-    readout,
-)
+from controllers.rti.preparation import embedding, make_hessian, preparation, qp_of, readout
 from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 from controllers.sensitivities import sensitivities
 from controllers.theta import Parameters

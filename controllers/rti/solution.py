@@ -39,8 +39,8 @@ class Functions:
     """The CasADi functions that a controller of the `problem` calls.
 
     `preparation` and `embedding` make the QP, `readout` takes its value, `gradient` and `policy`
-    its derivatives in θ (`controllers.sensitivities`). The memory of the first and the third hold a
-    sample's QP and its solution.
+    its derivatives in θ (`controllers.sensitivities`), the latter made when first asked for. The
+    memory of the first and the third hold a sample's QP and its solution.
     """
 
     problem: Problem
@@ -48,7 +48,7 @@ class Functions:
     embedding: StackedFunction
     readout: StackedFunction
     gradient: StackedFunction
-    policy: StackedFunction
+    policy: Callable[[], StackedFunction]
 
 
 Jacobians = Callable[[Vector, Vector], tuple[Matrix, Matrix] | None]
@@ -213,7 +213,7 @@ class RtiSolution:
             if found is not None:
                 return found
         dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
-        function = prepared.functions.policy
+        function = prepared.functions.policy()
         self._write_solution(function)
         inputs = function.inputs
         for name in ("A", "B", "L", "L_N"):

@@ -157,7 +157,7 @@ BAD_INPUT = {
 
 
 @pytest.mark.parametrize("case", BAD_INPUT)
-def test_bad_input_gives_one_clear_message_and_exit_code_2(case, cosim, tmp_path):
+def test_bad_input_gives_one_clear_message_and_exit_code_2(case, cosim, unwatched, tmp_path):
     documents = {
         "type": 'discount = "high"',
         "field": '[plant]\nfmuu = "x"',

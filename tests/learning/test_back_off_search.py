@@ -110,7 +110,7 @@ def test_no_true_bound_is_loosened_and_on_a_plateau_nothing_moves(problem, scena
         return sample
 
     loop.transition = indifferent
-    search = search_of(problem, scenario, start)
+    search = search_of(problem, scenario, start, 4000)
     least, most = start["x_l"], start["x_u"]
     while not search.done:
         rng, begins = np.random.default_rng(search.seed), False
@@ -134,6 +134,6 @@ def test_the_end_of_what_was_seen_is_not_taken_for_the_best(problem, scenario, s
         return sample
 
     loop.transition = falling
-    search = loop.run(search_of(problem, scenario, start), None)
+    search = loop.run(search_of(problem, scenario, start, 4000), None)
     run = {segment.kappa[0] for segment in search._plan}
     assert search.kappa[0] in run and search.kappa[0] >= 4.0

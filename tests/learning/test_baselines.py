@@ -75,11 +75,11 @@ def test_only_the_simulators_forms_put_the_plant_back(name, scenario):
 def test_the_last_digits_of_the_start_choose_nothing(problem, tmp_path):
     """As those of the tuned θ, which a conic solver gives to 1e-10."""
     J, tuned, rng = [], tune(problem).parameters, np.random.default_rng(0)
-    for size in (0.0, 1e-10, 1e-10):
+    for size in (0.0, 1e-10):
         theta = tuned.theta * (1 + size * rng.uniform(-1, 1, tuned.theta.size))
         start = tuned.with_theta(theta).save(tmp_path / "start.toml")
         J.append(train(make_run("backoff", "fouled", samples=2000, start=str(start))).J)
-    assert J[1:] == pytest.approx([J[0], J[0]], rel=1e-6)
+    assert J[1] == pytest.approx(J[0], rel=1e-6)
 
 
 @pytest.mark.slow

@@ -92,7 +92,7 @@ def test_batch_q_learning_finds_the_riccati_solution(linear_quadratic):
 def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, rule, settings):
     exact = linear_quadratic.riccati(1.0)[1]
     assert np.abs(exact - linear_quadratic.K).max() > 0.04
-    controller = learn(linear_quadratic, rule, 6000, 0.0, **settings | {"discount": 1.0})
+    controller = learn(linear_quadratic, rule, 4000, 0.0, **settings | {"discount": 1.0})
     assert gain(controller) == pytest.approx(exact, abs=0.01)
 
 
@@ -117,7 +117,7 @@ def test_actor_critic_nears_the_riccati_gain_of_the_mean_cost(linear_quadratic):
     exact = linear_quadratic.riccati(1.0)[1]
     start = gain(RtiNmpc(linear_quadratic.problem, linear_quadratic.wrong()))
     controller = learn(
-        linear_quadratic, ActorCritic, 20_000, 0.5, batch_size=2000, radius_end=0.05, **ACTOR
+        linear_quadratic, ActorCritic, 10_000, 0.5, batch_size=1000, radius_end=0.05, **ACTOR
     )
     assert np.abs(gain(controller) - exact).max() < 0.25 * np.abs(start - exact).max()
 

@@ -162,7 +162,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, 
     for name, value in smaller.items():
         monkeypatch.setattr(model_based, name, value)
     settings = {"first_update": 15} | then
-    every = {"samples": 80, "log_every": 20, "evaluate_every": 80, "checkpoint_every": 20}
+    every = {"samples": 60, "log_every": 20, "evaluate_every": 60, "checkpoint_every": 20}
     run = make_run("model-based", scenario, settings, start="tuned", **every)
     whole = train(run)
     assert whole.asks_for == "operation"

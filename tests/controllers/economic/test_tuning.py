@@ -106,7 +106,7 @@ def test_the_published_procedure_gives_the_published_hessian():
 @pytest.mark.parametrize("name", ["paper", "fast-sampling"])
 def test_the_tunings_model_is_integrated_to_a_hundred_millionth(name):
     problem = PROBLEMS[name]
-    exact = optimal_steady_state(replace(problem, substeps=200))
+    exact = optimal_steady_state(replace(problem, substeps=100))
     found = tune(problem).steady_state
     for one, other in ((found.A, exact.A), (found.B, exact.B)):
         assert one == pytest.approx(other, rel=1e-8, abs=1e-8)

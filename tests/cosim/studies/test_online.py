@@ -11,12 +11,12 @@ from cosim.studies import run as engine
 from cosim.studies.results import StudyResults
 from tests.helpers.toy_study import GROW, run_toy
 
-ONLINE = {"block": 500, "period": 1000, "signals": ["td_error"]}
+ONLINE = {"block": 100, "period": 200, "signals": ["td_error"]}
 
 
 def online(folder, jobs=1, **changes):
     case = [
-        {"name": "grow", "algorithm": GROW, "samples": 1000},
+        {"name": "grow", "algorithm": GROW, "samples": 200},
         {"controller": ["naive", "optimal"]},
     ]
     return run_toy(folder, jobs=jobs, online=ONLINE | changes, case=case, logs=["grow"])
@@ -35,10 +35,10 @@ def rows(results, case):
 def test_a_controller_runs_on_the_noise_of_every_training(results):
     scenario = Scenario.load("paper")
     with FmuPlant(scenario) as plant:
-        run = simulate(plant, naive(scenario), 1000, seed=1)
-    cost = (run.signals["stage_cost"].values + run.signals["penalty"].values).reshape(2, 500)
+        run = simulate(plant, naive(scenario), 200, seed=1)
+    cost = (run.signals["stage_cost"].values + run.signals["penalty"].values).reshape(2, 100)
     found = [row for row in rows(results, "naive") if row["training_seed"] == "1"]
-    assert [int(row["samples"]) for row in found] == [500, 1000]
+    assert [int(row["samples"]) for row in found] == [100, 200]
     np.testing.assert_array_equal([float(row["J"]) for row in found], cost.mean(axis=1))
 
 

@@ -60,9 +60,9 @@ def test_a_training_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path):
         toy = case(
             "c",
             "Interrupt",
-            1600,
+            800,
             settings={"marker": str(tmp_path / "marker")},
-            training={"checkpoint_every": 400},
+            training={"checkpoint_every": 200},
         )
         run_toy(out, case=[toy], training_seeds={"count": 1})
 
@@ -92,7 +92,8 @@ def test_a_changed_setting_is_named_and_trained_anew(tmp_path):
     def one(rate):
         run_toy(
             tmp_path,
-            case=[case("g", settings={"rate": rate})],
+            case=[case("g", samples=200, settings={"rate": rate})],
+            training_seeds={"count": 1},
             report=lambda _, line: lines.append(line),
         )
         return (tmp_path / "runs/paper/g/0/parameters.toml").read_text()

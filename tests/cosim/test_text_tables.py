@@ -2,7 +2,7 @@ import pytest
 
 from cosim.errors import CosimError
 from cosim.files import write_atomically
-from cosim.text_tables import csv_text, markdown_table, read_csv
+from cosim.text_tables import csv_text, read_csv
 
 
 def test_a_table_reads_back(tmp_path):
@@ -18,9 +18,3 @@ def test_a_damaged_table_is_one_message_with_the_file(tmp_path, content, message
     path.write_bytes(content)
     with pytest.raises(CosimError, match=rf"table\.csv.*{message}"):
         read_csv(path, CosimError)
-
-
-def test_a_markdown_table_has_text_left_and_numbers_right():
-    assert markdown_table(["case", "J"], [["q", "1.5"]]) == (
-        "| case | J |\n| --- | ---: |\n| q | 1.5 |\n"
-    )

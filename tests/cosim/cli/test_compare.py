@@ -41,13 +41,6 @@ def test_tolerances_make_runs_equal(cosim, runs):
     assert cosim("compare", "s0", "s1", *options)[0] == 0
 
 
-def test_json_is_all_that_goes_to_standard_output(cosim, runs):
-    code, out, _ = cosim("compare", "s0", "s1", "--json")
-    document = json.loads(out)
-    assert (code, document["equal"], document["first_difference"]) == (1, False, 0)
-    assert document["signals"]["X1"]["unit"] == "%"
-
-
 def test_record_writes_an_overlay(cosim, runs):
     assert cosim("compare", "s0", "s1", "--record", "both.rrd")[0] == 1
     assert (runs / "both.rrd").stat().st_size > 10_000

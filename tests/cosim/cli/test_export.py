@@ -13,11 +13,12 @@ import fmpy
 import numpy as np
 import pytest
 from fmpy import fmi2
+from typer.testing import CliRunner
 
 from benchmarks import importers
 from controllers.factories import naive, tuned
 from cosim import FmuPlant, Scenario, simulate
-from tests.helpers.command import run_cosim
+from cosim.cli.main import app
 
 pytestmark = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
@@ -32,8 +33,8 @@ def exported(tmp_path_factory):
     """A tuned controller's FMU for FMI 2.0, its loop with seed 5, and the command's JSON."""
     folder = tmp_path_factory.mktemp("export")
     fmu, ssp = folder / "controller.fmu", folder / "loop.ssp"
-    command = ["export", "tuned", "--out", fmu, "--ssp", ssp, "--seed", "5", "--local", "--json"]
-    result = run_cosim(*command, check=True)
+    command = f"export tuned --out {fmu} --ssp {ssp} --seed 5 --local --json"
+    result = CliRunner().invoke(app, command.split(), catch_exceptions=False)
     return fmu, ssp, json.loads(result.stdout)
 
 

@@ -46,24 +46,6 @@ def test_brackets_are_text(printed):
     assert "'rti-cosim[cluster]'" in text
 
 
-@pytest.mark.parametrize(
-    ("cells", "right"),
-    [
-        (("-1", "2.5"), True),
-        (("24.67 %", "nan"), True),
-        (("[72.43, 81.91]", "", "–"), True),
-        (("38.5 / 62.7 µs",), True),
-        (("1e-3", "lmi"), False),
-        (("no problem found",), False),
-    ],
-)
-def test_only_numbers_stand_on_the_right(printed, cells, right):
-    text = printed(False, "title", ("a wide heading above it all",), [(cell,) for cell in cells])
-    line = next(line for line in text.splitlines() if cells[0] in line)
-    assert line.startswith(f"│ {cells[0]}") is not right
-    assert line.endswith(f"{cells[0]} │") is right
-
-
 def test_a_reader_who_leaves_hears_nothing():
     reading, writing = os.pipe()
     os.close(reading)

@@ -2,9 +2,10 @@ import json
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
+from cosim.cli.main import app
 from learning.training import Training
-from tests.helpers.command import run_cosim
 
 SHORT = (
     "train", "-a", "q-learning", "-n", 200, "--log-every", 50, "--evaluate-every", 100,
@@ -17,7 +18,8 @@ SHORT = (
 def trained(tmp_path_factory):
     """A short training with everything that it can write, and the JSON that it printed."""
     folder = tmp_path_factory.mktemp("trained") / "run"
-    ended = run_cosim(*SHORT, "--out", folder, "--seed", 5, "--record", "--json", check=True)
+    words = (*SHORT, "--out", folder, "--seed", 5, "--record", "--json")
+    ended = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
     return folder, json.loads(ended.stdout)
 
 

@@ -2,7 +2,7 @@ import matplotlib as mpl
 import pytest
 
 from cosim.figures import save
-from cosim.figures.style import figure, label
+from cosim.figures.style import figure
 
 
 def drawing():
@@ -28,11 +28,3 @@ def test_the_users_settings_neither_matter_nor_change(tmp_path):
         styled = save(drawing(), tmp_path / "b.svg").read_bytes()
         assert dict(mpl.rcParams) == before
     assert styled == plain
-
-
-def test_names_become_mathematics_with_units():
-    assert label("X2", "%") == "$X_{2}$ [%]"
-    assert label("T200", "degC") == "$T_{200}$ [°C]"
-    assert label("stage_cost", "1") == "stage cost"
-    assert label("tank[1].level", "m") == "tank[1].level [m]"
-    assert label("price_$", "$") == r"price \$ [\$]"

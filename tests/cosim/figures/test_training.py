@@ -35,17 +35,6 @@ def test_costs_are_shown_as_regret_where_the_optimum_is_known():
     assert {text.get_text() for text in axes.texts} == {"training", "greedy", "naive", "optimal"}
 
 
-def test_the_four_blocks_that_moved_most_are_named():
-    axes = panels(training_figure(LOG, THETA, BASELINES, title="t"))["change of θ, by its scale"]
-    assert [text.get_text() for text in axes.texts] == [
-        "$x_{u}$",
-        r"$B_{\ell}$",
-        r"$b_{\ell}$",
-        "$c_{f}$",
-    ]
-    assert axes.lines[0].get_ydata()[-1] == pytest.approx(4 * np.sqrt(2))
-
-
 def test_what_was_not_measured_has_no_panel(tmp_path):
     log = LOG | {"td_error": UNKNOWN, "greedy_J": UNKNOWN, "greedy_violating_share": UNKNOWN}
     still = {"x_l": np.zeros((4, 2))}

@@ -1,6 +1,7 @@
 """Imports run one way: between the packages as designed, between files in no circle."""
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -28,6 +29,7 @@ ONLY = {"rerun": ("cosim.recording",), "fmpy": ("cosim.plant", "fmus", "cosim.cl
 """Third-party packages that only these modules import."""
 
 
+@cache
 def modules():
     """Every file's module name with its path."""
     found = {}
@@ -37,7 +39,8 @@ def modules():
     return found
 
 
-def imported(path, known):
+@cache
+def imported(path):
     """Modules that a file imports anywhere in it, for types only too, as full names."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -45,7 +48,7 @@ def imported(path, known):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             full = {f"{node.module}.{alias.name}" for alias in node.names}
-            names |= {name if name in known else node.module for name in full}
+            names |= {name if name in modules() else node.module for name in full}
     return names
 
 
@@ -53,7 +56,7 @@ def test_a_package_imports_only_those_it_may():
     known = modules()
     for name, path in known.items():
         package = name.partition(".")[0]
-        found = imported(path, known)
+        found = imported(path)
         others = {other.partition(".")[0] for other in found} & set(PACKAGES)
         assert others - {package} <= MAY[package], name
         assert not [other for other in found if other.startswith(HIDDEN.get(package, ()))], name
@@ -62,7 +65,7 @@ def test_a_package_imports_only_those_it_may():
 def test_the_ground_knows_nobody_who_stands_on_it():
     known = modules()
     for name in GROUND:
-        found = imported(known[f"cosim.{name}"], known)
+        found = imported(known[f"cosim.{name}"])
         assert not [other for other in found if other.startswith(ABOVE)], name
 
 
@@ -72,7 +75,7 @@ def test_a_library_of_one_room_is_imported_nowhere_else(library):
     users = [
         name
         for name, path in known.items()
-        if any(other.partition(".")[0] == library for other in imported(path, known))
+        if any(other.partition(".")[0] == library for other in imported(path))
     ]
     assert users
     assert [name for name in users if not name.startswith(ONLY[library])] == []
@@ -81,7 +84,7 @@ def test_a_library_of_one_room_is_imported_nowhere_else(library):
 def graph(known):
     """Imports between files; a package's face only hands names on and is left out."""
     files = {n for n in known if not n.endswith("__init__")}
-    return {name: imported(known[name], known) & files - {name} for name in files}
+    return {name: imported(known[name]) & files - {name} for name in files}
 
 
 def test_no_file_imports_itself_in_a_circle():

@@ -1,3 +1,5 @@
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -15,26 +17,32 @@ def off(number):
     return random_state(PROBLEM, np.random.default_rng(number))
 
 
+@cache
+def controller(iterations):
+    return RtiNmpc(PROBLEM, NAIVE, iterations=iterations)
+
+
+def first(s, iterations):
+    """The first feedback of a controller."""
+    controller(iterations).reset()
+    return controller(iterations).feedback(s)
+
+
 @pytest.mark.parametrize("number", range(4))
 def test_one_qp_is_the_real_time_iteration(number):
-    one, rti = RtiNmpc(PROBLEM, NAIVE, iterations=1), RtiNmpc(PROBLEM, NAIVE)
-    s = off(number)
-    assert one.feedback(s).value == rti.feedback(s).value
-    assert np.array_equal(one.feedback(s).action, rti.feedback(s).action)
+    one, rti = first(off(number), 1), RtiNmpc(PROBLEM, NAIVE).feedback(off(number))
+    assert one.value == rti.value
+    assert np.array_equal(one.action, rti.action)
 
 
 @pytest.mark.parametrize("number", range(4))
 def test_many_qps_end_at_the_converged_solution(number):
     s = off(number)
     converged = ConvergedNmpc(PROBLEM, NAIVE).feedback(s)
-    errors = [
-        np.abs(RtiNmpc(PROBLEM, NAIVE, iterations=k).feedback(s).action - converged.action)
-        for k in (1, 2, 4, 30)
-    ]
+    errors = [np.abs(first(s, k).action - converged.action) for k in (1, 2, 4, 30)]
     assert errors[-1].max() < 1e-6
     assert errors[2].max() <= errors[0].max() + 1e-9
-    value = RtiNmpc(PROBLEM, NAIVE, iterations=30).feedback(s).value
-    assert value == pytest.approx(converged.value, rel=1e-9)
+    assert first(s, 30).value == pytest.approx(converged.value, rel=1e-9)
 
 
 @pytest.mark.parametrize("number", range(3))

@@ -49,12 +49,6 @@ def test_a_run_s_indicators_are_those_of_its_own_closed_loop(whole):
     assert (row[0], float(row[3])) == ("100001", alone["J"])
 
 
-@pytest.mark.slow
-def test_two_workers_give_the_bytes_of_one(whole, tmp_path):
-    run_toy(tmp_path, jobs=2)
-    assert contents(tmp_path) == contents(whole)
-
-
 def test_a_training_that_was_interrupted_goes_on_from_its_checkpoint(tmp_path):
     def interrupted(out):
         toy = case(

@@ -67,7 +67,7 @@ def test_a_bound_that_binds_only_once_another_is_backed_off_is_searched_too(
     problem, scenario, start
 ):
     loop = Loop(problem, scenario, both=True)
-    search = loop.run(search_of(problem, scenario, start, 16000), None)
+    search = loop.run(search_of(problem, scenario, start, 10000), None)
     assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.02)
     assert search.theta["x_u"][1] == pytest.approx(79.8, abs=0.01)
 

@@ -38,7 +38,7 @@ def make_run(name, scenario="paper", **changes):
     "name",
     [
         "offset-free",
-        "policy-search-simulator",
+        pytest.param("policy-search-simulator", marks=pytest.mark.slow),
         pytest.param("backoff", marks=pytest.mark.slow),
         pytest.param("identified", marks=pytest.mark.slow),
     ],

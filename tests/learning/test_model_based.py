@@ -156,7 +156,9 @@ def test_the_model_takes_over_from_the_rule_at_a_change_of_the_plant(
     assert (len(seen), rule.needs_action_value, rule._era) == (2, False, 18)
 
 
-@pytest.mark.parametrize("then", [{}, {"then": "q-learning", "hand_over": 30}])
+@pytest.mark.parametrize(
+    "then", [pytest.param({}, marks=pytest.mark.slow), {"then": "q-learning", "hand_over": 30}]
+)
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch, then):
     smaller = {"BURN": 5, "COARSE": 25, "FINE": 30, "LEVELS": (0.0, 3.0), "FACTORS": ((1.2,),)}
     for name, value in smaller.items():

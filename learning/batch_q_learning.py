@@ -82,7 +82,6 @@ class BatchQLearning(ValueRule):
         batch["states"][row], batch["prediction_errors"][row] = transition.s, error
         expected = self._errors.expected_penalty(prediction)
         batch["corrections"][row] = expected - transition.next_penalty
-        self._average_cost.measure(transition.stage_cost + expected)
         self._buffer.add(transition)
         if len(self._buffer) < self._length:
             return None
@@ -113,7 +112,7 @@ class BatchQLearning(ValueRule):
             if self._variance == 0.0:
                 self._begin_filter(td_error)
                 information = self._information
-            gradient = self._average_cost.fitted(replayed.gradient * self._step.scale)
+            gradient = replayed.gradient * self._step.scale
             limit = settings.innovation_clip * self._variance**0.5
             innovation = np.clip(td_error, -limit, limit)
             information = self._information + gradient.T @ gradient / self._variance

@@ -60,15 +60,16 @@ class ValueConfiguration(Configuration):
     prediction_errors: Count = Field(
         1000, description="prediction errors over which the next penalty is expected"
     )
-    mean_cost_memory: Count | None = Field(
-        None,
-        description="samples over which the mean cost is measured; if not given, θ's fit has it",
-    )
 
     @property
     def criterion(self) -> float | None:
         """Discount of the TD error, None for the scenario's."""
         return 1.0 if self.discount is None else self.discount
+
+    @property
+    def following(self) -> int:
+        """Samples over which the mean cost follows the TD error; 0 where the fit of θ has it."""
+        return 0
 
     def narrowed(self, width: float) -> Self:
         """Copy whose prior is `width` times as wide."""
@@ -85,6 +86,12 @@ class QLearningConfiguration(ValueConfiguration):
         500, description="first samples, at which θ rests: they give noise and widths"
     )
     step_every: Count = Field(50, description="samples per step of θ")
+    variance_memory: Positive = Field(
+        200.0, description="samples over which the innovations' variance is taken"
+    )
+    mean_cost_memory: int = Field(
+        50, ge=0, description="samples over which the mean cost follows δ; 0: θ's fit has it"
+    )
     parameter_drift: NonNegative = Field(
         0.0,
         description="variance that each sample adds to θ, in units of the prior's, so that "
@@ -99,6 +106,11 @@ class QLearningConfiguration(ValueConfiguration):
     def criterion(self) -> float | None:
         """Discount of the TD error, None for the scenario's."""
         return super().criterion if self.rule == "kalman" else self.discount
+
+    @property
+    def following(self) -> int:
+        """Samples over which the mean cost follows the TD error; 0 where the fit of θ has it."""
+        return self.mean_cost_memory if self.rule == "kalman" else 0
 
     def without_part(self) -> Mapping[str, str]:
         """What belongs to other rules than the chosen one."""
@@ -136,7 +148,7 @@ class ValueRule(Algorithm):
         position, cost = self._step.blocks.slices["c_lambda"].start, self.scenario.controller
         level = float(self._step.scale[position])
         self._average_cost = AverageCost(
-            discount, position, level, cost.reference_cost, settings.mean_cost_memory
+            discount, position, level, cost.reference_cost, settings.following
         )
 
     def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
@@ -205,8 +217,8 @@ class QLearning(ValueRule):
         expected = self._errors.expected_penalty(prediction)
         value = transition.next_policy.value - transition.next_penalty + expected
         solution = transition.action_value
-        self._average_cost.measure(transition.stage_cost + expected)
         td_error = self._average_cost.target(transition.cost, value) - solution.value
+        self._average_cost.follow(td_error)
         first, count, self._count = self._first, self._count, self._count + 1
         if count < len(first["states"]):
             first["states"][count], first["prediction_errors"][count] = transition.s, error
@@ -303,38 +315,34 @@ class AverageCost:
 
     At γ = 1 the constant c_lambda cancels out of δ, and what the fit would have it do is to take
     up the mean of δ. That is what g, the mean cost per sample, has to do: so the step of
-    c_lambda goes to g, and c_lambda stays. This is differential Q-learning; it serves the
-    yardstick J itself, which a discounted optimum need not.
-
-    With a `memory` g is no part of the fit: it is the mean of the costs of so many samples, so that
-    what Q misjudges of the samples that explore does not go into it.
+    c_lambda goes to g, and c_lambda stays. It serves the yardstick J itself, which a discounted
+    optimum need not. With a `memory` g is no part of the fit, and each sample takes g ← g +
+    δ/memory: differential Q-learning after Wan, Naik and Sutton (2021).
 
     `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
     """
 
-    KEPT = ("mean_cost", "count")
+    KEPT = ("mean_cost",)
 
     def __init__(
-        self, discount: float, position: int, scale: float, start: float, memory: int | None = None
+        self, discount: float, position: int, scale: float, start: float, memory: int = 0
     ) -> None:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
         self._position, self._scale = position, scale
-        self._memory = memory if discount == 1.0 else None
-        self.count = 0
+        self._memory = memory if discount == 1.0 else 0
 
-    def measure(self, cost: float) -> None:
-        """Take a sample's cost into g, where that is measured."""
-        if self._memory is not None:
-            self.count += 1
-            self.mean_cost += (cost - self.mean_cost) / min(self.count, self._memory)
+    def follow(self, td_error: float) -> None:
+        """Take a sample's δ into g, where the fit does not have it."""
+        if self._memory:
+            self.mean_cost += td_error / self._memory
 
-    def fitted(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
-        """∇Q (n,) or (K, n) of what is fitted: without c_lambda where g is measured."""
-        if self._memory is None:
+    def fitted(self, gradient: Vector) -> Vector:
+        """∇Q (n,) of what is fitted: without c_lambda where g follows δ."""
+        if not self._memory:
             return gradient
         kept = gradient.copy()
-        kept[..., self._position] = 0.0
+        kept[self._position] = 0.0
         return kept
 
     def target(self, cost: Values, next_value: Values) -> Values:

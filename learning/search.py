@@ -38,6 +38,8 @@ RULES: dict[str, type[Algorithm]] = {
 }
 PRIOR_WIDTH = 0.3
 """Of a rule within the search, which judges each θ: wider than that of the rule alone."""
+RULE_DEFAULTS = {"prior_width": PRIOR_WIDTH, "variance_memory": 2000.0}
+"""Hyperparameters of a rule within the search that differ from those of the rule alone."""
 CANDIDATES = 3
 """θ of a phase of learning that are compared, at equal distances in samples."""
 SENSITIVITIES = 100
@@ -560,9 +562,9 @@ class SearchConfiguration(Configuration):
         """Settings of a rule in the search: those that they share, and the rule's own."""
         shared = {field: getattr(self, field) for field in Configuration.model_fields}
         own = self.rule_settings if name == self.rule else {}
-        if "prior_width" in RULES[name].Configuration.model_fields:
-            own = {"prior_width": PRIOR_WIDTH} | own
-        return RULES[name].Configuration.from_dict(shared | own)
+        rule = RULES[name].Configuration
+        shared |= {key: value for key, value in RULE_DEFAULTS.items() if key in rule.model_fields}
+        return rule.from_dict(shared | own)
 
     def without_part(self) -> Mapping[str, str]:
         """The settings that only a search with a rule has."""

@@ -121,14 +121,13 @@ def test_discounted_target_and_untouched_fit():
     assert average_cost.take(same) is same
 
 
-def test_a_measured_mean_cost_is_that_of_the_latest_samples_and_no_part_of_the_fit():
+def test_a_mean_cost_that_follows_the_td_error_is_no_part_of_the_fit():
     average_cost = AverageCost(1.0, 1, 10.0, 6000.0, 4)
-    for cost in (8.0, 4.0, 3.0, 1.0, 8.0):
-        average_cost.measure(cost)
-    assert average_cost.mean_cost == 5.0  # (3/4) of 4, the mean of four, and (1/4) of 8
-    assert average_cost.fitted(np.ones((2, 3))).tolist() == [[1.0, 0.0, 1.0]] * 2
+    average_cost.follow(8.0)
+    assert average_cost.mean_cost == 6002.0
+    assert average_cost.fitted(np.ones(3)).tolist() == [1.0, 0.0, 1.0]
     fitted = AverageCost(1.0, 1, 10.0, 6000.0)
-    fitted.measure(8.0)
+    fitted.follow(8.0)
     assert (fitted.mean_cost, fitted.fitted(np.ones(3)).tolist()) == (6000.0, [1.0] * 3)
 
 

@@ -125,11 +125,11 @@ class EmpiricalModel:
         residuals = np.concatenate([residuals - residuals.mean(axis=0), older])
         return cls(features, centre, unit, mean, covariance, residuals)
 
-    def mean_error(self, inputs: Array, outputs: Array) -> tuple[Array, Array]:
-        """Mean of the errors of prediction over h, (K,), and its derivative by `mean`, negative."""
+    def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
+        """Predictions of (s₊, ℓ) without r, h (M, K), and their derivative by `mean` over h."""
         y, G, h = self.features(inputs)
         design = _design(G, (inputs - self.centre) / self.unit) / h[:, :, None]
-        return ((outputs - y) / h - design @ self.mean).mean(axis=0), design.mean(axis=0)
+        return y + h * (design @ self.mean), h, design
 
     def cost_row(self, inputs: Array) -> Array:
         """Derivative of the mean cost at inputs (M, n+m) by `mean`."""

@@ -50,8 +50,10 @@ TAIL, TAIL_SAMPLES = 0.1, 120
 """The errors' tails are widened by `TAIL` √(`TAIL_SAMPLES` / their number)."""
 ALARM = 1e-7
 """Probability below which the mean error since the last fit speaks of another plant."""
-WINDOWS = (15, 60, 240)
-"""Latest samples of which that mean is taken, every `WINDOWS[0]` samples."""
+WINDOWS = (15, 60, 240, 960)
+"""Latest samples of which that mean and the mean cost are taken, every `WINDOWS[0]` samples."""
+BROKEN = 1.5
+"""Excess of such a mean cost, over that of the promise's dearest window, that breaks a promise."""
 POOL = 480
 """Number of residuals up to which those from before a change are kept."""
 CAUTION = 120
@@ -96,9 +98,10 @@ class ModelBased(Algorithm):
     """Operates with θ, fits the empirical model, searches on it, and operates on.
 
     An update is due whenever the model's data have doubled or `longest_interval` has passed, and as
-    soon as the errors since the last update have a mean that the model makes improbable: then the
-    plant has changed, and the data from there on count. θ moves only where the model, on new noise,
-    promises less for the new one.
+    soon as the errors since the last update have a mean that the model makes improbable, or the
+    samples are dearer than any of the rollout that promised θ's cost: then the plant has changed,
+    and the data from there on count. θ moves only where the model, on new noise, promises less for
+    the new one.
 
     With `then` a rule learns on after `hand_over` samples; the model only watches for a change of
     the plant, at which it takes over again.
@@ -107,7 +110,7 @@ class ModelBased(Algorithm):
     Configuration = ModelBasedConfiguration
     KEPT = (
         *("_rows", "back_off", "_pool", "_due", "_count", "_era", "_updated", "model_samples"),
-        *("_model", "_rule"),
+        *("_model", "_rule", "_limits"),
     )
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
@@ -129,6 +132,7 @@ class ModelBased(Algorithm):
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
         # Samples so far, at the last update, at the next one, and before the present plant's.
         self._count, self._updated, self._due, self._era = 0, 0, settings.first_update, 0
+        self._limits: Array = np.full(len(WINDOWS), np.inf)  # of the mean cost, for each window
         self._rule: QLearning | None = None
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
@@ -176,13 +180,17 @@ class ModelBased(Algorithm):
         (M, K), noise = model.residuals.shape, np.cov(model.residuals.T)
         if M < CAUTION:
             return 0
-        for window in WINDOWS:
-            if window > self._count - self._updated:
+        inputs, outputs = self._latest(min(self._count - self._updated, WINDOWS[-1]))
+        predicted, h, designs = model.predict(inputs)
+        errors = (outputs - predicted) / h
+        costs = ExpectedCosts(self._problem, model)(predicted, h)[0]
+        for window, limit in zip(WINDOWS, self._limits, strict=True):
+            if window > len(inputs):
                 return 0
-            mean, design = model.mean_error(*self._latest(window))
+            mean, design = errors[-window:].mean(axis=0), designs[-window:].mean(axis=0)
             covariance = noise / window + design @ model.covariance @ design.T
             statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
-            if fisher.sf(statistic, K, M - K) < ALARM:
+            if fisher.sf(statistic, K, M - K) < ALARM or costs[-window:].mean() > limit:
                 return window
         return 0
 
@@ -216,7 +224,9 @@ class ModelBased(Algorithm):
         present = self.controller.parameters
         new = search.theta(found)
         search.draw(FINE)
-        better = search.excess(search.promise(new), search.promise(present.theta)) <= 0
+        promise, kept = search.promise(new), search.promise(present.theta)
+        better = search.excess(promise, kept) <= 0
+        self._limits = (promise if better else kept).limits
         if better:
             self.back_off = found
             self.controller.theta = new
@@ -234,10 +244,35 @@ class ModelBased(Algorithm):
 
 
 class Promise(NamedTuple):
-    """Mean `cost` that a model promises, and its derivative by the model's coefficients, `row`."""
+    """Mean `cost` that a model promises, and its derivative by the model's coefficients, `row`.
+
+    `limits` are those of the mean cost of so many samples as each of `WINDOWS`.
+    """
 
     cost: float
     row: Array
+    limits: Array
+
+
+class ExpectedCosts:
+    """Costs of samples that a model predicts, the penalty by its expectation over all residuals."""
+
+    def __init__(self, problem: Problem, model: EmpiricalModel) -> None:
+        self.penalty = Penalty(
+            problem.state_lower,
+            problem.state_upper,
+            problem.penalty_linear,
+            problem.penalty_quadratic,
+        )
+        errors = model.residuals[:, : problem.n_states]
+        self._errors = SortedErrors(errors)
+        self._widened = 1 + TAIL * (TAIL_SAMPLES / len(errors)) ** 0.5
+
+    def __call__(self, predicted: Array, h: Array) -> tuple[Array, Array]:
+        """Costs (M,), and the penalty of each bound in it, (2n, M), of predictions and h (M, K)."""
+        due = expected_penalties(self.penalty, predicted[:, :-1], self._errors, self._widened * h)
+        penalties = due.swapaxes(0, 1).reshape(-1, len(predicted))
+        return predicted[:, -1] + penalties.sum(axis=0), penalties
 
 
 class BackOffs:
@@ -260,16 +295,10 @@ class BackOffs:
         n = problem.n_states
         self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
         self._start, self._rng = visited[-1, :n], rng
-        self._penalty = Penalty(
-            problem.state_lower,
-            problem.state_upper,
-            problem.penalty_linear,
-            problem.penalty_quadratic,
+        self._costs = ExpectedCosts(problem, model)
+        deviation = model.residuals[:, :n].std(axis=0) * model.features(visited)[2][:, :n].mean(
+            axis=0
         )
-        errors = model.residuals[:, :n]
-        self._errors = SortedErrors(errors)
-        self._widened = 1 + TAIL * (TAIL_SAMPLES / len(errors)) ** 0.5
-        deviation = errors.std(axis=0) * model.features(visited)[2][:, :n].mean(axis=0)
         self._unit = np.tile(np.maximum(deviation, 1e-6 * problem.units.state), 2)
         self._most = np.tile(ROOM * (problem.state_upper - problem.state_lower), 2)
         self._worth = np.zeros(2 * n)  # largest penalty of each bound so far, as a share of cost
@@ -289,18 +318,18 @@ class BackOffs:
 
     def promise(self, theta: Array) -> Promise:
         """What the model promises of a θ; infinite cost where the loop does not stay finite."""
-        n, picks, model = self._problem.n_states, self._picks, self._model
+        picks, model = self._picks, self._model
         parts = self._rollout(theta, self._start, model, picks)
         self.samples += len(parts[0])
         inputs, predicted, h = (part[BURN:] for part in parts)
         if len(inputs) < len(picks) - BURN or not np.isfinite(predicted).all():
-            return Promise(np.inf, np.zeros_like(model.mean))
-        penalties = expected_penalties(
-            self._penalty, predicted[:, :n], self._errors, self._widened * h
-        ).T.reshape(-1)
-        stage = float(predicted[:, n].mean())
-        self._worth = np.maximum(self._worth, penalties / abs(stage))
-        return Promise(stage + float(penalties.sum()), model.cost_row(inputs[::THINNED]))
+            return Promise(np.inf, np.zeros_like(model.mean), np.full(len(WINDOWS), np.inf))
+        costs, penalties = self._costs(predicted, h)
+        stage, cost = float(predicted[:, -1].mean()), float(costs.mean())
+        self._worth = np.maximum(self._worth, penalties.mean(axis=1) / abs(stage))
+        dearest = np.array([_moving_mean(costs, window).max(initial=cost) for window in WINDOWS])
+        limits = cost + BROKEN * (dearest - cost)
+        return Promise(cost, model.cost_row(inputs[::THINNED]), limits)
 
     def excess(self, one: Promise, other: Promise) -> float:
         """Cost of one above another's, in deviations of what the model knows of the difference."""
@@ -352,6 +381,11 @@ class BackOffs:
         told = [self.excess(promise, least) <= DOUBT for promise in promises]
         close = [point for point, like in zip(distinct, told, strict=True) if like]
         return min(close or distinct[:1], key=lambda point: float((point / self._unit).sum()))
+
+
+def _moving_mean(costs: Array, window: int) -> Array:
+    total: Array = np.concatenate([[0.0], costs]).cumsum()
+    return (total[window:] - total[:-window]) / window
 
 
 def _with(delta: Array, bounds: Sequence[int], values: Sequence[float]) -> Array:

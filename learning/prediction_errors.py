@@ -99,19 +99,19 @@ class SortedErrors:
 def expected_penalties(
     penalty: Penalty, predictions: Matrix, errors: SortedErrors, scales: Matrix | None = None
 ) -> Matrix:
-    """Mean penalty of each state's lower and upper bound, (n, 2), over all pairs f + h e.
+    """Penalty of each state's lower and upper bound, (n, 2, K), a mean over f + h e of all errors.
 
     `predictions` f and `scales` h are (K, n), h one if not given. The penalty is a sum over states
     and bounds, so sums over the errors beyond a bound do.
     """
-    costs = np.zeros((predictions.shape[1], 2))
+    costs = np.zeros((predictions.shape[1], 2, len(predictions)))
     for i, predicted in enumerate(predictions.T):
         h = np.ones(len(predicted)) if scales is None else scales[:, i]
         for k, bound in enumerate((penalty.lower[i], penalty.upper[i])):
             if np.isfinite(bound):
                 first, second = errors.beyond(i, (bound - predicted) / h, above=bool(k))
                 due = penalty.linear[i] * h * first + penalty.quadratic[i] * h**2 * second
-                costs[i, k] = due.mean()
+                costs[i, k] = due
     return costs
 
 

@@ -211,7 +211,7 @@ class PairedComparison:
             return block.expected
         if len(block.predictions) and len(self._pool):
             found = expected_penalties(self._penalty, block.predictions, self._pool)
-            return float(found.cumsum()[-1])
+            return float(found.mean(axis=-1).cumsum()[-1])
         return block.penalty
 
     def renew(self, blocks: int, episode: int | None = None) -> Generator[Request, Result, None]:

@@ -9,7 +9,7 @@ from controllers.factories import tuned
 from controllers.functions import find_compiler
 from learning import model_based
 from learning.empirical_model import EmpiricalModel, Features, Rollout
-from learning.model_based import BackOffs, ModelBased
+from learning.model_based import BackOffs, ExpectedCosts, ModelBased
 from learning.q_learning import QLearning
 from learning.training import to_csv
 from tests.helpers.training import killed_and_resumed, make_run, train
@@ -134,6 +134,21 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, featu
         inputs, outputs = plant_data(features, rng, 240, error, offset)
         rule._rows[:240] = np.column_stack([inputs, outputs])
         rule._count = 240
+        assert rule._changed(fitted) == window
+
+
+def test_a_plant_that_nears_its_bound_breaks_the_promise(scenario, base, features, fitted, rng):
+    run = make_run("model-based", scenario)
+    controller = SimpleNamespace(parameters=base, theta=base.theta)
+    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+    error = np.zeros(features.count)
+    error[0] = -0.2
+    inputs, outputs = plant_data(features, rng, 240, error)
+    cost = ExpectedCosts(rule._problem, fitted)(*fitted.predict(inputs)[:2])[0].mean()
+    rule._rows[:240] = np.column_stack([inputs, outputs])
+    rule._count = 240
+    for factor, window in ((1.01, 0), (0.99, 240)):
+        rule._limits = np.array([np.inf, np.inf, factor * cost, np.inf])
         assert rule._changed(fitted) == window
 
 

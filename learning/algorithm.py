@@ -53,8 +53,8 @@ class Update(NamedTuple):
 
     `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
     step, `smallest_eigenvalue` that of B_l and B_Vf at the new θ; `corrected` and `refused` say
-    that the step was changed to keep them definite, or not taken; `failures` counts QPs of the
-    algorithm's own that failed.
+    that the step was changed to keep them definite, or not taken, as the best back-off that lies at
+    the end of what was tried; `failures` counts QPs of the algorithm's own that failed.
 
     The last three are for algorithms that ask for a simulator; PrivilegeError otherwise. `episode`
     resets the plant to the scenario's initial state with this seed of its noise. `mark` remembers

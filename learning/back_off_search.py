@@ -55,7 +55,7 @@ class BackOffSearch:
     No true bound is loosened: x_l stays at or above the scenario's, x_u at or below. Of back-offs
     whose estimates differ by less than `PLATEAU` the smallest is taken. Where the estimate falls
     up to the end of what the samples speak for, the best back-off that was run is taken, and the
-    next round is about it.
+    next round is about it; `refused` says so of the latest round.
 
     Raises ConfigurationError on a budget that is too small to see anything.
     """
@@ -91,6 +91,7 @@ class BackOffSearch:
         self._schedule: list[tuple[int, int]] = []
         self._plan = [Segment(0, budget // SEGMENTS, self.kappa.copy())]
         self._segment = self._step = 0
+        self.refused = False
         self._binding, self._share = np.zeros(2 * n), np.zeros(2 * n)
         self._first: list[Vector] = []
         self._rows: list[Vector] = []
@@ -144,6 +145,7 @@ class BackOffSearch:
             if self._segment == 0:
                 self._first.append(np.concatenate([transition.s, transition.a, transition.next_s]))
         self._step += 1
+        self.refused = False
         if self._step < segment.steps:
             return False
         self._share = np.maximum(self._share, self._binding / segment.steps)
@@ -230,6 +232,7 @@ class BackOffSearch:
         grid = RESOLUTION * steps
         found = best_of(grid)
         if found == grid[-1] or (found == grid[0] and low > least):
+            self.refused = True
             return best_of(np.unique(kappa))
         return found
 

@@ -162,7 +162,8 @@ class BackOff(Algorithm):
             if not (begins or search.done):
                 return None
             self.theta = search.theta.theta
-            return self._move(search.candidate, self._episode(search) if begins else None)
+            episode = self._episode(search) if begins else None
+            return self._move(search.candidate, episode, search.refused)
         found = None if transition is None else self.learn(transition)
         if self._count == self._estimation and self.asks_for == "simulator":
             found = self.conclude()
@@ -174,9 +175,11 @@ class BackOff(Algorithm):
             return self._move(search.candidate, self._episode(search))
         return self._move(found)
 
-    def _move(self, parameters: Parameters, episode: int | None = None) -> Update:
+    def _move(
+        self, parameters: Parameters, episode: int | None = None, refused: bool = False
+    ) -> Update:
         old, self.controller.theta = self.controller.theta, parameters.theta
-        return moved(parameters.blocks, old, parameters.theta, episode=episode)
+        return moved(parameters.blocks, old, parameters.theta, refused=refused, episode=episode)
 
 
 class BackOffSimulator(BackOff):

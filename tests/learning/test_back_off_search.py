@@ -18,12 +18,14 @@ class Loop:
         self.model = OneStepModel(scenario)
         self.noises = {}
 
-    def run(self, search, seed_of):
+    def run(self, search):
+        self.refused = []
         while not search.done:
             rng = np.random.default_rng(search.seed)
             begins = False
             while not begins and not search.done:
                 begins = search.observe(self.transition(search, rng))
+            self.refused.append(search.refused)
         return search
 
     def transition(self, search, rng):
@@ -56,7 +58,8 @@ def search_of(problem, scenario, start, budget=8000):
 
 
 def test_the_least_cost_of_a_known_loop_is_found(problem, scenario, start):
-    search = Loop(problem, scenario).run(search_of(problem, scenario, start), None)
+    search = Loop(problem, scenario).run(search_of(problem, scenario, start))
+    assert not search.refused
     # 50 = 1e5·P(noise < −δ) at the optimum, so δ = 1 − 1e-3.
     assert search.theta["x_l"] == pytest.approx([25.999, 40.0], abs=0.01)
     assert np.array_equal(search.theta["x_u"], start["x_u"])
@@ -67,14 +70,14 @@ def test_a_bound_that_binds_only_once_another_is_backed_off_is_searched_too(
     problem, scenario, start
 ):
     loop = Loop(problem, scenario, both=True)
-    search = loop.run(search_of(problem, scenario, start, 10000), None)
+    search = loop.run(search_of(problem, scenario, start, 10000))
     assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.02)
     assert search.theta["x_u"][1] == pytest.approx(79.8, abs=0.01)
 
 
 def test_a_start_that_is_backed_off_too_far_is_taken_back(problem, scenario, start):
     cautious = start.replace({"x_l": [28.0, 40.0]})
-    search = Loop(problem, scenario).run(search_of(problem, scenario, cautious), None)
+    search = Loop(problem, scenario).run(search_of(problem, scenario, cautious))
     assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.03)
 
 
@@ -134,6 +137,7 @@ def test_the_end_of_what_was_seen_is_not_taken_for_the_best(problem, scenario, s
         return sample
 
     loop.transition = falling
-    search = loop.run(search_of(problem, scenario, start, 4000), None)
+    search = loop.run(search_of(problem, scenario, start, 4000))
     run = {segment.kappa[0] for segment in search._plan}
     assert search.kappa[0] in run and search.kappa[0] >= 4.0
+    assert sum(loop.refused) == 3 and loop.refused[-1]

@@ -358,26 +358,26 @@ def accurate_substeps(problem: Problem) -> int:
     steps. The problem's own number is doubled until doubling it once more changes less. Raises
     TuningError where that does not come about in 1024 steps.
     """
-    model, substeps = problem.model, problem.substeps
-    at = (problem.reference_state, problem.reference_action)
-    point = (*at, model.nominal_disturbance, model.nominal_parameters)
-
-    def end(steps: int) -> Array:
-        x, u, d, p = model.symbols()
-        following = discretise(model, problem.sampling_time, steps)(x, u, d, p)
-        jacobian = ca.jacobian(following, ca.vertcat(x, u))
-        return np.asarray(ca.Function("AB", [x, u, d, p], [jacobian])(*point).full())
-
-    present = end(substeps)
+    substeps, present = problem.substeps, np.hstack(linear_model(problem))
     while substeps <= 1024:
-        finer = end(2 * substeps)
+        finer = np.hstack(linear_model(dataclasses.replace(problem, substeps=2 * substeps)))
         if (np.abs(finer - present) <= 1e-8 * (1.0 + np.abs(present))).all():
             return substeps
         substeps, present = 2 * substeps, finer
     raise TuningError(
-        f"model '{model.name}' cannot be integrated to 1e-08 over a sample of "
+        f"model '{problem.model.name}' cannot be integrated to 1e-08 over a sample of "
         f"{problem.sampling_time:g} s"
     )
+
+
+def linear_model(problem: Problem) -> tuple[Array, Array]:
+    """A (n, n) and B (n, m) of the sampled nominal model at the problem's reference."""
+    model, (x, u, d, p) = problem.model, problem.model.symbols()
+    following = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
+    jacobian = ca.Function("AB", [x, u, d, p], [ca.jacobian(following, ca.vertcat(x, u))])
+    at = (problem.reference_state, problem.reference_action)
+    both = jacobian(*at, model.nominal_disturbance, model.nominal_parameters).full()
+    return both[:, : problem.n_states], both[:, problem.n_states :]
 
 
 def _rounded(block: Array) -> Array:

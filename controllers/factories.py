@@ -16,6 +16,7 @@ from controllers.theta import Parameters
 from cosim.scenario import Scenario
 
 if TYPE_CHECKING:
+    from controllers.linear import Lqr, PiLoops
     from controllers.optimum import OptimalPolicy, QuasiStaticPolicy
 
 # Imported where it is needed: who simulates an RTI-NMPC shall not pay for SciPy and Clarabel.
@@ -67,6 +68,20 @@ def tuned(scenario: Scenario) -> RtiNmpc:
 
     problem = Problem.from_scenario(scenario)
     return nmpc(scenario, tune(problem, value_offset=value_offset(scenario, problem)).parameters)
+
+
+def lqr(scenario: Scenario) -> Lqr:
+    """Linear state feedback with the tuned cost's weights."""
+    from controllers.linear import Lqr  # noqa: PLC0415
+
+    return Lqr(Problem.from_scenario(scenario))
+
+
+def pi(scenario: Scenario) -> PiLoops:
+    """A PI loop for each action, tuned by the SIMC rules."""
+    from controllers.linear import PiLoops  # noqa: PLC0415
+
+    return PiLoops(Problem.from_scenario(scenario))
 
 
 def converged(scenario: Scenario) -> RtiNmpc:

@@ -37,6 +37,7 @@ from controllers.errors import ModelError, OptimumError, QpError
 from controllers.model import Model
 from controllers.problem import VECTORS, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
+from cosim.protocols import Decision
 from cosim.scenario import Scenario
 
 Vector = NDArray[np.float64]
@@ -152,18 +153,6 @@ def read_optimum(path: Path, key: str) -> Optimum:
 # the optimal policy ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class OptimalSolution:
-    """Action (m,) and value at a state; `status` is `solved`, or `clamped` outside the grid."""
-
-    action: Vector
-    value: float
-    status: str = "solved"
-    residual: float = 0.0
-    predicted_states: None = None
-    predicted_actions: None = None
-
-
 class OptimalPolicy:
     """π* and V* = penalty + W of a problem under a disturbance law, from a solved grid.
 
@@ -234,8 +223,8 @@ class OptimalPolicy:
     def prepare(self) -> None:
         """Do nothing: all was prepared when the problem was solved."""
 
-    def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> OptimalSolution:
-        """π*(s) and V*(s), or Q*(s, a) where `a` is given; s (n,), a (m,).
+    def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
+        """π*(s) and V*(s), or Q*(s, a) with `a`; s (n,), a (m,); `clamped` outside the grid.
 
         Raises QpError, which a closed loop takes as a failure of the controller, where s or a is
         not finite.
@@ -249,9 +238,9 @@ class OptimalPolicy:
         status = "clamped" if clamped else "solved"
         if a is None:
             value = row.pop() + self.problem.penalty(state)
-            return OptimalSolution(np.array(row), value, status)
+            return Decision(np.array(row), value, status, 0.0)
         action = np.array(a, dtype=np.float64)
-        return OptimalSolution(action, self.action_value(state, action), status)
+        return Decision(action, self.action_value(state, action), status, 0.0)
 
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q*(s, a) = penalty(s) + E[ℓ − J* + V*(s₊)]."""
@@ -475,17 +464,18 @@ class QuasiStaticPolicy:
         """Advance the clock by one sample."""
         self._sample += 1
 
-    def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> OptimalSolution:
+    def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
         """Action and value at s (n,) for the plant as it is; raises QpError as each does."""
         share, lower = modf(self.law.position(max(self._sample, 0) * self._h))
         first = self.policies[int(lower)].feedback(s, a)
         if share == 0.0:
             return first
         second = self.policies[int(lower) + 1].feedback(s, a)
-        return OptimalSolution(
+        return Decision(
             (1.0 - share) * first.action + share * second.action,
             (1.0 - share) * first.value + share * second.value,
             "clamped" if "clamped" in (first.status, second.status) else "solved",
+            0.0,
         )
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from cosim.evaluation import evaluate as evaluate
     from cosim.plant import FmuPlant as FmuPlant
     from cosim.plugins import build_controller as build_controller
+    from cosim.protocols import Decision as Decision
     from cosim.scenario import Scenario as Scenario
     from cosim.simulation import simulate as simulate
     from cosim.studies.plan import Study as Study
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 # Imported on first use: `cosim --help` must not pay for NumPy, pydantic and fmpy.
 _HOMES = {
+    "Decision": "cosim.protocols",
     "Evaluation": "cosim.evaluation",
     "FmuPlant": "cosim.plant",
     "Scenario": "cosim.scenario",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import nan
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -73,6 +74,17 @@ class Solution(Protocol):
     @property
     def predicted_actions(self) -> Array | None:
         """Predicted actions, (N, m), or None."""
+
+
+class Decision(NamedTuple):
+    """The solution of a controller that knows its action (m,), and of the rest what it is given."""
+
+    action: Array
+    value: float = nan
+    status: str = "solved"
+    residual: float = nan
+    predicted_states: Array | None = None
+    predicted_actions: Array | None = None
 
 
 @runtime_checkable

@@ -17,14 +17,15 @@ if TYPE_CHECKING:
 
 def evaluate(
     controllers: Annotated[
-        str,
+        list[str],
         typer.Option(
             "--controllers",
             "-c",
-            help="Comma-separated: naive, tuned, commissioned, converged, optimal, a parameters "
-            "file or module:factory; NAME=… gives one another name.",
+            help="Comma-separated, or the option again: naive, tuned, commissioned, lqr, pi, "
+            "converged, optimal, a parameters file or module:factory; NAME=… gives one another "
+            "name.",
         ),
-    ] = "naive",
+    ] = ["naive"],  # noqa: B006
     scenario: cli.ScenarioOption = "paper",
     seeds: Annotated[int, cli.count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
     first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
@@ -61,8 +62,9 @@ def evaluate(
         if trajectories is not None:
             _judge(task, trajectories, cli.open_folder(out), out_)
             return
-        named = named_controllers(controllers)
-        words = ["--scenario", scenario, "--controllers", controllers, "--seeds", str(seeds)]
+        names = ",".join(controllers)
+        named = named_controllers(names)
+        words = ["--scenario", scenario, "--controllers", names, "--seeds", str(seeds)]
         words += ["--first-seed", str(first_seed)] * (first_seed > 0) + ["--steps", str(steps)]
         words += ["--burn-in", str(burn_in)] * (burn_in > 0)
         folder = cli.open_folder(out)

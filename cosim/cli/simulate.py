@@ -17,7 +17,7 @@ def simulate(
         typer.Option(
             "--controller",
             "-c",
-            help="naive, tuned, commissioned, converged, optimal, a parameters file, or "
+            help="naive, tuned, commissioned, lqr, pi, converged, optimal, a parameters file, or "
             "module:factory.",
         ),
     ] = "naive",

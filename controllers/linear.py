@@ -1,0 +1,106 @@
+"""What a control course would try first: a linear state feedback, and PI loops.
+
+Both hold the reference steady state and know the nominal model alone. Neither keeps a distance from
+a bound: that is asked for by the scenario's `reference_state`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import linear_sum_assignment
+
+from controllers.economic import linear_model, tune
+from controllers.errors import ControllerError
+from controllers.problem import Problem
+from cosim.protocols import Decision
+
+Array = NDArray[np.float64]
+
+
+class Lqr:
+    """u = u_s − K (x − x_s), clipped to the action bounds.
+
+    `gain` K (m, n) is that of the linear-quadratic problem whose weights are the convexified
+    Hessian of `controllers.economic.tune`, γ = 1, without bounds. Raises TuningError.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        (A, B), n, H = (
+            linear_model(problem),
+            problem.n_states,
+            tune(problem).convexification.hessian,
+        )
+        P = solve_discrete_are(A, B, H[:n, :n], H[n:, n:], s=H[:n, n:])
+        self.problem = problem
+        self.gain: Array = np.linalg.solve(H[n:, n:] + B.T @ P @ B, B.T @ P @ A + H[n:, :n])
+
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+    def prepare(self) -> None:
+        """Nothing can be prepared."""
+
+    def feedback(self, s: Array, a: Array | None = None) -> Decision:
+        """Action (m,) at the state s (n,), `a` (m,) where it is given."""
+        problem = self.problem
+        u = problem.reference_action - self.gain @ (s - problem.reference_state)
+        action: Array = np.clip(u, problem.action_lower, problem.action_upper)
+        return Decision(action if a is None else a)
+
+
+class PiLoops:
+    """A PI loop from a state to each action, its set-point the reference; u_s is fed forward.
+
+    `states` (m,) are the states that the actions hold (`pairing` of a sample's gains), `gain` (m,)
+    and `reset_time` (m,), in samples, follow from the SIMC rules (Skogestad 2003): with the other
+    states held, one answers as k/(τs + 1), and the hold delays it by θ = ½. With τ_c = θ that
+    makes K = τ/k and τ_I = min(τ, 4). An action at its bound stops its integral from going further
+    that way. Raises ControllerError where states and actions cannot be paired.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        A, B = linear_model(problem)
+        self.problem, self.states = problem, pairing(B)
+        pole = np.clip(np.diag(A), 1e-9, 1.0 - 1e-9)[self.states]  # an integrator's τ is long
+        time_constant = -1.0 / np.log(pole)
+        self.gain = time_constant * (1.0 - pole) / B[self.states, np.arange(len(B))]
+        self.reset_time = np.minimum(time_constant, 4.0)
+        self.reset()
+
+    def reset(self) -> None:
+        """Empty the integrals."""
+        self._integral = self._increment = np.zeros(self.states.size)
+
+    def prepare(self) -> None:
+        """Integrate the last sample's error."""
+        self._integral, self._increment = self._integral + self._increment, 0 * self._increment
+
+    def feedback(self, s: Array, a: Array | None = None) -> Decision:
+        """Action (m,) at the state s (n,), `a` (m,) where it is given."""
+        problem = self.problem
+        error = (problem.reference_state - s)[self.states]
+        u = problem.reference_action + self.gain * (error + self._integral)
+        action: Array = np.clip(u, problem.action_lower, problem.action_upper)
+        winds_up = (u - action) * self.gain * error > 0.0
+        self._increment = np.where(winds_up, 0.0, error / self.reset_time)
+        return Decision(action if a is None else a)
+
+
+def pairing(gains: Array) -> NDArray[np.intp]:
+    """State of each action, (m,), by the relative gains Λ = G ∘ G⁻ᵀ closest to 1; G (n, m).
+
+    Raises ControllerError unless G is square and regular and every λ chosen positive.
+    """
+    try:
+        relative = (gains * np.linalg.inv(gains).T).T
+    except np.linalg.LinAlgError:  # not square, or singular
+        relative = np.zeros_like(gains.T)
+    actions, states = linear_sum_assignment(np.abs(relative - 1.0))
+    if not (relative[actions, states] > 0.0).all():
+        raise ControllerError(
+            f"{gains.shape[0]} states and {gains.shape[1]} actions make no PI loops: they are one "
+            "state's to each action, and the gains of a sample must allow to pair them"
+        )
+    return np.asarray(states)

@@ -55,9 +55,11 @@ def test_the_same_command_and_seed_give_the_same_bytes(cosim, trained, tmp_path)
 
 
 def test_an_evaluation_knows_the_regret_without_naming_the_optimum(cosim):
-    code, out, _ = cosim("evaluate", "-c", "tuned", "--seeds", 2, "-n", 20, "-j", 1, "--json")
+    named = ("-c", "tuned", "-c", "same=tuned")
+    code, out, _ = cosim("evaluate", *named, "--seeds", 2, "-n", 20, "-j", 1, "--json")
     assert code == 0
     summary = json.loads(out)
+    assert summary["controllers"].keys() == {"tuned", "same"}
     assert summary["optimum"] == "optimal"
     assert summary["controllers"]["tuned"]["regret"]["value"] is not None
 

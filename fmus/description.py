@@ -108,6 +108,8 @@ def _common_attributes(variable: Variable, model: Model) -> Attributes:
     causality, variability, initial = _CAUSALITY[variable.kind]
     if variable.kind is Kind.OUTPUT and model.sampled:
         variability = "discrete"
+    if variable.kind is Kind.INPUT and variable.type is not Type.REAL:
+        variability = "discrete"
     return {
         "name": variable.name,
         "valueReference": model.value_reference(variable.name),

@@ -22,10 +22,10 @@ class SampledSystem:
     """A function of inputs and parameters that is evaluated once a `sampling_time` [s].
 
     `name` and `description` are for people, `identifier` is the model's C identifier. `signals` are
-    real variables: the inputs, then the outputs, then the tunable parameters; every output depends
-    on every input and parameter. `sources` are C headers by name, of which ``core.h`` defines what
-    ``sampled_sources/model_state.h`` lists; the arrays it is given and fills are ordered like the
-    signals. Raises BuildError on names that are taken twice.
+    real variables, or Boolean inputs: the inputs, then the outputs, then the tunable parameters;
+    every output depends on every input and parameter. `sources` are C headers by name, of which
+    ``core.h`` defines what ``sampled_sources/model_state.h`` lists; the arrays it is given and
+    fills are ordered like the signals. Raises BuildError on names that are taken twice.
     """
 
     name: str

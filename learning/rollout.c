@@ -24,7 +24,7 @@ int rollout(const double theta[], const double start[], const double c[], const 
     for (int step = 0; step < steps; step++, inputs += N_IN, predicted += K, h += K) {
         double G[K * FEATURES + 1], w[NOMINAL_W + 1];
         if (!all_finite(inputs, N_X)) return step;
-        core_evaluate(&state, inputs, theta);
+        core_act(&state, inputs, 0, theta);
         core_commit(&state);
         memcpy(inputs + N_X, state.applied, sizeof state.applied);
         const double *arguments[NOMINAL_ARG] = {inputs, inputs + N_X};

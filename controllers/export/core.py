@@ -36,7 +36,7 @@ STATUSES = (
 class Core:
     """A controller in C: `sources` by file name, and the `parameters` θ that it starts from.
 
-    `core.h` is what to include: it defines CoreState, core_reset, core_evaluate, core_commit and
+    `core.h` is what to include: it defines CoreState, core_reset, core_act, core_commit and
     core_outputs, all static. `problem` is the one it was made for.
     """
 

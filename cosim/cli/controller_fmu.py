@@ -17,7 +17,7 @@ from cosim.plant.wiring import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
-from fmus.model import FmiVersion, Kind, Variable
+from fmus.model import FmiVersion, Kind, Type, Variable
 from fmus.sampled import SampledSystem, build_sampled
 from fmus.ssp import Component, Connection, write_ssp
 
@@ -59,17 +59,26 @@ def sampled_controller(
         Variable(name, Kind.INPUT, unit=unit, start=start, description="measured state")
         for (name, unit), start in zip(states, problem.reference_state.tolist(), strict=True)
     ]
+    about = "whether the actions are those of manual_…, as of the next sample"
+    signals.append(
+        Variable("manual", Kind.INPUT, Type.BOOLEAN, start=0.0, min=0.0, max=1.0, description=about)
+    )
+    about = "action in manual; acts within the bounds of the action"
+    signals += [
+        Variable(f"manual_{name}", Kind.INPUT, unit=unit, start=start, description=about)
+        for (name, unit), start in zip(actions, problem.reference_action.tolist(), strict=True)
+    ]
     about = "action, within its bounds"
     signals += [
         Variable(name, Kind.OUTPUT, unit=unit, min=low, max=high, description=about)
         for (name, unit), (low, high) in zip(actions, bounds, strict=True)
     ]
     reports = {
-        "value": "value V(s) of the state",
+        "value": "value V(s) of the state, in manual Q(s, a)",
         "qp_status": f"of the present sample: {codes}",
         "kkt_residual": "largest KKT residual of the last QP that was solved",
         "qp_iterations": "steps of the QP solver in the last QP that was solved",
-        "failures": "samples without a solution so far; they repeat the last action",
+        "failures": "samples without a solution so far; they hold the last or manual action",
     }
     signals += [Variable(name, Kind.OUTPUT, description=text) for name, text in reports.items()]
     for quantities, k in predicted:

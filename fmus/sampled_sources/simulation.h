@@ -19,7 +19,7 @@ static Status do_step(Instance *instance, const char *function, double time, dou
     if (model->due) {
         if (!model->fresh) evaluate_sample(state);
         if (model->core.status != 0)
-            status = report(instance, WARNING, "%s: no solution at %.17g s: %s; last action kept.",
+            status = report(instance, WARNING, "%s: no solution at %.17g s: %s; the action is held.",
                             function, time, CORE_MESSAGES[model->core.status]);
         core_commit(&model->core);
     }

@@ -38,8 +38,8 @@ CORE = """
 #include "core.h"
 int size(void) { return (int)sizeof(CoreState); }
 void reset(CoreState *state) { core_reset(state); }
-int sample(CoreState *state, const double *s, const double *theta, double *y) {
-    core_evaluate(state, s, theta);
+int sample(CoreState *state, const double *s, const double *a, const double *theta, double *y) {
+    core_act(state, s, a, theta);
     core_outputs(state, y);
     core_commit(state);
     return (int)state->status;
@@ -92,7 +92,7 @@ class CompiledQpSolver:
 
 
 class CompiledController:
-    """The exported controller: `sample(s)` returns its outputs by name."""
+    """The exported controller: `sample(s)` returns outputs by name, `sample(s, a)` in manual."""
 
     def __init__(self, folder: Path, core: Core, *flags: str) -> None:
         self._library = library(folder, {**core.sources, "core.c": CORE.encode()}, *flags)
@@ -107,10 +107,11 @@ class CompiledController:
     def reset(self) -> None:
         self._library.reset(self._state)
 
-    def sample(self, s: np.ndarray) -> dict[str, np.ndarray]:
+    def sample(self, s: np.ndarray, a: np.ndarray | None = None) -> dict[str, np.ndarray]:
         self._s[:] = s
+        manual = None if a is None else _pointer(a)
         self._library.sample(
-            self._state, _pointer(self._s), _pointer(self.theta), _pointer(self._y)
+            self._state, _pointer(self._s), manual, _pointer(self.theta), _pointer(self._y)
         )
         cuts = np.cumsum([self.m, 1, 1, 1, 1, 1, (self.horizon + 1) * self.n])
         names = ("action", "value", "status", "residual", "iterations", "failures", "x", "u")

@@ -24,13 +24,22 @@ void ${name}_init($Name *controller) {
     core_reset((CoreState *)controller->memory);
 }
 
-int ${name}_step($Name *controller, const double state[${NAME}_STATES],
-          double action[${NAME}_ACTIONS]) {
+static int sample($Name *controller, const double state[], const double manual[], double action[]) {
     CoreState *const core = (CoreState *)controller->memory;
-    core_evaluate(core, state, controller->theta);
+    core_act(core, state, manual, controller->theta);
     core_commit(core);
     memcpy(action, core->applied, sizeof core->applied);
     return (int)core->status;
+}
+
+int ${name}_step($Name *controller, const double state[${NAME}_STATES],
+          double action[${NAME}_ACTIONS]) {
+    return sample(controller, state, 0, action);
+}
+
+int ${name}_manual($Name *controller, const double state[${NAME}_STATES],
+          double action[${NAME}_ACTIONS]) {
+    return sample(controller, state, action, action);
 }
 
 const char *${name}_message(int status) {

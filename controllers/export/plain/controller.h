@@ -49,6 +49,10 @@ void ${name}_init($Name *controller);
  * finite is a failure like any other. */
 int ${name}_step($Name *controller, const double state[${NAME}_STATES], double action[${NAME}_ACTIONS]);
 
+/* In manual, in the place of ${name}_step: `action` is the operator's and comes back within its bounds,
+ * whatever the status. The controller follows it, so that the next ${name}_step goes on from there. */
+int ${name}_manual($Name *controller, const double state[${NAME}_STATES], double action[${NAME}_ACTIONS]);
+
 /* A status in words. */
 const char *${name}_message(int status);
 

@@ -1,8 +1,9 @@
 /* The controller as a sampled system: state in, action out, once a sample.
  *
- * `core_evaluate` computes the outputs of the present sample and may be called again when the inputs
- * change; `core_commit` ends the sample. A sample without a solution repeats the last action and
- * forgets the guess.
+ * `core_act` computes the outputs of the present sample and may be called again when the state or the
+ * manual action changes; `core_commit` ends the sample. A sample without a solution repeats the last
+ * action and forgets the guess. In manual the QP has the operator's action for its first, Q(s, a), so
+ * that the next guess is what follows from it.
  */
 #ifndef CORE_H
 #define CORE_H
@@ -64,15 +65,16 @@ static void core_forget(CoreGuess *guess) {
 }
 
 /* Apart, so that the solver's arrays take the place of CasADi's work vector. */
-static QP_APART int core_solve(const RtiPrepared *prepared, RtiSolved *solved) {
+static QP_APART int core_solve(const RtiPrepared *prepared, RtiSolved *solved, const double a[]) {
     QP_SCRATCH QpWork work;
     const int status = rti_load(prepared, &work);
-    return status == RTI_SOLVED ? rti_feedback(prepared, &work, solved, 0) : status;
+    return status == RTI_SOLVED ? rti_feedback(prepared, &work, solved, a) : status;
 }
 
-/* V(s) and π(s) of the QP at the guess; anything but RTI_SOLVED leaves `solution` alone. */
+/* V(s) and π(s) of the QP at the guess, or Q(s, a) where `a` is given; anything but RTI_SOLVED leaves
+ * `solution` alone. */
 static int core_sample(const CoreGuess *guess, const double theta[], const double s[],
-                       CoreSolution *solution) {
+                       const double a[], CoreSolution *solution) {
     QP_SCRATCH RtiPrepared prepared;
     QP_SCRATCH RtiSolved solved;
     if (!well_posed(theta)) return RTI_ILL_POSED;
@@ -83,7 +85,7 @@ static int core_sample(const CoreGuess *guess, const double theta[], const doubl
     memcpy(solved.s, s, sizeof solved.s);
     int status = rti_prepare(&prepared);
     if (status != RTI_SOLVED) return status;
-    status = core_solve(&prepared, &solved);
+    status = core_solve(&prepared, &solved, a);
     if (status != RTI_SOLVED) return status;
     for (int k = 0; k <= HORIZON; k++)
         for (int i = 0; i < N_X; i++)
@@ -106,12 +108,23 @@ static void core_reset(CoreState *state) {
     memcpy(state->action, REFERENCE_ACTION, sizeof state->action);
 }
 
-static void core_evaluate(CoreState *state, const double s[], const double theta[]) {
-    state->status = core_sample(&state->guess, theta, s, &state->solution);
+/* `manual` is the operator's action, which acts within its bounds whatever the status is, or null in
+ * automatic. An entry that is not finite holds the last one. */
+static void core_act(CoreState *state, const double s[], const double manual[],
+                     const double theta[]) {
+    double a[N_U];
     for (int i = 0; i < N_U; i++)
-        state->action[i] = state->status == RTI_SOLVED
-                               ? qp_clip(state->solution.u[0][i], ACTION_LOWER[i], ACTION_UPPER[i])
-                               : state->applied[i];
+        a[i] = manual && isfinite(manual[i]) ? qp_clip(manual[i], ACTION_LOWER[i], ACTION_UPPER[i])
+                                             : state->applied[i];
+    state->status = core_sample(&state->guess, theta, s, manual ? a : 0, &state->solution);
+    for (int i = 0; !manual && state->status == RTI_SOLVED && i < N_U; i++)
+        a[i] = qp_clip(state->solution.u[0][i], ACTION_LOWER[i], ACTION_UPPER[i]);
+    memcpy(state->action, a, sizeof a);
+}
+
+/* The inputs of the table of variables: the state, whether the action is manual, the manual action. */
+static inline void core_evaluate(CoreState *state, const double inputs[], const double theta[]) {
+    core_act(state, inputs, inputs[N_X] != 0.0 ? inputs + N_X + 1 : 0, theta);
 }
 
 static void core_commit(CoreState *state) {

@@ -122,6 +122,35 @@ def test_a_sample_without_a_solution_repeats_the_action_and_forgets_the_guess(sm
     assert after["failures"] == 2
 
 
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+def test_in_manual_it_goes_on_from_the_operators_action(tmp_path: Path, hessian: str) -> None:
+    problem, rng = evaporator_problem(horizon=3), np.random.default_rng(3)
+    theta = Parameters.naive(problem)
+    ours = RtiNmpc(problem, theta, hessian=hessian)
+    exported = CompiledController(tmp_path, core(problem, theta, hessian))
+    for k in range(60):
+        s, manual = rng.normal((25.5, 50.0), (1.0, 2.0)), k % 6 in (2, 3, 4)
+        a = rng.normal(problem.reference_action, 100.0) if manual else None
+        found, applied = exported.sample(s, a), None
+        if manual:
+            applied = np.clip(a, problem.action_lower, problem.action_upper)
+            np.testing.assert_array_equal(found["action"], applied)
+        ours.prepare()
+        solution = ours.feedback(s, applied)
+        np.testing.assert_allclose(found["action"], solution.action, rtol=0, atol=ACTION)
+        np.testing.assert_allclose(found["value"], solution.value, rtol=1e-9)
+        np.testing.assert_allclose(found["x"], solution.predicted_states.ravel(), atol=1e-8)
+
+
+def test_in_manual_the_action_does_not_wait_for_a_solution(small) -> None:
+    small.reset()
+    held = small.sample(np.array([np.nan, 50.0]), np.array([210.0, np.nan]))
+    assert (held["status"], held["failures"]) == (3, 1)
+    expected = [210.0, evaporator_problem(horizon=1).reference_action[1]]
+    assert held["action"].tolist() == expected
+    assert small.sample(np.array([np.nan, 50.0]))["action"].tolist() == expected
+
+
 def test_an_ill_posed_theta_is_a_failure_with_the_reference_action(small) -> None:
     problem = evaporator_problem(horizon=1)
     small.reset()

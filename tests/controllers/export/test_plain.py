@@ -1,5 +1,6 @@
 """The controller as plain C: built as a user builds it, held to the Python controller."""
 
+import ctypes
 import os
 import re
 import shutil
@@ -66,6 +67,32 @@ def test_a_failed_sensor_holds_the_last_action_and_the_iteration_cap_is_a_failur
     np.testing.assert_array_equal(failed[:2], first[:2])
     capped = rows(built(exported, "-DQP_ITERATIONS=1"), [(10, 30)])
     assert capped[0, 2] == 2
+
+
+def test_automatic_goes_on_from_what_the_operator_did_in_manual(exported):
+    library = exported / "library.so"
+    subprocess.run(
+        [CC, *FLAGS, "-fPIC", "-shared", "evaporator_nmpc.c", "-o", library, "-lm"], cwd=exported,
+        check=True,
+    )  # fmt: skip
+    calls, controller = ctypes.CDLL(str(library)), ctypes.create_string_buffer(1 << 16)
+    calls.evaporator_nmpc_init(controller)
+    scenario = Scenario.load("paper")
+    python, action = tuned(scenario), np.zeros(2)
+    states = np.random.default_rng(1).normal((25.5, 50.0), (0.5, 1.0), (12, 2))
+    for k, s in enumerate(states):
+        manual = 4 <= k < 8
+        if k in (5, 6):
+            action[:] = [(230.0, 190.0), (500.0, 0.0)][k - 5]  # at k = 4 the last one stays
+        given = np.clip(action, scenario.action_lower, scenario.action_upper) if manual else None
+        call = calls.evaporator_nmpc_manual if manual else calls.evaporator_nmpc_step
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (s, action)]
+        assert call(controller, *pointers) == 0
+        python.prepare()
+        expected = python.feedback(s, given).action
+        np.testing.assert_allclose(action, expected, rtol=0, atol=1e-10)
+        if manual:
+            np.testing.assert_array_equal(action, given)
 
 
 def test_it_calls_no_more_than_it_says(exported):

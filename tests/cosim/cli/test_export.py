@@ -18,7 +18,9 @@ from typer.testing import CliRunner
 from benchmarks import importers
 from controllers.factories import naive, tuned
 from cosim import FmuPlant, Scenario, simulate
+from cosim.cli.controller_fmu import rti_controller, sampled_controller
 from cosim.cli.main import app
+from fmus.sampled import build_sampled
 
 pytestmark = pytest.mark.skipif(
     shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
@@ -118,12 +120,13 @@ def _instance(folder):
     fmu.setupExperiment()
     fmu.enterInitializationMode()
     fmu.exitInitializationMode()
-    fmu.references = [v.valueReference for v in description.modelVariables]
+    reals = [v for v in description.modelVariables if v.type == "Real"]
+    fmu.references = [v.valueReference for v in reals]
     return fmu
 
 
 def _sample(fmu, s, time):
-    """Every variable after the sample of state `s`."""
+    """Every real variable after the sample of state `s`."""
     fmu.setReal(fmu.references[:2], list(s))
     fmu.doStep(currentCommunicationPoint=time, communicationStepSize=60.0)
     return fmu.getReal(fmu.references)
@@ -153,6 +156,38 @@ def test_theta_set_in_the_fmu_is_the_controller_with_that_theta(exported):
         action = controller.feedback(s).action
         found = [result[name][k + 1] for name in ("P100", "F200")]
         np.testing.assert_allclose(found, action, rtol=0, atol=ACTION)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_automatic_goes_on_from_what_the_operator_did_in_manual(tmp_path, version):
+    """As the Python controller that is told of the actions; outside the bounds they are clipped."""
+    scenario = Scenario.load("paper").replace({"controller": {"horizon": 3}})
+    controller = rti_controller("tuned", scenario)
+    system = sampled_controller(controller, scenario, {})
+    names = ("time", "X2", "P2", "manual", "manual_P100", "manual_F200")
+    rows = [
+        (0.0, 25.0, 49.7, False, 0.0, 0.0),
+        (60.0, 25.4, 50.0, True, 230.0, 190.0),
+        (120.0, 26.0, 50.5, True, 500.0, 0.0),
+        (180.0, 25.5, 51.0, False, 230.0, 190.0),
+        (240.0, 25.2, 51.0, False, 230.0, 190.0),
+    ]
+    result = fmpy.simulate_fmu(
+        str(build_sampled(system, tmp_path / "controller.fmu", version)),
+        stop_time=300.0,
+        step_size=60.0,
+        output_interval=60.0,
+        input=np.array(rows, dtype=[(n, bool if n == "manual" else float) for n in names]),
+        output=["P100", "F200", "value"],
+    )
+    for (_, *s, manual, P100, F200), found in zip(rows, result.tolist()[1:], strict=True):
+        given = np.clip((P100, F200), scenario.action_lower, scenario.action_upper)
+        controller.prepare()
+        solution = controller.feedback(s, given if manual else None)
+        np.testing.assert_allclose(found[1:3], solution.action, rtol=0, atol=ACTION)
+        np.testing.assert_allclose(found[3], solution.value, rtol=1e-9)
+        if manual:
+            assert found[1:3] == tuple(given.tolist())
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,19 @@
 /* A small importer: controller_host LIBRARY VERSION STEPS.
  *
- * Gives an exported controller states at random, some far away, and prints the running hash of each
+ * Gives an exported controller states at random, some far away, in manual at every fifth, and prints the running hash of each
  * sample and how many had no solution.
  */
 #include "importer.h"
 
 #include "system.h"
+
+static void set_boolean(unsigned vr, bool value) {
+    const fmi2Boolean value2 = value;
+    if (version == 2)
+        CHECK(FMI2(SetBoolean)(instance, &vr, 1, &value2) == fmi2OK);
+    else
+        CHECK(FMI3(SetBoolean)(instance, &vr, 1, &value, 1) == fmi3OK);
+}
 
 static uint64_t generator = 1;
 
@@ -26,7 +34,10 @@ int main(int argc, char **argv) {
     for (int k = 0; k < atoi(argv[3]); k++) {
         const double width = k % 7 ? 0.03 : 0.5;
         for (unsigned vr = FIRST_INPUT; vr < FIRST_OUTPUT; vr++)
-            set(vr, VARIABLES[vr].start * (1.0 + width * (2.0 * random_number() - 1.0)));
+            if (VARIABLES[vr].type == BOOLEAN)
+                set_boolean(vr, k % 5 == 0);
+            else
+                set(vr, VARIABLES[vr].start * (1.0 + width * (2.0 * random_number() - 1.0)));
         const int status = step(SAMPLING_TIME * k, SAMPLING_TIME);
         CHECK(status == 0 || status == 1);
         failures += status;

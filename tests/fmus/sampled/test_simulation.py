@@ -76,7 +76,7 @@ def test_a_failure_is_a_warning_with_a_reason_and_keeps_the_output(make: Callabl
     fmu.set("u", -1.0)
     fmu.step(2.0)  # fmpy raises on an error, not on a warning
     assert fmu.get("y") == 1.0
-    assert "no solution at 2 s: the input is negative; last action kept" in fmu.log[-1]
+    assert "no solution at 2 s: the input is negative; the action is held" in fmu.log[-1]
     fmu.step(4.0)
 
 

@@ -22,7 +22,7 @@ from fmpy.model_description import ModelDescription, ModelVariable
 from numpy.typing import NDArray
 
 from fmus import CheckError, FmuError
-from fmus.check import NotOfferedError, declared_variables, information, initialised, validate
+from fmus.check import NotOfferedError, declared_variables, information, validate
 
 TIMEOUT = 300.0  # s for one importer
 JUDGES = ("fmpy", "fmutool")
@@ -92,6 +92,16 @@ def experiment(description: ModelDescription) -> Experiment:
     if not outputs:
         raise NotOfferedError("the FMU has no real output to compare")
     return Experiment(size, steps, outputs)
+
+
+def initialised(folder: str, description: ModelDescription) -> Any:
+    """A co-simulation instance of the unpacked FMU after initialisation."""
+    instance = fmpy.instantiate_fmu(folder, description, "CoSimulation")
+    if description.fmiVersion.startswith("2"):
+        instance.setupExperiment(startTime=0.0)
+    instance.enterInitializationMode()
+    instance.exitInitializationMode()
+    return instance
 
 
 def reference(fmu: Path) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import isfinite, modf
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,6 @@ from controllers.dynamic_programming.policy_iteration import (
     Optimum,
     Progress,
     Settings,
-    objection,
     solve,
 )
 from controllers.errors import ModelError, OptimumError, QpError
@@ -479,38 +478,14 @@ class QuasiStaticPolicy:
         )
 
 
-@dataclass(frozen=True)
-class Yardstick:
-    """What regret is measured against: `value`, a mean cost per sample, and its `kind`.
-
-    The kind `optimum` is J*; `reference` is a figure that a better controller may beat, and `note`
-    says why. `controller` is the one of that cost.
-    """
-
-    value: float
-    kind: Literal["optimum", "reference"]
-    controller: OptimalPolicy | QuasiStaticPolicy
-    note: str = ""
-
-
 def optimal(
     scenario: Scenario, progress: Callable[[Progress], None] | None = None
 ) -> OptimalPolicy | QuasiStaticPolicy:
     """The optimal policy of a scenario, or the quasi-static one of a plant that changes."""
-    if change_of(scenario) is None:
-        return OptimalPolicy.from_scenario(scenario, progress=progress)
-    return QuasiStaticPolicy.from_scenario(scenario, progress=progress)
+    kind = OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy
+    return kind.from_scenario(scenario, progress=progress)
 
 
-def yardstick(scenario: Scenario) -> Yardstick | None:
-    """What is stored for a scenario, None where nothing is; solves nothing."""
-    if (law := change_of(scenario)) is not None:
-        found = QuasiStaticPolicy.stored(scenario)
-        note = f"quasi-static: J* along {', '.join(law.present(0.0))}(t), no bound"
-        return None if found is None else Yardstick(found.gain, "reference", found, note)
-    policy = OptimalPolicy.stored(scenario)
-    if policy is None:
-        return None
-    certificate = policy.optimum.certificate
-    doubt = objection(certificate) if certificate else "not certified"
-    return Yardstick(policy.gain, "reference" if doubt else "optimum", policy, doubt or "")
+def stored(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy | None:
+    """The same where all of it is stored, else None; solves nothing."""
+    return (OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy).stored(scenario)

@@ -13,14 +13,7 @@ import pandas as pd
 from cosim.errors import EvaluationError, StudyError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
-from cosim.plugins import (
-    OURS,
-    build_controller,
-    code_hash,
-    depends_on,
-    parameters_hash,
-    versions,
-)
+from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
 from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
@@ -96,7 +89,7 @@ def evaluate(
         "steps": steps,
         "version": versions().partition("rti-cosim ")[2].partition(";")[0],
         "versions": versions(),
-        "code_hash": code_hash(OURS),
+        "code_hash": code_hash(),
         "scenario_hash": scenario.hash,
         "fmu_sha256": fmu,
         "command": command,
@@ -106,7 +99,7 @@ def evaluate(
     for name, item in named.items():
         controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
         parameters[name] = parameters_hash(controller)
-        depends = depends_on(scenario, item, type(controller), packages=OURS) | {
+        depends = depends_on(scenario, item, type(controller)) | {
             "fmu": fmu,
             "controller": item if isinstance(item, str) else _qualified(item),
             "parameters": parameters[name],

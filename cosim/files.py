@@ -170,23 +170,7 @@ def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str
     Raises `error` where there is no such regular file, or where it is not UTF-8, not TOML or larger
     than `LARGEST`.
     """
-    return parse_toml(_text(path, origin, error), origin, error)
-
-
-def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a JSON file, an object; raises `error` as `read_toml` does."""
     text = _text(path, origin, error)
-    try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as cause:
-        raise error(f"{origin} is not valid JSON: {cause}") from None
-    if not isinstance(document, dict):
-        raise error(f"{origin} is not a JSON object")
-    return document
-
-
-def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a TOML text; raises `error` where it is none."""
     try:
         document = tomllib.loads(text)
         deepest: list[Any] = [document]
@@ -199,6 +183,18 @@ def parse_toml(text: str, origin: str, error: type[Exception]) -> dict[str, Any]
     # Nesting without end exhausts the parser's stack, a number without end Python's patience.
     except (ValueError, RecursionError) as cause:
         raise error(f"{origin} is not valid TOML: {cause}") from None
+
+
+def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
+    """Document of a JSON file, an object; raises `error` as `read_toml` does."""
+    text = _text(path, origin, error)
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as cause:
+        raise error(f"{origin} is not valid JSON: {cause}") from None
+    if not isinstance(document, dict):
+        raise error(f"{origin} is not a JSON object")
+    return document
 
 
 def _text(path: str | Path, origin: str, error: type[Exception]) -> str:

@@ -7,29 +7,20 @@ from time import perf_counter
 
 import numpy as np
 
-from cosim.penalty import VIOLATING
 from cosim.protocols import Array, Controller, Plant
 from cosim.simulation import simulate
 from cosim.trajectory import Trajectory
 
 
 def indicators(run: Trajectory, burn_in: int = 0) -> dict[str, float]:
-    """Indicators of a run after its first `burn_in` samples, each a mean per sample unless noted.
+    """Indicators of a run after its first `burn_in` samples.
 
-    `economic_cost` ℓ; `mean_violation` Σᵢ vᵢ; `violating_share` share of samples with
-    Σᵢ vᵢ > `cosim.penalty.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does
-    not count; `J` mean of ℓ + penalty, to which every violation counts; `input_effort` (see there);
-    `failures` number of samples under the fallback action.
+    Its `Trajectory.means`; `input_effort` (see there); `failures`, the number of samples under the
+    fallback action.
     """
-    cost, violation = run["stage_cost"][burn_in:], run["violation"][burn_in:]
-    return {
-        "economic_cost": float(np.mean(cost)),
-        "mean_violation": float(np.mean(violation)),
-        "violating_share": float(np.mean(violation > VIOLATING)),
-        "J": float(np.mean(cost + run["penalty"][burn_in:])),
-        "input_effort": input_effort(
-            run.actions[burn_in:], run.scenario.action_lower, run.scenario.action_upper
-        ),
+    lower, upper = run.scenario.action_lower, run.scenario.action_upper
+    return run.means(burn_in) | {
+        "input_effort": input_effort(run.actions[burn_in:], lower, upper),
         "failures": float(np.sum(run["failed"][burn_in:])),
     }
 

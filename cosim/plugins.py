@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib
-import json
 import platform
 import re
 import sys
@@ -175,8 +174,6 @@ def _named(controller: Controller, name: str) -> Controller:
 # What a result depends on
 
 DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
-EVALUATING = tuple(package for package in OURS if package != "learning")
-"""Packages that decide what a controller does on a plant."""
 SUFFIXES = (".py", ".toml", ".fmu", ".npz")
 # Nothing that these files hold bears on a number.
 ASIDE = {"cli", "figures", "recording", "__pycache__", "report.py", "pictures.py"}
@@ -189,26 +186,16 @@ _looked_at: dict[str, object] = {}
 """Modules of whatever origin, by name, whose source need not be looked at again."""
 
 
-def depends_on(
-    scenario: Scenario,
-    *parts: Any,
-    settings: Mapping[str, Any] | None = None,
-    packages: tuple[str, ...] = EVALUATING,
-) -> dict[str, str]:
+def depends_on(scenario: Scenario, *parts: Any) -> dict[str, str]:
     """Hashes by name (16 hex digits each, versions as text) of all that a result depends on.
 
-    The versions of what computes, our own code (`packages`), the scenario, its FMU and models, the
-    `settings`, and of each of the `parts` (controllers, algorithms: a registered name, a
-    `module:Name`, a file's path, a class or factory) its files: a parameters file, or the module
-    and all that it imports from outside installed packages, as they were loaded. Data files that a
-    plug-in reads are not known. Raises the errors of `load_plugin` as ControllerLookupError.
+    The versions of what computes, our own code, the scenario, its FMU and models, and of each of
+    the `parts` (controllers, algorithms: a registered name, a `module:Name`, a file's path, a class
+    or factory) its files: a parameters file, or the module and all that it imports from outside
+    installed packages, as they were loaded. Data files that a plug-in reads are not known. Raises
+    the errors of `load_plugin` as ControllerLookupError.
     """
-    found = {
-        "versions": versions(),
-        "rti-cosim": code_hash(packages),
-        "scenario": scenario.hash,
-        "settings": _digest(json.dumps(settings or {}, sort_keys=True, default=str).encode()),
-    }
+    found = {"versions": versions(), "rti-cosim": code_hash(), "scenario": scenario.hash}
     fmu = Path(scenario.plant.fmu)
     if fmu.is_file():
         found[fmu.name] = _digest(fmu.read_bytes())
@@ -321,10 +308,10 @@ def versions() -> str:
 
 
 @cache
-def code_hash(packages: tuple[str, ...] = EVALUATING) -> str:
+def code_hash() -> str:
     """First 16 hex digits of the SHA-256 of the code that results depend on, FMUs included."""
     digest = hashlib.sha256()
-    for package in packages:
+    for package in OURS:
         for path in sorted((ROOT / package).rglob("*")):
             relative = path.relative_to(ROOT)
             if path.suffix in SUFFIXES and not ASIDE & set(relative.parts) and path.is_file():

@@ -133,20 +133,31 @@ class Trajectory(Shown):
         """Realised disturbances d_k, (K, p)."""
         return self._columns(self.scenario.plant.disturbances)
 
-    def summary(self) -> dict[str, Any]:
-        """Per-sample means of the run and its counts; the same for the same signals.
+    def means(self, burn_in: int = 0) -> dict[str, float]:
+        """Means a sample after the first `burn_in`.
 
-        `economic_cost` mean of ℓ; `mean_violation` mean of Σᵢ vᵢ; `violating_share` share of
-        samples with Σᵢ vᵢ > `VIOLATING`; `J` mean of ℓ + penalty; `failures` samples under the
-        fallback action; `explored` 0; `statuses` samples by
+        `economic_cost` ℓ; `mean_violation` Σᵢ vᵢ; `violating_share` share of samples with Σᵢ vᵢ >
+        `cosim.penalty.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does not
+        count; `J` mean of ℓ + penalty, to which every violation counts.
+        """
+        names = ("stage_cost", "penalty", "violation")
+        cost, penalty, violation = (self[name][burn_in:] for name in names)
+        return {
+            "economic_cost": float(np.mean(cost)),
+            "mean_violation": float(np.mean(violation)),
+            "violating_share": float(np.mean(violation > VIOLATING)),
+            "J": float(np.mean(cost + penalty)),
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """`means` of the run and its counts; the same for the same signals.
+
+        `failures` are samples under the fallback action; `explored` is 0; `statuses` samples by
         status.
         """
         return {
             "samples": len(self),
-            "economic_cost": float(np.mean(self["stage_cost"])),
-            "mean_violation": float(np.mean(self["violation"])),
-            "violating_share": float(np.mean(self["violation"] > VIOLATING)),
-            "J": float(np.mean(self["stage_cost"] + self["penalty"])),
+            **self.means(),
             "failures": int(np.sum(self["failed"])),
             "explored": int(np.sum(self["explored"])),
             "statuses": dict(sorted(Counter(self.status).items())),

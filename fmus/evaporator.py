@@ -9,7 +9,7 @@ import zipfile
 from pathlib import Path
 
 from cosim.files import temporary_folder
-from fmus import BuildError, plants
+from fmus import BuildError, plant
 from fmus.build import (
     COMPILER_FLAGS,
     PACKAGE,
@@ -170,11 +170,11 @@ def differences(built: Path, shipped: Path) -> list[str]:
 def compare_with_shipped() -> dict[str, list[str]]:
     """Build anew for every platform; file name → `differences` from the shipped file."""
     with temporary_folder("cosim-") as folder:
-        built = [*build(folder, every_platform=True), *plants.build(folder, every_platform=True)]
+        built = [*build(folder, every_platform=True), *plant.build(folder, every_platform=True)]
         return {path.name: differences(path, PACKAGE / path.name) for path in built}
 
 
 def build_in_place() -> list[Path]:
     """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
     (SOURCES / HEADER).write_text(header(model_token()))
-    return [*build(PACKAGE, every_platform=True), *plants.build(PACKAGE, every_platform=True)]
+    return [*build(PACKAGE, every_platform=True), *plant.build(PACKAGE, every_platform=True)]

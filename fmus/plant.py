@@ -1,13 +1,18 @@
-"""A plant of one's own as an FMU: a table of variables in Python, the equations in C, no more."""
+"""A plant of one's own as an FMU: a table of variables in Python, the equations in C, no more.
+
+The benchmark's own beside the evaporator, an exothermic reactor and four tanks, are made so: their
+variables are in `resources/NAME.csv`, their right-hand sides in `equations/NAME.h`.
+"""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 
-from fmus.build import RESOURCES, SOURCES, assemble, files_of, sources_of
+from fmus.build import PACKAGE, RESOURCES, SOURCES, assemble, files_of, sources_of
 from fmus.description import render
 from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable, read_variables
 
@@ -157,3 +162,41 @@ def build_plant(
 
 def _nominal(value: float) -> float:
     return abs(value) or 1.0
+
+
+PLANTS = {
+    "reactor": ("Exothermic stirred-tank reactor with disturbed feed", 12.0),
+    # Johansson (2000)
+    "tanks": ("Quadruple tank with water drawn at random from the lower tanks", 5.0),
+}
+"""By its name each plant's description and sampling time [s]."""
+_ROLES = ("states", "inputs", "disturbances", "outputs", "parameters")
+
+
+def model(name: str) -> Model:
+    """The table of a plant of `PLANTS`."""
+    signals: dict[str, list[Signal]] = {role: [] for role in _ROLES}
+    with (RESOURCES / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            start, low, high = (float(row[key]) for key in ("start", "min", "max"))
+            signals[row["role"]].append(
+                Signal(
+                    row["name"], row["unit"], start, low, high, row["description"],
+                    float(row["range"] or 0.0),
+                )
+            )  # fmt: skip
+    description, sampling_time = PLANTS[name]
+    return plant_model(name, description=description, sampling_time=sampling_time, **signals)
+
+
+def equations(name: str) -> bytes:
+    """The C header with a plant's right-hand side."""
+    return (PACKAGE / "equations" / f"{name}.h").read_bytes()
+
+
+def build(folder: Path, every_platform: bool = False) -> list[Path]:
+    """Build both FMUs (FMI 2.0) into `folder` and return their paths."""
+    return [
+        build_plant(model(name), equations(name), folder / f"{name}.fmu", 2, every_platform)
+        for name in PLANTS
+    ]

@@ -9,8 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.economic import tune
-from controllers.factories import nmpc, value_offset
+from controllers.factories import nmpc, tuned
 from controllers.functions import StackedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
@@ -30,9 +29,7 @@ _found: dict[tuple[str, str], Parameters] = {}
 
 def commissioned(scenario: Scenario) -> RtiNmpc:
     """RTI-NMPC with the cost tuned by economics, backed off for a guessed noise (`back_off`)."""
-    problem = Problem.from_scenario(scenario)
-    tuned = tune(problem, value_offset=value_offset(scenario, problem)).parameters
-    return nmpc(scenario, back_off(tuned, scenario))
+    return nmpc(scenario, back_off(tuned(scenario).parameters, scenario))
 
 
 def back_off(start: Parameters, scenario: Scenario) -> Parameters:

@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from controllers.model import Model
 from cosim.scenario import Scenario
-from cosim.validation import describe, suggestion
+from cosim.validation import describe
 from learning.errors import ConfigurationError
 
 Vector = NDArray[np.float64]
@@ -118,13 +118,7 @@ class Configuration(BaseModel):
             name, equals, text = assignment.partition("=")
             if not equals:
                 raise ConfigurationError(f"'{assignment}' is no hyperparameter; write name=value")
-            name = name.strip()
-            if name not in cls.model_fields:
-                raise ConfigurationError(
-                    f"there is no hyperparameter '{name}'{suggestion(name, cls.model_fields)}; "
-                    f"known are {', '.join(cls.model_fields)}"
-                )
-            values[name] = _value(text.strip())
+            values[name.strip()] = _value(text.strip())
         return cls.from_dict(values)
 
     @classmethod

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from controllers import compile_functions
 from controllers.factories import nmpc
-from controllers.optimum import QuasiStaticPolicy, change_of, yardstick
+from controllers.optimum import QuasiStaticPolicy, change_of, stored
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
@@ -381,14 +381,14 @@ def train(
 
 
 def stored_optimum(scenario: Scenario) -> str | None:
-    """`optimal` where it is the scenario's yardstick and can be had without solving anything.
+    """`optimal` where it is the plant's optimum and can be had without solving anything.
 
     A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
     scenario names the plant's own model.
     """
     if scenario.plant.fmu not in SHIPPED and scenario.plant.model is None:
         return None
-    return None if yardstick(scenario) is None else "optimal"
+    return None if stored(scenario) is None else "optimal"
 
 
 def run_training(

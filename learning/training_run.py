@@ -16,7 +16,7 @@ from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.plant import FmuPlant
-from cosim.plugins import OURS, depends_on
+from cosim.plugins import depends_on
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 from cosim.validation import suggestion
@@ -83,7 +83,7 @@ class TrainingRun:
         values["configuration"] = self.configuration.model_dump(mode="json")
         if (file := Path(self.start)).is_file():
             values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-        values["source"] = depends_on(self.scenario, self.algorithm, packages=OURS)
+        values["source"] = depends_on(self.scenario, self.algorithm)
         return values
 
     def starting_parameters(self) -> Parameters:

@@ -199,15 +199,10 @@ def resumable(how: Callable[[], str] = lambda: AGAIN) -> Iterator[None]:
 
 def dump(document: Mapping[str, Any]) -> str:
     """JSON text with sorted keys; a number that is not finite becomes null."""
-    return json.dumps(_finite(document), indent=2, sort_keys=True, allow_nan=False) + "\n"
+    from pydantic_core import to_json
 
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and value - value != 0.0 else value
+    plain = json.loads(to_json(dict(document), inf_nan_mode="null"))
+    return json.dumps(plain, indent=2, sort_keys=True) + "\n"
 
 
 def open_folder(folder: Path) -> Path:

@@ -20,7 +20,7 @@ from controllers.theta import Parameters
 from cosim.errors import StudyError
 from cosim.files import temporary_folder
 from cosim.plant import FmuPlant
-from cosim.plugins import OURS, build_controller, code_hash, depends_on, import_from, versions
+from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
 from cosim.protocols import Controller
 from cosim.scenario import Scenario, resolved
 from cosim.studies.document import (
@@ -33,14 +33,12 @@ from cosim.studies.document import (
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training import stored_optimum
+from learning.training import HELD_OUT, stored_optimum
 from learning.training_run import TrainingRun, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
 EVALUATION, GREEDY, ONLINE = "evaluation.csv", "greedy.csv", "online.csv"
 RUNS = "runs"
-HELD_OUT = 1_000_000
-"""First of the held-out seeds of greedy evaluations during training."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
 T = TypeVar("T")
@@ -460,7 +458,7 @@ def plan(study: Study) -> Plan:
             if training is not None:
                 training.prepare()
             parts = [case.target, *([case.start] if case.start.endswith(".toml") else [])]
-            depends[case.name, name] = depends_on(scenario, *parts, packages=OURS)
+            depends[case.name, name] = depends_on(scenario, *parts)
         facts: dict[str, Any] = {**depends[case.name, name], "fmu": plants[name]["fmu"]}
         if training is None:
             facts["controller"] = study.relative(case.controller or "")
@@ -487,7 +485,7 @@ def plan(study: Study) -> Plan:
         runs.append(found)
     _check_names(study)
     check_folders(runs)
-    about = {"versions": versions(), "code_hash": code_hash(OURS)}
+    about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
 
 

@@ -1,14 +1,10 @@
-"""The quasi-static reference of a plant that fouls or jumps, and the yardstick of any."""
-
-from dataclasses import replace
+"""The quasi-static reference of a plant that fouls or jumps, and the optimum of any."""
 
 import numpy as np
 import pytest
 
-from controllers import optimum as store
-from controllers.dynamic_programming.policy_iteration import Settings
 from controllers.errors import OptimumError
-from controllers.optimum import Fouling, OptimalPolicy, QuasiStaticPolicy, change_of, yardstick
+from controllers.optimum import Fouling, QuasiStaticPolicy, change_of, stored
 from cosim import FmuPlant, Scenario
 
 
@@ -79,33 +75,15 @@ def test_the_policy_follows_the_clock_between_the_tables(policy):
     assert (between < np.maximum(low, high)).all()
 
 
-@pytest.mark.parametrize("name", ["paper", "fast-sampling", "fouled", "mismatched"])
-def test_the_yardstick_of_a_preset_is_its_optimum(name):
-    found = yardstick(Scenario.load(name))
-    assert (found.kind, found.note) == ("optimum", "")
-    assert found.value == found.controller.gain
-
-
-def test_the_yardstick_of_the_drifting_plant_is_a_reference(drifting, policy):
-    found = yardstick(drifting)
-    assert found.kind == "reference"
-    assert "no bound" in found.note
-    assert found.value == policy.gain
-
-
 def test_a_plant_that_jumps_has_the_optimum_of_the_plant_as_it_is():
     jump = Scenario.load("jump")
-    policy, before, after = (
-        yardstick(jump).controller,
-        yardstick(Scenario.load("paper")),
-        yardstick(Scenario.load("fouled")),
-    )
+    policy, before, after = stored(jump), *(stored(Scenario.load(n)) for n in ("paper", "fouled"))
     first, second = (change.time for change in jump.plant.changes)
     times = [0.0, first - 60.0, first, second - 60.0, second, 1e9]
-    expected = [before.value] * 2 + [after.value] * 2 + [before.value] * 2
+    expected = [before.gain] * 2 + [after.gain] * 2 + [before.gain] * 2
     assert policy.gain_at(times).tolist() == expected
     share = first / second
-    assert policy.gain == pytest.approx(share * before.value + (1 - share) * after.value)
+    assert policy.gain == pytest.approx(share * before.gain + (1 - share) * after.gain)
     s = [28.0, 60.0]
     policy.reset()
     for _ in range(int(first / 60.0)):
@@ -121,20 +99,8 @@ def test_a_plant_cannot_foul_and_jump():
         change_of(Scenario.load("drifting").replace({"plant": {"changes": changes}}))
 
 
-def test_what_is_not_stored_has_no_yardstick(tmp_path, monkeypatch):
+def test_what_is_not_stored_is_not_had(tmp_path, monkeypatch):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    assert (
-        yardstick(Scenario.load("paper").replace({"plant": {"parameters": {"UA2": 6.5}}})) is None
-    )
+    assert stored(Scenario.load("paper").replace({"plant": {"parameters": {"UA2": 6.5}}})) is None
     slower = Scenario.load("drifting").replace({"plant": {"parameters": {"cleaning_period": 7.0}}})
-    assert yardstick(slower) is None
-
-
-def test_without_its_certificate_an_optimum_is_a_reference(tmp_path, monkeypatch):
-    known = OptimalPolicy.stored(Scenario.load("paper"))
-    key = store.optimum_key(known._plant, Settings())
-    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    store.keep(key, replace(known.optimum, certificate=()))
-    monkeypatch.setattr(store, "SHIPPED", tmp_path / "none")
-    found = yardstick(Scenario.load("paper"))
-    assert (found.kind, found.note) == ("reference", "not certified")
+    assert stored(slower) is None

@@ -79,13 +79,11 @@ def test_what_a_result_depends_on_has_names(plugin, tmp_path):
     name, _ = plugin
     build_controller(f"{name}:make", PAPER)
     (tmp_path / "theta.toml").write_text("a = 1\n")
-    found = depends_on(PAPER, "naive", f"{name}:make", "theta.toml", settings={"a": 1})
+    found = depends_on(PAPER, "naive", f"{name}:make", "theta.toml")
     modules = {f"{name}.py", f"{name}_helper.py", f"{name}_lazy.py"}
-    assert found.keys() == {
-        "versions", "rti-cosim", "scenario", "settings", "theta.toml", *modules
-    }  # fmt: skip
-    other = depends_on(Scenario.load("fouled"), "naive", "theta.toml", settings={"a": 2})
-    assert changed(found, other) == sorted(["scenario", "settings", *modules])
+    assert found.keys() == {"versions", "rti-cosim", "scenario", "theta.toml", *modules}
+    other = depends_on(Scenario.load("fouled"), "naive", "theta.toml")
+    assert changed(found, other) == sorted(["scenario", *modules])
 
 
 def test_a_class_and_a_partial_have_the_sources_of_their_module(plugin):

@@ -13,7 +13,7 @@ from controllers.factories import naive
 from controllers.problem import load_model
 from cosim import FmuPlant, Scenario, simulate
 from cosim.files import CACHE_VARIABLE
-from fmus import plants
+from fmus import plant as plants
 from fmus.plant import build_plant
 from tests.helpers.command import run_cosim
 from tests.helpers.tank import edited, without_attribute

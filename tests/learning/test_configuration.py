@@ -45,7 +45,7 @@ def test_a_bad_assignment_gets_one_clear_message(assignment, message):
 @pytest.mark.parametrize(
     ("algorithm", "assignment", "message"),
     [
-        ("batch-q-learning", "parameter_drift=0.1", "no hyperparameter 'parameter_drift'"),
+        ("batch-q-learning", "parameter_drift=0.1", "parameter_drift: unknown field"),
         ("search", "phase=100", "phase: has no part in a search without a rule"),
         ("backoff", "exploration_share=0.1", "exploration_share: has no part in a rule that tries"),
         (
@@ -53,7 +53,7 @@ def test_a_bad_assignment_gets_one_clear_message(assignment, message):
             "smallest_eigenvalue=0.1",
             "smallest_eigenvalue: has no part in a rule that",
         ),
-        ("q-learning", "block=4", "no hyperparameter 'block'"),
+        ("q-learning", "block=4", "block: unknown field"),
     ],
 )
 def test_what_acts_nowhere_is_refused(algorithm, assignment, message):

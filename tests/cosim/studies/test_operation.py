@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from controllers.optimum import change_of, yardstick
+from controllers.optimum import change_of, stored
 from cosim import Scenario, Study, train
 from cosim.studies.operation import dearest, judged, plant_at
 from cosim.studies.plan import plan
@@ -75,7 +75,7 @@ def test_the_plant_as_it_is_has_no_change_to_come():
     jump, drifting = Scenario.load("jump"), Scenario.load("drifting")
     after = plant_at(jump, 12_000 * 60.0)
     assert change_of(after) is None
-    assert yardstick(after).value == yardstick(Scenario.load("fouled")).value
+    assert stored(after).gain == stored(Scenario.load("fouled")).gain
     fouled = plant_at(drifting, 3 * 86_400.0)
     assert change_of(fouled) is None
     assert fouled.plant.parameters["UA2"] < 6.84

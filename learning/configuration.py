@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.special import ndtr
 
 from controllers.model import Model
 from cosim.scenario import Scenario
-from cosim.validation import describe
+from cosim.validation import validated
 from learning.errors import ConfigurationError
 
 Vector = NDArray[np.float64]
@@ -124,10 +124,7 @@ class Configuration(BaseModel):
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
         """Build from a mapping; raises ConfigurationError."""
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise ConfigurationError(f"hyperparameters: {describe(error, cls)}") from None
+        return validated(cls, values, "hyperparameters", ConfigurationError)
 
     def for_scenario(self, scenario: Scenario) -> Self:
         """Copy with what the scenario states in place of every default that it states."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cosim.errors import StudyError
 from cosim.files import read_toml
@@ -13,15 +13,7 @@ from cosim.validation import validated
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
 Seed = Annotated[int, Field(ge=0)]
-
-
-def _not_dots(name: str) -> str:
-    if not name.strip("."):
-        raise ValueError(f"'{name}' names a folder of its own; choose another name")
-    return name
-
-
-Name = Annotated[str, Field(min_length=1, pattern=r"^[\w.+-]+$"), AfterValidator(_not_dots)]
+Name = Annotated[str, Field(pattern=r"^\.*[\w+-][\w.+-]*$")]
 Source = Annotated[str, Field(min_length=1)]
 PerScenario = Count | dict[str, Count]
 """One number for all scenarios, or one for each by its name; `default` is that of the others."""

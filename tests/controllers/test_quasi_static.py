@@ -88,9 +88,9 @@ def test_a_plant_that_jumps_has_the_optimum_of_the_plant_as_it_is():
     policy.reset()
     for _ in range(int(first / 60.0)):
         policy.prepare()
-    np.testing.assert_array_equal(policy.feedback(s).action, before.controller.feedback(s).action)
+    np.testing.assert_array_equal(policy.feedback(s).action, before.feedback(s).action)
     policy.prepare()
-    np.testing.assert_array_equal(policy.feedback(s).action, after.controller.feedback(s).action)
+    np.testing.assert_array_equal(policy.feedback(s).action, after.feedback(s).action)
 
 
 def test_a_plant_cannot_foul_and_jump():

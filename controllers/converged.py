@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from controllers.dynamics import sampled_jacobian
 from controllers.errors import QpError
@@ -18,8 +18,7 @@ from controllers.qp.problem import NOT_CONVEX, QpSolution, SoftQp
 from controllers.rti import RtiNmpc
 from controllers.rti.solution import LinearisationPoint, RtiSolution
 from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
-
-Vector = NDArray[np.float64]
+from cosim.protocols import Vector
 
 
 def merit(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:

@@ -16,9 +16,7 @@ from controllers.errors import TuningError
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
-
-Array = NDArray[np.float64]
-
+from cosim.protocols import Array
 
 # A bound counts as strictly active above this share of the largest multiplier.
 _STRICT = 1e-6

@@ -15,14 +15,11 @@ from typing import TypeVar
 import casadi as ca
 import filelock
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
 from cosim.files import cache_folder, temporary_folder
 from cosim.processes import run_child
-
-Vector = NDArray[np.float64]
-
+from cosim.protocols import Vector
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 from controllers.dynamic_programming.bellman import (
@@ -36,11 +36,8 @@ from controllers.errors import ModelError, OptimumError, QpError
 from controllers.model import Model
 from controllers.problem import VECTORS, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
-from cosim.protocols import Decision
+from cosim.protocols import Decision, Vector
 from cosim.scenario import Scenario
-
-Vector = NDArray[np.float64]
-
 
 VERSION = 2
 """Part of every key: raise it when the solver changes what it finds."""
@@ -478,12 +475,10 @@ class QuasiStaticPolicy:
         )
 
 
-def optimal(
-    scenario: Scenario, progress: Callable[[Progress], None] | None = None
-) -> OptimalPolicy | QuasiStaticPolicy:
+def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
     """The optimal policy of a scenario, or the quasi-static one of a plant that changes."""
     kind = OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy
-    return kind.from_scenario(scenario, progress=progress)
+    return kind.from_scenario(scenario)
 
 
 def stored(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy | None:

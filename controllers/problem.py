@@ -15,9 +15,9 @@ from controllers.model import Model
 from controllers.qp.backends import FIXED, MEANING, SETTINGS
 from cosim.penalty import Penalty
 from cosim.plugins import blamed, load_plugin
+from cosim.protocols import Vector
 from cosim.scenario import Scenario
 
-Vector = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-Array = NDArray[np.float64]
+from cosim.protocols import Array
+
 nonnegative = clarabel.NonnegativeConeT
 second_order = clarabel.SecondOrderConeT
 semidefinite = clarabel.PSDTriangleConeT

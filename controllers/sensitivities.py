@@ -13,15 +13,14 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.dynamics import stage_parameter_gradient
 from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp.problem import QpSolution, SoftQp, kkt_solve
 from controllers.theta import SymbolicTheta, ThetaBlocks
+from cosim.protocols import Matrix
 
-Matrix = NDArray[np.float64]
 SOLUTION = ("xi", "t", "chi", "v", "lam")
 """First inputs of the sensitivities: a solution's parts."""
 

@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ModelError, ParameterError
 from controllers.problem import Problem
 from cosim.files import read_toml, write_atomically
+from cosim.protocols import Vector
 from cosim.text_tables import Shown
-
-Vector = NDArray[np.float64]
 
 
 @cache

@@ -10,12 +10,11 @@ import numpy as np
 import pandas as pd
 
 from cosim.errors import EvaluationError
-from cosim.kpis import indicators, measure
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import Array
 from cosim.scenario import Scenario
-from cosim.simulation import simulate
+from cosim.simulation import indicators, measure, simulate
 from learning.training import stored_optimum
 
 TOLERANCE = 1e-6

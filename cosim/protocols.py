@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from cosim.scenario import Scenario
 
 Array = NDArray[np.float64]
+Vector = Array
+Matrix = Array
 
 
 class Step(NamedTuple):

@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import cho_factor, cho_solve
 
+from cosim.protocols import Matrix, Vector
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import Configuration, Count, Positive
 from learning.step import ConstrainedStep, policy_gradient_fit
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 
 class ActorCriticConfiguration(Configuration):

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from cosim.plugins import ALGORITHMS, load_plugin, registered
+from cosim.protocols import Vector
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 from learning.checkpoint import arrays_of, take_up
 from learning.configuration import Configuration, Strategy
 from learning.errors import AlgorithmLookupError
 
-Vector = NDArray[np.float64]
 Privilege = Literal["operation", "simulator"]
 
 

@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Transition
 from learning.errors import ConfigurationError
 from learning.prediction_errors import OneStepModel, known_penalty
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 PHASES = ((3, (0.0, 2.0, 4.0)), (5, (-0.5, 0.0, 0.5)), (8, (-0.25, 0.25)))
 """Sixteenths of a bound's samples, and back-offs κ about the best so far, of each round."""

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import least_squares
 
@@ -22,6 +21,7 @@ from controllers.errors import TuningError
 from controllers.model import Model
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off_search import BackOffSearch
@@ -30,8 +30,6 @@ from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel
 from learning.step import moved
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 BackOffToo = Annotated[bool, Field(description="search the back-off of the active bounds")]
 ESTIMATION = 0.25
 """Share of the samples for the estimate that comes before a search."""

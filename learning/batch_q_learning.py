@@ -13,14 +13,13 @@ from scipy.linalg import cho_factor, cho_solve
 
 from controllers.errors import QpError
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
+from cosim.protocols import Matrix, Vector
 from learning.algorithm import Transition, Update
 from learning.configuration import Count
 from learning.errors import DivergenceError
 from learning.q_learning import OUTLIER, AverageCost, ValueConfiguration, ValueRule
 from learning.step import Fit
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 POINT = tuple(f"point_{name}" for name in LinearisationPoint._fields)
 NEXT_POINT = tuple(f"next_{name}" for name in POINT)
 COLUMNS = ("number", "s", "a", "explored", "cost", "next_s", *POINT, *NEXT_POINT)

@@ -8,19 +8,15 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.special import ndtr
 
 from controllers.model import Model
-from cosim.scenario import Scenario
+from cosim.protocols import Matrix, Vector
+from cosim.scenario import NonNegative, Positive, Scenario
 from cosim.validation import validated
 from learning.errors import ConfigurationError
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # The rules differ in how much exploration they need, so these two have other defaults in each.

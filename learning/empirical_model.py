@@ -25,9 +25,8 @@ from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.protocols import recover
+from cosim.protocols import Array, recover
 
-Array = NDArray[np.float64]
 PARAMETER_DEVIATION = 0.15
 """Prior standard deviation of a parameter's error, as a share of its value."""
 SLOPE_DEVIATION = 0.1

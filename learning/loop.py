@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
-from cosim.protocols import Step, recover
+from cosim.protocols import Step, Vector, recover
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import arrays_of, group, prefixed, take_up
 from learning.configuration import Strategy
 from learning.errors import PrivilegeError
 
-Vector = NDArray[np.float64]
 CHECKED_EVERY = 10
 """The flags of a solution cost as much as a feedback; of this many samples one pays for them."""
 

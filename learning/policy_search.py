@@ -11,13 +11,12 @@ from pydantic import Field
 from scipy.linalg import expm
 
 from controllers.theta import Parameters
+from cosim.protocols import Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.baselines import GreedyConfiguration
 from learning.configuration import Count, Positive
 from learning.step import HESSIANS, certificate, moved
-
-Vector = NDArray[np.float64]
 
 
 class PolicySearchConfiguration(GreedyConfiguration):

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.functions import StackedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.penalty import Penalty
+from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 
 
 class OneStepModel:

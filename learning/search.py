@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 
 from controllers.errors import ParameterError
 from controllers.theta import Parameters
+from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.actor_critic import ActorCritic
 from learning.algorithm import Algorithm, Transition, Update
@@ -29,8 +30,6 @@ from learning.prediction_errors import OneStepModel, SortedErrors, expected_pena
 from learning.q_learning import QLearning
 from learning.step import certificate, clip_eigenvalues, moved, prior_deviation
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 RULES: dict[str, type[Algorithm]] = {
     "q-learning": QLearning,
     "batch-q-learning": BatchQLearning,

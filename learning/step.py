@@ -19,12 +19,11 @@ from scipy.linalg import cho_factor, cho_solve
 from controllers import sdp
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
+from cosim.protocols import Matrix, Vector
 from learning.algorithm import Update
 from learning.configuration import Configuration
 from learning.errors import DivergenceError
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 HESSIANS = ("B_l", "B_Vf")
 LEVEL = 0.16
 """Width of c_lambda as a share of V's level, which is all that it carries."""

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers import compile_functions
 from controllers.factories import nmpc
@@ -22,12 +21,12 @@ from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
-from cosim.kpis import indicators_of
 from cosim.plant import FmuPlant
 from cosim.plant.archive import SHIPPED
 from cosim.plugins import build_controller
-from cosim.protocols import Controller, Plant, functions_of
+from cosim.protocols import Array, Controller, Plant, functions_of
 from cosim.scenario import Scenario
+from cosim.simulation import indicators_of
 from cosim.statistics import gap_closed, regret, shown
 from cosim.text_tables import Shown, csv_text
 from learning import checkpoint
@@ -41,7 +40,6 @@ from learning.training_run import Options, TrainingRun, begin, prepare
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"
 HELD_OUT = 1_000_000

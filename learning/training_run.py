@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.economic import tune
 from controllers.factories import nmpc
@@ -17,6 +16,7 @@ from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.plant import FmuPlant
 from cosim.plugins import depends_on
+from cosim.protocols import Vector
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 from cosim.validation import suggestion
@@ -26,7 +26,6 @@ from learning.configuration import Configuration
 from learning.errors import ConfigurationError, PrivilegeError
 from learning.loop import TrainingLoop
 
-Vector = NDArray[np.float64]
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
 EVERY = ("log_every", "evaluate_every", "checkpoint_every")

@@ -11,17 +11,15 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 
 from controllers.dynamic_programming.grid import Grid
 from controllers.errors import ModelError, OptimumError
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem, load_model
+from cosim.protocols import Array, Vector
 from cosim.scenario import Scenario
-
-Array = NDArray[np.float64]
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from controllers.dynamic_programming.grid import Grid
 from controllers.errors import OptimumError
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
-
-Array = NDArray[np.float64]
+from cosim.protocols import Array
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.errors import ControllerError, QpError
 from controllers.qp.problem import NOT_CONVEX, QpSolution, SoftQp, polish
@@ -14,7 +13,6 @@ from controllers.qp.problem import NOT_CONVEX, QpSolution, SoftQp, polish
 if TYPE_CHECKING:
     import qpsolvers
 
-Matrix = NDArray[np.float64]
 SOFT, FIXED = 8, 5
 SETTINGS = {"primal_tol": 1e-10, "dual_tol": 1e-12}
 MEANING = {

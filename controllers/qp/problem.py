@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from cosim.protocols import Matrix, Vector
+
 Mask = NDArray[np.bool_]
 
 

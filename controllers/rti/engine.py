@@ -11,14 +11,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.export.core import SOURCES, STATUSES, controller_sources, stack_needed
 from controllers.functions import library
 from controllers.rti.solution import Functions
 from controllers.theta import ThetaBlocks
+from cosim.protocols import Vector
 
-Vector = NDArray[np.float64]
 MOST = 700_000
 """Bytes of a sample's largest arrays beyond which CasADi's interpreter and DAQP do the work."""
 NOT_FINITE = STATUSES.index("not finite")

@@ -8,7 +8,7 @@ from functools import partial
 from math import isfinite
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError, ParameterError, QpError
 from controllers.export.core import STATUSES
@@ -21,10 +21,8 @@ from controllers.rti.preparation import embedding, make_hessian, preparation, qp
 from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
 from controllers.sensitivities import sensitivities
 from controllers.theta import Parameters
-from cosim.protocols import CompiledLoop
+from cosim.protocols import CompiledLoop, Vector
 from cosim.scenario import Scenario
-
-Vector = NDArray[np.float64]
 
 
 class RtiNmpc:

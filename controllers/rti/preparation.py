@@ -15,8 +15,7 @@ from controllers.functions import StackedFunction
 from controllers.problem import Problem
 from controllers.qp.problem import SoftQp
 from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
-
-Vector = NDArray[np.float64]
+from cosim.protocols import Vector
 
 
 def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:

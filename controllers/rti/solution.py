@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controllers.errors import ControllerError
 from controllers.functions import StackedFunction
@@ -17,9 +16,7 @@ from controllers.qp.problem import QpSolution, Residuals, SoftQp
 from controllers.rti.preparation import Lift, qp_of
 from controllers.sensitivities import SOLUTION, adjoint_directions, curvature_directions
 from controllers.theta import Parameters
-
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
+from cosim.protocols import Matrix, Vector
 
 
 class LinearisationPoint(NamedTuple):

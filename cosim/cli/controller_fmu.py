@@ -19,7 +19,7 @@ from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
 from fmus.model import FmiVersion, Kind, Type, Variable
 from fmus.sampled import SampledSystem, build_sampled
-from fmus.ssp import Component, Connection, write_ssp
+from fmus.ssp import write_ssp
 
 SAMPLES = 100
 """Default length of the SSP's experiment."""
@@ -168,16 +168,7 @@ def write_loop(controller: Path, scenario: Scenario, seed: int, target: Path) ->
         if kind == "Enumeration" and types.get(f"{name}_number") == "Integer":
             del starts[name]
             starts[f"{name}_number"] = ("Integer", value)
+    length = SAMPLES * scenario.sampling_time
     return write_ssp(
-        target,
-        "loop",
-        [
-            Component("controller", controller, {}),
-            Component("plant", archive.path, starts),
-        ],
-        [
-            *(Connection(("plant", name), ("controller", name)) for name in plant.states),
-            *(Connection(("controller", name), ("plant", name)) for name in plant.actions),
-        ],
-        stop_time=SAMPLES * scenario.sampling_time,
+        target, controller, archive.path, plant.states, plant.actions, starts, stop_time=length
     )

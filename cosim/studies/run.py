@@ -19,14 +19,13 @@ import loky
 from controllers import compile_functions
 from cosim.errors import EvaluationError, FailedRunsError
 from cosim.files import temporary_folder, write_atomically
-from cosim.kpis import measure
 from cosim.plant import FmuPlant
 from cosim.plant.archive import unpack
 from cosim.plugins import OURS, build_controller, code_hash, import_from
 from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
-from cosim.simulation import simulate
+from cosim.simulation import measure, simulate
 from cosim.studies import operation
 from cosim.studies.cluster import on_cluster
 from cosim.studies.plan import EVALUATION, Noise, Plan, Run, Study, Training, plan

@@ -72,7 +72,9 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
         kept = path.suffix in SUFFIXES or path.name == ABOUT
         if not path.is_file() or relative.parts[0] == RUNS or path.name == TIMING or not kept:
             continue
-        content = rounded_csv(path) if path.suffix == ".csv" else path.read_bytes()
+        content = path.read_bytes()
+        if path.suffix == ".csv":  # a last bit is no change
+            content = to_csv(pd.read_csv(path, dtype=str, na_filter=False).map(_rounded)).encode()
         if len(content) > LARGEST:
             left_out.append(relative.as_posix())
             continue
@@ -254,13 +256,8 @@ def _row(table: pd.DataFrame, row: object) -> str:
     return ", ".join(f"{key}={value}" for key, value in pairs if value)
 
 
-def rounded_csv(path: Path) -> bytes:
-    """A CSV file with numbers of eight digits, as tables are stored: a last bit is no change."""
-    return to_csv(pd.read_csv(path, dtype=str, na_filter=False).map(_rounded)).encode()
-
-
 def _rounded(cell: str) -> str:
-    """A cell's number with eight digits; whole numbers and words as they are."""
+    """A cell as tables store it: numbers with eight digits, whole ones and words as they are."""
     try:
         int(cell)
     except ValueError:

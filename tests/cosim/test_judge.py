@@ -13,7 +13,7 @@ from controllers.factories import tuned
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import EvaluationError
 from cosim.judge import judge
-from cosim.kpis import indicators
+from cosim.simulation import indicators
 from tests.helpers.loop import Hold
 
 ROOT = Path(__file__).parents[2]

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.kpis import indicators, input_effort
 from cosim.plugins import build_controller
 from cosim.signals import signal_names
+from cosim.simulation import indicators, input_effort
 from cosim.trajectory import Signal, Trajectory
 from tests.helpers.loop import Proportional
 

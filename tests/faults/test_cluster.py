@@ -85,7 +85,7 @@ def test_a_cluster_without_workers_is_named(monkeypatch):
 def test_a_worker_of_another_version_is_named(tmp_path):
     for package in PACKAGES:
         shutil.copytree(ROOT / package, tmp_path / package)
-    with (tmp_path / "cosim" / "kpis.py").open("a") as file:
+    with (tmp_path / "cosim" / "simulation.py").open("a") as file:
         file.write("\n# another version\n")
     with processes(code=tmp_path) as there:
         refused(there.address)

@@ -6,7 +6,7 @@ import pytest
 from controllers.optimum import QuasiStaticPolicy
 from controllers.rti import RtiNmpc
 from cosim import FmuPlant, Scenario
-from cosim.kpis import indicators_of
+from cosim.simulation import indicators_of
 from learning import QLearning
 from learning.training import COLUMNS, FIGURES, HELD_OUT, Judge, drift
 from learning.training_run import TrainingRun

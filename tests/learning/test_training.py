@@ -7,7 +7,7 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim import FmuPlant
-from cosim.kpis import indicators_of
+from cosim.simulation import indicators_of
 from learning.algorithm import Update, load_algorithm
 from learning.errors import CheckpointError
 from learning.q_learning import QLearning

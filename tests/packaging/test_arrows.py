@@ -19,7 +19,7 @@ MAY = {
 HIDDEN = {"controllers": ("cosim.plant", "fmus"), "fmus": ("cosim.plant",)}
 """A controller does not see the plant."""
 GROUND = (
-    "comparison", "environment", "errors", "files", "kpis", "penalty", "plugins", "processes",
+    "comparison", "environment", "errors", "files", "penalty", "plugins", "processes",
     "protocols", "scenario", "signals", "simulation", "statistics", "text_tables", "trajectory",
     "validation",
 )  # fmt: skip

@@ -14,9 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from controllers.economic import linear_model, tune
 from controllers.errors import ControllerError
 from controllers.problem import Problem
-from cosim.protocols import Decision
-
-Array = NDArray[np.float64]
+from cosim.protocols import Array, Decision
 
 
 class Lqr:

@@ -145,7 +145,8 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
             f"controller '{name}' is not a factory of one scenario: {blamed(error)}"
         ) from error
     except (Exception, SystemExit) as error:
-        if target == name and not _is_ours(error):
+        packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
+        if target == name and not packages & set(OURS):  # the words of ours say enough
             raise ControllerLookupError(
                 f"the factory of controller '{name}' failed: {blamed(error)}"
             ) from error
@@ -156,12 +157,6 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
             "or feedback"
         )
     return _named(controller, name)
-
-
-def _is_ours(error: BaseException) -> bool:
-    """Whether an error is one of this project, whose words say enough."""
-    packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
-    return bool(packages & set(OURS))
 
 
 def _named(controller: Controller, name: str) -> Controller:

@@ -64,27 +64,22 @@ def simulate(
     if steps < 1:
         raise CosimError(f"steps must be at least 1, not {steps}")
     run = _Run(plant, controller, steps, seed, residuals)
-    if recorder is None:
-        loop = _compiled_loop(plant, controller)
-        if loop is None:
-            run.go(None, progress)
-        else:
-            run.go_compiled(loop, progress)
+    if recorder is not None:
+        recorder.start(plant.scenario, controller, seed, steps, plant.units)
+        try:
+            run.go(recorder.record, progress)
+        finally:
+            recorder.close()
         return run.trajectory()
-    recorder.start(plant.scenario, controller, seed, steps, plant.units)
-    try:
-        run.go(recorder.record, progress)
-    finally:
-        recorder.close()
+    loop: CompiledLoop | None = None
+    if hasattr(type(plant), "drive") and hasattr(type(controller), "compiled_loop"):
+        # Their own, not a wrapper's.
+        loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
+    if loop is None:
+        run.go(None, progress)
+    else:
+        run.go_compiled(loop, progress)
     return run.trajectory()
-
-
-def _compiled_loop(plant: Plant, controller: Controller) -> CompiledLoop | None:
-    """The controller's own loop with the plant, if their classes have one, not a wrapper's."""
-    if not hasattr(type(plant), "drive") or not hasattr(type(controller), "compiled_loop"):
-        return None
-    loop: CompiledLoop | None = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
-    return loop
 
 
 class _Run:

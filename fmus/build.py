@@ -353,7 +353,7 @@ def sources_of(
     paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
     files = {path.name: path.read_bytes() for path in paths} | dict(own)
     variables = model.variables if rows is None else rows
-    token = _token(model, version, files)
+    token = token_of([model_description(version, "", model)], files)
     header = c_header(token, model.identifier, variables, f"from the table of {model.name}")
     files["variables.h"] = header.encode()
     files["buildDescription.xml"] = build_description(version, model).encode()
@@ -382,12 +382,9 @@ def assemble(
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
         **(files or {}),
     }
-    text = model_description(version, _token(model, version, written), model)
+    token = token_of([model_description(version, "", model)], written)
+    text = model_description(version, token, model)
     return build_fmu(target, sources, text, every_platform=every_platform, files=members)
-
-
-def _token(model: Model, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
-    return token_of([model_description(version, "", model)], sources)
 
 
 def token_of(texts: Sequence[str], sources: Mapping[str, bytes]) -> str:

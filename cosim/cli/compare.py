@@ -9,8 +9,6 @@ import typer
 
 from cosim.cli.output import JsonOption, output
 
-DIFFERENT = 1
-
 
 def compare(
     a: Annotated[
@@ -69,7 +67,7 @@ def compare(
         out_.note("\n".join(found))
         out_.json(comparison.as_document(result))
     if not result.equal:
-        raise typer.Exit(DIFFERENT)
+        raise typer.Exit(1)
 
 
 def _tolerances(options: list[str]) -> dict[str, float]:

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from cosim.cli.output import JsonOption, ScenarioOption, output
-
-
-class Format(StrEnum):
-    """What the controller is written as."""
-
-    FMU = "fmu"
-    C = "c"
 
 
 def export(
@@ -27,8 +19,8 @@ def export(
     ],
     scenario: ScenarioOption = "paper",
     format_: Annotated[
-        Format, typer.Option("--format", help="fmu, or c: one .c and .h, no FMI.")
-    ] = Format.FMU,
+        Literal["fmu", "c"], typer.Option("--format", help="fmu, or c: one .c and .h, no FMI.")
+    ] = "fmu",
     fmi: Annotated[int, typer.Option("--fmi", help="FMI version: 2 or 3.", min=2, max=3)] = 2,
     local: Annotated[
         bool,
@@ -63,7 +55,7 @@ def export(
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
         loaded = Scenario.load(scenario)
         rti = controller_fmu.rti_controller(controller, loaded)
-        if format_ is Format.C:
+        if format_ == "c":
             if ssp is not None:
                 raise CosimError("--ssp connects FMUs: leave --format c out")
             summary = controller_fmu.write_c(rti, loaded, out)

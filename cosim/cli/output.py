@@ -50,9 +50,6 @@ JsonOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON summary on standard output, nothing else.")
 ]
 
-AGAIN = "what is finished is kept: the same command goes on from there"
-"""How a command goes on that finds again what it has finished."""
-
 
 class Output:
     """Tables go to standard output, progress to standard error; with JSON, only JSON goes out."""
@@ -187,7 +184,11 @@ def output(as_json: bool) -> Iterator[Output]:
 
 
 @contextmanager
-def resumable(how: Callable[[], str] = lambda: AGAIN) -> Iterator[None]:
+def resumable(
+    how: Callable[[], str] = lambda: (
+        "what is finished is kept: the same command goes on from there"
+    ),
+) -> Iterator[None]:
     """Where the block is interrupted or terminated, say `how` to go on, if that is not empty."""
     try:
         yield

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -166,21 +165,14 @@ def _show(found: StudyResults, out_: cli.Output, columns: str | None = None) -> 
         out_.table(f"{found.name}: {scenario}", *found.lines(scenario, tuple(chosen)))
 
 
-class Budget(StrEnum):
-    """The budgets of `reproduce`."""
-
-    quick = "quick"
-    full = "full"
-
-
 def reproduce(
     budget: Annotated[
-        Budget,
+        Literal["quick", "full"],
         typer.Option(
             "--budget",
             help="quick: minutes on 2 cores; full: hours, with more seeds and samples.",
         ),
-    ] = Budget.quick,
+    ] = "quick",
     out: cli.OutOption = Path("cosim-reproduction"),
     jobs: cli.JobsOption = None,
     json: cli.JsonOption = False,
@@ -194,7 +186,7 @@ def reproduce(
     with cli.output(json) as out_:
         from cosim.studies.stored import stored_results
 
-        name = "reproduce" if budget is Budget.quick else "reproduce-full"
+        name = "reproduce" if budget == "quick" else "reproduce-full"
         found = _execute(stored_results() / f"{name}.toml", out, out_, jobs=jobs)
         page = found.report()
         _show(found, out_)

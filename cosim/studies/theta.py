@@ -142,7 +142,9 @@ def _apart(
         cost = (costs.loc[second] - costs.loc[first]).loc[change.index].to_numpy(dtype=np.float64)
         # Root of E‖mean‖² of as many differences whose expectation is zero.
         chance = np.sqrt(change.var().sum() / seeds) if seeds > 1 else 0.0
-        columns = change.to_numpy().T
+        # Entries whose 95 % interval leaves zero out, as one in twenty does by chance.
+        ends = [mean(column).t for column in change.to_numpy().T]
+        differing = sum(each is not None and not each[0] <= 0 <= each[1] for each in ends)
         rows.append(
             [
                 f"{names[second]} − {names[first]}",
@@ -152,16 +154,11 @@ def _apart(
                 shown(float(np.median(2 * size / ways)), None, 1, 3),
                 shown(float(np.linalg.norm(change.mean())), None, 1, 3),
                 shown(float(chance), None, 1, 3) if seeds > 1 else "",
-                f"{sum(_differs(mean(column)) for column in columns)}/{len(columns)}",
+                f"{differing}/{len(ends)}",
                 *(_shown(mean(column)) for column in moved.to_numpy().T),
             ]
         )
     return header, rows
-
-
-def _differs(estimate: Estimate) -> bool:
-    """Whether the 95 % interval leaves zero out, which one in twenty does by chance."""
-    return estimate.t is not None and not estimate.t[0] <= 0 <= estimate.t[1]
 
 
 def _shown(estimate: Estimate) -> str:

@@ -13,10 +13,12 @@ from scipy.special import ndtr
 
 from controllers.model import Model
 from cosim.protocols import Matrix, Vector
-from cosim.scenario import NonNegative, Positive, Scenario
+from cosim.scenario import Scenario
 from cosim.validation import validated
 from learning.errors import ConfigurationError
 
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 # The rules differ in how much exploration they need, so these two have other defaults in each.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
@@ -92,6 +92,9 @@ class QLearningConfiguration(ValueConfiguration):
     mean_cost_memory: int = Field(
         50, ge=0, description="samples over which the mean cost follows δ; 0: θ's fit has it"
     )
+    largest_step: NonNegative = Field(
+        1.0, description="prior deviations by which a step may move an entry of θ; 0: no limit"
+    )
     parameter_drift: NonNegative = Field(
         0.0,
         description="variance that each sample adds to θ, in units of the prior's, so that "
@@ -119,7 +122,7 @@ class QLearningConfiguration(ValueConfiguration):
         else:
             names = ["prior_width", "prior_samples", "measure_offset", "step_every"]
             names += ["innovation_clip", "variance_memory", "prediction_errors", "parameter_drift"]
-            names += ["mean_cost_memory"]
+            names += ["mean_cost_memory", "largest_step"]
         return dict.fromkeys(names, f"the rule {self.rule}")
 
 
@@ -183,8 +186,10 @@ class QLearning(ValueRule):
         δ = ℓ + p(s) + γ[V_θ(s₊) − p(s₊) + mean_i p(f(s, a) + e_i)] − Q_θ(s, a)
 
     with f the controller's nominal model and e_i its latest prediction errors. Every `step_every`
-    samples d goes into θ under the constraints on θ, in the metric P⁻¹. The first `prior_samples`
-    leave θ as it is, but for c_f, which becomes the mean of e. Kalman temporal differences after
+    samples d goes into θ under the constraints on θ, in the metric P⁻¹. Where that moves an entry
+    by more than `largest_step` prior deviations, ∇Q no longer holds (a bound that begins to bind):
+    d and what its samples have told are both cut by the same share. The first `prior_samples` leave
+    θ as it is, but for c_f, which becomes the mean of e. Kalman temporal differences after
     Geist and Pietquin (2010), linearised and with the target held.
     """
 
@@ -231,9 +236,8 @@ class QLearning(ValueRule):
         if self._count % every:
             return None
         error_size, self._squares = (self._squares / every) ** 0.5, 0.0
-        update = self._step.take(self._average_cost.take(self._regression.fit()), error_size)
-        self._regression.taken()
-        return update
+        fit = self._regression.take()
+        return self._step.take(self._average_cost.take(fit), error_size)
 
     def _begin_filter(self) -> Update:
         """Take the noise, the widths and c_f from the first samples."""
@@ -254,6 +258,7 @@ class QLearning(ValueRule):
             settings.innovation_clip,
             settings.variance_memory,
             settings.parameter_drift,
+            settings.largest_step or np.inf,
         )
 
     def _sample_step(self, transition: Transition) -> Update:
@@ -274,7 +279,8 @@ class KalmanRegression:
 
     Without clip and with r constant this is the ridge regression min Σ(δ−∇Qᵀd)²/r + ‖d‖². The
     innovation is cut at ±`clip`·√r; r follows the mean square of the innovations with a memory of
-    `memory` samples. `drift` is added to P's diagonal at each sample.
+    `memory` samples. `drift` is added to P's diagonal at each sample. A step `take`n has no entry
+    beyond ±`largest`.
     """
 
     mean: Vector
@@ -283,6 +289,13 @@ class KalmanRegression:
     clip: float
     memory: float
     drift: float = 0.0
+    largest: float = np.inf
+    before: Matrix = field(init=False)
+    """P at the last step."""
+
+    def __post_init__(self) -> None:
+        """No step has been taken yet."""
+        self.before = self.covariance.copy()
 
     def update(self, td_error: float, gradient: Vector) -> float:
         """Take δ and ∇Q (n,), scaled; returns the innovation δ − ∇Qᵀd."""
@@ -299,15 +312,21 @@ class KalmanRegression:
         self.variance += (square - self.variance) / self.memory
         return innovation
 
-    def fit(self) -> Fit:
-        """The step d as a fit in the metric P⁻¹, for constraints that it violates."""
+    def take(self) -> Fit:
+        """The step d, which starts from zero again, in the metric P⁻¹ for constraints on it.
+
+        A share α of a d that is too long is taken, and the same share of what P has lost since.
+        """
+        longest = float(np.abs(self.mean).max())
+        if longest > self.largest:
+            share = self.largest / longest
+            self.mean *= share
+            self.covariance = self.before + share * (self.covariance - self.before)
+        self.before = self.covariance.copy()
         covariance = (self.covariance + self.covariance.T) / 2
         information: Matrix = np.linalg.inv(covariance).astype(np.float64)
-        return Fit(information @ self.mean, self.mean.copy(), lambda: information)
-
-    def taken(self) -> None:
-        """The step has gone into θ: d starts from zero again, P stays."""
-        self.mean[:] = 0.0
+        step, self.mean = self.mean, np.zeros_like(self.mean)
+        return Fit(information @ step, step, lambda: information)
 
 
 class AverageCost:

@@ -86,7 +86,7 @@ def test_the_recursion_is_the_batch_ridge_regression(data):
     information = np.eye(4) + gradient.T @ gradient / 0.7
     assert kalman.mean == pytest.approx(np.linalg.solve(information, gradient.T @ errors / 0.7))
     assert kalman.covariance == pytest.approx(np.linalg.inv(information))
-    fit = kalman.fit()
+    fit = kalman.take()
     assert fit.metric() == pytest.approx(information)
     assert fit.metric() @ fit.minimiser == pytest.approx(fit.gradient)
 
@@ -96,6 +96,19 @@ def test_an_outlier_moves_no_further_than_the_clip():
     far.update(6.0, np.ones(1))
     clipped.update(1e9, np.ones(1))
     assert clipped.mean == pytest.approx(far.mean)
+
+
+def test_a_step_that_is_too_long_is_cut_and_so_is_what_it_tells(data):
+    gradient, errors = data
+    free, cut = regression(4, 0.7), regression(4, 0.7, largest=0.5)
+    for row, error in zip(gradient, errors, strict=True):
+        free.update(error, row)
+        cut.update(error, row)
+    step = free.take().minimiser
+    share = 0.5 / np.abs(step).max()
+    assert share < 1
+    assert cut.take().minimiser == pytest.approx(share * step)
+    assert cut.covariance == pytest.approx((1 - share) * np.eye(4) + share * free.covariance)
 
 
 def test_drift_lets_a_parameter_be_followed(rng):

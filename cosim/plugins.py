@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import importlib
+import os
 import platform
 import re
 import sys
@@ -33,6 +34,11 @@ OURS = ("fmus", "cosim", "controllers", "learning")
 """The packages of this distribution; any other is a user's."""
 ROOT = Path(__file__).absolute().parents[1]
 """Folder that holds them."""
+KNOWN = (
+    *(ROOT / package for package in OURS),
+    *(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")),
+)
+"""Folders of modules that are no user's, beside what is installed."""
 
 _folders: list[str] = []
 
@@ -276,7 +282,7 @@ def _hash_foreign_modules() -> None:
             continue
         _looked_at[name] = module
         file = getattr(module, "__file__", None)
-        if isinstance(file, str) and _is_foreign(str(Path(file).parent)):
+        if isinstance(file, str) and _is_foreign(file.rpartition(os.sep)[0]):
             with suppress(OSError):
                 _sources[name] = (module, _digest(Path(file).read_bytes()))
 
@@ -287,9 +293,7 @@ def _is_foreign(folder: str) -> bool:
     path = Path(folder).absolute()
     if {"site-packages", "dist-packages"} & set(path.parts):
         return False
-    own = [ROOT / package for package in OURS]
-    python = [Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")]
-    return not any(path.is_relative_to(place) for place in (*own, *python))
+    return not any(path.is_relative_to(place) for place in KNOWN)
 
 
 @cache

@@ -9,7 +9,6 @@ from functools import cache
 from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 from fmus.model import (
     FmiVersion,
@@ -55,7 +54,7 @@ def _template(name: str) -> Any:
 
 
 def _xml(text: str) -> str:
-    return escape(text, {'"': "&quot;", "\n": "&#10;"})
+    return html.escape(text, quote=False).replace('"', "&quot;").replace("\n", "&#10;")
 
 
 def _attributes(values: Attributes) -> str:

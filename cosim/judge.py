@@ -12,7 +12,7 @@ import pandas as pd
 from cosim.errors import EvaluationError
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
-from cosim.protocols import Array
+from cosim.protocols import Array, Decision
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, simulate
 from learning.training import stored_optimum
@@ -28,9 +28,7 @@ class _Recorded:
 
     def __init__(self, path: Path, states: pd.DataFrame, actions: Array) -> None:
         self._path, self._states, self._actions = path, states, actions
-        self._k, self.action, self.status = -1, actions[0], "solved"
-        self.value, self.residual = np.nan, np.nan
-        self.predicted_states = self.predicted_actions = None
+        self._k = -1
 
     def reset(self) -> None:
         """Begin with the first sample."""
@@ -40,7 +38,7 @@ class _Recorded:
         """Go on to the next sample."""
         self._k += 1
 
-    def feedback(self, s: Array, a: object = None) -> Any:
+    def feedback(self, s: Array, a: object = None) -> Decision:
         """The sample's action; EvaluationError where its state is not that of the seed's noise."""
         for (name, column), expected in zip(self._states.items(), s.tolist(), strict=True):
             found = float(column.iloc[self._k])
@@ -50,8 +48,7 @@ class _Recorded:
                     f"under these actions gives {expected!r} (cosim scenario NAME --seed-values K "
                     "prints the plant's start values)"
                 )
-        self.action = self._actions[self._k]
-        return self
+        return Decision(self._actions[self._k])
 
 
 def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:

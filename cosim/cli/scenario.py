@@ -15,8 +15,6 @@ from cosim.cli import output as cli
 if TYPE_CHECKING:
     from cosim.scenario import Scenario
 
-SHOW = "show"
-
 
 class ShowByDefault(TyperGroup):
     """`cosim scenario NAME` is `cosim scenario show NAME`."""
@@ -24,7 +22,7 @@ class ShowByDefault(TyperGroup):
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
         """Put `show` first where no command is named."""
         if not args or (args[0] not in self.commands and args[0] not in ctx.help_option_names):
-            args = [SHOW, *args]
+            args = ["show", *args]
         return super().parse_args(ctx, args)
 
 

@@ -9,7 +9,6 @@ import shlex
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -201,14 +200,6 @@ def image(path: Path) -> dict[str, str]:
         "source": f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}",
         "width": f"{1.7 * float(width[1]):.0f}px" if width else "auto",
     }
-
-
-def tables_html(tables: Sequence[Table]) -> str:
-    """Tables as HTML, for notebooks."""
-    return "".join(
-        f"<h4>{escape(title)}</h4>" + pd.DataFrame(rows, columns=list(header)).to_html(index=False)
-        for title, header, rows in tables
-    )
 
 
 def date(path: Path) -> str:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -382,7 +383,11 @@ class StudyResults(Shown):
 
     def _repr_html_(self) -> str:
         """Tables of all scenarios, for notebooks."""
-        return report.tables_html([(name, *self.lines(name, SHORT)) for name in self.scenarios])
+        tables = {name: self.lines(name, SHORT) for name in self.scenarios}
+        return "".join(
+            f"<h4>{escape(name)}</h4>" + pd.DataFrame(rows, columns=list(head)).to_html(index=False)
+            for name, (head, rows) in tables.items()
+        )
 
     def further(self) -> list[Table]:
         """Title, header and rows of the tables that the study asks for beside its summary."""

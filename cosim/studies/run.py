@@ -30,7 +30,7 @@ from cosim.studies import operation
 from cosim.studies.cluster import on_cluster
 from cosim.studies.plan import EVALUATION, Noise, Plan, Run, Study, Training, plan
 from cosim.studies.results import StudyResults
-from cosim.studies.store import CHECKPOINT, Measured, RunStore, Trained
+from cosim.studies.store import CHECKPOINT, FAILURE, Measured, RunStore, Trained
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 BLOCK = 20_000
@@ -274,7 +274,7 @@ class Runner:
         if isinstance(outcome, Failure):
             if name not in self.failures:
                 self.failures[name] = outcome
-                store.fail(outcome.trace)
+                write_atomically(store.folder / FAILURE, outcome.trace)
                 self._tell(f"failed: {name}: {outcome.message}")
             return
         store.unseal()

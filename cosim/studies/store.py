@@ -265,10 +265,6 @@ class RunStore:
         self._next[file] = time.monotonic() + PAUSE * (time.monotonic() - begin)
         self._unwritten.discard(file)
 
-    def fail(self, trace: str) -> None:
-        """Keep the traceback of what failed."""
-        write_atomically(self.folder / FAILURE, trace)
-
     @property
     def finished(self) -> bool:
         """Whether all that the plan asks of the run is there."""

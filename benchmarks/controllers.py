@@ -15,7 +15,7 @@ from benchmarks.ipopt import IpoptNmpc
 from benchmarks.measuring import clock, figure
 from controllers import Problem, RtiNmpc, compile_functions
 from controllers.factories import naive_parameters
-from controllers.qp.backends import DaqpBackend, qpsolvers_problem
+from controllers.qp import DaqpBackend, qpsolvers_problem
 from cosim import FmuPlant
 from cosim.simulation import spawn_seeds
 

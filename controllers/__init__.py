@@ -7,7 +7,7 @@ from controllers.errors import ControllerError, QpError
 from controllers.model import Model, Quantity
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc, compile_functions
-from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.rti.nmpc import LinearisationPoint, RtiSolution
 from controllers.theta import Parameters, ThetaBlocks
 
 if TYPE_CHECKING:

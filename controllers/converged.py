@@ -9,14 +9,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controllers.dynamics import sampled_jacobian
 from controllers.errors import QpError
 from controllers.functions import StackedFunction
 from controllers.problem import Problem
-from controllers.qp.backends import QpBackend
-from controllers.qp.problem import NOT_CONVEX, QpSolution, SoftQp
+from controllers.qp import NOT_CONVEX, QpBackend, QpSolution, SoftQp
 from controllers.rti import RtiNmpc
-from controllers.rti.solution import LinearisationPoint, RtiSolution
+from controllers.rti.nmpc import LinearisationPoint, RtiSolution
+from controllers.rti.preparation import sampled_jacobian
 from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
 from cosim.protocols import Vector
 

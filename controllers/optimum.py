@@ -19,15 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
-from controllers.dynamic_programming.bellman import (
+from controllers.dynamic_programming import (
     Accuracy,
     BellmanOperator,
-    PlantProblem,
-)
-from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import (
     Figure,
+    Grid,
     Optimum,
+    PlantProblem,
     Progress,
     Settings,
     solve,

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError
 from controllers.model import Model
-from controllers.qp.backends import FIXED, MEANING, SETTINGS
+from controllers.qp import FIXED, MEANING, SETTINGS
 from cosim.penalty import Penalty
 from cosim.plugins import blamed, load_plugin
 from cosim.protocols import Vector

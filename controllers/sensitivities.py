@@ -14,10 +14,10 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from controllers.dynamics import stage_parameter_gradient
 from controllers.functions import StackedFunction
 from controllers.problem import Problem
-from controllers.qp.problem import QpSolution, SoftQp, kkt_solve
+from controllers.qp import QpSolution, SoftQp, kkt_solve
+from controllers.rti.preparation import stage_parameter_gradient
 from controllers.theta import SymbolicTheta, ThetaBlocks
 from cosim.protocols import Matrix
 

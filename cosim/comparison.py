@@ -13,8 +13,7 @@ import numpy as np
 from cosim.errors import ComparisonError, ScenarioError
 from cosim.protocols import Array
 from cosim.scenario import Scenario
-from cosim.signals import clocked
-from cosim.trajectory import Signal, read_signals
+from cosim.trajectory import Signal, clocked, read_signals
 from cosim.validation import instead
 
 # Itself an error, of the size of rounding: no share of it is a tolerance.

@@ -122,7 +122,7 @@ what failed there (0: nothing), and FMI's status.
 class SampleBlock:
     """K consecutive samples of a run, as columns; arrays are views that the loop overwrites later.
 
-    `first` is the number of the first sample. `columns` maps each name in `cosim.signals.SIGNALS`
+    `first` is the number of the first sample. `columns` maps each name in `trajectory.SIGNALS`
     to its values, (K,) or for a vector (K, n), which `block[name]` gives; `status` are K words;
     `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m) are NaN where the controller
     gave none, or None if it never did in this block.

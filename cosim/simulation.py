@@ -7,7 +7,6 @@ from time import perf_counter
 
 import numpy as np
 
-from cosim import signals
 from cosim.errors import CosimError
 from cosim.protocols import (
     Array,
@@ -21,8 +20,15 @@ from cosim.protocols import (
     recover,
 )
 from cosim.scenario import Scenario
-from cosim.signals import SignalColumns
-from cosim.trajectory import FALLBACK, Signal, Trajectory
+from cosim.trajectory import (
+    FALLBACK,
+    NO_SOLUTION,
+    SIGNALS,
+    Sample,
+    Signal,
+    SignalColumns,
+    Trajectory,
+)
 
 BLOCK = 500
 
@@ -128,12 +134,12 @@ class _Run:
             step = plant.step(applied)
             plant_time = perf_counter() - begin
             read(
-                signals.Sample(
+                Sample(
                     k * sampling_time,
                     s,
                     applied,
                     step,
-                    signals.NO_SOLUTION if solution is None else solution,
+                    NO_SOLUTION if solution is None else solution,
                     solution is None,
                     prepare_time,
                     feedback_time,
@@ -234,7 +240,7 @@ class _Run:
     def trajectory(self) -> Trajectory:
         scenario = self._scenario
         named, timing = {}, {}
-        for kind in signals.SIGNALS:
+        for kind in SIGNALS:
             values = self._columns.columns[kind.name].reshape(self._steps, -1)
             if kind.clock:
                 timing[kind.name.removesuffix("_time")] = values[:, 0]

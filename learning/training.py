@@ -22,7 +22,7 @@ from controllers.theta import Parameters
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
-from cosim.plant.archive import SHIPPED
+from cosim.plant.fmi import SHIPPED
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller, Plant, functions_of
 from cosim.scenario import Scenario

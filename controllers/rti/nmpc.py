@@ -1,28 +1,376 @@
-"""Real-time-iteration NMPC: one QP a sample, prepared before the state is known."""
+"""Real-time-iteration NMPC: one QP a sample, prepared before the state is known; its solution."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from math import isfinite
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.export.core import STATUSES
-from controllers.functions import COMPILED, INTERPRETED, LONG, switch
+from controllers.export.core import SOURCES, STATUSES, controller_sources, stack_needed
+from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
-from controllers.qp.backends import QpBackend, make_backend
-from controllers.qp.problem import multipliers_at_kink
-from controllers.rti.engine import NOT_FINITE, Engine
-from controllers.rti.preparation import embedding, make_hessian, preparation, qp_of, readout
-from controllers.rti.solution import Functions, LinearisationPoint, Prepared, RtiSolution
-from controllers.sensitivities import sensitivities
-from controllers.theta import Parameters
-from cosim.protocols import CompiledLoop, Vector
+from controllers.qp import (
+    QpBackend,
+    QpSolution,
+    Residuals,
+    SoftQp,
+    make_backend,
+    multipliers_at_kink,
+)
+from controllers.rti.preparation import Lift, embedding, make_hessian, preparation, qp_of, readout
+from controllers.sensitivities import (
+    SOLUTION,
+    adjoint_directions,
+    curvature_directions,
+    sensitivities,
+)
+from controllers.theta import Parameters, ThetaBlocks
+from cosim.protocols import CompiledLoop, Matrix, Vector
 from cosim.scenario import Scenario
+
+
+class LinearisationPoint(NamedTuple):
+    """Where a QP is linearised: states x (N, n), actions u (N, m), costates (N, n).
+
+    The state at stage N is not needed since the terminal cost is quadratic; the costates χ_1 … χ_N
+    matter for the exact Hessian only.
+    """
+
+    x: Matrix
+    u: Matrix
+    costates: Matrix
+
+
+@dataclass(frozen=True)
+class Functions:
+    """The CasADi functions that a controller of the `problem` calls.
+
+    `preparation` and `embedding` make the QP, `readout` takes its value, `gradient` and `policy`
+    its derivatives in θ (`controllers.sensitivities`), the latter made when first asked for. The
+    memory of the first and the third hold a sample's QP and its solution.
+    """
+
+    problem: Problem
+    preparation: StackedFunction
+    embedding: StackedFunction
+    readout: StackedFunction
+    gradient: StackedFunction
+    policy: Callable[[], StackedFunction]
+
+
+Jacobians = Callable[[Vector, Vector], tuple[Matrix, Matrix] | None]
+"""dπ/dθ and dπ/ds of a prepared QP and its solution by compiled code; None where it cannot."""
+
+
+@dataclass(eq=False)
+class Prepared:
+    """What the preparation phase fixed, kept for read-outs after the next one has begun.
+
+    `memory` is a copy of the preparation's, `parameters` the θ; `spectrum` says what convexified
+    the Hessians, None for Gauss–Newton; `functions` are the maker's, and its `jacobians` where it
+    is compiled.
+    """
+
+    memory: Vector
+    parameters: Parameters
+    spectrum: Lift | None
+    functions: Functions
+    jacobians: Jacobians | None = None
+
+    def part(self, name: str) -> Vector:
+        """An input, result or other part of the preparation's memory, flat."""
+        return self.memory[self.functions.preparation.places[name]]
+
+    @cached_property
+    def point(self) -> LinearisationPoint:
+        """Where the QP is linearised."""
+        horizon = self.functions.problem.horizon
+        parts = (self.part(name) for name in LinearisationPoint._fields)
+        return LinearisationPoint(*(part.reshape(horizon, -1).copy() for part in parts))
+
+
+@dataclass(eq=False)
+class RtiSolution:
+    """The solution of one QP, read as V(s) and π(s), or as Q(s, a) where u_0 = a was enforced.
+
+    `action` (m,) is u_0; `value` is V or Q; `enforced` says which; `status` is `solved`. All
+    derivatives are those of the QP that was solved, at the point where it was linearised
+    (paper.tex, RTI Sensitivities); they are one-sided where `weakly_active`, and computed when they
+    are asked for from `prepared` and a copy of the read-out's `memory`.
+    """
+
+    action: Vector
+    value: float
+    prepared: Prepared = field(repr=False)
+    memory: Vector = field(repr=False)
+    enforced: bool = False
+    status: str = "solved"
+
+    def _part(self, name: str) -> Matrix:
+        return self.prepared.functions.readout.part(name, self.memory)
+
+    @cached_property
+    def multipliers(self) -> QpSolution:
+        """Primal-dual solution of the condensed QP."""
+        places = self.prepared.functions.readout.places
+        return QpSolution(*(self.memory[places[name]] for name in ("v", "nu", "lam")))
+
+    @cached_property
+    def qp(self) -> SoftQp:
+        """The condensed QP that was solved."""
+        functions, prepared = self.prepared.functions, self.prepared
+        return qp_of(functions.preparation, functions.readout, prepared.memory, self.memory)
+
+    @cached_property
+    def predicted_states(self) -> Matrix:
+        """Predicted states x_0 … x_N, shape (N+1, n)."""
+        return self._part("xi") + self.prepared.functions.problem.reference_state
+
+    @cached_property
+    def predicted_actions(self) -> Matrix:
+        """Predicted actions u_0 … u_{N−1}, shape (N, m)."""
+        reference = self.prepared.functions.problem.reference_action
+        return np.asarray(self.multipliers.v.reshape(-1, reference.size) + reference)
+
+    @property
+    def unshifted(self) -> LinearisationPoint:
+        """The solution as it is, as a point of linearisation for the same sample."""
+        return LinearisationPoint(
+            self.predicted_states[:-1], self.predicted_actions, self.costates[1:]
+        )
+
+    @property
+    def slack(self) -> Matrix:
+        """Slack of the soft state bounds at stages 1 … N, shape (N, n)."""
+        return self._part("t")
+
+    @property
+    def costates(self) -> Matrix:
+        """Multipliers χ_0 … χ_N of the initial value and the dynamics, shape (N+1, n).
+
+        χ_0 is dV/ds or dQ/ds. At a true bound the penalty of s itself has a kink, and half of its
+        slope is taken.
+        """
+        return self._part("chi")
+
+    @property
+    def action_gradient(self) -> Vector:
+        """dQ/da, shape (m,): zero where the action was not enforced."""
+        if not self.enforced:
+            return np.zeros(self.action.size)
+        return np.asarray(-self.multipliers.nu[: self.action.size])
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """KKT residuals of the QP's solution."""
+        return self.multipliers.residuals(self.qp)
+
+    @property
+    def residual(self) -> float:
+        """Largest KKT residual; compiled code has measured it when it solved."""
+        if self.prepared.jacobians is not None and not self.enforced:
+            return float(self.memory[self.prepared.functions.readout.places["residual"]][0])
+        return self.residuals.largest
+
+    @cached_property
+    def weakly_active(self) -> bool:
+        """Whether a limit is about to change its activity, so that derivatives are one-sided.
+
+        So it is too where an eigenvalue of the exact Hessian is about to be lifted.
+        """
+        spectrum = self.prepared.spectrum
+        lifting = spectrum is not None and spectrum.undecided()
+        return lifting or self.multipliers.weakly_active(self.qp)
+
+    @cached_property
+    def licq(self) -> bool:
+        """Whether the active constraints' gradients are linearly independent."""
+        return self.multipliers.licq_margin(self.qp) > 1e-9
+
+    @cached_property
+    def value_gradient(self) -> Vector:
+        """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
+        if self.prepared.jacobians is not None:
+            return self.memory[self.prepared.functions.readout.places["gradient"]]
+        function = self.prepared.functions.gradient
+        self._write_solution(function)
+        function()
+        return function.stack.copy()
+
+    @property
+    def policy_jacobian(self) -> Matrix:
+        """dπ/dθ, shape (m, n_θ); raises ControllerError where the action was enforced."""
+        return self._policy[0]
+
+    @property
+    def policy_state_jacobian(self) -> Matrix:
+        """dπ/ds, shape (m, n); raises ControllerError where the action was enforced."""
+        return self._policy[1]
+
+    @cached_property
+    def _policy(self) -> tuple[Matrix, Matrix]:
+        if self.enforced:
+            raise ControllerError(
+                "the action was enforced, so this solution is Q(s, a) and has no policy; "
+                "call feedback(s) without an action"
+            )
+        m, prepared = self.action.size, self.prepared
+        if prepared.jacobians is not None:
+            found = prepared.jacobians(prepared.memory, self.memory)
+            if found is not None:
+                return found
+        dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
+        function = prepared.functions.policy()
+        self._write_solution(function)
+        inputs = function.inputs
+        for name in ("A", "B", "L", "L_N"):
+            inputs[name][:] = prepared.part(name)
+        for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
+            inputs[name][:] = direction.reshape(-1)
+        if (spectrum := prepared.spectrum) is not None:
+            step = self._step_from_point()
+            moved = curvature_directions(self.qp.rows, dv, step, spectrum.contract)
+            inputs["dM"][:] = moved.reshape(-1)
+        function()
+        by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))
+        return by_theta.copy(), by_state.copy()
+
+    def _write_solution(self, function: StackedFunction) -> None:
+        """Give a read-out function the solution and the point of linearisation."""
+        inputs, prepared = function.inputs, self.prepared
+        places = prepared.functions.readout.places
+        for name in SOLUTION:
+            inputs[name][:] = self.memory[places[name]]
+        for name in ("x", "u", "theta"):
+            inputs[name][:] = prepared.part(name)
+        if prepared.spectrum is not None:
+            step = self._step_from_point()
+            seed = step[:, :, None] * step[:, None, :] / 2
+            inputs["M"][:] = prepared.spectrum.contract(seed).reshape(-1)
+            inputs["guess"][:] = prepared.part("costates")
+
+    def _step_from_point(self) -> Matrix:
+        """Δw of each stage, shape (N, n+m)."""
+        point = self.prepared.point
+        return np.concatenate(
+            [self.predicted_states[:-1] - point.x, self.predicted_actions - point.u], axis=1
+        )
+
+
+MOST = 700_000
+"""Bytes of a sample's largest arrays beyond which CasADi's interpreter and DAQP do the work."""
+NOT_FINITE = STATUSES.index("not finite")
+
+
+class Engine:
+    """Prepares and solves in the memory of a controller's `functions`; `load` makes one.
+
+    `prepare` and `feedback` return 0, or a status of the QP solver's. `action` (m,) is where the
+    action to enforce is written.
+    """
+
+    def __init__(self, path: str, functions: Functions) -> None:
+        self._library = library_ = ctypes.CDLL(path)
+        before, after = functions.preparation.memory, functions.readout.memory
+        library_.engine_sizes.restype = library_.engine_loop_size.restype = ctypes.c_size_t
+        library_.engine_run.restype = ctypes.c_longlong
+        sizes = [library_.engine_sizes(kind) for kind in range(3)]
+        assert sizes[:2] == [before.nbytes, after.nbytes], "Python and C lay memory out unlike"
+        self._work, self._other_work = np.zeros((2, sizes[2] // 8 + 1))
+        self._loop = np.zeros(library_.engine_loop_size() // 8 + 1)
+        self.action: Vector = np.zeros(functions.problem.n_actions)
+        kept = (before, self._work, self._other_work, after, self.action, self._loop)
+        self._before, self._workspace, self._other, self._after, action, self._begun = (
+            ctypes.c_void_p(array.ctypes.data) for array in kept
+        )
+        self._value = (self._before, self._workspace, self._after, None)
+        self._action_value = (self._before, self._workspace, self._after, action)
+        self._prepare: Callable[..., int] = library_.engine_prepare
+        self._feedback: Callable[..., int] = library_.engine_feedback
+        self._policy: Callable[..., int] = library_.engine_policy
+        n, m, size = functions.problem.n_states, self.action.size, functions.gradient.stack.size
+        self._jacobians: Vector = np.zeros((size + n) * m)
+        self._jacobians_at = ctypes.c_void_p(self._jacobians.ctypes.data)
+        self._split, self._m = size * m, m
+
+    @classmethod
+    def load(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
+        """The engine of a Gauss–Newton controller; None where it cannot be had.
+
+        That is without a compiler, where COSIM_COMPILE says `never`, and for long horizons.
+        """
+        named = {
+            "PREPARED": functions.preparation,
+            "EMBEDDED": functions.embedding,
+            "READ": functions.readout,
+            "GRADIENT": functions.gradient,
+            "POLICY": functions.policy(),
+        }
+        if stack_needed(functions.problem, named) > MOST:
+            return None
+        sources = controller_sources(functions.problem, blocks, "gauss-newton", named)
+        for name in ("sensitivities.h", "engine.c"):
+            sources[name] = (SOURCES / name).read_bytes()
+        path = library(sources, ["engine.c"])
+        return None if path is None else cls(str(path), functions)
+
+    def prepare(self) -> int:
+        """Preparation phase at the point and θ that the memory holds."""
+        return self._prepare(self._before, self._workspace)
+
+    def feedback(self, enforced: bool) -> int:
+        """Feedback phase for the memory's state, with `action` enforced or not."""
+        return self._feedback(*(self._action_value if enforced else self._value))
+
+    def batch(self, states: Vector) -> tuple[Vector, Vector]:
+        """π (K, m) and V (K,) of the memory's QP for states (K, n), NaN where there is none."""
+        actions, values = np.empty((len(states), self.action.size)), np.empty(len(states))
+        self._library.engine_batch(
+            *self._value[:3],
+            ctypes.c_longlong(len(states)),
+            *(ctypes.c_void_p(array.ctypes.data) for array in (states, actions, values)),
+        )
+        return actions, values
+
+    def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
+        """dπ/dθ (m, n_θ) and dπ/ds (m, n) of copies of the memory; None where LICQ fails."""
+        # In another workspace: the next feedback needs what the preparation factorised.
+        given = (ctypes.c_void_p(array.ctypes.data) for array in (before, after))
+        status = self._policy(*given, self._other, self._jacobians_at)
+        if status:
+            return None
+        parts = self._jacobians[: self._split], self._jacobians[self._split :]
+        by_theta, by_state = (part.reshape(self._m, -1).copy() for part in parts)
+        return by_theta, by_state
+
+    def begin(self) -> None:
+        """Make ready for a closed loop: no earlier sample is known."""
+        self._library.engine_begin(self._begun, self._before, self._after, self._workspace)
+
+    def run(self, plant: Any, first: int, table: Vector) -> tuple[int, int, int]:
+        """Run the plant, an instance's `native`, from sample `first` on; a row of `table` each.
+
+        Returns the number of the sample that it came to, what failed there (0 where nothing did)
+        and FMI's status. Other threads run meanwhile.
+        """
+        fault = (ctypes.c_int * 2)()
+        reached = self._library.engine_run(
+            self._begun,
+            ctypes.byref(plant),
+            ctypes.c_longlong(first),
+            ctypes.c_longlong(first + len(table)),
+            ctypes.c_void_p(table.ctypes.data),
+            fault,
+        )
+        return reached, fault[0], fault[1]
 
 
 class RtiNmpc:

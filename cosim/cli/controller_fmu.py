@@ -12,8 +12,8 @@ from controllers import RtiNmpc
 from controllers.export import STATUSES, core, plain_c
 from cosim.errors import ControllerLookupError
 from cosim.files import write_atomically
-from cosim.plant.archive import unpack
-from cosim.plant.wiring import start_values
+from cosim.plant.fmi import unpack
+from cosim.plant.fmu_plant import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds

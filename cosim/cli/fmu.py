@@ -34,8 +34,8 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
     with output(json) as out_:
         from cosim.errors import PlantError
-        from cosim.plant.archive import unpack
-        from cosim.plant.wiring import refusals
+        from cosim.plant.fmi import unpack
+        from cosim.plant.fmu_plant import refusals
         from fmus.check import information
 
         try:

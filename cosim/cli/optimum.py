@@ -13,7 +13,7 @@ import typer
 from cosim.cli import output as cli
 
 if TYPE_CHECKING:
-    from controllers.dynamic_programming.policy_iteration import Figure, Optimum, Progress
+    from controllers.dynamic_programming import Figure, Optimum, Progress
     from controllers.optimum import QuasiStaticPolicy
     from cosim.scenario import Scenario
 
@@ -82,8 +82,8 @@ def _solve(
 ) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
-    from controllers.dynamic_programming.bellman import PlantProblem
-    from controllers.dynamic_programming.policy_iteration import (
+    from controllers.dynamic_programming import (
+        PlantProblem,
         Row,
         Settings,
         certify,
@@ -147,7 +147,7 @@ def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) 
     import numpy as np
 
     from controllers import OptimalPolicy, factories
-    from controllers.dynamic_programming.policy_iteration import SEARCH, Figure
+    from controllers.dynamic_programming import SEARCH, Figure
     from cosim.plant import FmuPlant
     from cosim.simulation import simulate
     from cosim.statistics import mean

@@ -139,7 +139,7 @@ class Output:
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""
-        from cosim.plant.archive import SHIPPED, unpack
+        from cosim.plant.fmi import SHIPPED, unpack
 
         if fmu not in SHIPPED:
             found = unpack(fmu)

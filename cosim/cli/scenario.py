@@ -70,7 +70,7 @@ def show(
 
 
 def _seed_values(scenario: Scenario, seed: int) -> dict[str, float | bool | int]:
-    from cosim.plant.wiring import start_values
+    from cosim.plant.fmu_plant import start_values
     from cosim.simulation import spawn_seeds
 
     types: dict[str, Callable[[float], float | bool | int]] = {"Real": float, "Boolean": bool}

@@ -12,9 +12,8 @@ import numpy as np
 import tomli_w
 
 from cosim.errors import PlantError
-from cosim.plant.archive import SHIPPED, UnpackedFmu, unpack
-from cosim.plant.fmu_plant import FmuPlant
-from cosim.plant.wiring import has_start
+from cosim.plant.fmi import SHIPPED, UnpackedFmu, unpack
+from cosim.plant.fmu_plant import FmuPlant, has_start
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion

@@ -12,7 +12,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from cosim import signals
 from cosim.protocols import Controller, SampleBlock, controller_name
 from cosim.recording.stream import (
     SERIES,
@@ -29,7 +28,7 @@ from cosim.recording.stream import (
     view,
 )
 from cosim.scenario import Scenario
-from cosim.signals import SignalKind
+from cosim.trajectory import SIGNALS, SignalKind
 
 ALONE = ("states", "actions", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
@@ -62,7 +61,7 @@ class RerunRecorder:
         """Open the file and write what is known before the first sample."""
         name = controller_name(controller)
         self._seconds = steps * scenario.sampling_time
-        recorded = [kind for kind in signals.SIGNALS if kind.group is not None]
+        recorded = [kind for kind in SIGNALS if kind.group is not None]
         self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
         self._predicted: dict[str, Channel] = {}
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])

@@ -20,7 +20,7 @@ from controllers import compile_functions
 from cosim.errors import EvaluationError, FailedRunsError
 from cosim.files import temporary_folder, write_atomically
 from cosim.plant import FmuPlant
-from cosim.plant.archive import unpack
+from cosim.plant.fmi import unpack
 from cosim.plugins import OURS, build_controller, code_hash, import_from
 from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
 from cosim.protocols import Controller

@@ -6,8 +6,7 @@ import pytest
 from benchmarks.ipopt import IpoptNmpc
 from controllers import ConvergedNmpc, LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import QpError
-from controllers.qp.backends import DaqpBackend
-from controllers.qp.problem import NOT_CONVEX
+from controllers.qp import NOT_CONVEX, DaqpBackend
 from tests.helpers.differences import assert_close, derivative, natural_scale
 from tests.helpers.sampling import (
     evaporator_problem,

@@ -7,9 +7,7 @@ import pytest
 import scipy.stats
 
 from controllers import OptimalPolicy, Quantity, evaporator, factories
-from controllers.dynamic_programming.bellman import PlantProblem
-from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import Settings, objection, solve, study
+from controllers.dynamic_programming import Grid, PlantProblem, Settings, objection, solve, study
 from controllers.errors import OptimumError
 from controllers.optimum import SHIPPED, optimum_key, read_optimum
 from controllers.problem import Problem

@@ -5,8 +5,8 @@ import pytest
 
 import fmus
 from cosim.errors import PlantError
-from cosim.plant import archive
-from cosim.plant.archive import unpack
+from cosim.plant import fmi
+from cosim.plant.fmi import unpack
 from tests.helpers.tank import edited
 
 
@@ -105,10 +105,10 @@ def test_what_is_no_honest_fmu_is_refused_in_one_line(case, tmp_path):
 
 def test_an_archive_of_absurd_size_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     path = _zip(tmp_path / "big.fmu", [("modelDescription.xml", "x" * 3000)])
-    monkeypatch.setattr(archive, "MAX_BYTES", 2999)
+    monkeypatch.setattr(fmi, "MAX_BYTES", 2999)
     with pytest.raises(PlantError, match="unpacks to more than"):
         unpack(path)
-    monkeypatch.setattr(archive, "MAX_ENTRIES", 0)
+    monkeypatch.setattr(fmi, "MAX_ENTRIES", 0)
     with pytest.raises(PlantError, match="more than 0 entries"):
         unpack(path)
 

@@ -6,8 +6,8 @@ import pytest
 
 from cosim import FmuPlant, Scenario
 from cosim.errors import CapabilityError, PlantError
-from cosim.plant.archive import unpack
-from cosim.plant.wiring import refusals
+from cosim.plant.fmi import unpack
+from cosim.plant.fmu_plant import refusals
 from tests.helpers.kinds import REALS, build_kind, scenario_for
 from tests.helpers.tank import edited
 

@@ -3,9 +3,8 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.plugins import build_controller
-from cosim.signals import signal_names
 from cosim.simulation import indicators, input_effort
-from cosim.trajectory import Signal, Trajectory
+from cosim.trajectory import Signal, Trajectory, signal_names
 from tests.helpers.loop import Proportional
 
 

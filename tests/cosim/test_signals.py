@@ -1,12 +1,10 @@
 import numpy as np
 import pytest
 
-import cosim.signals
 from cosim import FmuPlant, simulate
 from cosim.comparison import compare, load_run
 from cosim.recording import RerunRecorder, read_recording
-from cosim.signals import SIGNALS, SignalKind
-from cosim.trajectory import read_csv
+from cosim.trajectory import SIGNALS, SignalKind, read_csv
 from tests.helpers.loop import Proportional
 
 
@@ -20,7 +18,8 @@ TOY = SignalKind("distance", distance, "%", "costs")
 @pytest.fixture
 def toy(monkeypatch):
     """A signal more, declared in the one place there is."""
-    monkeypatch.setattr(cosim.signals, "SIGNALS", (*SIGNALS, TOY))
+    for module in ("trajectory", "simulation", "recording.run"):
+        monkeypatch.setattr(f"cosim.{module}.SIGNALS", (*SIGNALS, TOY))
 
 
 def run(folder, scenario):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import fmus
-from cosim.plant.archive import place
+from cosim.plant.fmi import place
 from tests.helpers.command import run_cosim
 
 
@@ -64,7 +64,7 @@ def test_a_damaged_folder_is_replaced(cache, archive, damage, tmp_path):
 
 RACE = """
 import sys, zipfile
-from cosim.plant.archive import place
+from cosim.plant.fmi import place
 sys.stdin.readline()
 with zipfile.ZipFile(sys.argv[1]) as archive:
     for _ in range(20):
@@ -89,7 +89,7 @@ def test_without_a_cache_the_folder_ends_with_the_process(tmp_path):
     temporary, file = tmp_path / "temporary", tmp_path / "file"
     temporary.mkdir()
     file.touch()
-    code = "from cosim.plant.archive import unpack; print(unpack('evaporator').folder)"
+    code = "from cosim.plant.fmi import unpack; print(unpack('evaporator').folder)"
     said = subprocess.run(
         [sys.executable, "-c", code],
         env=os.environ | {"COSIM_CACHE": str(file), "TMPDIR": str(temporary)},

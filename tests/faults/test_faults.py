@@ -15,7 +15,7 @@ import pytest
 from benchmarks.kill import JOBS, campaign
 from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.factories import naive
-from controllers.qp.backends import DaqpBackend
+from controllers.qp import DaqpBackend
 from cosim import FmuPlant, Scenario, simulate
 from tests.helpers.command import run_cosim
 from tests.helpers.drawing import skip_without_driver

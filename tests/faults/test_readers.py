@@ -19,7 +19,7 @@ from controllers.errors import ParameterError
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import PlantError, RecordingError, ScenarioError, TrajectoryError
-from cosim.plant.archive import unpack
+from cosim.plant.fmi import unpack
 from cosim.recording import RerunRecorder, read_recording
 from cosim.trajectory import read_csv
 from fmus import path as shipped

@@ -3,7 +3,7 @@
 import numpy as np
 
 from cosim.protocols import SampleBlock
-from cosim.signals import SIGNALS
+from cosim.trajectory import SIGNALS
 
 
 def random_block(scenario, rng, first=0, samples=10, predicts=True, status="solved"):

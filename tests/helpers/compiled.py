@@ -14,7 +14,7 @@ import pytest
 
 from controllers.export import Core
 from controllers.export.core import QP_SOURCES, SOURCES
-from controllers.qp.problem import QpSolution, SoftQp
+from controllers.qp import QpSolution, SoftQp
 
 FLAGS = ("-std=c99", "-O0", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from controllers import Model, Problem, Quantity
-from controllers.dynamic_programming.bellman import DisturbanceLaw, PlantProblem
+from controllers.dynamic_programming import DisturbanceLaw, PlantProblem
 
 
 class LinearPlant:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from controllers.qp.problem import QpSolution, SoftQp
+from controllers.qp import QpSolution, SoftQp
 
 
 def scalar_qp(f: float, *, w: float = 1.0, W: float = 1.0, limit: float = 1.0) -> SoftQp:

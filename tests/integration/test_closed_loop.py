@@ -5,7 +5,7 @@ import pytest
 
 from controllers import ConvergedNmpc, Parameters, Problem, RtiNmpc
 from controllers.factories import naive
-from controllers.qp.backends import make_backend
+from controllers.qp import make_backend
 from cosim import FmuPlant, simulate
 
 STARTS = [

@@ -20,7 +20,7 @@ HIDDEN = {"controllers": ("cosim.plant", "fmus"), "fmus": ("cosim.plant",)}
 """A controller does not see the plant."""
 GROUND = (
     "comparison", "environment", "errors", "files", "penalty", "plugins", "processes",
-    "protocols", "scenario", "signals", "simulation", "statistics", "text_tables", "trajectory",
+    "protocols", "scenario", "simulation", "statistics", "text_tables", "trajectory",
     "validation",
 )  # fmt: skip
 """Modules of cosim that all packages may import; they import none of controllers and learning."""

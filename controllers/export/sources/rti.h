@@ -122,7 +122,7 @@ static void rti_guess(const RtiPrepared *prepared, double set[QP_LIMITS]) {
 }
 
 /* Of all multipliers of Q(s, a) at a kink, those that make dQ/da as small as they can: see
- * `controllers.qp.problem.multipliers_at_kink`. Least squares by one-sided Jacobi rotations. */
+ * `controllers.qp.multipliers_at_kink`. Least squares by one-sided Jacobi rotations. */
 static void rti_kink(const RtiPrepared *prepared, RtiSolved *solved) {
     const double *const rows = prepared->stack + PREPARED_Gamma;
     const double *const low = solved->embedded + EMBEDDED_lower;

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from controllers.dynamic_programming.bellman import (
+from controllers.dynamic_programming import (
     Accuracy,
     BellmanOperator,
     DisturbanceLaw,
+    Grid,
     PlantProblem,
+    accurate_substeps,
 )
-from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import accurate_substeps
 from controllers.errors import OptimumError
 from controllers.model import discretise, economic_cost
 from tests.helpers.sampling import evaporator_problem

@@ -1,6 +1,6 @@
 import pytest
 
-from controllers.dynamic_programming.policy_iteration import (
+from controllers.dynamic_programming import (
     Figure,
     Settings,
     certify,

@@ -2,7 +2,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from controllers.dynamic_programming.bellman import Elementwise
+from controllers.dynamic_programming import Elementwise
 from controllers.evaporator import model
 from controllers.model import discretise
 

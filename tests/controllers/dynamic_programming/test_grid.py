@@ -2,8 +2,7 @@ import itertools
 
 import numpy as np
 
-from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import graded_axis
+from controllers.dynamic_programming import Grid, graded_axis
 
 GRID = Grid((np.array([0.0, 0.5, 2.0]), np.array([-1.0, 1.0, 1.5, 4.0]), np.array([0.0, 1.0])))
 

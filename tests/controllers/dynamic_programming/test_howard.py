@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from controllers.dynamic_programming.grid import Grid
-from controllers.dynamic_programming.policy_iteration import evaluate
+from controllers.dynamic_programming import Grid, evaluate
 
 STATES = 12
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from controllers.dynamic_programming.policy_iteration import nelder_mead, scan
+from controllers.dynamic_programming import nelder_mead, scan
 
 LOWER, UPPER = np.array([-4.0, -4.0]), np.array([4.0, 4.0])
 

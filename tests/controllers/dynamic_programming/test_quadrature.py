@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from controllers.dynamic_programming.bellman import DisturbanceLaw, Refinement
+from controllers.dynamic_programming import DisturbanceLaw, Refinement
 
 LAWS = {
     "uniform": lambda mean, spread: scipy.stats.uniform(mean - spread, 2 * spread),

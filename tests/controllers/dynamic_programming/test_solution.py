@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from controllers.dynamic_programming.policy_iteration import Settings, refine, solve
+from controllers.dynamic_programming import Settings, refine, solve
 from controllers.errors import OptimumError
 from tests.helpers.linear_plant import PLANE, SCALAR, LinearPlant
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from controllers import optimum as store
-from controllers.dynamic_programming.bellman import DisturbanceLaw, PlantProblem
-from controllers.dynamic_programming.policy_iteration import Figure, Settings, solve
+from controllers.dynamic_programming import DisturbanceLaw, Figure, PlantProblem, Settings, solve
 from controllers.errors import OptimumError
 from controllers.problem import Problem
 from cosim import Scenario

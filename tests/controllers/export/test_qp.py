@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from controllers.errors import QpError
-from controllers.qp.backends import make_backend
-from controllers.qp.problem import SoftQp, polish
+from controllers.qp import SoftQp, make_backend, polish
 from tests.helpers.compiled import FAMILIES, CompiledQpSolver, random_qps
 
 RESIDUAL = 1e-9

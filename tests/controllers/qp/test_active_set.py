@@ -1,6 +1,6 @@
 import numpy as np
 
-from controllers.qp.problem import QpSolution, kkt_solve, polish
+from controllers.qp import QpSolution, kkt_solve, polish
 from tests.helpers.scalar import scalar_qp, solution
 from tests.helpers.stored import solve
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controllers.errors import QpError
-from controllers.qp.backends import make_backend
+from controllers.qp import make_backend
 from tests.helpers.scalar import CASES, scalar_qp
 from tests.helpers.stored import qps, solve
 

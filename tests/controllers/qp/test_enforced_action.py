@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from controllers.qp.problem import multipliers_at_kink
+from controllers.qp import multipliers_at_kink
 from tests.helpers.scalar import scalar_qp, solution
 from tests.helpers.stored import prepared
 

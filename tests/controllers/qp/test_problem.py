@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from controllers.qp.problem import QpSolution, SoftQp
+from controllers.qp import QpSolution, SoftQp
 from tests.helpers.scalar import CASES, scalar_qp, solution
 from tests.helpers.stored import qps, solve
 

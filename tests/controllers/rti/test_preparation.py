@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from controllers import ThetaBlocks
-from controllers.dynamics import sampled_jacobian
 from controllers.model import discretise
-from controllers.rti.preparation import embedding, preparation, readout
+from controllers.rti.preparation import embedding, preparation, readout, sampled_jacobian
 from controllers.theta import SymbolicTheta
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from controllers import evaporator
 from controllers.problem import Problem
-from controllers.rti.solution import RtiSolution
+from controllers.rti.nmpc import RtiSolution
 from cosim.cli.main import app
-from cosim.plant.wiring import Wirer
+from cosim.plant.fmu_plant import Wirer
 from learning.back_off_search import BackOffSearch
 
 pytestmark = pytest.mark.campaign

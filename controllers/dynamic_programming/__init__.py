@@ -1,1 +1,0 @@
-"""Dynamic programming on a state grid: quadrature, interpolation, policy iteration."""

@@ -17,6 +17,7 @@ from cosim.cli import (
     evaluate,
     export,
     fmu,
+    new,
     optimum,
     scenario,
     simulate,
@@ -88,6 +89,7 @@ for panel, function, example in (
     (RUN, compare.compare, "compare cosim-run other-run --relative 1e-9"),
     (LEARN, optimum.optimum, "optimum --scenario paper"),
     (LEARN, optimum.tuning, "tuning --scenario paper --out tuned.toml"),
+    (BUILD, new.new, "new rule my_rule"),
     (BUILD, export.export, "export tuned --out controller.fmu --ssp loop.ssp"),
     (RUN, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):

@@ -5,19 +5,18 @@ The study's folder lies outside the checkout, and the command runs as a process 
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+
+from tests.helpers.command import run_cosim
 
 pytestmark = pytest.mark.slow
 
 TABLES = ("evaluation.csv", "curves.csv", "runs.csv", "summary.csv", "aggregate.csv", "study.json")
-HOW_TO = Path(__file__).parents[2] / "docs" / "how-to" / "algorithm.md"
 STUDY = """\
 schema = 1
 name = "mine"
@@ -28,7 +27,7 @@ curves = { points = 2, seeds = 2, steps = 40 }
 
 [[case]]
 name = "mine"
-algorithm = "my_algorithm:CappedTd"
+algorithm = "capped_td:CappedTd"
 samples = 600
 settings = { radius = [0.02, 0.05] }
 training = { checkpoint_every = 300 }
@@ -71,8 +70,7 @@ UNDER_WAY = "runs/*/*/*/checkpoint.npz"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("user")
-    algorithm = re.search(r'```python title="my_algorithm.py"\n(.*?)```', HOW_TO.read_text(), re.S)
-    (folder / "my_algorithm.py").write_text(algorithm[1])
+    run_cosim("new", "rule", "capped_td", folder=folder, check=True)
     (folder / "my_controller.py").write_text(CONTROLLER)
     (folder / "other.toml").write_text('extends = "paper"\nname = "other"\ndiscount = 0.95\n')
     (folder / "study.toml").write_text(STUDY)

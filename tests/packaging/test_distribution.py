@@ -102,7 +102,7 @@ def test_the_wheel_holds_the_committed_data_to_the_byte(wheel, checkout):
     assert {f"{package}/py.typed" for package in packages} <= stored.keys()
     patterns = (
         "fmus/*.fmu", "fmus/sources/*", "fmus/plant_sources/*", "fmus/resources/*",
-        "fmus/templates/*", "cosim/presets/*.toml",
+        "fmus/templates/*", "cosim/presets/*.toml", "cosim/skeletons/*/*",
     )  # fmt: skip
     files = [path for pattern in patterns for path in checkout.glob(pattern)]
     assert len(files) > 20

@@ -1,0 +1,44 @@
+"""What `cosim new` writes is what a page shows, and runs by the commands that it prints."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.code_blocks import ROOT
+
+PAGES = {
+    "rule": ("capped_td", "algorithm.md"),
+    "controller": ("proportional", "controller.md"),
+    "plant": ("heater", "your-plant.md"),
+    "study": ("mine", "study.md"),
+}
+
+
+@pytest.mark.parametrize("kind", PAGES)
+def test_a_skeleton_is_what_its_page_shows_and_is_written_once(kind, cosim, tmp_path):
+    name, page = PAGES[kind]
+    assert cosim("new", kind, name)[0] == 0
+    text = (ROOT / "docs" / "how-to" / page).read_text("utf-8")
+    files = list(tmp_path.iterdir())
+    shown = [f'title="{path.name}"\n{path.read_text("utf-8")}```' in text for path in files]
+    assert all(shown)
+    files[-1].write_text("mine")
+    for path in files[:-1]:
+        path.unlink()
+    code, _, err = cosim("new", kind, name)
+    assert (code, err.count("\n"), files[-1].read_text()) == (2, 1, "mine")
+    assert list(tmp_path.iterdir()) == files[-1:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", PAGES)
+def test_a_skeleton_runs_by_the_commands_that_are_printed(kind, cosim, tmp_path):
+    said = cosim("new", kind, "my_own", "--out", "a folder")[2]
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    script = "set -e\n" + said.partition("next:\n")[2]
+    env = os.environ | {"PATH": path}
+    subprocess.run(script, shell=True, cwd=tmp_path, env=env, check=True)
+    assert (tmp_path / "a folder" / "my_own-run" / "summary.json").is_file()

@@ -25,8 +25,7 @@ from cosim import Scenario
 from cosim.plugins import build_controller
 from learning.q_learning import QLearning
 from learning.search import Search
-from learning.training import run_training
-from learning.training_run import TrainingRun
+from learning.training import TrainingRun, run_training
 
 TENTHS = 10
 PAGE = os.sysconf("SC_PAGE_SIZE")

@@ -7,7 +7,7 @@ from unittest.mock import patch
 from benchmarks.measuring import clock, figure
 from cosim import FmuPlant
 from learning.algorithm import load_algorithm
-from learning.training_run import begin, prepare
+from learning.training import begin, prepare
 
 ALGORITHMS = ("q-learning", "actor-critic", "batch-q-learning")
 REPETITIONS = 20

@@ -22,7 +22,7 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from learning import empirical_model, model_based
-from learning.training_run import begin, prepare
+from learning.training import begin, prepare
 
 PARTS = {
     "parameters": (empirical_model, "PARAMETER_DEVIATION", 1e-6),  # W alone is fitted

@@ -22,8 +22,16 @@ import fmpy
 
 from cosim.files import replacing, temporary_folder
 from fmus import BuildError
-from fmus.description import build_description, c_header, model_description, render
-from fmus.model import C_IDENTIFIER, FmiVersion, Model, Variable
+from fmus.model import (
+    C_IDENTIFIER,
+    FmiVersion,
+    Model,
+    Variable,
+    build_description,
+    c_header,
+    model_description,
+    render,
+)
 
 PACKAGE = Path(__file__).parent
 SOURCES = PACKAGE / "sources"

@@ -20,14 +20,17 @@ from fmus.build import (
     compilers,
     token_of,
 )
-from fmus.description import (
+from fmus.model import (
     LICENSE,
+    FmiVersion,
+    Model,
+    Unit,
     build_description,
     c_header,
     model_description,
+    read_variables,
     render,
 )
-from fmus.model import FmiVersion, Model, Unit, read_variables
 
 _EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
 

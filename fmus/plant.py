@@ -13,8 +13,7 @@ from math import inf
 from pathlib import Path
 
 from fmus.build import PACKAGE, RESOURCES, SOURCES, assemble, files_of, sources_of
-from fmus.description import render
-from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable, read_variables
+from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable, read_variables, render
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (

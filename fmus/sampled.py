@@ -10,9 +10,8 @@ from pathlib import Path
 
 from fmus import BuildError
 from fmus.build import assemble, files_of, sources_of
-from fmus.description import render
 from fmus.evaporator import UNITS
-from fmus.model import FmiVersion, Kind, Model, Unit, Variable
+from fmus.model import FmiVersion, Kind, Model, Unit, Variable, render
 
 _SAMPLES = 100
 

@@ -9,7 +9,7 @@ import fmpy
 
 from fmus import BuildError
 from fmus.build import write_archive
-from fmus.description import render
+from fmus.model import render
 
 # Importers of FMI 2.0 set an enumeration through its number.
 _ELEMENTS = {"Real": "Real", "Integer": "Integer", "Boolean": "Boolean", "Enumeration": "Integer"}

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from learning.step import ConstrainedStep as ConstrainedStep
     from learning.step import td_step as td_step
     from learning.training import Training as Training
+    from learning.training import TrainingRun as TrainingRun
     from learning.training import train as train
-    from learning.training_run import TrainingRun as TrainingRun
 
 # Imported on first use: a command that trains nothing must not pay for SciPy.
 _HOMES = {
@@ -40,8 +40,7 @@ _HOMES = {
     "q_learning": "QLearning",
     "search": "Search",
     "step": "ConstrainedStep td_step",
-    "training": "Training train",
-    "training_run": "TrainingRun",
+    "training": "Training TrainingRun train",
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names.split()}
 __all__ = sorted(_HOME)  # noqa: PLE0605 - a list all the same

@@ -1,44 +1,218 @@
-"""`train`: one training from Python or the command line, and what came of it."""
+"""`train`: one training, from Python or the command line: settings, start, log and judge."""
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
 from itertools import islice
 from math import inf, isfinite, isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
 from controllers import compile_functions
+from controllers.economic import tune
 from controllers.factories import nmpc
 from controllers.optimum import QuasiStaticPolicy, change_of, stored
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.theta import Parameters
+from controllers.theta import Parameters, ThetaBlocks
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plant.fmi import SHIPPED
-from cosim.plugins import build_controller
-from cosim.protocols import Array, Controller, Plant, functions_of
+from cosim.plugins import build_controller, depends_on
+from cosim.protocols import Array, Controller, Plant, Vector, functions_of
 from cosim.scenario import Scenario
-from cosim.simulation import indicators_of
+from cosim.simulation import indicators_of, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
 from cosim.text_tables import Shown, csv_text
+from cosim.validation import suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up
+from learning.commissioning import back_off
 from learning.configuration import Configuration
-from learning.errors import CheckpointError, ConfigurationError, DivergenceError
+from learning.errors import CheckpointError, ConfigurationError, DivergenceError, PrivilegeError
+from learning.loop import TrainingLoop
 from learning.step import certificate
-from learning.training_run import Options, TrainingRun, begin, prepare
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+SAMPLES = 50_000
+"""Of a run where neither user nor algorithm says how many."""
+EVERY = ("log_every", "evaluate_every", "checkpoint_every")
+LEAST = {"seed": 0} | dict.fromkeys(
+    ("samples", *EVERY, "evaluation_seeds", "evaluation_steps", "rest_after"), 1
+)
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """What identifies a training run; a checkpoint goes on only in the very same one.
+
+    The `algorithm` by name, its `configuration`, completed by what the `scenario` states; the other
+    fields' meaning is their help in `cosim train`. A greedy J that is worse than that of the naive
+    θ and that of the start by more than (`divergence` − 1) of its magnitude, twice in a row or at
+    the end, is divergence and ends the run.
+
+    Raises ConfigurationError on counts that make no run.
+    """
+
+    algorithm: str
+    scenario: Scenario
+    samples: int
+    seed: int
+    configuration: Configuration
+    controller: str = "rti"
+    log_every: int = 1000
+    evaluate_every: int = 5000
+    checkpoint_every: int = 5000
+    evaluation_seeds: int = 4
+    evaluation_steps: int = 500
+    divergence: float = 1.5
+    start: str = "naive"
+    rest_after: int | None = None
+
+    def __post_init__(self) -> None:
+        """Complete the configuration and check the counts."""
+        completed = self.configuration.for_scenario(self.scenario)
+        object.__setattr__(self, "configuration", completed)
+        for name, least in LEAST.items():
+            if (value := getattr(self, name)) is not None and value < least:
+                raise ConfigurationError(f"{name} must be at least {least}, not {value}")
+        for name in EVERY[1:]:
+            if getattr(self, name) % self.log_every:
+                raise ConfigurationError(
+                    f"{name} = {getattr(self, name)} must be a multiple of log_every = "
+                    f"{self.log_every}"
+                )
+
+    def identity(self) -> dict[str, Any]:
+        """The run as JSON-ready values, with the hashes of all code that its result depends on."""
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        values["scenario"] = self.scenario.hash
+        values["configuration"] = self.configuration.model_dump(mode="json")
+        if (file := Path(self.start)).is_file():
+            values["start"] = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+        values["source"] = depends_on(self.scenario, self.algorithm)
+        return values
+
+    def starting_parameters(self) -> Parameters:
+        """θ where the run starts; the errors are those of `starting_parameters` below."""
+        problem = Problem.from_scenario(self.scenario)
+        if self.start != "commissioned":
+            return starting_parameters(problem, self.configuration, self.start)
+        return back_off(starting_parameters(problem, self.configuration, "tuned"), self.scenario)
+
+
+class Options(TypedDict, total=False):
+    """The fields of `TrainingRun` that `train` takes as further keywords."""
+
+    controller: str
+    log_every: int
+    evaluate_every: int
+    checkpoint_every: int
+    evaluation_seeds: int
+    evaluation_steps: int
+    divergence: float
+    rest_after: int | None
+
+
+def prepare(
+    algorithm: str,
+    scenario: Scenario,
+    samples: int | None,
+    settings: Mapping[str, Any] | Configuration | None,
+    options: Mapping[str, Any],
+) -> TrainingRun:
+    """The run of an algorithm by name, checked; `options` are the other fields of `TrainingRun`.
+
+    Raises AlgorithmLookupError; ConfigurationError on settings or options that make no run.
+    """
+    found = load_algorithm(algorithm)
+    known = [option.name for option in fields(TrainingRun)]
+    for name in options:
+        if name not in known:
+            raise ConfigurationError(f"training has no option '{name}'{suggestion(name, known)}")
+    if not isinstance(settings, Configuration):
+        settings = found.Configuration.from_dict(dict(settings or {}))
+    return TrainingRun(
+        algorithm=algorithm,
+        scenario=scenario,
+        samples=getattr(found, "budget", SAMPLES) if samples is None else samples,
+        configuration=settings,
+        **options,
+    )
+
+
+def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> TrainingLoop:
+    """The loop of a run at its start: the plant is reset, once, and the first state is solved for.
+
+    All random numbers come from the run's seed.
+    """
+    controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
+    strategy = run.configuration.strategy(run.scenario)
+    plant_seed, rng = spawn_seeds(run.seed)
+    # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
+    own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])
+    rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
+    loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
+    first: int | None = getattr(rule, "first_episode", None)
+    if first is not None and rule.asks_for != "simulator":
+        raise PrivilegeError(
+            f"{algorithm.__name__} asks for a plant in operation and states 'first_episode', which "
+            "only a simulator has"
+        )
+    loop.start(plant.reset(plant_seed if first is None else first))
+    return loop
+
+
+def starting_parameters(
+    problem: Problem, configuration: Configuration, start: str = "naive"
+) -> Parameters:
+    """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
+
+    `start` is `naive`, `tuned` or the path of a parameters file. `naive` and `tuned` take c_lambda
+    from the configuration; blocks that a file has stand as they are, those of the configuration's
+    parametrisation that it lacks start as with `naive`. Raises ConfigurationError where the file
+    has slack weights and the parametrisation none, ParameterError on a bad file, TuningError where
+    the tuning fails.
+    """
+    file = None if start in ("naive", "tuned") else Parameters.load(start, problem)
+    if file is not None and "w_sigma" in file.blocks and configuration.parametrisation == "paper":
+        raise ConfigurationError(
+            f"{start}: θ has slack weights, which the parametrisation 'paper' has not; set "
+            "parametrisation=extended"
+        )
+    learned = configuration.learned_parameters(problem.model)
+    given = file.blocks.block("p").labels if file is not None and "p" in file.blocks else ()
+    blocks = ThetaBlocks.of(
+        problem,
+        slack_weights=configuration.parametrisation == "extended",
+        model_parameters=(*given, *(name for name in learned if name not in given)),
+    )
+    # The level of V is that of the TD error's discount.
+    chosen: float | None = getattr(configuration, "discount", None)
+    discounted = configuration.value_offset == "discounted"
+    offset = problem.value_level(chosen) if discounted else None
+    if start == "tuned":
+        found = tune(problem, blocks, value_offset=offset).parameters
+    else:
+        found = Parameters.naive(problem, blocks, value_offset=offset)
+    names = [name for name in ("w_sigma", "W_sigma") if name in blocks]
+    values: dict[str, Vector] = {name: blocks.scale[blocks.slices[name]] for name in names}
+    if file is not None:
+        values |= {block.name: file[block.name] for block in file.blocks}
+    if given:
+        values["p"] = np.concatenate([values["p"], found["p"][len(given) :]])
+    return found.replace(values)
+
 
 CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"
 LOG, PARAMETERS = "learning.csv", "parameters.toml"

@@ -116,8 +116,7 @@ def train(
     """
     with cli.output(json) as out_:
         from learning.algorithm import load_algorithm
-        from learning.training import CHECKPOINT, run_training, stored_optimum
-        from learning.training_run import prepare
+        from learning.training import CHECKPOINT, prepare, run_training, stored_optimum
 
         found = load_algorithm(algorithm)
         if explain:

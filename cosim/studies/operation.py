@@ -24,8 +24,7 @@ from cosim.studies.store import KEYS, LOG, measured, read_table
 from cosim.text_tables import Table
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
-from learning.training import LogRow
-from learning.training_run import TrainingRun, begin
+from learning.training import LogRow, TrainingRun, begin
 
 WINDOW = 100
 """Samples in a row of which the dearest are reported."""

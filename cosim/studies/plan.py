@@ -33,8 +33,7 @@ from cosim.studies.document import (
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training import HELD_OUT, stored_optimum
-from learning.training_run import TrainingRun, prepare
+from learning.training import HELD_OUT, TrainingRun, prepare, stored_optimum
 
 BASELINES, NAIVE = "baselines", "naive"
 EVALUATION, GREEDY, ONLINE = "evaluation.csv", "greedy.csv", "online.csv"

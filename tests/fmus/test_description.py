@@ -6,9 +6,8 @@ import fmpy
 import pytest
 
 import fmus
-from fmus.description import model_description
 from fmus.evaporator import EVAPORATOR, VARIABLES
-from fmus.model import Kind, Type, continuous_dependencies, initial_dependencies
+from fmus.model import Kind, Type, continuous_dependencies, initial_dependencies, model_description
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 

@@ -10,7 +10,7 @@ from lxml import etree
 import fmus
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_loop
 from cosim.scenario import Scenario
-from fmus.description import build_description, model_description
+from fmus.model import build_description, model_description
 from fmus.plant import Signal, plant_model
 from fmus.sampled import build_sampled
 

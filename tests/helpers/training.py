@@ -13,8 +13,7 @@ from controllers.rti import RtiNmpc
 from cosim import Scenario
 from learning.algorithm import Algorithm, load_algorithm
 from learning.loop import TrainingLoop
-from learning.training import LogRow, Training, run_training
-from learning.training_run import TrainingRun
+from learning.training import LogRow, Training, TrainingRun, run_training
 
 
 class Killed(BaseException):

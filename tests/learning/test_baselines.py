@@ -14,8 +14,7 @@ from cosim import FmuPlant, Scenario, simulate
 from learning.algorithm import load_algorithm
 from learning.policy_search import Coordinates
 from learning.prediction_errors import OneStepModel
-from learning.training import to_csv
-from learning.training_run import begin
+from learning.training import begin, to_csv
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed, train
 

@@ -10,7 +10,7 @@ from learning import BatchQLearning, QLearning
 from learning.batch_q_learning import ReplayBuffer
 from learning.checkpoint import arrays_of, take_up
 from learning.q_learning import AverageCost
-from learning.training_run import TrainingRun, begin, starting_parameters
+from learning.training import TrainingRun, begin, starting_parameters
 from tests.helpers.training import looped
 
 

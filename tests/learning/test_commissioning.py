@@ -4,7 +4,7 @@ import pytest
 from controllers.economic import tune
 from cosim.plugins import build_controller
 from learning import commissioning
-from learning.training_run import prepare
+from learning.training import prepare
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant, Scenario
 from cosim.simulation import indicators_of
 from learning import QLearning
-from learning.training import COLUMNS, FIGURES, HELD_OUT, Judge, drift
-from learning.training_run import TrainingRun
+from learning.training import COLUMNS, FIGURES, HELD_OUT, Judge, TrainingRun, drift
 from tests.helpers.training import make_run, train
 
 

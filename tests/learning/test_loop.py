@@ -14,8 +14,7 @@ from learning import QLearning
 from learning.algorithm import Update
 from learning.errors import PrivilegeError
 from learning.loop import PlantInOperation, TrainingLoop
-from learning.training import HELD_OUT, run_training
-from learning.training_run import TrainingRun, begin, starting_parameters
+from learning.training import HELD_OUT, TrainingRun, begin, run_training, starting_parameters
 
 
 @pytest.fixture(scope="module")

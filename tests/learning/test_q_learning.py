@@ -8,7 +8,7 @@ from cosim import FmuPlant
 from learning import QLearning
 from learning.q_learning import AverageCost, KalmanRegression
 from learning.step import Fit
-from learning.training_run import starting_parameters
+from learning.training import starting_parameters
 from tests.helpers.training import looped
 
 AS_PRINTED = {

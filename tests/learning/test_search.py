@@ -6,7 +6,7 @@ import pytest
 from cosim import FmuPlant
 from learning.errors import ConfigurationError
 from learning.search import Search
-from learning.training_run import TrainingRun, begin
+from learning.training import TrainingRun, begin
 
 SETTINGS = {
     "none": {},

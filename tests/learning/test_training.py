@@ -41,7 +41,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, name, tmp_
 
 def train_start(run):
     from controllers.problem import Problem
-    from learning.training_run import starting_parameters
+    from learning.training import starting_parameters
 
     return starting_parameters(Problem.from_scenario(run.scenario), run.configuration).theta
 

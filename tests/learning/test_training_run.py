@@ -6,7 +6,7 @@ from controllers.theta import Parameters, ThetaBlocks
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
-from learning.training_run import starting_parameters
+from learning.training import starting_parameters
 
 
 def test_the_papers_theta_is_the_naive_guess(problem):

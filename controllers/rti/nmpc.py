@@ -723,10 +723,6 @@ class RtiNmpc:
                 actions[k], values[k] = solution.action, solution.value
         return actions, values
 
-    def value_batch(self, states: ArrayLike) -> Vector:
-        """V (K,) of the prepared QP at states (K, n); see `feedback_batch`."""
-        return self.feedback_batch(states)[1]
-
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q(s, a) of the prepared QP."""
         return self._solve(s, a).value

@@ -44,7 +44,7 @@ def new(
         from cosim.files import write_atomically
 
         if not re.fullmatch(r"[a-z]\w*", name, re.ASCII | re.IGNORECASE) or iskeyword(name):
-            raise CosimError(f"'{name}' names no module: give a letter, then letters, digits and _")
+            raise CosimError(f"'{name}' is no name of a module: letters, digits and _, no keyword")
         names = {"NAME": name, "CLASS": re.sub("(?:^|_)(.?)", lambda m: m[1].upper(), name)}
 
         def filled(text: str) -> str:

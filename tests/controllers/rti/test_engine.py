@@ -110,7 +110,6 @@ def test_a_batch_is_the_feedback_of_each_state_and_moves_no_guess(learnt):
         controller.feedback(states[0])
         controller.prepare()
         actions, values = controller.feedback_batch(states)
-        np.testing.assert_array_equal(controller.value_batch(states), values)
         assert np.isnan(values[7]) and np.isnan(actions[7]).all()
         for k in known:
             assert np.array_equal(controller.policy(states[k]), actions[k])

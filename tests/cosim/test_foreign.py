@@ -1,15 +1,19 @@
 """FMUs that this project did not write, or that misbehave."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
-from cosim import FmuPlant, simulate
+from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import CapabilityError, PlantError
+from cosim.plant.fmi import unpack
+from cosim.plant.fmu_plant import refusals
 from tests.helpers.command import run_cosim
+from tests.helpers.kinds import REALS, build_kind, scenario_for
 from tests.helpers.loop import Hold
-from tests.helpers.tank import build_tank, write_scenario
+from tests.helpers.tank import build_tank, edited, write_scenario
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +93,180 @@ def test_a_chatty_fmu_does_not_spoil_json(tanks, tmp_path):
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["samples"] == 3
     assert "a chatty FMU" in result.stderr
+
+
+CS = 'CoSimulation modelIdentifier="kinds" '
+VARIABLE_STEP = 'canHandleVariableCommunicationStepSize="true"'
+
+
+@pytest.fixture(params=[2, 3], ids=["fmi2", "fmi3"])
+def version(request):
+    return request.param
+
+
+def trajectory(scenario, seed=0, steps=3):
+    with FmuPlant(scenario) as plant:
+        rows = [plant.reset(seed)[0]]
+        return rows + [plant.step([2.0]).s[0] for _ in range(steps)]
+
+
+def expected(steps=3, start=1.0, push=0.0):
+    rows = [start]
+    for _ in range(steps):
+        rows.append(rows[-1] + 0.5 * (2.0 - rows[-1]) + push)
+    return rows
+
+
+def test_the_plain_kind_runs(tmp_path, version):
+    fmu = build_kind(tmp_path, version)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    assert list(refusals(unpack(fmu))) == []
+
+
+def test_references_that_collide_between_types_are_kept_apart(tmp_path):
+    """FMI 2.0: u is Real 0 and seed Integer 0, x is Real 1 and fault Integer 1."""
+    reals = REALS.replace("range 4  parameter  fixed    0", "range 4  parameter  fixed    0")
+    fmu = build_kind(tmp_path, 2, reals=reals)
+    scenario = scenario_for(tmp_path, fmu, parameters=", range = 0.125")
+    assert trajectory(scenario, seed=4) == expected(push=0.5)
+    assert trajectory(scenario, seed=0) == expected()
+
+
+def test_an_array_beside_the_scalars_is_no_obstacle(tmp_path):
+    dimension = '<Dimension start="3"/>'
+    more = f'<Float64 name="profile" valueReference="5" causality="output">{dimension}</Float64>'
+    fmu = build_kind(tmp_path, 3, more=more)
+    scenario = scenario_for(tmp_path, fmu)
+    assert trajectory(scenario) == expected()
+    named = Scenario.load(scenario).replace({"plant": {"states": ["profile"]}})
+    with pytest.raises(PlantError, match=r"'profile'.* is a Float64 array, not a scalar Float64"):
+        FmuPlant(named)
+
+
+def test_a_string_is_no_obstacle_unless_it_is_named(tmp_path, version):
+    common = 'name="label" valueReference="30" causality="parameter" variability="fixed"'
+    more = (
+        f'<ScalarVariable {common}><String start="a"/></ScalarVariable>'
+        if version == 2
+        else f'<String {common}><Start value="a"/></String>'
+    )
+    fmu = build_kind(tmp_path, version, more=more)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    named = scenario_for(tmp_path, fmu, parameters=", label = 1.0")
+    with pytest.raises(PlantError, match=r"'label'.* is a String, which cannot be set here"):
+        FmuPlant(named)
+
+
+def test_a_step_that_ends_the_simulation_is_an_error(tmp_path):
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, 3), fault=13)
+    with FmuPlant(scenario) as plant:
+        plant.reset(0)
+        with pytest.raises(PlantError, match="ended the step early"):
+            plant.step([1.0])
+
+
+def test_a_tunable_parameter_serves_as_action(tmp_path, version):
+    reals = REALS.replace("u     0  input      -        0", "u 0 parameter tunable 0")
+    fmu = build_kind(tmp_path, version, reals=reals)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+
+
+@pytest.mark.parametrize("size", ["0.5", "0.125"])
+def test_a_constant_step_may_have_any_size(tmp_path, version, size):
+    """canHandleVariableCommunicationStepSize, false by default, forbids that the size changes."""
+    experiment = f'<DefaultExperiment stepSize="{size}"/>'
+    fmu = build_kind(tmp_path, version, face=CS, experiment=experiment)
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+
+
+def test_an_output_that_starts_exactly_is_its_own_start_parameter(tmp_path, version):
+    plain = build_kind(tmp_path, version)
+    path = scenario_for(tmp_path, tmp_path / f"exact{version}.fmu")
+    path.write_text(path.read_text().replace('"x_start"', '"x"'))
+    with pytest.raises(PlantError, match="without a start"):
+        FmuPlant(Scenario.load(path).replace({"plant": {"fmu": str(plain)}}))
+    reals = re.sub(r"(?m)^(x +1 .* )-", r"\g<1>1", REALS)
+    exact = 'name="x" initial="exact"'
+    edited(
+        build_kind(tmp_path, version, reals=reals),
+        tmp_path / f"exact{version}.fmu",
+        lambda text: text.replace('name="x"', exact),
+    )
+    FmuPlant(path).close()
+
+
+def test_a_fixed_internal_step_takes_its_multiples(tmp_path):
+    fmu = build_kind(tmp_path, 3, face=f'{CS} fixedInternalStepSize="0.25"')
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    with pytest.raises(PlantError, match=r"multiples of 0\.25 s .*sampling time of 0\.6 s is none"):
+        FmuPlant(scenario_for(tmp_path, fmu, sampling_time=0.6))
+
+
+def test_model_exchange_alone_is_refused(tmp_path, version):
+    fmu = build_kind(tmp_path, version, face='ModelExchange modelIdentifier="kinds"')
+    with pytest.raises(PlantError, match=r"no co-simulation interface \(it has: model exchange\)"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_one_instance_per_process_is_kept_to(tmp_path, version):
+    face = f'{CS} {VARIABLE_STEP} canBeInstantiatedOnlyOncePerProcess="true"'
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, version, face=face))
+    with (
+        FmuPlant(scenario),
+        pytest.raises(CapabilityError, match="only once per process; close the other"),
+    ):
+        FmuPlant(scenario)
+    assert trajectory(scenario) == expected()
+
+
+def test_one_that_needs_its_tool_is_refused(tmp_path, version):
+    fmu = build_kind(tmp_path, version, face=f'{CS} {VARIABLE_STEP} needsExecutionTool="true"')
+    with pytest.raises(PlantError, match=r"needs the tool that made it to run"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+@pytest.mark.parametrize(("fault", "status"), [(1, -7), (2, 9)])
+def test_a_status_that_fmi_does_not_have_is_an_error(tmp_path, version, fault, status):
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, version), fault=fault)
+    with FmuPlant(scenario) as plant:
+        plant.reset(0)
+        with pytest.raises(PlantError, match=f"DoStep returned status {status}, which FMI does"):
+            plant.step([1.0])
+
+
+@pytest.mark.parametrize("identifier", ["../../kinds", "/tmp/kinds", "a b", "kinds.so", "1kinds"])
+def test_a_model_identifier_is_no_path(tmp_path, version, identifier):
+    fmu = build_kind(
+        tmp_path, version, face=f'CoSimulation modelIdentifier="{identifier}" {VARIABLE_STEP}'
+    )
+    with pytest.raises(
+        PlantError, match=r"modelIdentifier .*C identifier|invalid model description"
+    ):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_a_library_that_is_no_entry_of_the_archive_is_not_loaded(tmp_path, version):
+    fmu = build_kind(
+        tmp_path, version, face=f'CoSimulation modelIdentifier="other" {VARIABLE_STEP}'
+    )
+    folder = (
+        unpack(fmu).folder / "binaries" / next((unpack(fmu).folder / "binaries").iterdir()).name
+    )
+    (folder / "other.so").write_bytes((folder / "kinds.so").read_bytes())
+    try:
+        with pytest.raises(PlantError, match="has no binary for"):
+            FmuPlant(scenario_for(tmp_path, fmu))
+    finally:
+        (folder / "other.so").unlink()
+
+
+def test_what_is_no_library_is_named(tmp_path, version):
+    fmu = build_kind(tmp_path, version, data=b"text")
+    with pytest.raises(PlantError, match="is not a shared library"):
+        FmuPlant(scenario_for(tmp_path, fmu))
+
+
+def test_an_archive_with_backslashes_runs(tmp_path, version):
+    fmu = build_kind(tmp_path, version, separator="\\")
+    assert trajectory(scenario_for(tmp_path, fmu)) == expected()
+    assert (unpack(fmu).folder / "resources" / "readme.txt").read_bytes() == b"nothing"

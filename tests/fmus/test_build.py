@@ -1,4 +1,4 @@
-from __future__ import annotations
+"""The user's check of an FMU, and the independent importers that every FMU of ours must pass."""
 
 import importlib.util
 import json
@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import fmus
-from fmus import build, evaporator
+from benchmarks import importers
+from fmus import build, check, evaporator
 from fmus.build import compilers
 from tests.helpers import crosscheck
 
@@ -105,3 +106,18 @@ def test_committed_header_is_not_stale() -> None:
     assert (build.SOURCES / evaporator.HEADER).read_text() == evaporator.header(
         evaporator.model_token()
     ), "run `cosim fmu build --in-place` and commit what it writes"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", fmus.NAMES)
+def test_every_installed_importer_passes(name: str) -> None:
+    findings = importers.check(fmus.path(name))
+    bad = (importers.FAILED, importers.CANNOT, importers.NOTED)
+    assert [f for f in findings if f.status in bad] == []
+    assert all(f.status == importers.PASSED for f in findings if f.tool in ("fmpy", "casadi"))
+
+
+def test_the_shipped_files_pass(version: int) -> None:
+    findings = check.check(fmus.path(fmus.NAMES[version - 2]))
+    assert [f.status for f in findings] == ["passed"] * 3
+    assert "all finite" in findings[-1].detail

@@ -1,13 +1,28 @@
-from __future__ import annotations
+"""Every FMU and SSP that we make, against the standards' own XML schemas, which fmpy carries."""
 
+import zipfile
+from pathlib import Path
 from xml.etree import ElementTree
 
 import fmpy
+import numpy as np
 import pytest
+from lxml import etree
 
 import fmus
-from fmus.evaporator import EVAPORATOR, VARIABLES
-from fmus.model import Kind, Type, continuous_dependencies, initial_dependencies, model_description
+from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_loop
+from cosim.scenario import Scenario
+from fmus.evaporator import EVAPORATOR, UNITS, VARIABLES
+from fmus.model import (
+    Kind,
+    Type,
+    build_description,
+    continuous_dependencies,
+    initial_dependencies,
+    model_description,
+)
+from fmus.plant import Signal, plant_model
+from fmus.sampled import build_sampled
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 
@@ -122,3 +137,99 @@ def test_continuous_dependencies(open_fmu) -> None:
                     found[unknown].add(name)
         model.set_states([30.0, 60.0])
     assert found == {name: set(continuous_dependencies(name, EVAPORATOR)) for name in UNKNOWNS}
+
+
+BY_NAME = EVAPORATOR.by_name
+
+
+@pytest.mark.parametrize("variable", VARIABLES, ids=lambda v: v.name)
+def test_ranges_are_given_and_hold_the_start(variable) -> None:
+    if variable.kind is Kind.INDEPENDENT or variable.type in (Type.SEED, Type.SEED_HIGH):
+        return
+    assert variable.min < variable.max
+    if variable.settable:
+        assert variable.min <= variable.start <= variable.max
+    if variable.type is Type.REAL:
+        assert variable.nominal is not None
+        assert variable.unit in {unit.name for unit in UNITS}
+
+
+def test_extreme_normal_draws_stay_within_the_declared_range() -> None:
+    """The largest |Z| of 53-bit Box and Muller is √(106 ln 2) = 8.58."""
+    largest = np.sqrt(106 * np.log(2))
+    for name in ("X1", "F1", "T1", "T200"):
+        nominal, spread = BY_NAME[f"{name}_nominal"], BY_NAME[f"{name}_range"]
+        assert BY_NAME[name].min <= nominal.min - largest * spread.max
+        assert BY_NAME[name].max >= nominal.max + largest * spread.max
+
+
+def test_derived_units_follow_from_their_parts() -> None:
+    """kg/kPa, K/kPa and K/% agree with the units that they are made of."""
+    units = {unit.name: unit for unit in UNITS}
+    for quotient in ("kg/kPa", "K/kPa", "K/%", "kPa/s", "%/s", "kW/K"):
+        over, under = (units[part] for part in quotient.split("/"))
+        exponents: dict[str, int] = dict(over.exponents)
+        for base, exponent in under.exponents:
+            exponents[base] = exponents.get(base, 0) - exponent
+        exponents = {base: exponent for base, exponent in exponents.items() if exponent}
+        assert dict(units[quotient].exponents) == exponents
+        assert units[quotient].factor == pytest.approx(over.factor / under.factor)
+
+
+SCHEMAS = Path(fmpy.__file__).parent
+FMI = {
+    2: {"modelDescription.xml": "schema/fmi2/fmi2ModelDescription.xsd"},
+    3: {
+        "modelDescription.xml": "schema/fmi3/fmi3ModelDescription.xsd",
+        "terminalsAndIcons/terminalsAndIcons.xml": "schema/fmi3/fmi3TerminalsAndIcons.xsd",
+    },
+}
+BUILD = {"sources/buildDescription.xml": "schema/fmi3/fmi3BuildDescription.xsd"}
+SSP = {
+    "SystemStructure.ssd": "ssp/schema/SystemStructureDescription.xsd",
+    "resources/plant.ssv": "ssp/schema/SystemStructureParameterValues.xsd",
+}
+
+
+def hold(text, schema):
+    """Raise AssertionError with the schema's words where `text` is not valid."""
+    validator = etree.XMLSchema(file=str(SCHEMAS / schema))
+    assert validator.validate(etree.fromstring(text)), validator.error_log
+
+
+def hold_archive(path, schemas):
+    with zipfile.ZipFile(path) as container:
+        present = [name for name in schemas if name in container.namelist()]
+        for name in present:
+            hold(container.read(name), schemas[name])
+    return present
+
+
+@pytest.mark.parametrize(("name", "version"), [("evaporator", 2), ("evaporator_fmi3", 3)])
+def test_the_shipped_fmus(name, version):
+    assert len(hold_archive(fmus.path(name), FMI[version] | BUILD)) == version
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_plant_of_ones_own(version):
+    signal = Signal("x", "m", 1.0, 0.0, 10.0, "level", 0.1)
+    model = plant_model(
+        "tank",
+        states=[signal],
+        inputs=[Signal("u", "1", 0.0, 0.0, 1.0, "valve")],
+        disturbances=[Signal("d", "m", 0.0, -1.0, 1.0, "inflow", 0.1)],
+        outputs=[Signal("cost", "1", 0.0, 0.0, 9.0, "cost")],
+        sampling_time=1.0,
+    )
+    hold(model_description(version, "{1}", model).encode(), FMI[version]["modelDescription.xml"])
+    hold(build_description(version, model).encode(), BUILD["sources/buildDescription.xml"])
+
+
+def test_an_exported_controller_and_its_loop(tmp_path):
+    scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})
+    system = sampled_controller(rti_controller("naive", scenario), scenario, {"X2": "%"})
+    for version in (2, 3):
+        fmu = build_sampled(system, tmp_path / f"c{version}.fmu", version)
+        assert len(hold_archive(fmu, FMI[version] | BUILD)) == 2
+    loop = write_loop(tmp_path / "c2.fmu", scenario, 3, tmp_path / "loop.ssp")
+    assert len(hold_archive(loop, SSP)) == 2

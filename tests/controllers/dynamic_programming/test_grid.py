@@ -1,8 +1,22 @@
 import itertools
 
+import casadi as ca
 import numpy as np
+import pytest
+import scipy.optimize
+import scipy.stats
 
-from controllers.dynamic_programming import Grid, graded_axis
+from controllers.dynamic_programming import (
+    DisturbanceLaw,
+    Elementwise,
+    Grid,
+    Refinement,
+    graded_axis,
+    nelder_mead,
+    scan,
+)
+from controllers.evaporator import model
+from controllers.model import discretise
 
 GRID = Grid((np.array([0.0, 0.5, 2.0]), np.array([-1.0, 1.0, 1.5, 4.0]), np.array([0.0, 1.0])))
 
@@ -92,3 +106,197 @@ def test_graded_axis_is_dense_at_features_grows_outside_and_meets_its_marks():
     # Growth is that of a continuous width, so that a cell may be a little wider than 1.3 times.
     assert (cells[1:] / cells[:-1] < 1.5).all()
     assert len(axis) < 100
+
+
+LAWS = {
+    "uniform": lambda mean, spread: scipy.stats.uniform(mean - spread, 2 * spread),
+    "normal": scipy.stats.norm,
+}
+
+
+@pytest.mark.parametrize("kind", LAWS)
+def test_moments_up_to_twice_the_nodes_are_those_of_scipy(kind):
+    law = DisturbanceLaw(kind, np.array([1.5]), np.array([0.7]))
+    rule = law.rule((5,))
+    distribution = LAWS[kind](1.5, 0.7)
+    for degree in range(1, 10):
+        assert rule.weights @ rule.nodes[:, 0] ** degree == pytest.approx(
+            distribution.moment(degree), rel=1e-12
+        )
+
+
+def test_product_rule_integrates_products():
+    law = DisturbanceLaw("uniform", np.array([0.0, 2.0]), np.array([1.0, 3.0]))
+    rule = law.rule((3, 4))
+    x, y = rule.nodes.T
+    assert len(rule.weights) == 12
+    assert rule.weights.sum() == pytest.approx(1.0, rel=1e-14)
+    # E[x²] = 1/3, E[y²] = 4 + 3.
+    assert rule.weights @ (x**2 * y**2) == pytest.approx(7 / 3, rel=1e-13)
+
+
+@pytest.mark.parametrize("kind", ["uniform", "normal", "none"])
+def test_draws_have_the_laws_moments(kind):
+    law = DisturbanceLaw(kind, np.array([5.0, -1.0]), np.array([1.0, 0.0]))
+    draws = law.draw(np.random.default_rng(1), 40_000)
+    variance = {"uniform": 1 / 3, "normal": 1.0, "none": 0.0}[kind]
+    np.testing.assert_allclose(draws.mean(axis=0), [5.0, -1.0], atol=0.02)
+    np.testing.assert_allclose(draws.var(axis=0), [variance, 0.0], atol=0.02)
+
+
+def test_refinement_reproduces_polynomials_of_the_coarse_degree():
+    law = DisturbanceLaw("uniform", np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.5, 2.0]))
+    coarse, fine = law.rule((4, 3, 2)), law.rule((9, 8, 5))
+
+    def polynomial(nodes):
+        x, y, z = nodes.T
+        return np.stack([x**3 * y**2 * z, 1 + x - y * z])
+
+    carried = Refinement(coarse, fine)(polynomial(coarse.nodes))
+    np.testing.assert_allclose(carried, polynomial(fine.nodes), rtol=1e-12, atol=1e-12)
+
+
+UNARY = {
+    "neg": lambda a: -a,
+    "square": lambda a: a * a,
+    "twice": lambda a: 2 * a,
+    "inverse": lambda a: 1 / a,
+    "exp": ca.exp,
+    "log": ca.log,
+    "log1p": ca.log1p,
+    "expm1": ca.expm1,
+    "sqrt": ca.sqrt,
+    "power": lambda a: a**2.5,
+    "sin": ca.sin,
+    "cos": ca.cos,
+    "tan": ca.tan,
+    "asin": ca.asin,
+    "acos": ca.acos,
+    "atan": ca.atan,
+    "sinh": ca.sinh,
+    "cosh": ca.cosh,
+    "tanh": ca.tanh,
+    "abs": ca.fabs,
+    "sign": lambda a: ca.sign(a - 0.5),
+    "floor": lambda a: ca.floor(3 * a),
+    "ceil": lambda a: ca.ceil(3 * a),
+    "not": lambda a: ca.logic_not(a > 0.5),
+}
+BINARY = {
+    "pow": lambda a, b: a**b,
+    "atan2": ca.atan2,
+    "hypot": ca.hypot,
+    "fmin": ca.fmin,
+    "fmax": ca.fmax,
+    "less": lambda a, b: a < b,
+    "less or equal": lambda a, b: a <= b,
+    "equal": lambda a, b: ca.floor(2 * a) == ca.floor(2 * b),
+    "unequal": lambda a, b: ca.floor(2 * a) != ca.floor(2 * b),
+    "and": lambda a, b: ca.logic_and(a > 0.5, b > 0.5),
+    "or": lambda a, b: ca.logic_or(a > 0.5, b > 0.5),
+    "if else": lambda a, b: ca.if_else(a > b, ca.exp(a), b),
+}
+
+
+@pytest.mark.parametrize("name", [*UNARY, *BINARY])
+def test_every_operation_agrees_with_casadi(name):
+    a, b = ca.SX.sym("a"), ca.SX.sym("b")
+    result = UNARY[name](a) if name in UNARY else BINARY[name](a, b)
+    function = ca.Function("f", [ca.vertcat(a, b)], [result])
+    points = np.random.default_rng(2).uniform(0.05, 0.95, (2, 200))
+    (values,) = Elementwise(function)(points)
+    np.testing.assert_allclose(
+        np.broadcast_to(values, 200), function.map(200)(points).full()[0], rtol=1e-14
+    )
+
+
+def test_sampled_evaporator_agrees_with_casadi_to_rounding():
+    evaporator = model()
+    function = discretise(evaporator, 60.0, 4)
+    generator = np.random.default_rng(5)
+    x, u = generator.uniform(25, 60, (2, 300)), generator.uniform(100, 400, (2, 300))
+    d = evaporator.nominal_disturbance[:, None] * generator.uniform(0.8, 1.2, (4, 300))
+    p = evaporator.nominal_parameters
+    expected = function.map(300)(x, u, d, np.tile(p[:, None], (1, 300))).full()
+    np.testing.assert_allclose(Elementwise(function)(x, u, d, p), expected, rtol=1e-13)
+
+
+LOWER, UPPER = np.array([-4.0, -4.0]), np.array([4.0, 4.0])
+
+
+def minimise(function, start, size=0.5, iterations=200, precision=1e-12):
+    start = np.array(start, dtype=float)
+    return nelder_mead(
+        function,
+        start,
+        np.full(start.shape, size),
+        LOWER,
+        UPPER,
+        iterations=iterations,
+        precision=precision,
+    )
+
+
+def test_each_of_many_quadratics_is_minimised():
+    generator = np.random.default_rng(0)
+    roots = generator.normal(size=(50, 2, 2)) + 1.5 * np.eye(2)
+    centres = generator.uniform(-3, 3, (50, 2))
+
+    def function(rows, points):
+        return np.square(np.einsum("bij,bj->bi", roots[rows], points - centres[rows])).sum(axis=1)
+
+    points, values = minimise(function, np.zeros((50, 2)))
+    np.testing.assert_allclose(points, centres, atol=1e-4)
+    assert values.max() < 1e-10
+
+
+def test_box_constrained_quadratic_agrees_with_scipy():
+    matrix, centre = np.array([[2.0, 0.8], [0.8, 1.0]]), np.array([6.0, 1.0])
+
+    def function(rows, points):
+        return np.einsum("bi,ij,bj->b", points - centre, matrix, points - centre)
+
+    point, value = minimise(function, [[0.0, 0.0]])
+    expected = scipy.optimize.minimize(
+        lambda x: (x - centre) @ matrix @ (x - centre),
+        np.zeros(2),
+        bounds=list(zip(LOWER, UPPER, strict=True)),
+        method="L-BFGS-B",
+    )
+    np.testing.assert_allclose(point[0], expected.x, atol=1e-4)
+    assert value[0] == pytest.approx(expected.fun, rel=1e-6)
+
+
+def test_search_follows_a_steep_kinked_valley():
+    # As the penalty makes it: slope 1e5 across, gentle along, not aligned with the axes.
+    def function(rows, points):
+        x, y = points.T
+        return 1e5 * np.maximum(x - 0.3 * y, 0.0) - 60 * (x - 0.3 * y) + 0.05 * (y - 2.0) ** 2
+
+    point, value = minimise(function, [[-1.0, -2.0]], iterations=400)
+    assert value[0] == pytest.approx(0.0, abs=2e-3)
+    np.testing.assert_allclose(point[0], [0.6, 2.0], atol=0.2)
+
+
+def test_result_is_never_worse_than_the_start_nor_outside_the_box():
+    def function(rows, points):
+        return np.sin(9 * points[:, 0]) * np.cos(7 * points[:, 1]) + 0.1 * points.sum(axis=1)
+
+    start = np.random.default_rng(1).uniform(-4, 4, (200, 2))
+    points, values = minimise(function, start, iterations=7)
+    rows = np.arange(200)
+    assert (values <= function(rows, start)).all()
+    np.testing.assert_array_equal(values, function(rows, points))
+    assert ((points >= LOWER) & (points <= UPPER)).all()
+
+
+def test_scan_finds_the_better_basin_and_keeps_a_good_start():
+    def function(rows, points):
+        return np.minimum(
+            np.square(points - 3.0).sum(axis=1) - 1.0, np.square(points + 2.0).sum(axis=1)
+        )
+
+    start = np.array([[-2.0, -2.0], [3.0, 3.0]])
+    points, values = scan(function, start, LOWER, UPPER, 9)
+    np.testing.assert_array_equal(points, [[3.0, 3.0], [3.0, 3.0]])
+    np.testing.assert_array_equal(values, [-1.0, -1.0])

@@ -1,0 +1,327 @@
+"""Q(s, a) where the enforced action puts the next state exactly on its bound."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from controllers.errors import QpError
+from controllers.qp import QpSolution, SoftQp, kkt_solve, make_backend, multipliers_at_kink, polish
+from tests.helpers.scalar import CASES, scalar_qp, solution
+from tests.helpers.stored import prepared, qps, solve
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """Every ninth stored QP with its solution."""
+    return list(solve("daqp", range(0, len(qps()), 9)))
+
+
+def moved(answer, name, index, step):
+    parts = {part: value.copy() for part, value in answer._asdict().items()}
+    parts[name][index] += step
+    return QpSolution(**parts)
+
+
+def rows_qp(rows):
+    rows = np.array(rows, dtype=float)
+    count, size = rows.shape
+    return SoftQp(
+        H=np.eye(size),
+        f=np.zeros(size),
+        lower=np.full(size, -10.0),
+        upper=np.full(size, 10.0),
+        rows=rows,
+        row_lower=np.full(count, -100.0),
+        row_upper=np.zeros(count),
+        w=np.ones(count),
+        W=np.ones(count),
+    )
+
+
+# objective and slack --------------------------------------------------------------------------
+
+
+# residuals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_residuals_vanish_at_the_solution(case):
+    (f, w, W), expected = CASES[case]
+    residuals = solution(*expected).residuals(scalar_qp(f, w=w, W=W))
+    assert max(residuals) < 1e-14
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", ["v", "nu", "lam"])
+@pytest.mark.parametrize("step", [-1e-3, 1e-3])
+def test_any_change_of_the_solution_shows(case, name, step):
+    (f, w, W), expected = CASES[case]
+    changed = moved(solution(*expected), name, 0, step)
+    assert changed.residuals(scalar_qp(f, w=w, W=W)).largest > 1e-5
+
+
+# activity -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_active_names_the_branch(case):
+    (f, w, W), expected = CASES[case]
+    held, at_limit, violated = solution(*expected).active(scalar_qp(f, w=w, W=W))
+    assert held[0] == case.startswith("saturated")
+    assert at_limit[0] == (case == "at the limit")
+    assert violated[0] == (case.startswith("violated") or case == "saturated")
+
+
+@pytest.mark.parametrize(
+    ("qp", "answer"),
+    [
+        (scalar_qp(-1.0), (1.0, 0.0, 0.0)),  # reaches the limit with λ = 0
+        (scalar_qp(-2.0), (1.0, 0.0, 1.0)),  # about to leave the limit: λ = w
+        (scalar_qp(-10.0, limit=50.0), (10.0, 0.0, 0.0)),  # reaches the bound with ν = 0
+    ],
+)
+def test_weak_activity_is_flagged(qp, answer):
+    assert solution(*answer).residuals(qp).largest == 0.0
+    assert solution(*answer).weakly_active(qp)
+
+
+def test_a_row_at_its_limit_that_nothing_moves_is_flagged():
+    qp = scalar_qp(-1.5)
+    qp.lower[:] = qp.upper[:] = 1.0
+    assert solution(1.0, 0.0, 0.5).weakly_active(qp)
+
+
+# licq -----------------------------------------------------------------------------------------
+
+
+def licq(rows, active):
+    lam = np.where(active, 0.5, 0.0)
+    size = len(rows[0])
+    return QpSolution(np.zeros(size), np.zeros(size), lam).licq_margin(rows_qp(rows))
+
+
+def test_the_margin_is_the_sine_of_half_the_angle_between_two_rows():
+    angle = 0.3
+    margin = licq([[1, 0], [np.cos(angle), np.sin(angle)]], [True, True])
+    assert margin == pytest.approx(np.sqrt(2) * np.sin(angle / 2))
+
+
+@pytest.mark.parametrize("rows", [[[1, 1], [2, 2]], [[0, 0], [1, 0]], [[1, 0], [0, 1], [1, 1]]])
+def test_dependent_rows_have_no_margin(rows):
+    assert licq(rows, [True] * len(rows)) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_the_stored_set_holds_what_it_is_for():
+    answers = list(solve("daqp"))
+    assert len(answers) == len(qps()) >= 300
+    assert sum(answer.enforced for answer in answers) >= 150
+    assert sum(bool((answer.slack > 1e-6).any()) for answer in answers) >= 80
+    free = [answer.multipliers.nu[2 if answer.enforced else 0 :] for answer in answers]
+    assert sum(bool((np.abs(nu) > 1e-6).any()) for nu in free) >= 80
+    assert max(float(np.abs(answer.multipliers.lam).max()) for answer in answers) > 9e4
+    assert {qp.hessian for qp in qps()} == {"gauss-newton", "exact"}
+
+
+def test_polishing_mends_inaccurate_solutions_of_real_qps(rng):
+    for answer in solve("daqp", range(0, 480, 17)):
+        exact = answer.multipliers
+        rough = QpSolution(*(part * (1 + 1e-7 * rng.normal(size=part.size)) for part in exact))
+        assert polish(answer.qp, rough).residuals(answer.qp).largest < 1e-9
+
+
+def test_a_solution_on_the_wrong_active_set_is_left_alone():
+    qp = scalar_qp(-3.0)
+    wrong = solution(0.9, 0.0, 0.0)
+    assert polish(qp, wrong).residuals(qp).largest <= wrong.residuals(qp).largest
+
+
+def test_rows_of_the_inverse_solve_the_kkt_system(rng):
+    for answer in solve("daqp", range(0, 480, 17)):
+        qp, active = answer.qp, answer.multipliers.active(answer.qp)
+        held, at_limit, violated = active
+        seeds = rng.normal(size=(2, qp.f.size))
+        v, lam = kkt_solve(qp, active, seeds, np.zeros((2, qp.w.size)))
+        W = np.where(violated, 2 * qp.W, 0)
+        left = v @ qp.H + (v @ qp.rows.T * W) @ qp.rows + lam @ qp.rows
+        np.testing.assert_allclose(left[:, ~held], seeds[:, ~held], atol=1e-8)
+        assert not v[:, held].any()
+        assert not lam[:, ~at_limit].any()
+
+
+def test_dependent_rows_get_the_least_multipliers():
+    qp = scalar_qp(-1.5)
+    qp.rows, qp.w, qp.W = np.ones((2, 1)), np.ones(2), np.ones(2)
+    active = (np.array([False]), np.array([True, True]), np.array([False, False]))
+    v, lam = kkt_solve(qp, active, np.array([[1.5]]), np.array([[1.0, 1.0]]))
+    np.testing.assert_allclose(v, [[1.0]], atol=1e-12)
+    np.testing.assert_allclose(lam, [[0.25, 0.25]], atol=1e-12)
+
+
+FREE = np.array([-10.0]), np.array([10.0])
+
+
+def enforced(f, v):
+    qp = scalar_qp(f)
+    qp.lower[:] = qp.upper[:] = v
+    return qp
+
+
+def test_away_from_the_kink_nothing_changes():
+    qp = enforced(-3.0, 2.0)
+    before = solution(2.0, -2.0, 3.0)
+    assert multipliers_at_kink(qp, before, *FREE) is before
+
+
+@pytest.mark.parametrize("lam", [0.0, 0.3, 1.0])
+def test_at_the_policy_the_multipliers_are_those_of_the_value(lam):
+    # f = −1.5: the policy is v = 1 with λ = 0.5, ν = 0; any λ in [0, 1] solves Q(s, 1).
+    settled = multipliers_at_kink(enforced(-1.5, 1.0), solution(1.0, 0.5 - lam, lam), *FREE)
+    np.testing.assert_allclose(np.ravel(settled), [1.0, 0.0, 0.5], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("f", "expected"),
+    [
+        (-3.0, (1.0, 1.0, 1.0)),  # the policy lies above: one more unit of a gains 1
+        (0.5, (1.0, -1.5, 0.0)),  # the policy lies below
+    ],
+)
+def test_elsewhere_the_multipliers_stay_within_their_range(f, expected):
+    settled = multipliers_at_kink(enforced(f, 1.0), solution(1.0, -f - 1.0 - 0.3, 0.3), *FREE)
+    np.testing.assert_allclose(np.ravel(settled), expected, atol=1e-15)
+
+
+def test_the_action_gradient_lies_between_the_one_sided_derivatives():
+    checked = 0
+    for nmpc, qp in prepared("daqp", range(0, 480, 8)):
+        policy = nmpc.feedback(qp.s)
+        at = nmpc.feedback(qp.s, policy.action)
+        if at.licq:
+            continue
+        checked += 1
+        for i in range(2):
+            step = np.zeros(2)
+            step[i] = 1e-5
+            ahead = (nmpc.action_value(qp.s, policy.action + step) - at.value) / 1e-5
+            behind = (at.value - nmpc.action_value(qp.s, policy.action - step)) / 1e-5
+            slack = 1e-3 * max(1.0, abs(ahead), abs(behind))
+            assert behind - slack <= at.action_gradient[i] <= ahead + slack
+    assert checked > 5
+
+
+QPSOLVERS = ["proxqp", *(f"qpsolvers:{name}" for name in ("clarabel", "daqp", "quadprog"))]
+EVERY = ["daqp", *QPSOLVERS]
+
+
+def read_out(answer):
+    """z = (x, u, slack) and all multipliers of one solution."""
+    return {
+        "states": answer.predicted_states,
+        "controls": answer.predicted_actions,
+        "slack": answer.slack,
+        "multipliers of bounds": answer.multipliers.nu,
+        "multipliers of rows": answer.multipliers.lam,
+        "costates": answer.costates,
+    }
+
+
+@lru_cache(maxsize=1)
+def reference():
+    return [read_out(answer) for answer in solve("daqp")]
+
+
+def assert_agreement(backend, picked):
+    """To 1e-6 relative to max(1, |·|): multipliers reach 1e5, the slack's linear weight."""
+    for k, answer in zip(picked, solve(backend, picked), strict=True):
+        assert answer.residual < 2e-9
+        for name, value in read_out(answer).items():
+            expected = reference()[k][name]
+            error = np.abs(value - expected) / np.maximum(1, np.abs(expected))
+            assert error.max() <= 1e-6, f"QP {k}: {name} of {backend} differ by {error.max():.1e}"
+
+
+@pytest.mark.parametrize("backend", EVERY)
+@pytest.mark.parametrize("case", CASES)
+def test_a_closed_form_solution_is_found(backend, case):
+    (f, w, W), expected = CASES[case]
+    qp = scalar_qp(f, w=w, W=W)
+    solver = make_backend(backend)
+    solver.load(qp)
+    np.testing.assert_allclose(np.ravel(solver.solve(qp)), expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", EVERY)
+def test_a_fixed_variable_stays_and_has_its_multiplier(backend):
+    qp = scalar_qp(-3.0)
+    qp.lower[:] = qp.upper[:] = 2.0
+    solver = make_backend(backend)
+    solver.load(qp)
+    # v + f + ν + λ = 0 with λ = 1 + 2·1
+    np.testing.assert_allclose(np.ravel(solver.solve(qp)), [2.0, -2.0, 3.0], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", QPSOLVERS)
+def test_qpsolvers_agrees_on_a_part_of_the_stored_set(backend):
+    assert_agreement(backend, range(0, len(qps()), 11))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", QPSOLVERS)
+def test_qpsolvers_agrees_on_the_whole_stored_set(backend):
+    assert_agreement(backend, range(len(qps())))
+
+
+def test_daqp_gives_the_same_bits_whatever_it_solved_before():
+    picked = range(0, len(qps()), 5)
+    first = dict(zip(picked, solve("daqp", picked), strict=True))
+    shuffled = list(reversed(first))
+    for k, again in zip(shuffled, solve("daqp", shuffled), strict=True):
+        for before, after in zip(first[k].multipliers, again.multipliers, strict=True):
+            assert before.tobytes() == after.tobytes()
+
+
+# failures -------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("backend", EVERY)
+def test_an_infeasible_qp_raises_and_is_carried(backend):
+    qp = scalar_qp(-1.0)
+    qp.lower[:], qp.upper[:] = 2.0, 1.0
+    solver = make_backend(backend)
+    with pytest.raises(QpError) as caught:
+        solver.load(qp)
+        solver.solve(qp)
+    assert caught.value.status
+    assert caught.value.is_solver_failure
+    assert caught.value.qp is not qp
+    np.testing.assert_array_equal(caught.value.qp.lower, qp.lower)
+
+
+@pytest.mark.parametrize("backend", EVERY)
+def test_a_qp_that_is_not_convex_raises_and_is_carried(backend):
+    qp = scalar_qp(-1.0)
+    qp.H[:] = -1.0
+    solver = make_backend(backend)
+    with pytest.raises(QpError) as caught:
+        solver.load(qp)
+        solver.solve(qp)
+    assert caught.value.status == "not convex"
+    np.testing.assert_array_equal(caught.value.qp.H, qp.H)
+
+
+@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
+def test_a_backend_recovers_from_a_failure(backend):
+    solver = make_backend(backend)
+    bad, good = scalar_qp(-1.5), scalar_qp(-1.5)
+    bad.lower[:], bad.upper[:] = 2.0, 1.0
+    for qp in (good, bad):
+        try:
+            solver.load(qp)
+            solver.solve(qp)
+        except QpError:
+            assert qp is bad
+    solver.load(good)
+    _, expected = CASES["at the limit"]
+    np.testing.assert_allclose(np.ravel(solver.solve(good)), expected, rtol=0, atol=1e-8)

@@ -1,11 +1,10 @@
-"""C sources and a model description made an FMU: platforms, compilers, archives that repeat."""
+"""C sources and a model description made an FMU: compilers, archives that repeat."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.util
 import os
-import platform as host
 import shutil
 import struct
 import subprocess
@@ -21,7 +20,7 @@ from xml.etree import ElementTree
 import fmpy
 
 from cosim.files import replacing, temporary_folder
-from fmus import BuildError
+from fmus import PLATFORMS, UNIVERSAL, BuildError, Platform, present
 from fmus.model import (
     C_IDENTIFIER,
     FmiVersion,
@@ -38,78 +37,6 @@ SOURCES = PACKAGE / "sources"
 RESOURCES = PACKAGE / "resources"
 
 
-@dataclass(frozen=True)
-class Platform:
-    """A platform by its FMI 3.0 tuple.
-
-    Its folder under ``binaries/`` in FMI 2.0, the suffix of shared libraries there, and the target
-    by which the cross-compiler knows it.
-    """
-
-    tuple: str
-    fmi2_folder: str
-    suffix: str
-    target: str
-
-    def folder(self, fmi_version: str) -> str:
-        """The name of its folder under ``binaries/`` in FMI `fmi_version`."""
-        return self.fmi2_folder if fmi_version.startswith("2") else self.tuple
-
-
-PLATFORMS = (
-    Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
-    Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
-    Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu"),
-    Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos.11.0"),
-    Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos.11.0"),
-)
-
-_ARCHITECTURES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
-_SYSTEMS = {"linux": "linux", "win32": "windows", "darwin": "darwin"}
-
-
-def present() -> Platform:
-    """The platform at hand; raises BuildError for one that is not in `PLATFORMS`."""
-    machine = host.machine().lower()
-    name = f"{_ARCHITECTURES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
-    for platform in PLATFORMS:
-        if platform.tuple == name:
-            return platform
-    known = ", ".join(platform.tuple for platform in PLATFORMS)
-    raise BuildError(f"no binaries are built for {name}; known are {known}")
-
-
-_ELF = {0x3E: "x86_64", 0xB7: "aarch64", 0x03: "x86", 0x28: "aarch32"}
-_PE = {0x8664: "x86_64", 0xAA64: "aarch64", 0x14C: "x86", 0x1C4: "aarch32"}
-_MACH_O = {0x01000007: "x86_64", 0x0100000C: "aarch64", 7: "x86"}
-_UNIVERSAL, _MACH_O_64, _MACH_O_32 = 0xCAFEBABE, 0xFEEDFACF, 0xFEEDFACE
-
-
-def platforms_of(library: bytes) -> tuple[str, ...]:
-    """FMI 3.0's tuples of the platforms that can load `library`: none where it is no library.
-
-    Several for macOS' universal binaries. An architecture unknown here reads ``?``.
-    """
-    try:
-        if library[:4] == b"\x7fELF":
-            order = "<" if library[5] == 1 else ">"
-            return (f"{_ELF.get(struct.unpack_from(order + 'H', library, 18)[0], '?')}-linux",)
-        if library[:2] == b"MZ":
-            start = struct.unpack_from("<I", library, 0x3C)[0]
-            if library[start : start + 4] == b"PE\0\0":
-                machine = struct.unpack_from("<H", library, start + 4)[0]
-                return (f"{_PE.get(machine, '?')}-windows",)
-        if struct.unpack_from("<I", library)[0] in (_MACH_O_64, _MACH_O_32):
-            return (f"{_MACH_O.get(struct.unpack_from('<I', library, 4)[0], '?')}-darwin",)
-        magic, count = struct.unpack_from(">II", library)
-        if magic == _UNIVERSAL and count < 10:
-            codes = (struct.unpack_from(">I", library, 8 + 20 * i)[0] for i in range(count))
-            return tuple(f"{_MACH_O.get(code, '?')}-darwin" for code in codes)
-    except (struct.error, IndexError):
-        pass
-    return ()
-
-
 _ALIGNMENT = 14  # binary digits: pages of 16 KiB on Apple silicon
 
 
@@ -119,7 +46,7 @@ def universal_binary(libraries: Sequence[bytes]) -> bytes:
     The layout is that of ``fat_header`` and ``fat_arch`` in macOS' mach-o/fat.h.
     """
     page = 1 << _ALIGNMENT
-    table = struct.pack(">II", _UNIVERSAL, len(libraries))
+    table = struct.pack(">II", UNIVERSAL, len(libraries))
     body = b""
     for library in libraries:
         architecture = struct.unpack_from("<II", library, 4)  # cputype, cpusubtype

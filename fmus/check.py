@@ -16,8 +16,7 @@ from fmpy.model_description import ModelDescription
 from fmpy.validation import validate_fmu
 from lxml import etree
 
-from fmus import CheckError, FmuError
-from fmus.build import platforms_of
+from fmus import CheckError, FmuError, platforms_of
 
 _INTERFACES = {
     "CoSimulation": "co-simulation",

@@ -47,7 +47,7 @@ def export(
         from cosim.errors import CosimError
         from cosim.plant import FmuPlant
         from cosim.scenario import Scenario
-        from fmus.build import PLATFORMS, present
+        from fmus import PLATFORMS, present
         from fmus.model import FmiVersion
 
         for target in [out] if ssp is None else [out, ssp]:

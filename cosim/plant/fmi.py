@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 import fmus
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import cache_folder, temporary_folder
-from fmus.build import platforms_of, present
+from fmus import platforms_of, present
 from fmus.model import C_IDENTIFIER
 
 SHIPPED = (*fmus.NAMES, *fmus.PLANTS)

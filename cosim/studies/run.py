@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import os
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from time import perf_counter
 from typing import Any
 
@@ -27,12 +33,15 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import measure, simulate
 from cosim.studies import operation
-from cosim.studies.cluster import on_cluster
 from cosim.studies.plan import EVALUATION, Noise, Plan, Run, Study, Training, plan
 from cosim.studies.results import StudyResults
 from cosim.studies.store import CHECKPOINT, FAILURE, Measured, RunStore, Trained
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
+ANSWER_SECONDS = 10.0
+"""Time in which a scheduler answers."""
+WORKER_SECONDS = 300.0
+"""Time for which a cluster may be without a worker while there is work."""
 BLOCK = 20_000
 """Samples of an item of evaluation, about: a few seconds of work."""
 NONE = Noise((), 0)
@@ -313,7 +322,7 @@ def _outcomes(
 ) -> Generator[tuple[Item, Outcome], None, None]:
     """Do items in this process, in `jobs` processes or on a cluster, in no certain order."""
     if scheduler is not None:
-        yield from on_cluster(scheduler, perform, items)
+        yield from _on_cluster(scheduler, items)
         return
     if jobs == 1:
         yield from map(perform, items)
@@ -336,6 +345,127 @@ def _begin(parent: int) -> None:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     follow_parent(parent)
+
+
+def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome]]:
+    """Do items on the workers of a scheduler that somebody else runs, in the order they end.
+
+    A scheduler that dies or is silent ends in EvaluationError, of one line.
+    """
+    with _client(address) as (dask, client), _translated(dask, address):
+        ended: SimpleQueue[Any] = SimpleQueue()
+        futures = client.map(perform, items, pure=False)
+        for future in futures:
+            future.add_done_callback(ended.put)
+        worked = time.monotonic()
+        for _ in items:
+            while True:
+                try:
+                    future = ended.get(timeout=ANSWER_SECONDS)
+                    break
+                except Empty:
+                    if asyncio.run(_identity(dask, address))["workers"]:
+                        worked = time.monotonic()
+                    elif time.monotonic() - worked > WORKER_SECONDS:
+                        raise _without_worker(address) from None
+            yield future.result()
+
+
+@contextmanager
+def _client(address: str) -> Iterator[tuple[Any, Any]]:
+    """Dask and a client of a scheduler that has just answered and has a worker."""
+    try:
+        dask: Any = import_module("distributed")
+    except ImportError:
+        raise EvaluationError(
+            "a Dask scheduler needs the extra 'cluster': pip install 'rti-cosim[cluster]'"
+        ) from None
+    with _quiet():
+        # A client made for an address where nobody answers can hang when it is dropped.
+        try:
+            found = asyncio.run(_identity(dask, address))
+            if not isinstance(found, dict) or found.get("type") != "Scheduler":
+                raise ValueError("what answers is no scheduler")
+            client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
+        except Exception as error:
+            raise EvaluationError(
+                f"the Dask cluster at '{address}' does not answer: {_line(error)}"
+            ) from None
+        try:
+            client.wait_for_workers(1, timeout=WORKER_SECONDS)
+            yield dask, client
+        except TimeoutError:
+            raise _without_worker(address) from None
+        finally:
+            with suppress(Exception):
+                client.close(timeout=ANSWER_SECONDS)
+
+
+@contextmanager
+def _translated(dask: Any, address: str) -> Iterator[None]:
+    """Say in a line what becomes of a cluster."""
+    same = (
+        "install the same version of rti-cosim, and what the items need, on scheduler and workers"
+    )
+    try:
+        yield
+    except dask.KilledWorker as error:
+        text = f"workers of the cluster died again and again: {_line(error)}"
+    except ModuleNotFoundError as error:
+        text = f"a worker of the cluster cannot import '{error.name}'; {same}"
+    except (CancelledError, OSError, TimeoutError) as error:
+        text = (
+            f"the Dask cluster at '{address}' is gone or does not answer ({_line(error)}); what is "
+            "finished is stored: the same command goes on"
+        )
+    except RuntimeError as error:
+        if "deserialization" not in str(error):
+            raise
+        text = f"the Dask cluster at '{address}' cannot read its items; {same}"
+    else:
+        return
+    raise EvaluationError(text)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence Dask's log: the exception says what went wrong, once."""
+    names = [n for n in logging.Logger.manager.loggerDict if n.partition(".")[0] == "distributed"]
+    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in levels:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)
+
+
+def _without_worker(address: str) -> EvaluationError:
+    return EvaluationError(
+        f"the Dask cluster at '{address}' has had no worker for {WORKER_SECONDS:g} s; start some, "
+        f"with the same version of rti-cosim: dask worker {address}"
+    )
+
+
+async def _identity(dask: Any, address: str) -> Any:
+    """What a scheduler says of itself; raises TimeoutError where it says nothing."""
+    connect = import_module("distributed.comm").connect
+    async with asyncio.timeout(ANSWER_SECONDS):
+        security = dask.Security().get_connection_args("client")
+        comm = await connect(address, timeout=ANSWER_SECONDS, **security)
+        try:
+            await comm.write({"op": "identity", "reply": True})
+            return await comm.read()
+        finally:
+            comm.abort()
+
+
+def _line(error: BaseException) -> str:
+    """What an error says, or is, in at most a line."""
+    if isinstance(error, TimeoutError):
+        return f"no answer within {ANSWER_SECONDS:g} s"
+    return " ".join(str(error).split())[:300] or type(error).__name__
 
 
 def study(

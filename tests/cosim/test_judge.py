@@ -12,7 +12,7 @@ import pytest
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario, simulate
 from cosim.errors import EvaluationError
-from cosim.judge import judge
+from cosim.evaluation import judge
 from cosim.simulation import indicators
 from tests.helpers.loop import Hold
 

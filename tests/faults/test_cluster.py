@@ -11,7 +11,7 @@ import pytest
 from controllers.factories import naive
 from cosim import evaluate
 from cosim.errors import EvaluationError
-from cosim.studies import cluster as engine
+from cosim.studies import run as engine
 from tests.helpers.command import run_cosim
 from tests.helpers.schedulers import ANSWERS, PACKAGES, ROOT, listener, processes
 

@@ -54,16 +54,6 @@ def test_the_same_command_and_seed_give_the_same_bytes(cosim, trained, tmp_path)
         assert (tmp_path / "again" / file).read_bytes() == (trained[0] / file).read_bytes()
 
 
-def test_an_evaluation_knows_the_regret_without_naming_the_optimum(cosim):
-    named = ("-c", "tuned", "-c", "same=tuned")
-    code, out, _ = cosim("evaluate", *named, "--seeds", 2, "-n", 20, "-j", 1, "--json")
-    assert code == 0
-    summary = json.loads(out)
-    assert summary["controllers"].keys() == {"tuned", "same"}
-    assert summary["optimum"] == "optimal"
-    assert summary["controllers"]["tuned"]["regret"]["value"] is not None
-
-
 def test_training_starts_from_tuned_and_from_a_file(cosim, undrawn):
     slow = (*SHORT, "--set", "prior_width=1e-3")
     code, out, _ = cosim(*slow, "--start", "tuned", "--out", "one", "--json")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.importers import check
 from cosim.text_tables import markdown_table
-from fmus.build import PLATFORMS
+from fmus import PLATFORMS
 from fmus.model import FmiVersion
 from tests.helpers.platforms import (
     LAWS,

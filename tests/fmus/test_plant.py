@@ -10,8 +10,8 @@ import fmpy
 import numpy as np
 import pytest
 
-from fmus import BuildError
-from fmus.build import PLATFORMS, build_folder, present
+from fmus import PLATFORMS, BuildError, present
+from fmus.build import build_folder
 from fmus.model import Kind
 from fmus.plant import Signal, build_plant, plant_model
 

@@ -9,7 +9,7 @@ from tempfile import mkdtemp
 
 import fmpy
 
-from fmus.build import present
+from fmus import present
 from tests.helpers.one_state import write_one_state
 
 SOURCE = Path(__file__).parent / "foreign" / "kinds.c"

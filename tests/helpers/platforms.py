@@ -20,7 +20,8 @@ import fmus
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
-from fmus.build import PLATFORMS, SOURCES, Platform, cross_compiler
+from fmus import PLATFORMS, Platform
+from fmus.build import SOURCES, cross_compiler
 from fmus.evaporator import EVAPORATOR, HEADER
 from fmus.model import FmiVersion
 from fmus.sampled import SampledSystem, sampled_sources

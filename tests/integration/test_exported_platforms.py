@@ -9,7 +9,7 @@ from pathlib import Path
 import fmpy
 import pytest
 
-from fmus.build import PLATFORMS
+from fmus import PLATFORMS
 from fmus.check import information
 from tests.helpers.platforms import (
     MARKS,

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import fmus
-from fmus.build import PLATFORMS
+from fmus import PLATFORMS
 from fmus.evaporator import EVAPORATOR
 from tests.helpers import mach_o
 

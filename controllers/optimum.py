@@ -482,3 +482,14 @@ def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
 def stored(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy | None:
     """The same where all of it is stored, else None; solves nothing."""
     return (OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy).stored(scenario)
+
+
+def stored_optimum(scenario: Scenario) -> str | None:
+    """`optimal` where it is the plant's optimum and can be had without solving anything.
+
+    A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
+    scenario names the plant's own model.
+    """
+    if scenario.plant.foreign and scenario.plant.model is None:
+        return None
+    return None if stored(scenario) is None else "optimal"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from controllers.optimum import stored_optimum
 from cosim.errors import EvaluationError, StudyError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
@@ -23,7 +24,6 @@ from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, chec
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING, to_csv
 from cosim.text_tables import Shown
-from learning.training import stored_optimum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

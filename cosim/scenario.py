@@ -74,6 +74,11 @@ class ChangeTable(Table):
     """Tunable parameters of the FMU and their values from then on."""
 
 
+def is_file(fmu: str) -> bool:
+    """Whether an FMU is given by its path, and not by the name of a shipped one."""
+    return Path(fmu).suffix == ".fmu" or len(Path(fmu).parts) > 1
+
+
 class PlantTable(Table):
     """The FMU and the map from its variables to states, actions, disturbances and stage cost.
 
@@ -100,6 +105,11 @@ class PlantTable(Table):
     """Model of the plant for its optimum, `module:factory`, where the controller's is another."""
     mapping: MappingTable = MappingTable()
     """Table `[plant.mapping]`."""
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the FMU is a file, and not one of the shipped."""
+        return is_file(self.fmu)
 
 
 class DisturbanceTable(Table):
@@ -456,10 +466,8 @@ def resolved(
     """
     result = copy.deepcopy(dict(document))
     plant = result.get("plant")
-    if isinstance(plant, dict) and isinstance(plant.get("fmu"), str):
-        fmu = Path(plant["fmu"])
-        if fmu.suffix == ".fmu" or len(fmu.parts) > 1:
-            plant["fmu"] = str(folder / fmu)
+    if isinstance(plant, dict) and isinstance(fmu := plant.get("fmu"), str) and is_file(fmu):
+        plant["fmu"] = str(folder / fmu)
     if (base := result.pop("extends", None)) is None:
         return result
     if not isinstance(base, str):

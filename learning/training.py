@@ -17,14 +17,13 @@ import numpy as np
 from controllers import compile_functions
 from controllers.economic import tune
 from controllers.factories import nmpc
-from controllers.optimum import QuasiStaticPolicy, change_of, stored
+from controllers.optimum import QuasiStaticPolicy, change_of, stored_optimum
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
-from cosim.plant.fmi import SHIPPED
 from cosim.plugins import build_controller, depends_on
 from cosim.protocols import Array, Controller, Plant, Vector, functions_of
 from cosim.scenario import Scenario
@@ -550,17 +549,6 @@ def train(
     run = prepare(algorithm, scenario, samples, settings, fields)
     optimum = optimum or stored_optimum(scenario)
     return run_training(run, out, resume=resume, optimum=optimum, progress=progress)
-
-
-def stored_optimum(scenario: Scenario) -> str | None:
-    """`optimal` where it is the plant's optimum and can be had without solving anything.
-
-    A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
-    scenario names the plant's own model.
-    """
-    if scenario.plant.fmu not in SHIPPED and scenario.plant.model is None:
-        return None
-    return None if stored(scenario) is None else "optimal"
 
 
 def run_training(

@@ -115,8 +115,9 @@ def train(
     says why.
     """
     with cli.output(json) as out_:
+        from controllers.optimum import stored_optimum
         from learning.algorithm import load_algorithm
-        from learning.training import CHECKPOINT, prepare, run_training, stored_optimum
+        from learning.training import CHECKPOINT, prepare, run_training
 
         found = load_algorithm(algorithm)
         if explain:

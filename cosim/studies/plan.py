@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self, TypeVar, get_args, get_origin
 import numpy as np
 
 from controllers.factories import nmpc
+from controllers.optimum import stored_optimum
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.errors import StudyError
@@ -33,7 +34,7 @@ from cosim.studies.document import (
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
-from learning.training import HELD_OUT, TrainingRun, prepare, stored_optimum
+from learning.training import HELD_OUT, TrainingRun, prepare
 
 BASELINES, NAIVE = "baselines", "naive"
 EVALUATION, GREEDY, ONLINE = "evaluation.csv", "greedy.csv", "online.csv"

@@ -47,7 +47,9 @@ class BatchQLearning(ValueRule):
 
     `relinearisations` times a batch, linearised anew where the last step led to: the iterated
     filter (Gauss–Newton on the posterior). TD errors hold the next penalty's expectation and are
-    cut at ±`innovation_clip`·√r. The first batch gives noise, widths and c_f as well.
+    cut at ±`innovation_clip`·√r. Where a step moves an entry by more than `largest_step`, it and
+    what the batch tells are both cut by the same share, as online. The first batch gives noise,
+    widths and c_f as well.
     """
 
     Configuration = BatchQLearningConfiguration
@@ -114,10 +116,14 @@ class BatchQLearning(ValueRule):
             gradient = replayed.gradient * self._step.scale
             limit = settings.innovation_clip * self._variance**0.5
             innovation = np.clip(td_error, -limit, limit)
-            information = self._information + gradient.T @ gradient / self._variance
+            told = gradient.T @ gradient / self._variance
+            information = self._information + told
             slope = gradient.T @ innovation / self._variance
             slope -= self._information @ (self._present - self._mean)
-            fit = self._average_cost.take(_newton(information, slope))
+            fit = _newton(information, slope)
+            share = 1.0 / max(float(np.abs(fit.minimiser).max()) / settings.longest, 1.0)
+            information = self._information + share * told
+            fit = self._average_cost.take(fit.shrunk(share))
             update = self._step.take(fit, float(np.sqrt(np.mean(td_error**2))))
         if update is None:
             raise DivergenceError("no transition of a batch can be replayed")

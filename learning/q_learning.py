@@ -60,6 +60,9 @@ class ValueConfiguration(Configuration):
     prediction_errors: Count = Field(
         1000, description="prediction errors over which the next penalty is expected"
     )
+    largest_step: NonNegative = Field(
+        1.0, description="prior deviations by which a step may move an entry of θ; 0: no limit"
+    )
 
     @property
     def criterion(self) -> float | None:
@@ -70,6 +73,11 @@ class ValueConfiguration(Configuration):
     def following(self) -> int:
         """Samples over which the mean cost follows the TD error; 0 where the fit of θ has it."""
         return 0
+
+    @property
+    def longest(self) -> float:
+        """Prior deviations by which a step may move an entry of θ."""
+        return self.largest_step or np.inf
 
     def narrowed(self, width: float) -> Self:
         """Copy whose prior is `width` times as wide."""
@@ -91,9 +99,6 @@ class QLearningConfiguration(ValueConfiguration):
     )
     mean_cost_memory: int = Field(
         50, ge=0, description="samples over which the mean cost follows δ; 0: θ's fit has it"
-    )
-    largest_step: NonNegative = Field(
-        1.0, description="prior deviations by which a step may move an entry of θ; 0: no limit"
     )
     parameter_drift: NonNegative = Field(
         0.0,
@@ -258,7 +263,7 @@ class QLearning(ValueRule):
             settings.innovation_clip,
             settings.variance_memory,
             settings.parameter_drift,
-            settings.largest_step or np.inf,
+            settings.longest,
         )
 
     def _sample_step(self, transition: Transition) -> Update:

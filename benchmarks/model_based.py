@@ -31,6 +31,8 @@ PARTS = {
     "doubt": (model_based, "DOUBT", 0.0),  # the least promised cost, not the smallest back-off
     "tail": (model_based, "TAIL", 0.0),
     "caution": (model_based, "CAUTION", 0),
+    "reach": (model_based, "REACH", np.inf),  # a rollout is lost only where it is not finite
+    "promise": (model_based, "BROKEN", np.inf),  # no promise is ever broken
     "nothing": (model_based, "CAUTION", model_based.CAUTION),
 }
 SEEDS, STEPS, BURN = range(700_000, 700_005), 1300, 300

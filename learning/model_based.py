@@ -50,10 +50,14 @@ TAIL, TAIL_SAMPLES = 0.1, 120
 """The errors' tails are widened by `TAIL` √(`TAIL_SAMPLES` / their number)."""
 ALARM = 1e-7
 """Probability below which the mean error since the last fit speaks of another plant."""
+SUSPICION = 1e-4
+"""That probability where the promise is broken as well."""
 WINDOWS = (15, 60, 240, 960)
 """Latest samples of which that mean and the mean cost are taken, every `WINDOWS[0]` samples."""
 BROKEN = 1.5
 """Excess of such a mean cost, over that of the promise's dearest window, that breaks a promise."""
+REACH = 2.0
+"""Ranges of the latest states and costs by which a rollout's mean may differ from theirs."""
 POOL = 480
 """Number of residuals up to which those from before a change are kept."""
 CAUTION = 120
@@ -98,10 +102,10 @@ class ModelBased(Algorithm):
     """Operates with θ, fits the empirical model, searches on it, and operates on.
 
     An update is due whenever the model's data have doubled or `longest_interval` has passed, and as
-    soon as the errors since the last update have a mean that the model makes improbable, or the
-    samples are dearer than any of the rollout that promised θ's cost: then the plant has changed,
-    and the data from there on count. θ moves only where the model, on new noise, promises less for
-    the new one.
+    soon as samples are dearer than any of the rollout that promised θ's cost. Where the errors
+    since the last update have a mean that the model makes improbable, the plant has changed, and
+    the data from there on count. θ moves only where the model, on new noise, promises less for the
+    new one.
 
     With `then` a rule learns on after `hand_over` samples; the model only watches for a change of
     the plant, at which it takes over again.
@@ -149,11 +153,7 @@ class ModelBased(Algorithm):
         self._rows[self._count % len(self._rows)] = np.concatenate(row)
         self._count += 1
         if self._model is not None and (self._count - self._updated) % WINDOWS[0] == 0:
-            window = self._changed(self._model)
-            if window:
-                self._era, self._due = self._count - window, self._count
-                self._pool = self._model.residuals[-POOL:]
-                self._set_rule(None)
+            self._watch(self._model)
         if self._rule is not None:
             return self._rule.observe(transition)
         update = self._update() if self._count >= self._due else None
@@ -175,24 +175,29 @@ class ModelBased(Algorithm):
         rows = self._rows[np.arange(self._count - count, self._count) % len(self._rows)]
         return rows[:, : self._features.inputs], rows[:, self._features.inputs :]
 
-    def _changed(self, model: EmpiricalModel) -> int:
-        """Number of latest samples that speak of another plant than the model's, or 0."""
+    def _watch(self, model: EmpiricalModel) -> None:
+        """Make an update due where the promise is broken or, on new data, the plant is another."""
         (M, K), noise = model.residuals.shape, np.cov(model.residuals.T)
         if M < CAUTION:
-            return 0
+            return
         inputs, outputs = self._latest(min(self._count - self._updated, WINDOWS[-1]))
         predicted, h, designs = model.predict(inputs)
         errors = (outputs - predicted) / h
         costs = ExpectedCosts(self._problem, model)(predicted, h)[0]
         for window, limit in zip(WINDOWS, self._limits, strict=True):
             if window > len(inputs):
-                return 0
+                return
+            broken = costs[-window:].mean() > limit
+            if broken:
+                self._due = self._count
             mean, design = errors[-window:].mean(axis=0), designs[-window:].mean(axis=0)
             covariance = noise / window + design @ model.covariance @ design.T
             statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
-            if fisher.sf(statistic, K, M - K) < ALARM or costs[-window:].mean() > limit:
-                return window
-        return 0
+            if fisher.sf(statistic, K, M - K) < (SUSPICION if broken else ALARM):
+                self._era, self._due = self._count - window, self._count
+                self._pool = model.residuals[-POOL:]
+                self._set_rule(None)
+                return
 
     def _least(self, inputs: Array) -> Array:
         """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
@@ -217,15 +222,17 @@ class ModelBased(Algorithm):
         self._updated = self._count
         interval = max(age, self.configuration.first_update)
         self._due = self._count + min(interval, self.configuration.longest_interval)
-        search = BackOffs(
-            self._problem, self._rollout, self._base, self._model, inputs[-RECENT:], self.rng
-        )
+        latest, _ = self._latest(min(self._count, RECENT, len(self._rows)))
+        search = BackOffs(self._problem, self._rollout, self._base, self._model, latest, self.rng)
         found = search.best(self.back_off, self._least(inputs))
         present = self.controller.parameters
         new = search.theta(found)
         search.draw(FINE)
         promise, kept = search.promise(new), search.promise(present.theta)
-        better = search.excess(promise, kept) <= 0
+        known = np.isfinite(kept.cost)
+        better = known and search.excess(promise, kept) <= 0
+        if not known:
+            self._due = min(self._due, self._count + CAUTION)
         self._limits = (promise if better else kept).limits
         if better:
             self.back_off = found
@@ -279,8 +286,9 @@ class BackOffs:
     """Searches back-offs δ (2n,) of the lower, then the upper state bounds on an empirical model.
 
     `visited` are the latest inputs (s, a), (M, n+m), oldest first; rollouts begin at the last one's
-    state. All θ meet the same noise until the next `draw`. δ are multiples of a twentieth of the
-    error's order of magnitude, so that no last digit decides.
+    state, and are lost where their mean state or cost is far from those of these samples: the model
+    has gone where the plant has not been. All θ meet the same noise until the next `draw`. δ are
+    multiples of a twentieth of the error's order of magnitude, so that no last digit decides.
     """
 
     def __init__(
@@ -296,6 +304,8 @@ class BackOffs:
         self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
         self._start, self._rng = visited[-1, :n], rng
         self._costs = ExpectedCosts(problem, model)
+        seen = np.column_stack([visited[:, :n], self._costs(*model.predict(visited)[:2])[0]])
+        self._centre, self._reach = seen.mean(axis=0), REACH * np.ptp(seen, axis=0)
         deviation = model.residuals[:, :n].std(axis=0) * model.features(visited)[2][:, :n].mean(
             axis=0
         )
@@ -317,16 +327,20 @@ class BackOffs:
         return base.replace(moved).theta
 
     def promise(self, theta: Array) -> Promise:
-        """What the model promises of a θ; infinite cost where the loop does not stay finite."""
+        """What the model promises of a θ; infinite cost where the rollout is lost."""
         picks, model = self._picks, self._model
         parts = self._rollout(theta, self._start, model, picks)
         self.samples += len(parts[0])
         inputs, predicted, h = (part[BURN:] for part in parts)
+        lost = Promise(np.inf, np.zeros_like(model.mean), np.full(len(WINDOWS), np.inf))
         if len(inputs) < len(picks) - BURN or not np.isfinite(predicted).all():
-            return Promise(np.inf, np.zeros_like(model.mean), np.full(len(WINDOWS), np.inf))
+            return lost
         costs, penalties = self._costs(predicted, h)
         stage, cost = float(predicted[:, -1].mean()), float(costs.mean())
         self._worth = np.maximum(self._worth, penalties.mean(axis=1) / abs(stage))
+        mean = np.append(inputs[:, : len(self._start)].mean(axis=0), cost)
+        if (np.abs(mean - self._centre) > self._reach).any():
+            return lost
         dearest = np.array([_moving_mean(costs, window).max(initial=cost) for window in WINDOWS])
         limits = cost + BROKEN * (dearest - cost)
         return Promise(cost, model.cost_row(inputs[::THINNED]), limits)

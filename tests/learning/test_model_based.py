@@ -96,7 +96,8 @@ def riding(problem, base, n, slope):
     return rollout
 
 
-def test_the_back_off_of_a_known_loop_is_found(problem, base, features, rng):
+@pytest.fixture
+def search(problem, base, rng):
     residuals = np.column_stack([rng.uniform(-1.0, 1.0, (20_000, 1)), np.zeros((20_000, 2))])
     model = SimpleNamespace(
         residuals=residuals,
@@ -104,14 +105,23 @@ def test_the_back_off_of_a_known_loop_is_found(problem, base, features, rng):
         covariance=np.zeros((1, 1)),
         features=lambda visited: (None, None, np.ones((len(visited), 3))),
         cost_row=lambda inputs: np.zeros(1),
+        predict=lambda inputs: (inputs[:, :3] * [1.0, 1.0, 0.0], np.ones((len(inputs), 3)), None),
     )
     visited = np.tile([27.0, 60.0, 220.0, 230.0], (10, 1))
-    slope = 10_000.0
-    loop = riding(problem, base, 2, slope)
-    found = BackOffs(problem, loop, base, model, visited, rng).best(np.zeros(4), np.zeros(4))
+    visited[0, 0] = 20.0
+    return BackOffs(problem, riding(problem, base, 2, 10_000.0), base, model, visited, rng)
+
+
+def test_the_back_off_of_a_known_loop_is_found(search):
+    found = search.best(np.zeros(4), np.zeros(4))
     # slope = 1e5 · P(noise < −δ) at the optimum; the tails are widened by a per cent.
     assert found[0] == pytest.approx(0.8, abs=0.06)
     assert (found[1:] == 0).all()
+
+
+def test_a_loop_that_goes_where_the_plant_has_not_been_promises_nothing(search):
+    costs = [search.promise(search.theta(np.array([delta, 0, 0, 0]))).cost for delta in (14, 20)]
+    assert np.isfinite(costs).tolist() == [True, False]
 
 
 def test_back_offs_shrink_little_further_than_the_plant_has_been(scenario, base, rng):
@@ -134,7 +144,8 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, featu
         inputs, outputs = plant_data(features, rng, 240, error, offset)
         rule._rows[:240] = np.column_stack([inputs, outputs])
         rule._count = 240
-        assert rule._changed(fitted) == window
+        rule._watch(fitted)
+        assert rule._count - rule._era == (window or 240)
 
 
 def test_a_plant_that_nears_its_bound_breaks_the_promise(scenario, base, features, fitted, rng):
@@ -147,9 +158,11 @@ def test_a_plant_that_nears_its_bound_breaks_the_promise(scenario, base, feature
     cost = ExpectedCosts(rule._problem, fitted)(*fitted.predict(inputs)[:2])[0].mean()
     rule._rows[:240] = np.column_stack([inputs, outputs])
     rule._count = 240
-    for factor, window in ((1.01, 0), (0.99, 240)):
+    rule._due = 960
+    for factor, due in ((1.01, 960), (0.99, 240)):
         rule._limits = np.array([np.inf, np.inf, factor * cost, np.inf])
-        assert rule._changed(fitted) == window
+        rule._watch(fitted)
+        assert (rule._due, rule._era) == (due, 0)
 
 
 def test_the_model_takes_over_from_the_rule_at_a_change_of_the_plant(
@@ -158,11 +171,10 @@ def test_the_model_takes_over_from_the_rule_at_a_change_of_the_plant(
     run = make_run("model-based", scenario, {"then": "q-learning", "hand_over": 30})
     rule = ModelBased(tuned(scenario), scenario, run.configuration, 1000, None, rng)
     monkeypatch.setattr(rule, "_update", lambda: None)
-    monkeypatch.setattr(rule, "_changed", lambda _: 15)
     seen = []
     monkeypatch.setattr(QLearning, "observe", lambda _, transition: seen.append(transition))
-    zero = np.zeros(2)
-    sample = SimpleNamespace(s=zero, a=zero, next_s=zero, stage_cost=0.0)
+    s, a = np.array([27.0, 60.0]), np.array([220.0, 230.0])
+    sample = SimpleNamespace(s=s, a=a, next_s=2 * s, stage_cost=0.0)
     for _ in range(32):
         rule.observe(sample)
     assert (len(seen), rule.needs_action_value, rule.explores) == (2, True, True)

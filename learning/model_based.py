@@ -58,6 +58,8 @@ BROKEN = 1.5
 """Excess of such a mean cost, over that of the promise's dearest window, that breaks a promise."""
 REACH = 2.0
 """Ranges of the latest states and costs by which a rollout's mean may differ from theirs."""
+FORETOLD, EVIDENCE = 240, 3.0
+"""Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
 POOL = 480
 """Number of residuals up to which those from before a change are kept."""
 CAUTION = 120
@@ -199,6 +201,23 @@ class ModelBased(Algorithm):
                 self._set_rule(None)
                 return
 
+    def _outdated(self, inputs: Array, outputs: Array) -> int:
+        """Number of oldest samples without which the model foretells the latest quarter better."""
+        latest = len(inputs) // 4
+        if latest < FORETOLD:
+            return 0
+        older, losses = (len(inputs) - latest) // 2, []
+        models = [
+            EmpiricalModel.fit(self._features, inputs[first:-latest], outputs[first:-latest])
+            for first in (0, older)
+        ]
+        precision = np.linalg.pinv(np.cov(models[1].residuals.T))
+        for model in models:
+            predicted, h, _ = model.predict(inputs[-latest:])
+            errors = (outputs[-latest:] - predicted) / h
+            losses.append(float(np.einsum("mi,ij,mj->", errors, precision, errors)) / 2)
+        return older if losses[0] - losses[1] > EVIDENCE else 0
+
     def _least(self, inputs: Array) -> Array:
         """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
 
@@ -214,8 +233,11 @@ class ModelBased(Algorithm):
         return least
 
     def _update(self) -> Update:
+        inputs, outputs = self._latest(min(self._count - self._era, len(self._rows)))
+        if outdated := self._outdated(inputs, outputs):
+            inputs, outputs = inputs[outdated:], outputs[outdated:]
+            self._era = self._count - len(inputs)
         age = self._count - self._era
-        inputs, outputs = self._latest(min(age, len(self._rows)))
         self._model = EmpiricalModel.fit(
             self._features, inputs, outputs, self._pool[: max(POOL - age, 0)]
         )

@@ -148,6 +148,20 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, featu
         assert rule._count - rule._era == (window or 240)
 
 
+def test_data_from_before_a_slow_change_are_dropped(scenario, base, features, rng):
+    run = make_run("model-based", scenario)
+    controller = SimpleNamespace(parameters=base, theta=base.theta)
+    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+    error = np.zeros(features.count)
+    parts = []
+    for _ in range(4):
+        parts.append(plant_data(features, rng, 500, error.copy()))
+        error[0] -= 0.01
+    inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    same = np.concatenate([parts[0][0]] * 4), np.concatenate([parts[0][1]] * 4)
+    assert (rule._outdated(inputs, outputs), rule._outdated(*same)) == (750, 0)
+
+
 def test_a_plant_that_nears_its_bound_breaks_the_promise(scenario, base, features, fitted, rng):
     run = make_run("model-based", scenario)
     controller = SimpleNamespace(parameters=base, theta=base.theta)

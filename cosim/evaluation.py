@@ -367,9 +367,9 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
     A file has a column for each state and action of the scenario by name (a unit in brackets may
     follow) and a row a sample: the state, and the action that was then applied. The actions are
     played back on the seed's noise, and what the file says of the states is checked against it:
-    the figures are those of the playback. Columns `file`, `seed`, `steps`, `indicators`', and
-    `optimum` and `regret`, J of the stored optimum on the same noise, NaN where there is none.
-    Raises EvaluationError with file, sample and both values.
+    the figures are those of the playback. Columns `file`, `scenario` and its hash, `seed`, `steps`,
+    `indicators`', and `optimum` and `regret`, J of the stored optimum on the same noise, NaN where
+    there is none. Raises EvaluationError with file, sample and both values.
     """
     paths = sorted(folder.glob("*.csv"))
     if not paths:
@@ -379,7 +379,8 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
     with FmuPlant(scenario) as plant:
         for path in paths:
             seed, recorded, steps = _read(path, scenario)
-            row: dict[str, Any] = {"file": path.name, "seed": seed, "steps": steps}
+            row: dict[str, Any] = {"file": path.name, "scenario": scenario.name}
+            row |= {"scenario_hash": scenario.hash, "seed": seed, "steps": steps}
             row |= indicators(simulate(plant, recorded, steps, seed, residuals=False))
             cost = np.nan if optimum is None else measure(plant, optimum, seed, steps)[0]["J"]
             rows.append(row | {"optimum": cost, "regret": row["J"] / cost - 1})

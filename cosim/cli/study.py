@@ -267,3 +267,17 @@ def update(
         stored.write_readme(folder, studies)
         out_.note(f"stored {', '.join(names or studies)} in {folder.resolve()}")
         out_.json({"updated": list(names or studies)})
+
+
+@results.command()
+def board(
+    folder: Annotated[Path, typer.Argument(help="Folder of entries.")] = Path("results/board"),
+    json: cli.JsonOption = False,
+) -> None:
+    """Check a board's entries, play their runs back, and write the board's README.md."""
+    with cli.output(json) as out_:
+        from cosim.studies.stored import write_board
+
+        names = write_board(folder)
+        out_.note(f"entries: {', '.join(names)}")
+        out_.json({"entries": names})

@@ -33,6 +33,7 @@ PARTS = {
     "caution": (model_based, "CAUTION", 0),
     "reach": (model_based, "REACH", np.inf),  # a rollout is lost only where it is not finite
     "promise": (model_based, "BROKEN", np.inf),  # no promise is ever broken
+    "dropping": (model_based, "EVIDENCE", np.inf),  # the fit uses all data since the last change
     "nothing": (model_based, "CAUTION", model_based.CAUTION),
 }
 SEEDS, STEPS, BURN = range(700_000, 700_005), 1300, 300

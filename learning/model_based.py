@@ -54,10 +54,12 @@ SUSPICION = 1e-4
 """That probability where the promise is broken as well."""
 WINDOWS = (15, 60, 240, 960)
 """Latest samples of which that mean and the mean cost are taken, every `WINDOWS[0]` samples."""
+SETTLING = 30
+"""Samples after an update that do not break its promise, which is of a loop that has settled."""
 BROKEN = 1.5
 """Excess of such a mean cost, over that of the promise's dearest window, that breaks a promise."""
 REACH = 2.0
-"""Ranges of the latest states and costs by which a rollout's mean may differ from theirs."""
+"""Ranges of the latest states by which a rollout's mean may differ from theirs."""
 FORETOLD, EVIDENCE = 240, 3.0
 """Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
 POOL = 480
@@ -189,7 +191,7 @@ class ModelBased(Algorithm):
         for window, limit in zip(WINDOWS, self._limits, strict=True):
             if window > len(inputs):
                 return
-            broken = costs[-window:].mean() > limit
+            broken = len(inputs) > SETTLING and costs[-window:].mean() > limit
             if broken:
                 self._due = self._count
             mean, design = errors[-window:].mean(axis=0), designs[-window:].mean(axis=0)
@@ -251,11 +253,10 @@ class ModelBased(Algorithm):
         new = search.theta(found)
         search.draw(FINE)
         promise, kept = search.promise(new), search.promise(present.theta)
-        known = np.isfinite(kept.cost)
-        better = known and search.excess(promise, kept) <= 0
-        if not known:
-            self._due = min(self._due, self._count + CAUTION)
+        better = search.excess(promise, kept) <= 0
         self._limits = (promise if better else kept).limits
+        if not np.isfinite(self._limits).all():
+            self._due = min(self._due, self._count + WINDOWS[-2])
         if better:
             self.back_off = found
             self.controller.theta = new
@@ -308,9 +309,10 @@ class BackOffs:
     """Searches back-offs δ (2n,) of the lower, then the upper state bounds on an empirical model.
 
     `visited` are the latest inputs (s, a), (M, n+m), oldest first; rollouts begin at the last one's
-    state, and are lost where their mean state or cost is far from those of these samples: the model
-    has gone where the plant has not been. All θ meet the same noise until the next `draw`. δ are
-    multiples of a twentieth of the error's order of magnitude, so that no last digit decides.
+    state, and are lost where they cost more on average than the dearest of these samples, or their
+    mean state is far from that of `RECENT` of them: the model has gone where the plant has not
+    been. All θ meet the same noise until the next `draw`. δ are multiples of a twentieth of the
+    error's order of magnitude, so that no last digit decides.
     """
 
     def __init__(
@@ -326,8 +328,11 @@ class BackOffs:
         self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
         self._start, self._rng = visited[-1, :n], rng
         self._costs = ExpectedCosts(problem, model)
-        seen = np.column_stack([visited[:, :n], self._costs(*model.predict(visited)[:2])[0]])
-        self._centre, self._reach = seen.mean(axis=0), REACH * np.ptp(seen, axis=0)
+        self._dearest = self._costs(*model.predict(visited)[:2])[0].max()
+        states = visited[:, :n]
+        self._centre, self._reach = states.mean(axis=0), REACH * np.ptp(states, axis=0)
+        if len(visited) < RECENT:  # the plant has not settled yet
+            self._reach[:] = np.inf
         deviation = model.residuals[:, :n].std(axis=0) * model.features(visited)[2][:, :n].mean(
             axis=0
         )
@@ -360,8 +365,8 @@ class BackOffs:
         costs, penalties = self._costs(predicted, h)
         stage, cost = float(predicted[:, -1].mean()), float(costs.mean())
         self._worth = np.maximum(self._worth, penalties.mean(axis=1) / abs(stage))
-        mean = np.append(inputs[:, : len(self._start)].mean(axis=0), cost)
-        if (np.abs(mean - self._centre) > self._reach).any():
+        away = np.abs(inputs[:, : len(self._start)].mean(axis=0) - self._centre)
+        if cost > self._dearest or (away > self._reach).any():
             return lost
         dearest = np.array([_moving_mean(costs, window).max(initial=cost) for window in WINDOWS])
         limits = cost + BROKEN * (dearest - cost)

@@ -107,7 +107,7 @@ def search(problem, base, rng):
         cost_row=lambda inputs: np.zeros(1),
         predict=lambda inputs: (inputs[:, :3] * [1.0, 1.0, 0.0], np.ones((len(inputs), 3)), None),
     )
-    visited = np.tile([27.0, 60.0, 220.0, 230.0], (10, 1))
+    visited = np.tile([27.0, 60.0, 220.0, 230.0], (model_based.RECENT, 1))
     visited[0, 0] = 20.0
     return BackOffs(problem, riding(problem, base, 2, 10_000.0), base, model, visited, rng)
 

@@ -195,21 +195,22 @@ class Rollout:
         (c, W), a = model.coefficients, problem.reference_action
         controller.theta = theta
         controller.reset()
-        for step, pick in enumerate(picks):
-            if not np.isfinite(s).all():
-                return inputs[:step], predicted[:step], h[:step]
-            try:
-                controller.prepare()
-                a = np.clip(
-                    controller.feedback(s).action, problem.action_lower, problem.action_upper
-                )
-            except Exception as error:
-                recover(controller, error)
-            inputs[step] = np.concatenate([s, a])
-            y, G, size = self._features(inputs[step][None])
-            predicted[step] = y[0] + G[0] @ c + W @ np.append(1.0, inputs[step])
-            h[step] = size[0]
-            s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
+        with np.errstate(over="ignore", invalid="ignore"):  # of a loop that runs away
+            for step, pick in enumerate(picks):
+                if not np.isfinite(s).all():
+                    return inputs[:step], predicted[:step], h[:step]
+                try:
+                    controller.prepare()
+                    a = np.clip(
+                        controller.feedback(s).action, problem.action_lower, problem.action_upper
+                    )
+                except Exception as error:
+                    recover(controller, error)
+                inputs[step] = np.concatenate([s, a])
+                y, G, size = self._features(inputs[step][None])
+                predicted[step] = y[0] + G[0] @ c + W @ np.append(1.0, inputs[step])
+                h[step] = size[0]
+                s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
         return inputs, predicted, h
 
 

@@ -481,6 +481,8 @@ class StudyResults(Shown):
             for case, rows in trained.groupby("case", sort=False)
             if case not in self.baselines
         }
+        if not curves:
+            return None
         ends = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J.last()
         ends = ends.groupby("case").median()
         first, optimum = (self.about[kind].get(scenario) for kind in ("naive", "optimum"))

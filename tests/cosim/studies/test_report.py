@@ -55,6 +55,13 @@ def test_the_page_holds_every_row_figure_and_definition(results, page):
     assert "2 other seeds × 20 samples" in page
 
 
+def test_a_study_of_baselines_alone_draws_no_course_of_learning(tmp_path):
+    baselines = [{**case, "group": "baselines"} for case in CASES[:1]]
+    drawn = run_toy(tmp_path, case=baselines).draw(tmp_path)
+    assert [name for name in drawn["paper"] if name.startswith("curves")] == []
+    assert [name for name in drawn["paper"] if name.startswith("regret")] != []
+
+
 def test_the_markdown_has_the_same_tables(results, page):
     text = (results.folder / "report.md").read_text("utf-8")
     assert all(results.table(scenario) in text for scenario in results.scenarios)

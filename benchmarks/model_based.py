@@ -31,8 +31,8 @@ PARTS = {
     "doubt": (model_based, "DOUBT", 0.0),  # the least promised cost, not the smallest back-off
     "tail": (model_based, "TAIL", 0.0),
     "caution": (model_based, "CAUTION", 0),
-    "reach": (model_based, "REACH", np.inf),  # a rollout is lost only where it is not finite
-    "promise": (model_based, "BROKEN", np.inf),  # no promise is ever broken
+    "reach": (model_based, "REACH", 1e9),  # a rollout is lost by its cost alone
+    "promise": (model_based, "BROKEN", 1e9),  # no promise is ever broken
     "dropping": (model_based, "EVIDENCE", np.inf),  # the fit uses all data since the last change
     "nothing": (model_based, "CAUTION", model_based.CAUTION),
 }

@@ -328,14 +328,13 @@ class BackOffs:
         self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
         self._start, self._rng = visited[-1, :n], rng
         self._costs = ExpectedCosts(problem, model)
-        self._dearest = self._costs(*model.predict(visited)[:2])[0].max()
+        predicted, h, _ = model.predict(visited)
+        self._dearest = self._costs(predicted, h)[0].max()
         states = visited[:, :n]
         self._centre, self._reach = states.mean(axis=0), REACH * np.ptp(states, axis=0)
         if len(visited) < RECENT:  # the plant has not settled yet
             self._reach[:] = np.inf
-        deviation = model.residuals[:, :n].std(axis=0) * model.features(visited)[2][:, :n].mean(
-            axis=0
-        )
+        deviation = model.residuals[:, :n].std(axis=0) * h[:, :n].mean(axis=0)
         self._unit = np.tile(np.maximum(deviation, 1e-6 * problem.units.state), 2)
         self._most = np.tile(ROOM * (problem.state_upper - problem.state_lower), 2)
         self._worth = np.zeros(2 * n)  # largest penalty of each bound so far, as a share of cost

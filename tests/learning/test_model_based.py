@@ -103,7 +103,6 @@ def search(problem, base, rng):
         residuals=residuals,
         mean=np.zeros(1),
         covariance=np.zeros((1, 1)),
-        features=lambda visited: (None, None, np.ones((len(visited), 3))),
         cost_row=lambda inputs: np.zeros(1),
         predict=lambda inputs: (inputs[:, :3] * [1.0, 1.0, 0.0], np.ones((len(inputs), 3)), None),
     )

@@ -13,6 +13,9 @@ from cosim.penalty import Penalty
 from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 
+SLOWEST = 1000.0
+"""Samples of the slowest time constant that is believed: of a state that integrates, say."""
+
 
 class OneStepModel:
     """f(s, a), the next state that the controller's own nominal model predicts, (n,).
@@ -28,8 +31,10 @@ class OneStepModel:
         step = discretise(model, problem.sampling_time, problem.substeps)
         x, u = ca.SX.sym("x", problem.n_states), ca.SX.sym("u", problem.n_actions)
         d, p = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
-        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": step(x, u, d, p)})
-        self._model = model
+        next_state = step(x, u, d, p)
+        self._function = StackedFunction("f", {"x": x, "u": u}, {"y": next_state})
+        self._transition = ca.Function("A", [x, u], [ca.jacobian(next_state, x)])
+        self._problem, self._model = problem, model
         free = ca.SX.sym("p", len(model.parameters))
         self._parametric = ca.Function("f", [x, u, free], [step(x, u, d, free)])
 
@@ -39,6 +44,12 @@ class OneStepModel:
         function.inputs["x"][:], function.inputs["u"][:] = s, a
         function()
         return function.stack.copy()
+
+    def slowest(self) -> float:
+        """Samples of f's slowest time constant at the reference, `SLOWEST` at most."""
+        transition = self._transition(self._problem.reference_state, self._problem.reference_action)
+        largest = np.abs(np.linalg.eigvals(transition.full())).max()
+        return float(1.0 / max(1.0 - largest, 1.0 / SLOWEST))
 
     def parameters(self, theta: Parameters) -> Vector:
         """All parameters of the model at θ, (n_p,): the nominal ones but for its block p."""

@@ -70,9 +70,9 @@ class ValueConfiguration(Configuration):
         return 1.0 if self.discount is None else self.discount
 
     @property
-    def following(self) -> int:
-        """Samples over which the mean cost follows the TD error; 0 where the fit of θ has it."""
-        return 0
+    def following(self) -> float:
+        """Time constants over which the mean cost follows δ; 0 where the fit of θ has it."""
+        return 0.0
 
     @property
     def longest(self) -> float:
@@ -97,8 +97,10 @@ class QLearningConfiguration(ValueConfiguration):
     variance_memory: Positive = Field(
         200.0, description="samples over which the innovations' variance is taken"
     )
-    mean_cost_memory: int = Field(
-        50, ge=0, description="samples over which the mean cost follows δ; 0: θ's fit has it"
+    mean_cost_memory: NonNegative = Field(
+        1.6,
+        description="slowest time constants of the nominal model over which the mean cost follows "
+        "δ; 0: θ's fit has it",
     )
     parameter_drift: NonNegative = Field(
         0.0,
@@ -116,9 +118,9 @@ class QLearningConfiguration(ValueConfiguration):
         return super().criterion if self.rule == "kalman" else self.discount
 
     @property
-    def following(self) -> int:
-        """Samples over which the mean cost follows the TD error; 0 where the fit of θ has it."""
-        return self.mean_cost_memory if self.rule == "kalman" else 0
+    def following(self) -> float:
+        """Time constants over which the mean cost follows δ; 0 where the fit of θ has it."""
+        return self.mean_cost_memory if self.rule == "kalman" else 0.0
 
     def without_part(self) -> Mapping[str, str]:
         """What belongs to other rules than the chosen one."""
@@ -155,9 +157,8 @@ class ValueRule(Algorithm):
         discount = self.scenario.discount if settings.criterion is None else settings.criterion
         position, cost = self._step.blocks.slices["c_lambda"].start, self.scenario.controller
         level = float(self._step.scale[position])
-        self._average_cost = AverageCost(
-            discount, position, level, cost.reference_cost, settings.following
-        )
+        memory = settings.following * self._model.slowest()
+        self._average_cost = AverageCost(discount, position, level, cost.reference_cost, memory)
 
     def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
         """The prior's mean; its deviations become the coordinates.
@@ -349,12 +350,12 @@ class AverageCost:
     KEPT = ("mean_cost",)
 
     def __init__(
-        self, discount: float, position: int, scale: float, start: float, memory: int = 0
+        self, discount: float, position: int, scale: float, start: float, memory: float = 0.0
     ) -> None:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
         self._position, self._scale = position, scale
-        self._memory = memory if discount == 1.0 else 0
+        self._memory = memory if discount == 1.0 else 0.0
 
     def follow(self, td_error: float) -> None:
         """Take a sample's δ into g, where the fit does not have it."""

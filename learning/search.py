@@ -37,7 +37,12 @@ RULES: dict[str, type[Algorithm]] = {
 }
 PRIOR_WIDTH = 0.3
 """Of a rule within the search, which judges each θ: wider than that of the rule alone."""
-RULE_DEFAULTS = {"prior_width": PRIOR_WIDTH, "variance_memory": 2000.0, "largest_step": 0.0}
+RULE_DEFAULTS = {
+    "prior_width": PRIOR_WIDTH,
+    "variance_memory": 2000.0,
+    "largest_step": 0.0,
+    "mean_cost_memory": 0.0,
+}
 """Hyperparameters of a rule within the search that differ from those of the rule alone."""
 CANDIDATES = 3
 """θ of a phase of learning that are compared, at equal distances in samples."""

@@ -33,6 +33,8 @@ SLOPE_DEVIATION = 0.1
 """That of W's slopes, in standard deviations of the error over one of the input."""
 FLOOR = 0.1
 """Least h, as a share of its value at the reference."""
+EXACT = 1e-6
+"""Least deviation of an output, as a share of its size: two integrators differ by as much."""
 ROUNDS = 2
 """Fits, each with the residuals' covariance of the one before."""
 
@@ -110,11 +112,12 @@ class EmpiricalModel:
                 np.outer(deviation, np.append(1.0, slopes)).reshape(-1),
             ]
         )
-        residuals = target - target.mean(axis=0)
+        residuals, size = target - target.mean(axis=0), ((y / h) ** 2).mean(axis=0)
         for _ in range(ROUNDS):
             known = np.concatenate([residuals, older])
             noise = known.T @ known / len(known)
-            noise += np.diag(1e-9 * np.diag(noise) + np.finfo(float).tiny)
+            variance = np.diag(noise)
+            noise = noise + np.diag(np.maximum(EXACT**2 * size - variance, 1e-9 * variance))
             whiten = np.linalg.inv(np.linalg.cholesky(noise))
             rows = (whiten @ design).reshape(-1, design.shape[2]) * prior
             precision = rows.T @ rows + np.eye(prior.size)

@@ -8,9 +8,9 @@ smallest is taken.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from learning.checkpoint import group
 from learning.configuration import Configuration, Count
 from learning.empirical_model import EmpiricalModel, Features, Rollout
 from learning.prediction_errors import SortedErrors, expected_penalties
-from learning.q_learning import QLearning, QLearningConfiguration
 from learning.step import moved
 
 Array = NDArray[np.float64]
@@ -85,21 +84,6 @@ class ModelBasedConfiguration(Configuration):
     exploration_samples: Count = Field(
         480, description="samples that explore after the start and after a change of the plant"
     )
-    then: Literal["none", "q-learning"] = Field(
-        "none", description="the rule that learns on from the θ to which the model has led"
-    )
-    hand_over: Count = Field(
-        1920, description="samples after the start or a change from which that rule learns"
-    )
-
-    def without_part(self) -> Mapping[str, str]:
-        """The setting that only a run with a rule after the model has."""
-        return {"hand_over": "a run without a rule after the model"} if self.then == "none" else {}
-
-    def rule(self) -> QLearningConfiguration:
-        """Settings of the rule that learns on: the model's back-offs hold for the offset as is."""
-        shared = {name: getattr(self, name) for name in Configuration.model_fields}
-        return QLearningConfiguration.from_dict(shared | {"measure_offset": False})
 
 
 class ModelBased(Algorithm):
@@ -110,15 +94,12 @@ class ModelBased(Algorithm):
     since the last update have a mean that the model makes improbable, the plant has changed, and
     the data from there on count. θ moves only where the model, on new noise, promises less for the
     new one.
-
-    With `then` a rule learns on after `hand_over` samples; the model only watches for a change of
-    the plant, at which it takes over again.
     """
 
     Configuration = ModelBasedConfiguration
     KEPT = (
         *("_rows", "back_off", "_pool", "_due", "_count", "_era", "_updated", "model_samples"),
-        *("_model", "_rule", "_limits"),
+        *("_model", "_limits"),
     )
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
@@ -141,15 +122,13 @@ class ModelBased(Algorithm):
         # Samples so far, at the last update, at the next one, and before the present plant's.
         self._count, self._updated, self._due, self._era = 0, 0, settings.first_update, 0
         self._limits: Array = np.full(len(WINDOWS), np.inf)  # of the mean cost, for each window
-        self._rule: QLearning | None = None
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
 
     @property
     def explores(self) -> bool:
         """Whether the samples explore now."""
-        early = self._count - self._era < self.configuration.exploration_samples
-        return early or self._rule is not None
+        return self._count - self._era < self.configuration.exploration_samples
 
     def observe(self, transition: Transition) -> Update | None:
         """Keep a transition; move θ where it is time."""
@@ -158,21 +137,7 @@ class ModelBased(Algorithm):
         self._count += 1
         if self._model is not None and (self._count - self._updated) % WINDOWS[0] == 0:
             self._watch(self._model)
-        if self._rule is not None:
-            return self._rule.observe(transition)
-        update = self._update() if self._count >= self._due else None
-        settings = self.configuration
-        if settings.then != "none" and self._count - self._era >= settings.hand_over:
-            self._set_rule(self._new_rule())
-        return update
-
-    def _new_rule(self) -> QLearning:
-        rule, samples = self.configuration.rule(), self.samples
-        return QLearning(self.controller, self.scenario, rule, samples, self.strategy, self.rng)
-
-    def _set_rule(self, rule: QLearning | None) -> None:
-        self._rule = rule
-        self.needs_action_value = rule is not None
+        return self._update() if self._count >= self._due else None
 
     def _latest(self, count: int) -> tuple[Array, Array]:
         """Inputs (s, a) and outputs (s₊, ℓ) of the latest samples, oldest first."""
@@ -200,7 +165,6 @@ class ModelBased(Algorithm):
             if fisher.sf(statistic, K, M - K) < (SUSPICION if broken else ALARM):
                 self._era, self._due = self._count - window, self._count
                 self._pool = model.residuals[-POOL:]
-                self._set_rule(None)
                 return
 
     def _outdated(self, inputs: Array, outputs: Array) -> int:
@@ -266,8 +230,6 @@ class ModelBased(Algorithm):
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Take back what `state` gave."""
-        if group(state, "_rule "):
-            self._set_rule(self._new_rule())
         super().restore(state)
         if model := group(state, "_model "):
             self._model = EmpiricalModel(self._features, **model)
@@ -363,7 +325,8 @@ class BackOffs:
             return lost
         costs, penalties = self._costs(predicted, h)
         stage, cost = float(predicted[:, -1].mean()), float(costs.mean())
-        self._worth = np.maximum(self._worth, penalties.mean(axis=1) / abs(stage))
+        size = max(abs(stage), np.finfo(np.float64).eps)
+        self._worth = np.maximum(self._worth, penalties.mean(axis=1) / size)
         away = np.abs(inputs[:, : len(self._start)].mean(axis=0) - self._centre)
         if cost > self._dearest or (away > self._reach).any():
             return lost

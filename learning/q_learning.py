@@ -98,7 +98,7 @@ class QLearningConfiguration(ValueConfiguration):
         200.0, description="samples over which the innovations' variance is taken"
     )
     mean_cost_memory: NonNegative = Field(
-        1.6,
+        1.625,
         description="slowest time constants of the nominal model over which the mean cost follows "
         "δ; 0: θ's fit has it",
     )
@@ -157,7 +157,7 @@ class ValueRule(Algorithm):
         discount = self.scenario.discount if settings.criterion is None else settings.criterion
         position, cost = self._step.blocks.slices["c_lambda"].start, self.scenario.controller
         level = float(self._step.scale[position])
-        memory = settings.following * self._model.slowest()
+        memory = round(settings.following * self._model.slowest())
         self._average_cost = AverageCost(discount, position, level, cost.reference_cost, memory)
 
     def _begin(self, states: Matrix, errors: Matrix, noise: float) -> Parameters:
@@ -350,12 +350,12 @@ class AverageCost:
     KEPT = ("mean_cost",)
 
     def __init__(
-        self, discount: float, position: int, scale: float, start: float, memory: float = 0.0
+        self, discount: float, position: int, scale: float, start: float, memory: int = 0
     ) -> None:
         self.discount = discount
         self.mean_cost = start if discount == 1.0 else 0.0
         self._position, self._scale = position, scale
-        self._memory = memory if discount == 1.0 else 0.0
+        self._memory = memory if discount == 1.0 else 0
 
     def follow(self, td_error: float) -> None:
         """Take a sample's δ into g, where the fit does not have it."""

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import casadi as ca
+import clarabel
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import null_space, solve_discrete_are
 
-from controllers import sdp
 from controllers.errors import TuningError
 from controllers.model import discretise
 from controllers.problem import Problem
@@ -216,9 +218,9 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     basis = [("α", H)]
     basis += [("δP", rotation(A, B, e)) for e in _symmetric_basis(n)]
     basis += [("F", C.T @ e @ C) for e in _symmetric_basis(n_c)]
-    columns = np.stack([sdp.svec(matrix) for _, matrix in basis], axis=1)
+    columns = np.stack([svec(matrix) for _, matrix in basis], axis=1)
     count, triangle = columns.shape[1], columns.shape[0]
-    identity = sdp.svec(np.eye(size))[:, None]
+    identity = svec(np.eye(size))[:, None]
     # Variables: α, δP, F, β, t with t ≥ ‖F‖.
     n_F = n_c * (n_c + 1) // 2
     zeros = np.zeros((triangle, 1))
@@ -229,10 +231,14 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     above, below = np.hstack([-columns, zeros, zeros]), np.hstack([columns, -identity, zeros])
     constraints = np.vstack([nonnegative, norm, above, below])
     offset = np.concatenate([np.zeros(2 + n_F), -identity[:, 0], np.zeros(triangle)])
-    cones = [sdp.nonnegative(1), sdp.second_order(1 + n_F), *2 * [sdp.semidefinite(size)]]
+    cones = [
+        clarabel.NonnegativeConeT(1),
+        clarabel.SecondOrderConeT(1 + n_F),
+        *2 * [clarabel.PSDTriangleConeT(size)],
+    ]
     objective = np.zeros(count + 2)
     objective[-2:] = 1.0, weight
-    z, status = sdp.solve(
+    z, status = solve_conic(
         np.zeros((count + 2, count + 2)), objective, constraints, offset, cones, iterations=500
     )
     if z is None or not z[0] > 0:
@@ -393,3 +399,39 @@ def _short(array: Array) -> str:
     """Entries to five digits, on one line."""
     rows = [_short(row) if row.ndim else f"{float(row):.5g}" for row in array]
     return f"[{', '.join(rows)}]"
+
+
+def solve_conic(
+    P: Array, q: Array, A: Array, b: Array, cones: Sequence[Any], *, iterations: int = 200
+) -> tuple[Array | None, str]:
+    """Solve min ½xᵀPx + qᵀx s.t. b − Ax in the product of Clarabel's `cones`.
+
+    P (d, d), of which the upper triangle is read, q (d,), A (c, d), b (c,). `PSDTriangleConeT`, of
+    positive semidefinite matrices, takes the rows that `svec` gives. Returns the minimiser, None
+    where there is none, and the solver's word for how it ended.
+    """
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_iter = iterations
+    solution = clarabel.DefaultSolver(
+        sparse.csc_matrix(np.triu(P)), q, sparse.csc_matrix(A), b, list(cones), settings
+    ).solve()
+    status = str(solution.status)
+    return np.array(solution.x) if status in {"Solved", "AlmostSolved"} else None, status
+
+
+def svec(matrix: Array) -> Array:
+    """Vector of a symmetric matrix with its inner product: `svec_order` of its upper triangle."""
+    order, weight = svec_order(len(matrix))
+    packed: Array = matrix[np.triu_indices(len(matrix))]
+    return weight * packed[order]
+
+
+def svec_order(dimension: int) -> tuple[NDArray[np.intp], Array]:
+    """Order and weights that make `svec` of an upper triangle packed row by row.
+
+    Clarabel stacks the upper triangle column by column, off-diagonal entries times √2.
+    """
+    rows, columns = np.triu_indices(dimension)
+    order = np.lexsort((rows, columns))
+    return order, np.where(rows == columns, 1.0, np.sqrt(2.0))[order]

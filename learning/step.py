@@ -12,11 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import clarabel
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from controllers import sdp
+from controllers.economic import solve_conic, svec_order
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.protocols import Matrix, Vector
@@ -145,18 +146,18 @@ def definite(
     matrices, offsets, cones = [], [], []
     for name in HESSIANS:
         block, where = blocks.block(name), blocks.slices[name]
-        order, weight = sdp.svec_order(block.shape[0])
+        order, weight = svec_order(block.shape[0])
         shifted = matrix_of(blocks, theta, name) - smallest * np.eye(block.shape[0])
         rows = np.zeros((block.size, blocks.size))
         ratio = (scale[where] / blocks.scale[where])[order]
         rows[np.arange(block.size), where.start + order] = -weight * ratio
         matrices.append(rows)
         offsets.append(weight * block.pack(shifted)[order])
-        cones.append(sdp.semidefinite(block.shape[0]))
+        cones.append(clarabel.PSDTriangleConeT(block.shape[0]))
     # Dividing by the metric's size keeps the solver's absolute tolerances meaningful.
     metric = fit.metric()
     unit = max(float(np.abs(metric).max()), np.finfo(float).tiny)
-    step, _ = sdp.solve(
+    step, _ = solve_conic(
         2 * metric / unit,
         -2 * fit.gradient / unit,
         np.vstack(matrices),

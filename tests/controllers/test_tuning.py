@@ -1,12 +1,20 @@
 from dataclasses import replace
 
 import casadi as ca
+import clarabel
 import numpy as np
 import pytest
 import scipy.linalg
 
-from controllers import LinearisationPoint, Model, Quantity, RtiNmpc, sdp
-from controllers.economic import convexify, optimal_steady_state, rotation, tune
+from controllers import LinearisationPoint, Model, Quantity, RtiNmpc
+from controllers.economic import (
+    convexify,
+    optimal_steady_state,
+    rotation,
+    solve_conic,
+    svec,
+    tune,
+)
 from controllers.errors import TuningError
 from controllers.model import discretise, economic_cost
 from tests.helpers.sampling import evaporator_problem
@@ -20,20 +28,24 @@ def random_symmetric(rng, size):
 @pytest.mark.parametrize("size", [1, 2, 4])
 def test_svec_keeps_the_inner_product(rng, size):
     a, b = random_symmetric(rng, size), random_symmetric(rng, size)
-    assert sdp.svec(a) @ sdp.svec(b) == pytest.approx(np.trace(a @ b), rel=1e-13)
+    assert svec(a) @ svec(b) == pytest.approx(np.trace(a @ b), rel=1e-13)
 
 
 def test_the_nearest_semidefinite_matrix_is_the_clipped_one(rng):
     size = 4
     target = random_symmetric(rng, size)
     count = size * (size + 1) // 2
-    x, status = sdp.solve(
-        np.eye(count), -sdp.svec(target), -np.eye(count), np.zeros(count), [sdp.semidefinite(size)]
+    x, status = solve_conic(
+        np.eye(count),
+        -svec(target),
+        -np.eye(count),
+        np.zeros(count),
+        [clarabel.PSDTriangleConeT(size)],
     )
     values, vectors = np.linalg.eigh(target)
     clipped = (vectors * np.maximum(values, 0.0)) @ vectors.T
     assert status == "Solved"
-    np.testing.assert_allclose(x, sdp.svec(clipped), atol=1e-6)
+    np.testing.assert_allclose(x, svec(clipped), atol=1e-6)
 
 
 PROBLEMS = {

@@ -35,12 +35,6 @@ def test_a_bad_value_has_one_clear_error(case):
         evaporator_problem(**BAD[case])
 
 
-def test_penalty_is_linear_plus_quadratic_in_the_violation():
-    problem = evaporator_problem(penalty_quadratic=[1, 3])
-    assert problem.penalty([25.0, 80.0]) == 0.0
-    assert problem.penalty([24.5, 83.0]) == 1e5 * 0.5 + 0.25 + 1e5 * 3 + 3 * 9
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [

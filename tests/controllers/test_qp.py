@@ -1,4 +1,4 @@
-"""Q(s, a) where the enforced action puts the next state exactly on its bound."""
+"""QPs: residuals, active sets, the KKT system, multipliers at a kink, and the solvers."""
 
 from functools import lru_cache
 
@@ -37,9 +37,6 @@ def rows_qp(rows):
         w=np.ones(count),
         W=np.ones(count),
     )
-
-
-# objective and slack --------------------------------------------------------------------------
 
 
 # residuals ------------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """Whatever ends a command ends what it started; one writer per folder; foreign code is watched."""
 
-import json
 import os
 import re
 import signal
@@ -164,13 +163,6 @@ def test_an_fmu_that_ends_the_process_is_one_line_and_exit_code_2(tmp_path, faul
     (line,) = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
     assert words in line
     assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_json_and_notes_come_through_the_watching_process(tmp_path):
-    fmu = build_kind(tmp_path, 2)
-    result = run_foreign(tmp_path, fmu, 0, "--json")
-    assert json.loads(result.stdout)["samples"] == 3
-    assert run_foreign(tmp_path, fmu, 0).stderr.count("native code of") == 1
 
 
 @SLOW

@@ -43,12 +43,6 @@ def test_the_same_seed_repeats_and_another_differs(evaporator, paper):
     assert not same(first, simulate(evaporator, Proportional(paper), 40, seed=2))
 
 
-def test_controllers_with_one_seed_meet_the_same_noise(evaporator, paper):
-    one = simulate(evaporator, Proportional(paper), 40, seed=1)
-    two = simulate(evaporator, Hold(paper.reference_action), 40, seed=1)
-    np.testing.assert_array_equal(one.disturbances, two.disturbances)
-
-
 def test_sampling_instants_are_multiples_of_the_sampling_time():
     with FmuPlant(Scenario.load("paper").replace({"sampling_time": 0.1})) as plant:
         trajectory = simulate(plant, Proportional(plant.scenario), 1000, seed=0)

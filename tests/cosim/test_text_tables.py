@@ -1,8 +1,54 @@
+"""Results in one line at a prompt and as a table with a picture in a notebook; tables as CSV."""
+
+import numpy as np
 import pytest
 
+import cosim
 from cosim.errors import CosimError
 from cosim.files import write_atomically
 from cosim.text_tables import csv_text, read_csv
+from learning.errors import ConfigurationError
+
+
+@pytest.fixture(scope="module")
+def run():
+    scenario = cosim.Scenario.load("paper")
+    with cosim.FmuPlant(scenario) as plant:
+        return cosim.simulate(plant, cosim.build_controller("naive", scenario), 20, 0)
+
+
+@pytest.fixture(scope="module")
+def training():
+    sizes = {"log_every": 20, "evaluate_every": 40, "checkpoint_every": 40}
+    return cosim.train("q-learning", samples=40, evaluation_seeds=1, evaluation_steps=10, **sizes)
+
+
+def test_every_result_is_one_short_line(run, training):
+    scenario = cosim.Scenario.load("paper")
+    evaluation = cosim.evaluate(scenario, ["naive"], 2, 10)
+    for result in (run, training, evaluation, scenario, training.parameters):
+        text = repr(result)
+        assert text.startswith(f"{type(result).__name__}(") and text.endswith(")")
+        assert "\n" not in text and len(text) < 300
+        page = result._repr_html_()
+        assert f"<caption>{type(result).__name__}</caption>" in page
+        drawn = result not in (scenario, training.parameters)
+        assert ('src="data:image/png;base64,' in page) == drawn
+
+
+def test_frames_hold_the_values(run, training):
+    frame = run.to_pandas()
+    np.testing.assert_array_equal(frame["X2"], run["X2"])
+    assert list(frame["status"]) == list(run.status)
+    np.testing.assert_array_equal(training.to_pandas()["samples"], [20, 40])
+    np.testing.assert_array_equal(
+        training.parameters.to_pandas()["theta"], training.parameters.theta
+    )
+
+
+def test_an_unknown_option_of_a_training_is_refused_by_name():
+    with pytest.raises(ConfigurationError, match="did you mean 'evaluate_every'"):
+        cosim.train("q-learning", evaluate_evry=10)
 
 
 def test_a_table_reads_back(tmp_path):
@@ -10,11 +56,3 @@ def test_a_table_reads_back(tmp_path):
     assert text == 'name,value\n"a,b",1\n"say ""c""",\n'
     path = write_atomically(tmp_path / "table.csv", text)
     assert read_csv(path, CosimError) == [["name", "value"], ["a,b", "1"], ['say "c"', ""]]
-
-
-@pytest.mark.parametrize(("content", "message"), [(b"", "is empty"), (b"\xff", "cannot be read")])
-def test_a_damaged_table_is_one_message_with_the_file(tmp_path, content, message):
-    path = tmp_path / "table.csv"
-    path.write_bytes(content)
-    with pytest.raises(CosimError, match=rf"table\.csv.*{message}"):
-        read_csv(path, CosimError)

@@ -32,22 +32,6 @@ def test_csv_reads_back_to_the_same_bits(trajectory, tmp_path):
     assert copy.to_csv() == trajectory.to_csv()
 
 
-def test_summary_is_the_means_of_the_definitions(trajectory, paper):
-    v = np.maximum(
-        np.maximum(paper.state_lower - trajectory.states, trajectory.states - paper.state_upper), 0
-    )
-    penalty = (v * paper.penalty_linear + v**2 * paper.penalty_quadratic).sum(axis=1)
-    summary = trajectory.summary()
-    assert summary["samples"] == 300
-    assert summary["economic_cost"] == pytest.approx(trajectory["stage_cost"].mean(), rel=1e-14)
-    assert summary["mean_violation"] == pytest.approx(v.sum(axis=1).mean(), rel=1e-12)
-    assert summary["violating_share"] == np.mean((v > 0).any(axis=1)) > 0
-    expected = (trajectory["stage_cost"] + penalty).mean()
-    assert summary["J"] == pytest.approx(expected, rel=1e-12)
-    assert summary["failures"] == 0
-    assert summary["statuses"] == {"solved": 300}
-
-
 def test_clock_readings_are_only_in_the_timing(trajectory, tmp_path):
     assert set(trajectory.timing) == {"prepare", "feedback", "plant"}
     assert not {"timing", "prepare", "feedback", "plant"} & set(trajectory.summary())

@@ -321,18 +321,3 @@ def test_exit_code_0_means_results_whatever_a_plug_in_does(tmp_path, what):
         assert words in done.stderr
         assert "Traceback" not in done.stderr
         assert done.stderr.count("error: ") == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["import", "evaluate", "workers"])
-def test_an_early_exit_elsewhere_is_one_line_too(tmp_path, where):
-    text = PLUGIN.format(body="os._exit(0)" if where in ("evaluate", "workers") else "pass")
-    if where == "import":
-        text = "import os; os._exit(0)"
-    (tmp_path / "mine.py").write_text(text)
-    jobs = 2 if where == "workers" else 1
-    words = f"evaluate -c mine:make --seeds 2 -n 2 --jobs {jobs} --out out"
-    done = run_cosim(*words.split(), folder=tmp_path, env={"PYTHONPATH": ROOT})
-    assert done.returncode == 2
-    assert done.stderr.count("error: ") == 1
-    assert not (tmp_path / "out" / "summary.json").exists()

@@ -172,15 +172,6 @@ def make(scenario):
 """
 
 
-@pytest.mark.slow
-def test_a_plant_that_crashes_in_workers_ends_the_evaluation_in_one_line(tmp_path, tank):
-    scenario = write_scenario(tmp_path, tank, fault=5)
-    (tmp_path / "still.py").write_text(STILL)
-    command = ["evaluate", "-s", str(scenario), "-c", "still:make", "--seeds", "2", "-n", "5"]
-    line = refused(command_line(tmp_path, *command, "--jobs", "2", "--out", "out"))
-    assert "died" in line
-
-
 # Solvers ---------------------------------------------------------------------------------------
 
 SHARE = 0.01

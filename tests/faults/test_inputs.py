@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from controllers import Parameters, Problem
-from controllers.errors import ControllerError, ParameterError
+from controllers.errors import ParameterError
 from controllers.factories import naive
 from cosim import FmuPlant, Scenario, simulate
 from cosim.cli.main import app
@@ -287,16 +287,3 @@ def hold(loop, change):
 @pytest.mark.parametrize("kind", WHOLE)
 def test_an_absurd_theta_is_refused_or_the_loop_goes_on(loop, kind):
     hold(loop, WHOLE[kind])
-
-
-@pytest.mark.parametrize("value", [math.nan, -math.inf])
-def test_a_theta_that_is_no_number_is_refused(loop, value):
-    _, controller, start = loop
-    theta = start.theta.copy()
-    theta[-1] = value
-    with pytest.raises(ControllerError, match="finite"):
-        start.with_theta(theta)
-    controller.theta = start.theta
-    with pytest.raises(ControllerError):
-        controller.theta = theta
-    assert np.array_equal(controller.theta, start.theta)

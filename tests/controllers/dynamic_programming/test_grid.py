@@ -125,16 +125,6 @@ def test_moments_up_to_twice_the_nodes_are_those_of_scipy(kind):
         )
 
 
-def test_product_rule_integrates_products():
-    law = DisturbanceLaw("uniform", np.array([0.0, 2.0]), np.array([1.0, 3.0]))
-    rule = law.rule((3, 4))
-    x, y = rule.nodes.T
-    assert len(rule.weights) == 12
-    assert rule.weights.sum() == pytest.approx(1.0, rel=1e-14)
-    # E[x²] = 1/3, E[y²] = 4 + 3.
-    assert rule.weights @ (x**2 * y**2) == pytest.approx(7 / 3, rel=1e-13)
-
-
 @pytest.mark.parametrize("kind", ["uniform", "normal", "none"])
 def test_draws_have_the_laws_moments(kind):
     law = DisturbanceLaw(kind, np.array([5.0, -1.0]), np.array([1.0, 0.0]))

@@ -214,7 +214,6 @@ def test_a_point_that_does_not_fit_is_refused_and_changes_nothing(name, nmpc, pr
 
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
-@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid:RuntimeWarning")
 def test_a_model_that_blows_up_raises_and_the_qp_is_carried(nmpc, problem, rng):
     point = random_point(problem, rng)
     point.x[:] = 1e200

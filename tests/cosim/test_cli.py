@@ -122,34 +122,3 @@ def test_a_short_run_loads_no_scipy(tmp_path):
     )
     assert (tmp_path / "summary.json").is_file()
     assert result.stderr.splitlines()[-1] == "False"
-
-
-BAD_INPUT = {
-    "unknown preset": (["simulate", "-s", "papr"], ["unknown scenario 'papr'", "paper"]),
-    "unknown controller": (["simulate", "-c", "nave"], ["unknown controller 'nave'", "naive"]),
-    "missing module": (["simulate", "-c", "nomodule:make"], ["nomodule"]),
-    "missing factory": (["simulate", "-c", "json:make"], ["json:make", "make"]),
-    "not a factory": (["simulate", "-c", "json:loads"], ["json:loads", "factory"]),
-    "not a controller": (["simulate", "-c", "builtins:type"], ["lacks reset, prepare or feedback"]),
-    "missing parameters": (["simulate", "-c", "no-theta.toml"], ["no-theta.toml"]),
-    "bad parameters": (["simulate", "-c", "type.toml"], ["type.toml"]),
-    "unwritable folder": (["simulate", "--out", "/proc/none"], ["cannot write", "/proc/none"]),
-    "unknown command": (["simulat"], ["simulat"]),
-    "unknown option": (["simulate", "--sed", "1"], ["--sed"]),
-}
-
-
-@pytest.mark.parametrize("case", BAD_INPUT)
-def test_bad_input_gives_one_clear_message_and_exit_code_2(case, cosim, unwatched, tmp_path):
-    (tmp_path / "type.toml").write_text('extends = "paper"\ndiscount = "high"\n')
-    arguments, words = BAD_INPUT[case]
-    code, out, err = cosim(*arguments)
-    assert code == 2
-    assert out == ""
-    assert "Traceback" not in err
-    if err.startswith("error: "):
-        assert err.count("\n") == 1
-    else:
-        assert err.startswith("Usage: ")
-    for word in words:
-        assert word in err

@@ -185,6 +185,13 @@ def test_a_bad_number_is_refused_by_every_option(cosim, tmp_path):
 
 
 WRONG = [
+    "simulate --scenario papr",
+    "simulate --controller nave",
+    "simulate --controller json:make",
+    "simulate --controller json:loads",
+    "simulate --controller builtins:type",
+    "simulate --controller no-theta.toml",
+    "simulate --controller type.toml",
     "simulate --controller controllers.errors:QpError",
     "simulate --out blocked/inside --steps 3",
     "evaluate --controllers ,",
@@ -194,6 +201,18 @@ WRONG = [
     "train --algorithm a:b",
     "train --algorithm q-learning --set nothing",
     "train --algorithm q-learning --set step_size=zero",
+    "train --algorithm q-learning --resume",
+    "train --algorithm q-learning --controller mpc",
+    "train --algorithm q-learning --evaluate-every 70",
+    "fmu info none.fmu",
+    "fmu info blocked",
+    "fmu check none.fmu",
+    "fmu check blocked",
+    "fmu build",
+    "fmu build --check --out x",
+    "fmu build . --out x",
+    "fmu build . --out x.fmu",
+    "fmu build --out blocked",
     "view blocked --json",
     "new rule json",
     "new plant 2_tanks",
@@ -207,6 +226,7 @@ WRONG = [
 @pytest.mark.parametrize("line", WRONG)
 def test_a_wrong_name_is_one_line_and_exit_code_2(cosim, unwatched, tmp_path, line):
     (tmp_path / "blocked").write_text("this is no folder, and no file of any known kind\n")
+    (tmp_path / "type.toml").write_text('extends = "paper"\ndiscount = "high"\n')
     code, out, err = cosim(*line.split())
     assert code == 2, err
     assert "Traceback" not in err

@@ -54,30 +54,6 @@ def test_build_writes_both_files_and_makes_the_folder(cosim, tmp_path):
     assert json.loads(out)["built"] == [f"new/folder/{name}" for name in names]
 
 
-BAD_INPUT = {
-    "no such file": (["info", "none.fmu"], "there is no file none.fmu"),
-    "no FMU": (["info", "text.fmu"], "text.fmu is not an FMU"),
-    "nothing to check": (["check", "none.fmu"], "does not exist"),
-    "check of no FMU": (["check", "text.fmu"], "not an FMU"),
-    "build without a target": (["build"], "give one of --out DIR, --check and --in-place"),
-    "build with two": (["build", "--check", "--out", "x"], "give one of --out DIR"),
-    "own plant into a folder": (["build", ".", "--out", "x"], "FOLDER --out FILE.fmu"),
-    "own plant without a description": (["build", ".", "--out", "x.fmu"], "No such file"),
-    "build into a file": (["build", "--out", "text.fmu"], "text.fmu"),
-}
-
-
-@pytest.mark.parametrize(("arguments", "message"), BAD_INPUT.values(), ids=BAD_INPUT)
-def test_bad_input_is_one_line_and_exit_code_2(cosim, tmp_path, arguments, message):
-    (tmp_path / "text.fmu").write_text("text")
-    code, out, err = cosim("fmu", *arguments)
-    assert code == 2
-    assert out == ""
-    assert err.startswith("error: ")
-    assert message in err
-    assert err.count("\n") == 1
-
-
 def test_missing_compiler_is_told(cosim, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     code, _, err = cosim("fmu", "build", "--out", "x")

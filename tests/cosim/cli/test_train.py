@@ -69,24 +69,6 @@ def test_explain_lists_every_hyperparameter(cosim):
     assert json.loads(out)["radius"]["meaning"].startswith("trust region")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("-a", "q-lerning"), "did you mean 'q-learning'"),
-        (("-a", "q-learning", "--set", "prior_widht=1"), "did you mean 'prior_width'"),
-        (("-a", "q-learning", "--set", "prior_width=-2"), "prior_width"),
-        (("-a", "q-learning", "--resume"), "there is no checkpoint to resume from"),
-        (("-a", "q-learning", "--controller", "mpc"), "there is no NMPC 'mpc'"),
-        (("-a", "q-learning", "--evaluate-every", "70"), "multiple of log_every"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(cosim, arguments, message):
-    code, _, err = cosim("train", *arguments, "--out", "run")
-    assert code == 2
-    assert err.startswith("error: ") and len(err.strip().splitlines()) == 1
-    assert message in err
-
-
 def test_divergence_ends_with_exit_code_1_and_says_why(cosim, undrawn, tmp_path):
     code, out, _ = cosim(
         "train", "-a", "q-learning", "-n", 6000, "--log-every", 500, "--evaluate-every", 1000,

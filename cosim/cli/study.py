@@ -276,7 +276,7 @@ def board(
 ) -> None:
     """Check a board's entries, play their runs back, and write the board's README.md."""
     with cli.output(json) as out_:
-        from cosim.studies.stored import write_board
+        from cosim.studies.board import write_board
 
         names = write_board(folder)
         out_.note(f"entries: {', '.join(names)}")

@@ -1,4 +1,4 @@
-"""A folder of stored studies: NAME.toml says what was measured, NAME/ holds it; board/, others'."""
+"""A folder of stored studies: NAME.toml says what was measured, NAME/ holds it."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ import shutil
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-import numpy as np
 import pandas as pd
 from pydantic import Field
 
 from cosim.comparison import RunSignals, compare
 from cosim.errors import ResultsError
-from cosim.evaluation import judge
 from cosim.files import read_json, read_toml, write_atomically
-from cosim.scenario import Scenario
-from cosim.statistics import regret, shown
 from cosim.studies.document import StudyTable, Table
 from cosim.studies.document import read as read_study
 from cosim.studies.pictures import LOGS, TRAJECTORIES
@@ -27,7 +23,6 @@ from cosim.studies.results import ABOUT, CURVES, StudyResults
 from cosim.studies.store import KEYS, TIMING, to_csv
 from cosim.trajectory import Signal
 from cosim.validation import instead, validated
-from learning.algorithm import Privilege
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"
@@ -37,9 +32,6 @@ UNCOMPARED = ["status", "residual"]
 LARGEST = 4_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
 SUFFIXES = (".csv", ".toml", ".md", ".svg", ".png")
-BOARD_SEEDS, BOARD_STEPS = range(3_000_000, 3_000_005), 2000
-"""Noise of a board's entries, which no study and no training may meet, and samples on each."""
-Text = Annotated[str, Field(pattern=r"^[^|<>\[\]\\`\r\n]+$")]
 
 
 def stored_results() -> Path:
@@ -98,48 +90,6 @@ def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
     there = [name for name in studies if (folder / name / ABOUT).is_file()]
     results = {name: StudyResults.load(folder / name) for name in there}
     write_atomically(folder / "README.md", rendered("readme.md", studies=studies, results=results))
-
-
-class Entry(Table):
-    """entry.toml of a board's entry: who, what, and what finding it asked of the plant."""
-
-    name: Text
-    authors: Text
-    link: Annotated[str, Field(pattern=r"^(https?://[^\s|<>()]+)?$")] = ""
-    scenario: Annotated[str, Field(pattern=r"^[\w-]+$")]
-    asks_for: Literal["nothing"] | Privilege
-    samples: Annotated[int, Field(ge=0)]
-
-
-def read_entry(folder: Path) -> tuple[Entry, pd.DataFrame]:
-    """A board's entry and its judged runs, those in `runs` played back; raises CosimError."""
-    path, origin = folder / "entry.toml", f"'{folder / 'entry.toml'}'"
-    entry = validated(Entry, read_toml(path, origin, ResultsError), origin, ResultsError)
-    scenario = Scenario.load(entry.scenario)
-    asked = [(seed, BOARD_STEPS, scenario.hash) for seed in BOARD_SEEDS]
-    try:
-        rows = pd.read_csv(folder / "judged.csv", dtype={"scenario_hash": str})
-        found = list(rows[["seed", "steps", "scenario_hash"]].itertuples(False, None))
-        if found != asked or not np.isfinite(rows["J"]).all():
-            raise ValueError(f"judged.csv must have J and seed, steps, scenario_hash = {asked}")
-        again = judge(scenario, folder / "runs").set_index("seed")[["J", "optimum"]]
-        said = rows.set_index("seed").loc[again.index, ["J", "optimum"]]
-        if again.index[0] != BOARD_SEEDS[0] or not np.allclose(again, said, 1e-6, equal_nan=True):
-            raise ValueError("runs/ must hold the run of the first seed, and give judged.csv's row")
-        if (entry.asks_for == "nothing") != (not entry.samples):
-            raise ValueError("samples must be 0 where asks_for is 'nothing', and only there")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ResultsError(f"'{folder}': {error}") from None
-    return entry, rows
-
-
-def write_board(folder: Path) -> list[str]:
-    """Check the entries of a board and write its README.md; returns their folders' names."""
-    paths = sorted(path.parent for path in folder.glob("*/entry.toml"))
-    entries = sorted(map(read_entry, paths), key=lambda one: float(one[1]["J"].mean()))
-    page = rendered("board.md", entries=entries, regret=regret, shown=shown)
-    write_atomically(folder / "README.md", page)
-    return [path.name for path in paths]
 
 
 class Tolerance(Table):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cosim.errors import CosimError
-from cosim.studies.stored import read_entry, write_board
+from cosim.studies.board import read_entry, write_board
 
 BOARD = Path(__file__).parents[3] / "results" / "board"
 

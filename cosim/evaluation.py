@@ -16,6 +16,7 @@ from cosim.errors import EvaluationError, StudyError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
+from cosim.progress import told
 from cosim.protocols import Array, Controller, Decision
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, simulate
@@ -51,7 +52,7 @@ def evaluate(
     folder: str | Path | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
-    progress: Callable[[int, str], None] | None = None,
+    progress: Callable[[int, str], None] | bool = False,
     command: str = "cosim.evaluate",
 ) -> Evaluation:
     """Run every controller on every seed and return the table; the bytes depend on no worker.
@@ -74,7 +75,8 @@ def evaluate(
     folder : where finished runs are kept and found again; None keeps none.
     jobs : worker processes; 1 works in this process.
     scheduler : address of a Dask scheduler, used in place of `jobs`.
-    progress : called with the samples done, and with a line on what is done anew.
+    progress : called with the samples done, and with a line on what is done anew; True draws a
+        bar.
     command : the text of the column `command`.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
@@ -114,9 +116,9 @@ def evaluate(
         runs.append(Run(key, case, scenario, item, None, depends, noise))
     check_folders(runs)
 
-    tell = progress or (lambda samples, line: None)
-
-    with temporary_folder("cosim-evaluation-") as own:
+    total = sum(run.samples for run in runs)
+    bar = told(progress, scenario.name, total)
+    with temporary_folder("cosim-evaluation-") as own, bar as tell:
         runner = Runner(runs, Path(folder or own), (Path.cwd(),), lambda s, _: tell(s.samples, ""))
         for line in runner.remarks:
             tell(0, line)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from time import perf_counter
 
 import numpy as np
 
 from cosim.errors import CosimError
+from cosim.progress import told
 from cosim.protocols import (
     Array,
     CompiledLoop,
@@ -53,15 +55,15 @@ def simulate(
     seed: int,
     *,
     recorder: Recorder | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] | bool = False,
     residuals: bool = True,
 ) -> Trajectory:
     """Run a controller on a plant for `steps` samples from the scenario's initial state.
 
     Each sample: `prepare`, then `feedback(s)`, then the plant steps under the action, which the
     actuators saturate to the scenario's action bounds. `recorder` gets the run block by block;
-    `progress` the number of samples done. `residuals` says whether the controller's KKT residuals
-    are wanted, which some compute only when asked: NaN without.
+    `progress` the number of samples done; True draws a bar. `residuals` says whether the
+    controller's KKT residuals are wanted, which some compute only when asked: NaN without.
 
     If the controller fails to solve (an exception whose class has `is_solver_failure`), the last
     applied action is applied again (at the first sample the scenario's reference action), the
@@ -72,19 +74,19 @@ def simulate(
     run = _Run(plant, controller, steps, seed, residuals)
     if recorder is not None:
         recorder.start(plant.scenario, controller, seed, steps, plant.units)
-        try:
-            run.go(recorder.record, progress)
-        finally:
-            recorder.close()
-        return run.trajectory()
     loop: CompiledLoop | None = None
-    if hasattr(type(plant), "drive") and hasattr(type(controller), "compiled_loop"):
+    drives = recorder is None and hasattr(type(plant), "drive")
+    if drives and hasattr(type(controller), "compiled_loop"):
         # Their own, not a wrapper's.
         loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
-    if loop is None:
-        run.go(None, progress)
-    else:
-        run.go_compiled(loop, progress)
+    with told(progress, plant.scenario.name, steps) as tell:
+        if loop is not None:
+            run.go_compiled(loop, tell)
+        elif recorder is None:
+            run.go(None, tell)
+        else:
+            with closing(recorder):
+                run.go(recorder.record, tell)
     return run.trajectory()
 
 
@@ -109,7 +111,7 @@ class _Run:
         self._final_state: Array | None = None
 
     def go(
-        self, record: Callable[[SampleBlock], None] | None, progress: Callable[[int], None] | None
+        self, record: Callable[[SampleBlock], None] | None, progress: Callable[[int], None]
     ) -> None:
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
         sampling_time = self._scenario.sampling_time
@@ -153,11 +155,10 @@ class _Run:
                 block = self._block(k // BLOCK * BLOCK, k + 1)
                 if record is not None:
                     record(block)
-                if progress is not None:
-                    progress(k + 1)
+                progress(k + 1)
         self._final_state = s
 
-    def go_compiled(self, loop: CompiledLoop, progress: Callable[[int], None] | None) -> None:
+    def go_compiled(self, loop: CompiledLoop, progress: Callable[[int], None]) -> None:
         """Run with the controller's loop, to the same columns."""
         scenario, plant, columns = self._scenario, self._plant, self._columns
         s = plant.reset(spawn_seeds(self._seed)[0])
@@ -187,8 +188,7 @@ class _Run:
                 },
             )
             self._status += [FALLBACK if each else "solved" for each in failed]
-            if progress is not None:
-                progress(end)
+            progress(end)
 
     def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
         """Prepare and feed back, timed apart; None if the controller declares a failure."""

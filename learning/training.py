@@ -25,6 +25,7 @@ from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, depends_on
+from cosim.progress import told
 from cosim.protocols import Array, Controller, Plant, Vector, functions_of
 from cosim.scenario import Scenario
 from cosim.simulation import indicators_of, spawn_seeds
@@ -45,6 +46,14 @@ if TYPE_CHECKING:
 
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
+SHOWN = (
+    ("J", "J", 1, ".0f"),
+    ("greedy_J", "greedy", 1, ".0f"),
+    ("regret", "regret %", 100, ".3g"),
+    ("td_error", "TD", 1, ".3g"),
+    ("smallest_eigenvalue", "λmin", 1, ".2g"),
+)
+"""Columns of the log behind the progress bar: name, text, scale, format."""
 EVERY = ("log_every", "evaluate_every", "checkpoint_every")
 LEAST = {"seed": 0} | dict.fromkeys(
     ("samples", *EVERY, "evaluation_seeds", "evaluation_steps", "rest_after"), 1
@@ -519,7 +528,7 @@ def train(
     out: str | Path | None = None,
     resume: bool = False,
     optimum: str | None = None,
-    progress: Callable[[int, LogRow], None] | None = None,
+    progress: Callable[[int, LogRow], None] | bool = False,
     **options: Unpack[Options],
 ) -> Training:
     """Train a controller's θ on a scenario's plant.
@@ -540,7 +549,7 @@ def train(
         the rest.
     resume : go on from the checkpoint in `out`.
     optimum : name of the controller whose J is J*; None is `optimal` where its solution is stored.
-    progress : called with the samples done and the last row of the log.
+    progress : called with the samples done and the last row of the log; True draws a bar.
     options : further fields of `TrainingRun`, `evaluate_every=1000` say; see `Options`.
     """
     if not isinstance(scenario, Scenario):
@@ -557,7 +566,7 @@ def run_training(
     *,
     resume: bool = False,
     optimum: str | None = None,
-    progress: Callable[[int, LogRow], None] | None = None,
+    progress: Callable[[int, LogRow], None] | bool = False,
     rule: type[Algorithm] | None = None,
 ) -> Training:
     """Train as `run` says; the other arguments and the errors are those of `train`.
@@ -583,7 +592,8 @@ def run_training(
         else:
             session.checkpoint()
         judge = Judge(run, evaluation_plant, session.start, best)
-        status = session.run_to_the_end(judge, progress)
+        with told(progress, run.algorithm, run.samples, _Remark()) as tell:
+            status = session.run_to_the_end(judge, tell)
         parameters = session.loop.parameters
         return Training(
             run=run,
@@ -602,6 +612,19 @@ def run_training(
         )
 
 
+class _Remark:
+    """What is shown behind the bar: the last value that the log has of each of its figures."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, float] = {}
+
+    def __call__(self, done: int, row: LogRow) -> tuple[int, str]:
+        last = self._last
+        last.update({name: value for name, value in row.items() if not isnan(value)})
+        shown = [f"{t} {scale * last[n]:{form}}" for n, t, scale, form in SHOWN if n in last]
+        return done, "  ".join(shown)
+
+
 class _Session:
     """A run that goes on: its loop, its log so far, and its checkpoint."""
 
@@ -617,7 +640,7 @@ class _Session:
         self.drift = drift(run.scenario)
         self.without_checkpoint: str | None = None
 
-    def run_to_the_end(self, judge: Judge, progress: Callable[[int, LogRow], None] | None) -> str:
+    def run_to_the_end(self, judge: Judge, progress: Callable[[int, LogRow], None]) -> str:
         """Take all samples, with log, evaluations and checkpoints; `finished` or `diverged: …`."""
         run, loop = self.run, self.loop
         while (number := loop.counts.number) < run.samples:
@@ -637,8 +660,7 @@ class _Session:
                 return trouble
             if number % run.checkpoint_every == 0 or number == run.samples:
                 self.checkpoint()
-            if progress is not None:
-                progress(number, row)
+            progress(number, row)
         return "finished"
 
     def row(self, number: int, judge: Judge | None) -> LogRow:

@@ -58,10 +58,8 @@ def demo(
             named = {NAIVE: NAIVE, BACKED_OFF: "", LEARNT: "", OPTIMAL: OPTIMAL}
             for name, training in trained.items():
                 named[name] = str(training.parameters.save(work / f"{training.run.algorithm}.toml"))
-            total = len(named) * RUNS * steps
-            with out_.progress("samples of the comparison", total) as progress:
-                seeds = range(first, first + RUNS)
-                found = evaluate(scenario, named, seeds, steps, progress=progress)
+            seeds = range(first, first + RUNS)
+            found = evaluate(scenario, named, seeds, steps, progress=out_.live)
             runs = {
                 name: simulate(plant, build_controller(named[name], scenario), steps, first)
                 for name in (NAIVE, LEARNT, OPTIMAL)
@@ -89,20 +87,18 @@ def demo(
 def _train(
     algorithm: str, start: str, samples: int, seed: int, settings: dict[str, Any], out_: cli.Output
 ) -> Training:
-    from cosim.cli.train import remark
     from learning.training import train
 
     every = max(1, samples // 10)
-    with out_.progress(f"{algorithm} from {start}", samples) as progress:
-        return train(
-            algorithm,
-            SCENARIO,
-            samples,
-            settings=settings,
-            seed=seed,
-            start=start,
-            progress=remark(progress),
-            log_every=every,
-            evaluate_every=every,
-            checkpoint_every=every,
-        )
+    return train(
+        algorithm,
+        SCENARIO,
+        samples,
+        settings=settings,
+        seed=seed,
+        start=start,
+        progress=out_.live,
+        log_every=every,
+        evaluate_every=every,
+        checkpoint_every=every,
+    )

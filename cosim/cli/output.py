@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,18 +57,24 @@ class Output:
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
         self._stdout: int | None = None
-        self._live: Console | None = None
+        self._aside: Callable[[], AbstractContextManager[None]] = nullcontext
+
+    @property
+    def live(self) -> bool:
+        """Whether progress is shown: on a terminal, unless JSON was asked for."""
+        return not self.as_json and sys.stderr.isatty()
 
     def console(self) -> Console:
-        """Console of standard error, for progress and notes; a note goes above a bar."""
+        """Console of standard error, for progress and notes."""
         from rich.console import Console
 
-        return self._live or Console(stderr=True)
+        return Console(stderr=True)
 
     def note(self, text: str) -> None:
-        """Print a line on standard error, unless JSON was asked for."""
+        """Print a line on standard error, above a bar, unless JSON was asked for."""
         if not self.as_json:
-            self.console().print(text, highlight=False, soft_wrap=True, markup=False)
+            with self._aside():
+                self.console().print(text, highlight=False, soft_wrap=True, markup=False)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print a table, columns of numbers right justified and the others left.
@@ -115,27 +121,17 @@ class Output:
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator[Callable[..., None]]:
         """Progress bar on standard error; yields a function of the number done and a remark."""
-        if self.as_json or not sys.stderr.isatty():
-            yield lambda done, remark="": None
-            return
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
+        from cosim.progress import told
 
-        console = self.console()
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        ends = (TimeRemainingColumn(), TextColumn("{task.fields[remark]}"))
-        with Progress(*columns, *ends, console=console) as bar:
-            task = bar.add_task(label, total=total, remark="")
-            self._live = console
+        with told(self.live, label, total) as show:
+            if self.live:
+                from tqdm import tqdm
+
+                self._aside = tqdm.external_write_mode
             try:
-                yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
+                yield show
             finally:
-                self._live = None
+                self._aside = nullcontext
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""

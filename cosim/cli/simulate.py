@@ -54,8 +54,7 @@ def simulate(
                 from cosim.recording import RerunRecorder
 
                 recorder = RerunRecorder(folder / "run.rrd")
-            with out_.progress(f"{controller} on {loaded.name}", steps) as progress:
-                trajectory = run(plant, law, steps, seed, recorder=recorder, progress=progress)
+            trajectory = run(plant, law, steps, seed, recorder=recorder, progress=out_.live)
             summary: dict[str, Any] = {
                 "version": version("rti-cosim"),
                 "scenario": loaded.name,

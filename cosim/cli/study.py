@@ -75,15 +75,12 @@ def _execute(
     for scenario in definition.scenarios.values():
         out_.announce(scenario.plant.fmu)
     planned = plan(definition)
-    label, total = f"{definition.name}, thousands of samples", round(planned.samples / 1000)
-    with cli.resumable(), out_.progress(label, total) as bar:
+    with cli.resumable(), out_.progress(definition.name, planned.samples) as bar:
 
         def report(state: State, line: str) -> None:
-            failed = f", {state.failed} failed" if state.failed else ""
-            runs = f"{state.runs}/{state.all_runs} runs{failed}"
-            bar(round(state.samples / 1000), runs)
+            bar(*state.short)
             if line:
-                out_.note(f"{runs}  {line}")
+                out_.note(f"{state.short[1]}  {line}")
 
         try:
             return study(
@@ -91,7 +88,7 @@ def _execute(
                 folder,
                 jobs=jobs or cpu_count(),
                 scheduler=scheduler,
-                report=report,
+                progress=report,
                 planned=planned,
                 figures=figures,
             )

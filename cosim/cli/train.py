@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +11,7 @@ from cosim.cli import output as cli
 from cosim.errors import CosimError
 
 if TYPE_CHECKING:
-    from learning.training import LogRow, Training
+    from learning.training import Training
 
 FILES = (
     "checkpoint.npz",
@@ -24,14 +22,6 @@ FILES = (
     "training.rrd",
 )
 """What a training leaves in its folder; each belongs to the same run."""
-# Columns of the log behind the progress bar: name, text, scale, format.
-FIGURES = (
-    ("J", "J", 1, ".0f"),
-    ("greedy_J", "greedy", 1, ".0f"),
-    ("regret", "regret %", 100, ".3g"),
-    ("td_error", "TD", 1, ".3g"),
-    ("smallest_eigenvalue", "λmin", 1, ".2g"),
-)
 
 
 def train(
@@ -153,11 +143,9 @@ def train(
             go_on = f"the same command with --resume goes on from {checkpoint}"
             return go_on if checkpoint.is_file() else ""
 
-        with cli.resumable(how), out_.progress(algorithm, run.samples) as progress:
+        with cli.resumable(how):
             best = optimum or stored_optimum(run.scenario)
-            training = run_training(
-                run, folder, resume=resume, optimum=best, progress=remark(progress)
-            )
+            training = run_training(run, folder, resume=resume, optimum=best, progress=out_.live)
         if reason := training.without_checkpoint:
             out_.note(f"left no checkpoint, --resume is not possible: {reason}")
         timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
@@ -173,18 +161,6 @@ def train(
         out_.json(summary, folder)
     if training.status != "finished":
         raise typer.Exit(1)
-
-
-def remark(progress: Callable[..., None]) -> Callable[[int, LogRow], None]:
-    """Show J, TD error, regret and the smallest eigenvalue of the log's rows behind the bar."""
-    last: dict[str, float] = {}
-
-    def update(done: int, row: LogRow) -> None:
-        last.update({name: value for name, value in row.items() if not isnan(value)})
-        shown = [f"{t} {scale * last[n]:{form}}" for n, t, scale, form in FIGURES if n in last]
-        progress(done, "  ".join(shown))
-
-    return update
 
 
 def record_training(path: Path, training: Training) -> None:

@@ -29,6 +29,7 @@ from cosim.plant import FmuPlant
 from cosim.plant.fmi import unpack
 from cosim.plugins import OURS, build_controller, code_hash, import_from
 from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
+from cosim.progress import told
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import measure, simulate
@@ -194,6 +195,12 @@ class State:
     runs: int
     all_runs: int
     failed: int
+
+    @property
+    def short(self) -> tuple[int, str]:
+        """The samples, and the rest in words."""
+        failed = f", {self.failed} failed" if self.failed else ""
+        return self.samples, f"{self.runs}/{self.all_runs} runs{failed}"
 
 
 Report = Callable[[State, str], None]
@@ -474,7 +481,7 @@ def study(
     *,
     jobs: int = 1,
     scheduler: str | None = None,
-    report: Report = lambda state, line: None,
+    progress: Report | bool = False,
     planned: Plan | None = None,
     figures: bool = True,
 ) -> StudyResults:
@@ -488,7 +495,8 @@ def study(
     source : a study, its file, or the same document as a mapping.
     jobs : worker processes; 1 works in this process. No byte of a table depends on it.
     scheduler : address of a Dask scheduler, used in place of `jobs`.
-    report : gets the state after every work item, and a line for each run that ends or fails.
+    progress : called with the state after every work item, and with a line for each run that ends
+        or fails; True draws a bar.
     planned : what `plan` returned, if it is known.
     figures : whether the study's trajectories and logs are drawn.
     """
@@ -497,10 +505,12 @@ def study(
     definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     planned = planned or plan(definition)
-    runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
-    for line in runner.remarks:
-        report(State(0, 0, len(planned.runs), 0), line)
-    runner.go(jobs, scheduler)
+    bar = told(progress, definition.name, planned.samples, lambda state, _: state.short)
+    with bar as report:
+        runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
+        for line in runner.remarks:
+            report(State(0, 0, len(planned.runs), 0), line)
+        runner.go(jobs, scheduler)
     results = StudyResults.collect(planned, folder).write(planned, figures=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))

@@ -79,4 +79,4 @@ def document(**changes):
 
 def run_toy(out, *, jobs=1, report=lambda state, line: None, **changes):
     """Run the document with some changes."""
-    return study(document(**changes), out, jobs=jobs, report=report)
+    return study(document(**changes), out, jobs=jobs, progress=report)

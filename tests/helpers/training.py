@@ -47,7 +47,7 @@ def train(
     *,
     rule: type[Algorithm] | None = None,
     resume: bool = False,
-    progress: Callable[[int, LogRow], None] | None = None,
+    progress: Callable[[int, LogRow], None] | bool = False,
 ) -> Training:
     """Train to the end without an optimum, by another rule than the run's where one is given."""
     return run_training(run, out, rule=rule, resume=resume, progress=progress)

@@ -10,6 +10,7 @@ from scipy.optimize import fsolve
 
 from controllers.evaporator import model as evaporator
 from controllers.model import Model, Quantity, discretise, economic_cost
+from tests.helpers import paper
 
 
 def scalar_model(ode, time_unit=1.0):
@@ -54,18 +55,12 @@ X_S = [25.0, 49.74297463837443]
 U_S = [191.71322465335396, 215.88843973473226]
 
 
-def paper(x, u, d=(5.0, 10.0, 40.0, 25.0), UA2=6.84, h=0.16):
-    """Right-hand side and stage cost as printed in paper.tex, Simulations."""
-    (X2, P2), (P100, F200), (X1, F1, T1, T200) = x, u, d
-    a, b, c, dd, e, f, g = 0.5616, 0.3126, 48.43, 0.507, 55.0, 0.1538, 90.0
-    M, C, Cp, lam, lam_s, F3 = 20.0, 4.0, 0.07, 38.5, 36.6, 50.0
-    T2, T3, T100 = a * P2 + b * X2 + c, dd * P2 + e, f * P100 + g
-    Q100 = h * (F1 + F3) * (T100 - T2)
-    F4 = (Q100 - F1 * Cp * (T2 - T1)) / lam
-    F5 = UA2 * (T3 - T200) / (1 + UA2 / (2 * Cp * F200)) / lam
-    F2, F100 = F1 - F4, Q100 / lam_s
-    rate = [(F1 * X1 - F2 * X2) / M, (F4 - F5) / C]
-    return np.array(rate), 10.09 * (F2 + F3) + 600 * F100 + 0.6 * F200
+NOMINAL = (5.0, 10.0, 40.0, 25.0)
+
+
+def rate_and_cost(x, u, d=NOMINAL, **changes):
+    found = paper.evaporator(x, u, d, **changes)
+    return found["rates"], found["economic_cost"]
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +79,7 @@ def test_rate_and_cost_are_those_of_the_paper(samples):
     f = ca.Function("f", [x, u, d, p], [model.ode(x, u, d, p)])
     cost = economic_cost(model)
     for x, u, d in samples:
-        rate, expected = paper(x, u, d)
+        rate, expected = rate_and_cost(x, u, d)
         arguments = (x, u, d, model.nominal_parameters)
         np.testing.assert_allclose(np.array(f(*arguments)).ravel(), rate, rtol=1e-12, atol=1e-12)
         assert float(cost(*arguments)) == pytest.approx(expected, rel=1e-13)
@@ -97,17 +92,17 @@ def test_a_parameter_given_in_p_is_used(samples):
     changed = model.nominal_parameters
     changed[model.parameter_indices(("UA2", "h"))] = 7.0, 0.17
     x, u, d = samples[0]
-    rate, _ = paper(x, u, d, UA2=7.0, h=0.17)
+    rate, _ = rate_and_cost(x, u, d, UA2=7.0, h=0.17)
     np.testing.assert_allclose(np.array(f(x, u, d, changed)).ravel(), rate, rtol=1e-12)
 
 
 def test_the_reference_is_the_least_costly_steady_state_on_the_bound():
     # One degree of freedom is left on X2 = 25: P2; the stationary point is the reference.
     def controls(pressure):
-        return fsolve(lambda u: paper([25.0, pressure], u)[0], U_S, xtol=1e-14)
+        return fsolve(lambda u: rate_and_cost([25.0, pressure], u)[0], U_S, xtol=1e-14)
 
     def cost(pressure):
-        return paper([25.0, pressure], controls(pressure))[1]
+        return rate_and_cost([25.0, pressure], controls(pressure))[1]
 
     assert cost(X_S[1]) == pytest.approx(6210.384509575885, rel=1e-12)
     np.testing.assert_allclose(controls(X_S[1]), U_S, rtol=1e-10)
@@ -122,7 +117,7 @@ def test_a_sample_follows_an_accurate_integration_to_fourth_order(samples):
         worst = 0.0
         for x, u, d in samples:
             exact = solve_ivp(
-                lambda _, x, u=u, d=d: paper(x, u, d)[0], (0, 1), x, rtol=1e-13, atol=1e-13
+                lambda _, x, u=u, d=d: rate_and_cost(x, u, d)[0], (0, 1), x, rtol=1e-13, atol=1e-13
             ).y[:, -1]
             found = np.array(f(x, u, d, model.nominal_parameters)).ravel()
             worst = max(worst, np.abs(found - exact).max())

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 import fmus
 from benchmarks.importers import relative_difference
 from tests.helpers import crosscheck
+from tests.helpers.paper import evaporator
 
 
 @pytest.mark.parametrize("name", fmus.NAMES)
@@ -33,7 +34,6 @@ def test_model_exchange_agrees_to_1e_6(version: int, case: str) -> None:
 
 
 def test_stored_states_solve_the_differential_equations() -> None:
-    """Model of the evaporator with its numbers written out; time in minutes."""
     for case in crosscheck.CASES:
         stored = crosscheck.load(case)
         for k in range(len(stored) - 1):
@@ -45,13 +45,8 @@ def test_stored_states_solve_the_differential_equations() -> None:
             tau = (k - 43.2 * (k // 43.2)) / 1440 if case == "drifting" else 0.0
             ua2 = 6.84 * (0.6 + 0.4 * np.exp(-20.0 * tau))
 
-            def rates(_, y, p100=p100, f200=f200, x1=x1, f1=f1, t1=t1, t200=t200, ua2=ua2):
-                x2, p2 = y
-                t2, t3 = 0.5616 * p2 + 0.3126 * x2 + 48.43, 0.507 * p2 + 55
-                q100 = 0.16 * (f1 + 50) * (0.1538 * p100 + 90 - t2)
-                f4 = (q100 - f1 * 0.07 * (t2 - t1)) / 38.5
-                f5 = ua2 * (t3 - t200) / (1 + ua2 / (0.14 * f200)) / 38.5
-                return (f1 * x1 - (f1 - f4) * x2) / 20, (f4 - f5) / 4
+            def rates(_, y, u=(p100, f200), d=(x1, f1, t1, t200), ua2=ua2):
+                return evaporator(y, u, d, UA2=ua2)["rates"]
 
             start = stored["X2"][k], stored["P2"][k]
             end = solve_ivp(rates, (0, 1), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]

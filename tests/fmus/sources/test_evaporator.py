@@ -7,45 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from fmus.evaporator import EVAPORATOR
+from tests.helpers.paper import ALGEBRAIC, NUMBERS, evaporator
 
 DISTURBANCES = ("X1", "F1", "T1", "T200")
-PARAMETERS = [
-    "a",
-    "b",
-    "c",
-    "d",
-    "e",
-    "f",
-    "g",
-    "h",
-    "M",
-    "C",
-    "UA2",
-    "Cp",
-    "lambda_",
-    "lambda_s",
-    "F3",
-]
-ALGEBRAIC = ["F2", "F4", "F5", "F100", "T2", "T3", "T100", "UA1", "Q100", "Q200", "economic_cost"]
-
-
-def outputs(x, u, d, p) -> dict[str, float]:
-    """The paper's equations, solved by hand for each output; time in minutes."""
-    (x2, p2), (p100, f200), (x1, f1, t1, t200) = x, u, d
-    t2, t3, t100 = p["a"] * p2 + p["b"] * x2 + p["c"], p["d"] * p2 + p["e"], p["f"] * p100 + p["g"]
-    ua1 = p["h"] * (f1 + p["F3"])
-    q100 = ua1 * (t100 - t2)
-    f4 = (q100 - f1 * p["Cp"] * (t2 - t1)) / p["lambda_"]
-    q200 = p["UA2"] * (t3 - t200) / (1 + p["UA2"] / (2 * p["Cp"] * f200))
-    f2, f5, f100 = f1 - f4, q200 / p["lambda_"], q100 / p["lambda_s"]
-    cost = 10.09 * (f2 + p["F3"]) + 600 * f100 + 0.6 * f200
-    rates = np.array([(f1 * x1 - f2 * x2) / p["M"], (f4 - f5) / p["C"]])
-    values = (f2, f4, f5, f100, t2, t3, t100, ua1, q100, q200, cost)
-    return dict(zip(ALGEBRAIC, values, strict=True)) | {"rates": rates}
-
-
-def defaults() -> dict[str, float]:
-    return {name: float(EVAPORATOR.by_name[name].start) for name in PARAMETERS}
 
 
 def random_points(count: int, seed: int = 0) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -68,12 +32,16 @@ def start(plant, x, u, d, p):
     )
 
 
+def test_the_papers_numbers_are_the_defaults() -> None:
+    assert {name: EVAPORATOR.by_name[name].start for name in NUMBERS} == NUMBERS
+
+
 def test_outputs_and_derivatives_at_random_points(open_fmu, version: int) -> None:
     rng = np.random.default_rng(1)
     for x, u, d in random_points(30):
-        p = {name: value * rng.uniform(0.9, 1.1) for name, value in defaults().items()}
+        p = {name: value * rng.uniform(0.9, 1.1) for name, value in NUMBERS.items()}
         plant = start(open_fmu(version), x, u, d, p)
-        expected = outputs(x, u, d, p)
+        expected = evaporator(x, u, d, **p)
         np.testing.assert_allclose(
             plant.get(*ALGEBRAIC), [expected[n] for n in ALGEBRAIC], rtol=1e-12, atol=1e-11
         )
@@ -90,12 +58,12 @@ WORST_CORNER = (
 
 
 def test_step_is_within_the_documented_5e_10_of_a_tight_integration(open_fmu, version: int) -> None:
-    p = defaults()
+    p = NUMBERS
     for x, u, d in [*random_points(40, seed=2), WORST_CORNER]:
         plant = start(open_fmu(version), x, u, d, p)
         plant.step(0.0, 60.0)
         exact = solve_ivp(
-            lambda t, y, u=u, d=d: outputs(y, u, d, p)["rates"],
+            lambda t, y, u=u, d=d: evaporator(y, u, d, **p)["rates"],
             (0.0, 1.0), x, method="DOP853", rtol=1e-13, atol=1e-13,
         ).y[:, -1]  # fmt: skip
         np.testing.assert_allclose(plant.get("X2", "P2"), exact, rtol=5e-10, atol=0)
@@ -104,11 +72,11 @@ def test_step_is_within_the_documented_5e_10_of_a_tight_integration(open_fmu, ve
 @pytest.mark.parametrize("sampling_time", [6.0, 60.0, 3600.0])
 def test_long_run_is_within_1e_9(plant, sampling_time: float) -> None:
     x, u, d = random_points(1, seed=3)[0]
-    p = defaults()
+    p = NUMBERS
     start(plant, x, u, d, p | {"sampling_time": sampling_time})
     plant.step(0.0, 3600.0)
     exact = solve_ivp(
-        lambda t, y: outputs(y, u, d, p)["rates"], (0.0, 60.0), x,
+        lambda t, y: evaporator(y, u, d, **p)["rates"], (0.0, 60.0), x,
         method="DOP853", rtol=1e-13, atol=1e-13,
     ).y[:, -1]  # fmt: skip
     np.testing.assert_allclose(plant.get("X2", "P2"), exact, rtol=1e-9, atol=0)
@@ -116,10 +84,10 @@ def test_long_run_is_within_1e_9(plant, sampling_time: float) -> None:
 
 def test_integration_is_of_fourth_order(open_fmu, version: int) -> None:
     """Halving the step of a non-stiff problem divides the error by about 2⁴."""
-    p = defaults() | {"M": 1.0}
+    p = NUMBERS | {"M": 1.0}
     x, u, d = np.array([25.0, 50.0]), np.array([200.0, 200.0]), np.array([5.0, 10.0, 40.0, 25.0])
     exact = solve_ivp(
-        lambda t, y: outputs(y, u, d, p)["rates"], (0.0, 0.2), x,
+        lambda t, y: evaporator(y, u, d, **p)["rates"], (0.0, 0.2), x,
         method="DOP853", rtol=1e-13, atol=1e-13,
     ).y[0, -1]  # fmt: skip
     errors = []

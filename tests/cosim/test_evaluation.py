@@ -57,23 +57,6 @@ def test_two_workers_give_the_bytes_of_one(paper):
     assert contents(evaluate(paper, BOTH, 4, 40, jobs=2)) == contents(evaluate(paper, BOTH, 4, 40))
 
 
-@pytest.fixture
-def cluster(ledger):
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    ) as cluster:
-        yield cluster.scheduler_address
-
-
-@pytest.mark.slow
-def test_a_killed_dask_worker_loses_nothing(paper, cluster, ledger):
-    broken = evaluate(paper, {"mortal": mortal}, 5, 20, scheduler=cluster)
-    assert len(ledger()) > 5, "no run was begun twice, so none was killed"
-    assert contents(broken) == contents(evaluate(paper, {"mortal": mortal}, 5, 20))
-
-
 def test_a_finished_evaluation_is_read_not_run_again(paper, tmp_path, ledger):
     first = evaluate(paper, {"noting": noting}, 3, 20, folder=tmp_path / "out")
     runs = len(ledger())

@@ -59,13 +59,6 @@ def test_a_missing_capability_is_an_error_only_when_asked_for(tanks, tmp_path):
         plant.step([3.0])
 
 
-def test_returned_nan_is_an_error_that_names_variable_and_step(tanks, tmp_path):
-    with FmuPlant(write_scenario(tmp_path, tanks[True], fault=1)) as plant:
-        plant.reset(0)
-        with pytest.raises(PlantError, match="returned x = nan at step 0"):
-            plant.step([1.0])
-
-
 @pytest.mark.parametrize(
     ("fault", "words"), [(2, "error: tank: out of water"), (3, "fatal: tank: burst")]
 )

@@ -12,7 +12,6 @@ from controllers.factories import naive
 from cosim import evaluate
 from cosim.errors import EvaluationError
 from cosim.studies import run as engine
-from tests.helpers.command import run_cosim
 from tests.helpers.schedulers import ANSWERS, PACKAGES, ROOT, listener, processes
 
 pytest.importorskip("distributed")
@@ -109,12 +108,3 @@ def test_a_scheduler_that_ends_or_hangs_ends_the_run_and_loses_nothing(number, t
         stop.join()
     assert "\n" not in str(caught.value)
     assert 1 <= len(rows.read_text().splitlines()) - 1 < 400
-
-
-@SLOW
-def test_the_command_says_so_in_a_line_with_exit_code_2(tmp_path):
-    with listener(ANSWERS["silent"]) as address:
-        words = ["evaluate", "--seeds", "1", "-n", "3", "--scheduler", address, "-o", "out"]
-        done = run_cosim(*words, folder=tmp_path, timeout=120)
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith(f"error: the Dask cluster at '{address}'")

@@ -143,12 +143,3 @@ def test_the_installed_results_hold(installed, tmp_path):
     words = ("results", "check", "closed-loop", "--json")
     result = json.loads(run(installed, "-m", "cosim", *words, cwd=tmp_path, env=env))
     assert result["same"] is True
-
-
-def test_importing_warns_of_nothing(installed, tmp_path):
-    code = "import cosim.cli, cosim.figures, cosim.recording, controllers, fmus, learning"
-    run(installed, "-W", "error", "-c", code, cwd=tmp_path, env=bare_environment(installed))
-
-
-def test_the_dependencies_agree(installed, tmp_path):
-    run(installed, "-m", "pip", "check", cwd=tmp_path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from inspect import getdoc
 from itertools import pairwise
 from typing import Annotated, Any
 
@@ -54,6 +55,10 @@ class _Commands(TyperGroup):
             if not {before, name} & set(OUTPUTS):
                 inputs += [word, *re.split("[,=]", word)]
         protect(inputs)
+        if {"-h", "--help"} & {*args}:
+            import typer.rich_utils
+
+            typer.rich_utils.RANGE_STRING = ""  # [1<=x<=100000000] takes a narrow terminal's room
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -102,6 +107,10 @@ for panel, group, example in (
 ):
     name = example.partition(" ")[0]
     app.add_typer(group, name=name, rich_help_panel=panel, epilog=f"Example: cosim {example}")
+for group in (app, scenario.app, study.app, study.results, fmu.app):
+    for command in group.registered_commands:  # paragraphs as wide as the terminal
+        paragraphs = (getdoc(command.callback) or "").split("\n\n")
+        command.help = "\n\n".join(paragraph.replace("\n", " ") for paragraph in paragraphs)
 
 EXIT_BAD_INPUT = 2
 EXIT_UNFORESEEN = 70

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import fmpy
 import pytest
-from fmpy import fmi2, fmi3
 
 from fmus import BuildError
 from fmus.model import Kind, Variable
 from fmus.sampled import SampledSystem, build_sampled
+from tests.helpers.instance import Instance
 
 CORE = b"""
 #ifndef CORE_H
@@ -62,75 +61,17 @@ def built(request, adder: SampledSystem, tmp_path_factory) -> tuple[int, Path]:
         pytest.skip(str(error))
 
 
-class Instance:
-    """An instance with the names of FMI 2.0's functions for both versions; `log` has its words."""
-
-    def __init__(self, folder: Path, version: int) -> None:
-        description = fmpy.read_model_description(str(folder))
-        self.references = {v.name: v.valueReference for v in description.modelVariables}
-        self.log: list[str] = []
-        self.version = version
-        self.fmu = (fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave)(
-            guid=description.guid,
-            unzipDirectory=str(folder),
-            modelIdentifier="adder",
-            instanceName="test",
-        )
-        if version == 2:
-            callbacks = fmi2.fmi2CallbackFunctions()
-            callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(
-                lambda *a: self.log.append(a[4].decode())
-            )
-            self.fmu.instantiate(callbacks=callbacks)
-        else:
-            self.fmu.instantiate(logMessage=lambda *a: self.log.append(a[3].decode()))
-
-    def start(self, time: float = 0.0) -> Instance:
-        if self.version == 2:
-            self.fmu.setupExperiment(startTime=time)
-            self.fmu.enterInitializationMode()
-        else:
-            self.fmu.enterInitializationMode(startTime=time)
-        self.fmu.exitInitializationMode()
-        return self
-
-    def set(self, name: str, value: float) -> None:
-        setter = self.fmu.setReal if self.version == 2 else self.fmu.setFloat64
-        setter([self.references[name]], [value])
-
-    def get(self, name: str) -> float:
-        getter = self.fmu.getReal if self.version == 2 else self.fmu.getFloat64
-        return getter([self.references[name]])[0]
-
-    def step(self, time: float, size: float = STEP) -> None:
-        self.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)
-
-    def snapshot(self) -> object:
-        return self.fmu.getFMUstate() if self.version == 2 else self.fmu.getFMUState()
-
-    def restore(self, state: object) -> None:
-        (self.fmu.setFMUstate if self.version == 2 else self.fmu.setFMUState)(state)
-
-    def serialise(self, state: object) -> bytes:
-        name = "serializeFMUstate" if self.version == 2 else "serializeFMUState"
-        return bytes(getattr(self.fmu, name)(state))
-
-    def deserialise(self, data: bytes) -> object:
-        name = "deSerializeFMUstate" if self.version == 2 else "deserializeFMUState"
-        return getattr(self.fmu, name)(data)
-
-
 @pytest.fixture
-def make(built: tuple[int, Path]) -> Iterator[Callable[[], Instance]]:
+def make(built: tuple[int, Path], tmp_path: Path) -> Iterator[Callable[[], Instance]]:
+    """A new instance, not yet initialised; all are freed after the test."""
     version, path = built
-    folder = fmpy.extract(str(path))
+    fmpy.extract(str(path), str(tmp_path / "unzipped"))
     made: list[Instance] = []
 
     def new() -> Instance:
-        made.append(Instance(Path(folder), version))
+        made.append(Instance(tmp_path / "unzipped", version))
         return made[-1]
 
     yield new
     for instance in made:
-        instance.fmu.freeInstance()
-    shutil.rmtree(folder)
+        instance.close()

@@ -43,14 +43,10 @@ def test_serialised_state_continues_bit_identically_in_another_process(
     plant.free(state)
     expected = plant.run(10, start=420.0)
     code = f"""
-import importlib.util, pathlib, sys
-spec = importlib.util.spec_from_file_location("adapter", {__file__!r}.replace(
-    "sources/test_snapshot.py", "conftest.py"))
-adapter = importlib.util.module_from_spec(spec)
-sys.modules["adapter"] = adapter
-spec.loader.exec_module(adapter)
-plant = adapter.Instance(pathlib.Path({str(folders[version])!r}), {version}, False)
-plant.restore(plant.deserialise(pathlib.Path({str(tmp_path / "state")!r}).read_bytes()))
+from pathlib import Path
+from tests.helpers.instance import Instance
+plant = Instance(Path({str(folders[version])!r}), {version})
+plant.restore(plant.deserialise(Path({str(tmp_path / "state")!r}).read_bytes()))
 print(repr(plant.run(10, start=420.0)))
 """
     result = subprocess.run(

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_are
 from scipy.optimize import linear_sum_assignment
 
-from controllers.economic import linear_model, tune
+from controllers.economic import linear_model, local_feedback, tune
 from controllers.errors import ControllerError
 from controllers.problem import Problem
 from cosim.protocols import Array, Decision
@@ -25,14 +24,9 @@ class Lqr:
     """
 
     def __init__(self, problem: Problem) -> None:
-        (A, B), n, H = (
-            linear_model(problem),
-            problem.n_states,
-            tune(problem).convexification.hessian,
-        )
-        P = solve_discrete_are(A, B, H[:n, :n], H[n:, n:], s=H[:n, n:])
+        H = tune(problem).convexification.hessian
         self.problem = problem
-        self.gain: Array = np.linalg.solve(H[n:, n:] + B.T @ P @ B, B.T @ P @ A + H[n:, :n])
+        self.gain = -local_feedback(*linear_model(problem), H, np.zeros((0, len(H)))).gain
 
     def reset(self) -> None:
         """Nothing is remembered."""

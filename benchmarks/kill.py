@@ -30,8 +30,7 @@ from pathlib import Path
 from cosim.files import read_arrays
 from cosim.processes import HOLDER, LOCK, hold, release
 from cosim.recording import read_recording
-from tests.helpers.command import run_cosim, start_cosim
-from tests.helpers.processes import alive, eventually
+from tests.helpers.command import alive, eventually, run_cosim, start_cosim
 
 ROOT = Path(__file__).parents[1]
 MARK = "COSIM_KILL"

@@ -13,9 +13,8 @@ import pytest
 from cosim import processes
 from cosim.errors import CosimError
 from cosim.processes import run_child
-from tests.helpers.command import run_cosim, start_cosim
+from tests.helpers.command import alive, eventually, run_cosim, start_cosim
 from tests.helpers.kinds import build_kind, scenario_for
-from tests.helpers.processes import alive, eventually
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 SLOW = pytest.mark.slow

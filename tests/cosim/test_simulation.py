@@ -112,10 +112,10 @@ class Predicting(Proportional):
 
     def feedback(self, s, a=None):
         answer = super().feedback(s)
-        if s[0] > 25.0:
-            answer.predicted_states = np.tile(s, (4, 1))
-            answer.predicted_actions = np.tile(answer.action, (3, 1))
-        return answer
+        if s[0] <= 25.0:
+            return answer
+        states, actions = np.tile(s, (4, 1)), np.tile(answer.action, (3, 1))
+        return answer._replace(predicted_states=states, predicted_actions=actions)
 
 
 def test_a_recorder_gets_the_whole_run_in_blocks(evaporator, paper):

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim import FmuPlant, Scenario, simulate
+from cosim import Decision, FmuPlant, Scenario, simulate
 from cosim.comparison import compare, load_run
 from cosim.errors import CosimError, StudyError
 from cosim.files import check_target, protect, write_atomically
 from cosim.studies.plan import RunKey
 from tests.helpers.command import run_cosim
-from tests.helpers.loop import Answer, Proportional
+from tests.helpers.loop import Proportional
 
 PAPER = Scenario.load("paper")
 ROOT = str(Path(__file__).parents[2])
@@ -84,7 +84,7 @@ SOLUTIONS = {"None": None, "an action": np.array(GOOD), "a dict": {"action": np.
 @pytest.mark.parametrize("kind", ACTIONS)
 def test_an_action_of_a_wrong_kind_shape_or_value_is_one_line(plant, kind):
     with pytest.raises(CosimError) as error:
-        simulate(plant, Plugin(lambda k, s: Answer(ACTIONS[kind])), 2, 0)
+        simulate(plant, Plugin(lambda k, s: Decision(ACTIONS[kind])), 2, 0)
     assert "action" in one_line(error)
 
 
@@ -108,7 +108,7 @@ PREDICTIONS = {
 def test_a_prediction_that_changes_its_shape_or_kind_is_one_line(plant, kind):
     def answer(k, s):
         states, actions = PREDICTIONS[kind](k)
-        return Answer(np.array(GOOD), predicted_states=states, predicted_actions=actions)
+        return Decision(np.array(GOOD), predicted_states=states, predicted_actions=actions)
 
     with pytest.raises(CosimError, match="prediction") as error:
         simulate(plant, Plugin(answer), 3, 0, recorder=Keep())
@@ -128,7 +128,7 @@ WRITES = {
 def test_the_state_that_a_controller_reads_cannot_be_written(plant, way):
     def answer(k, s):
         WRITES[way](s)
-        return Answer(np.array(GOOD))
+        return Decision(np.array(GOOD))
 
     with pytest.raises(ValueError, match="read-only"):
         simulate(plant, Plugin(answer), 2, 0)

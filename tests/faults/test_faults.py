@@ -38,7 +38,8 @@ def command_line(folder, *words, limit=None):
         if limit is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    return run_cosim(*words, folder=folder, preexec_fn=confine)
+    root = str(Path(__file__).parents[2])
+    return run_cosim(*words, folder=folder, env={"PYTHONPATH": root}, preexec_fn=confine)
 
 
 def refused(result):
@@ -148,28 +149,20 @@ def tank(tmp_path_factory):
 )
 def test_a_failing_plant_ends_the_run_in_one_line(tmp_path, tank, fault, words):
     scenario = write_scenario(tmp_path, tank, fault=fault)
-    (tmp_path / "still.py").write_text(STILL)
-    command = ["simulate", "-s", str(scenario), "-c", "still:make", "-n", "5", "--out", "out"]
+    command = [
+        "simulate",
+        "-s",
+        str(scenario),
+        "-c",
+        "tests.helpers.loop:hold",
+        "-n",
+        "5",
+        "--out",
+        "out",
+    ]
     said = refused(command_line(tmp_path, *command))
     assert words in said
     assert not list((tmp_path / "out").glob("*"))
-
-
-STILL = """
-from types import SimpleNamespace
-import numpy as np
-
-class Still:
-    def __init__(self, u): self.u = np.array(u)
-    def reset(self): pass
-    def prepare(self): pass
-    def feedback(self, s, a=None):
-        return SimpleNamespace(action=self.u, value=0.0, status="solved", residual=0.0,
-                               predicted_states=None, predicted_actions=None)
-
-def make(scenario):
-    return Still(scenario.reference_action)
-"""
 
 
 # Solvers ---------------------------------------------------------------------------------------

@@ -1,13 +1,16 @@
-"""The command line in a process of its own."""
+"""The command line in a process of its own; waiting for what it does, and for its end."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 NOTHING: Mapping[str, str] = {}
 LONG_STUDY = """\
@@ -57,3 +60,20 @@ def start_cosim(
         text=True,
         **options,
     )
+
+
+def alive(number):
+    """Whether a process runs; a dead one that nobody waits for counts as ended."""
+    try:
+        return psutil.Process(int(number)).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def eventually(condition, seconds=20.0):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False

@@ -10,7 +10,7 @@ from tempfile import mkdtemp
 import fmpy
 
 from fmus import present
-from tests.helpers.one_state import write_one_state
+from tests.helpers.tank import write_one_state
 
 SOURCE = Path(__file__).parent / "foreign" / "kinds.c"
 REALS = """

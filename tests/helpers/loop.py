@@ -1,18 +1,8 @@
 """Small controllers to drive the loop with, in place of an NMPC."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
-
-@dataclass
-class Answer:
-    action: np.ndarray
-    value: float = float("nan")
-    status: str = "solved"
-    residual: float = float("nan")
-    predicted_states: np.ndarray | None = None
-    predicted_actions: np.ndarray | None = None
+from cosim import Decision
 
 
 class Proportional:
@@ -34,7 +24,7 @@ class Proportional:
     def feedback(self, s, a=None):
         error = self._scenario.reference_state - s
         action = self._scenario.reference_action + self._gain * np.array([error[0], 0.0])
-        return Answer(action, value=float(error[0]))
+        return Decision(action, value=float(error[0]))
 
 
 class SolverFailed(Exception):
@@ -67,7 +57,7 @@ class Hold:
     """Applies one action for ever."""
 
     def __init__(self, action):
-        self._answer = Answer(np.array(action))
+        self._answer = Decision(np.array(action))
 
     def reset(self):
         pass

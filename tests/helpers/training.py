@@ -84,3 +84,18 @@ def looped(
     loop = TrainingLoop(plant, controller, algorithm, strategy, rng)
     loop.start(plant.reset(seed))
     return loop
+
+
+class Carrier:
+    """A stand-in for a controller of which only θ matters."""
+
+    def __init__(self, parameters):
+        self.parameters = parameters
+
+    @property
+    def theta(self):
+        return self.parameters.theta
+
+    @theta.setter
+    def theta(self, theta):
+        self.parameters = self.parameters.with_theta(theta)

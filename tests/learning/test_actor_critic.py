@@ -7,7 +7,7 @@ from controllers.theta import Parameters
 from learning import ActorCritic
 from learning.actor_critic import AdvantageRegression, lstdv
 from learning.algorithm import Transition
-from tests.helpers.carrier import Carrier
+from tests.helpers.training import Carrier
 
 
 class Solution:

@@ -20,8 +20,8 @@ from learning.step import (
     td_fit,
     td_step,
 )
-from tests.helpers.carrier import Carrier
 from tests.helpers.other_units import factors
+from tests.helpers.training import Carrier
 
 SIZE = 6
 

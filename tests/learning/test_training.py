@@ -179,15 +179,3 @@ def test_a_run_that_began_otherwise_is_given_no_more_samples(scenario, tmp_path,
     longer = dataclasses.replace(run, samples=400)
     with pytest.raises(CheckpointError, match=message):
         train(longer, tmp_path, resume=True)
-
-
-def test_scenarios_that_differ_in_open_points_train_differently(scenario):
-    run = make_run(scenario, "q-learning", samples=60)
-    theta = {train(run).parameters.hash}
-    for stated in (
-        {"exploration": {"kind": "additive", "probability": 0.1, "standard_deviation": [3.0, 3.0]}},
-        {"controller": {"value_offset": "stage-cost"}},
-    ):
-        other = dataclasses.replace(run, scenario=scenario.replace(stated))
-        theta.add(train(other).parameters.hash)
-    assert len(theta) == 3

@@ -9,9 +9,8 @@ from learning import ActorCritic, BatchQLearning, QLearning
 from learning.configuration import Configuration
 from learning.step import ConstrainedStep, Fit, least_eigenvalue
 from learning.training import starting_parameters
-from tests.helpers.carrier import Carrier
 from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
-from tests.helpers.training import looped
+from tests.helpers.training import Carrier, looped
 
 SAMPLES = 240
 SETTINGS = {

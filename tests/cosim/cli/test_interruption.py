@@ -7,8 +7,7 @@ import sys
 
 import pytest
 
-from tests.helpers.command import LONG_STUDY
-from tests.helpers.processes import eventually
+from tests.helpers.command import LONG_STUDY, eventually
 
 AGAIN = "; what is finished is kept: the same command goes on from there"
 COMMANDS = {

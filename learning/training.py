@@ -527,11 +527,10 @@ def train(
     settings: Mapping[str, Any] | Configuration | None = None,
     out: str | Path | None = None,
     resume: bool = False,
-    optimum: str | None = None,
     progress: Callable[[int, LogRow], None] | bool = False,
     **options: Unpack[Options],
 ) -> Training:
-    """Train a controller's θ on a scenario's plant.
+    """Train a controller's θ on a scenario's plant; J* is that of its stored optimum, if any.
 
     Raises AlgorithmLookupError, ConfigurationError, ScenarioError, PlantError, CheckpointError,
     each in one line, before the work where it can be known before; PrivilegeError where an
@@ -548,7 +547,6 @@ def train(
     out : folder that the run's checkpoints are kept in; None keeps none. `Training.save` writes
         the rest.
     resume : go on from the checkpoint in `out`.
-    optimum : name of the controller whose J is J*; None is `optimal` where its solution is stored.
     progress : called with the samples done and the last row of the log; True draws a bar.
     options : further fields of `TrainingRun`, `evaluate_every=1000` say; see `Options`.
     """
@@ -556,7 +554,7 @@ def train(
         scenario = Scenario.load(scenario)
     fields = {"seed": seed, "start": str(start), **options}
     run = prepare(algorithm, scenario, samples, settings, fields)
-    optimum = optimum or stored_optimum(scenario)
+    optimum = stored_optimum(scenario)
     return run_training(run, out, resume=resume, optimum=optimum, progress=progress)
 
 

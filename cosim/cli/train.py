@@ -63,13 +63,6 @@ def train(
     controller: Annotated[
         str, typer.Option("--controller", help="What carries θ: rti or converged.")
     ] = "rti",
-    optimum: Annotated[
-        str | None,
-        typer.Option(
-            "--optimum",
-            help="Controller whose J is J*; default: optimal, where its solution is stored.",
-        ),
-    ] = None,
     log_every: Annotated[int, cli.count("--log-every", text="Samples per row of the log.")] = 1000,
     evaluate_every: Annotated[
         int, cli.count("--evaluate-every", text="Samples per greedy evaluation.")
@@ -144,7 +137,7 @@ def train(
             return go_on if checkpoint.is_file() else ""
 
         with cli.resumable(how):
-            best = optimum or stored_optimum(run.scenario)
+            best = stored_optimum(run.scenario)
             training = run_training(run, folder, resume=resume, optimum=best, progress=out_.live)
         if reason := training.without_checkpoint:
             out_.note(f"left no checkpoint, --resume is not possible: {reason}")

@@ -1,5 +1,7 @@
 """The plan of the search on plants whose costs are known: no model, no controller, no rule."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,16 @@ from learning.search import (
 BLOCKS = 8
 
 
+def drive(plan, answer):
+    """What a generator of requests returns once each has been answered."""
+    try:
+        request = next(plan)
+        while True:
+            request = plan.send(answer(request))
+    except StopIteration as end:
+        return end.value
+
+
 class Plant:
     """Answers with the block costs of each θ, known by the value of c_lambda; counts blocks."""
 
@@ -25,13 +37,7 @@ class Plant:
         self.costs, self.episodes, self.run, self.block = costs, [], {}, 0
 
     def drive(self, plan):
-        """What a generator of requests returns once each has been answered."""
-        try:
-            request = next(plan)
-            while True:
-                request = plan.send(self.answer(request))
-        except StopIteration as end:
-            return end.value
+        return drive(plan, self.answer)
 
     def answer(self, request):
         name = float(request.theta[self.where][0])
@@ -134,14 +140,12 @@ class Bowl:
         back_off = parameters["x_l"][0] - 27.5 - decades
         return 6300.0 + 40.0 * back_off**2 + 10.0 * (decades - np.log10(self.best)) ** 2
 
+    def answer(self, request):
+        cost = 0.0 if isinstance(request, Settle) else self.cost(request.theta)
+        return Block(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
+
     def drive(self, plan):
-        try:
-            request = next(plan)
-            while True:
-                cost = 0.0 if isinstance(request, Settle) else self.cost(request.theta)
-                request = plan.send(Block(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None))
-        except StopIteration as end:
-            return end.value
+        return drive(plan, self.answer)
 
 
 @pytest.fixture
@@ -241,15 +245,7 @@ class Quadratic:
 
 
 def run(search, plant):
-    plan, results = search.plan(), []
-    request = next(plan)
-    while True:
-        result = plant.answer(request)
-        results.append(result)
-        try:
-            request = plan.send(result)
-        except StopIteration:
-            return results
+    drive(search.plan(), plant.answer)
 
 
 def test_line_searches_alone_come_near_the_best(scenario, problem):
@@ -287,15 +283,15 @@ def test_a_rule_that_only_does_harm_loses_nothing(scenario, problem, seed):
 def test_what_is_reported_has_won(scenario, problem):
     sought = search(scenario, problem, 40_000)
     plant = Quadratic(scenario, sought._start, noise=0.0)
-    plan, incumbent = sought.plan(), sought.comparison.incumbent.theta
-    request, costs, changes = next(plan), [plant.cost(incumbent)], 0
-    while True:
-        try:
-            request = plan.send(plant.answer(request))
-        except StopIteration:
-            break
-        changes += not np.array_equal(incumbent, sought.comparison.incumbent.theta)
-        incumbent = sought.comparison.incumbent.theta
-        costs.append(plant.cost(incumbent))
+    incumbents = [sought.comparison.incumbent.theta]
+
+    def answer(request):
+        incumbents.append(sought.comparison.incumbent.theta)
+        return plant.answer(request)
+
+    drive(sought.plan(), answer)
+    incumbents.append(sought.comparison.incumbent.theta)
+    costs = [plant.cost(theta) for theta in incumbents]
+    changes = sum(not np.array_equal(one, other) for one, other in pairwise(incumbents))
     assert changes > 3
     assert (np.diff(costs) <= 0).all(), "without noise no winner is dearer than what it beat"

@@ -72,26 +72,6 @@ def test_plant_is_the_one_of_that_parameter(open_fmu, version: int) -> None:
         assert fouled.get("X2", "P2") == other.get("X2", "P2")
 
 
-def test_snapshot_and_serialised_state_carry_it(open_fmu, version: int) -> None:
-    first, second = (open_fmu(version) for _ in range(2))
-    first.initialise(seed=4, **FAST)
-    first.step(0.0, 4000.0)
-    state = first.save()
-    data = first.serialise(state)
-    first.step(4000.0, 8000.0)
-    expected = first.run(0)
-    first.restore(state)
-    first.step(4000.0, 8000.0)
-    assert first.run(0) == expected
-    second.initialise()
-    other = second.deserialise(data)
-    second.restore(other)
-    second.step(4000.0, 8000.0)
-    assert second.run(0) == expected
-    first.free(state)
-    second.free(other)
-
-
 def test_model_exchange_changes_it_at_time_events_alone(open_fmu, version: int) -> None:
     model = open_fmu(version, exchange=True).initialise(stochastic=False, **FAST)
     plant = open_fmu(version).initialise(stochastic=False, **FAST)

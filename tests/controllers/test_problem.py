@@ -36,17 +36,17 @@ def test_a_bad_value_has_one_clear_error(case):
 
 
 @pytest.mark.parametrize(
-    ("name", "message"),
+    "name",
     [
-        ("controllers.nowhere:model", "No module named"),
-        ("controllers.evaporator:nothing", "no attribute 'nothing'"),
-        ("controllers.evaporator", "name it as module:factory"),
-        ("", "name it as module:factory"),
-        ("controllers.evaporator:STATES", "not callable"),
-        ("builtins:dict", "returned dict, not a controllers.Model"),
+        "controllers.nowhere:model",
+        "controllers.evaporator:nothing",
+        "controllers.evaporator",
+        "",
+        "controllers.evaporator:STATES",
+        "builtins:dict",
     ],
 )
-def test_a_model_that_cannot_be_had_is_named(name, message):
+def test_a_model_that_cannot_be_had_is_refused(name):
     with pytest.raises(ModelError):
         load_model(name)
 

@@ -11,12 +11,6 @@ from tests.helpers.scalar import CASES, scalar_qp, solution
 from tests.helpers.stored import prepared, qps, solve
 
 
-@pytest.fixture(scope="module")
-def solved():
-    """Every ninth stored QP with its solution."""
-    return list(solve("daqp", range(0, len(qps()), 9)))
-
-
 def moved(answer, name, index, step):
     parts = {part: value.copy() for part, value in answer._asdict().items()}
     parts[name][index] += step

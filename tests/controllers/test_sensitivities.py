@@ -201,17 +201,10 @@ def change_of_activity(blocks, number):
 
 
 @pytest.mark.parametrize("number", range(12))
-def test_the_flag_is_up_where_activity_is_weak(number):
-    step, low, high, _ = change_of_activity("paper", number)
-    assert step(s=low).weakly_active
-    assert step(s=high).weakly_active
-
-
-@pytest.mark.parametrize("number", range(12))
-def test_the_flag_is_down_beside_it(number):
+def test_the_flag_is_up_where_activity_is_weak_and_down_beside_it(number):
     step, low, high, way = change_of_activity("paper", number)
-    flags = [step(s=s + c * way).weakly_active for s, c in ((low, -1e-4), (high, 1e-4))]
-    assert flags == [False, False]
+    states = (low - 1e-4 * way, low, high, high + 1e-4 * way)
+    assert [step(s=s).weakly_active for s in states] == [False, True, True, False]
 
 
 def test_the_flag_is_up_where_an_eigenvalue_is_about_to_be_lifted():

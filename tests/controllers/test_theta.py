@@ -29,23 +29,20 @@ def test_packing_undoes_unpacking_bit_for_bit(entries):
 
 
 @pytest.mark.parametrize(
-    ("value", "message"),
+    "value",
     [
-        ([[1.0, 2.0], [2.0, 1.0]], r"shape \(2, 2\); it must have \(3, 3\)"),
-        ([[1, 0, 0], [0, 1, 0], [1e-9, 0, 1]], "must be symmetric"),
-        ([[np.nan, 0, 0], [0, 1, 0], [0, 0, 1]], "not finite"),
-        ([[1, 0, 0], [0, np.inf, 0], [0, 0, 1]], "not finite"),
-        ([[1, 0], [0, 1, 0]], "holds no float64 numbers"),
-        ("identity", "holds no float64 numbers"),
-        ({"a": 1}, "holds no float64 numbers"),
-        (10**400, "holds no float64 numbers"),
-        (
-            [[True, False, False], [False, True, False], [False, False, True]],
-            "holds no float64 numbers",
-        ),
+        [[1.0, 2.0], [2.0, 1.0]],
+        [[1, 0, 0], [0, 1, 0], [1e-9, 0, 1]],
+        [[np.nan, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, np.inf, 0], [0, 0, 1]],
+        [[1, 0], [0, 1, 0]],
+        "identity",
+        {"a": 1},
+        10**400,
+        [[True, False, False], [False, True, False], [False, False, True]],
     ],
 )
-def test_a_bad_value_is_refused_with_the_block_named(value, message):
+def test_a_bad_value_is_refused(value):
     with pytest.raises(ParameterError):
         MATRIX.pack(value)
 

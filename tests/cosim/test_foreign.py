@@ -118,9 +118,7 @@ def test_the_plain_kind_runs(tmp_path, version):
 
 def test_references_that_collide_between_types_are_kept_apart(tmp_path):
     """FMI 2.0: u is Real 0 and seed Integer 0, x is Real 1 and fault Integer 1."""
-    reals = REALS.replace("range 4  parameter  fixed    0", "range 4  parameter  fixed    0")
-    fmu = build_kind(tmp_path, 2, reals=reals)
-    scenario = scenario_for(tmp_path, fmu, parameters=", range = 0.125")
+    scenario = scenario_for(tmp_path, build_kind(tmp_path, 2), parameters=", range = 0.125")
     assert trajectory(scenario, seed=4) == expected(push=0.5)
     assert trajectory(scenario, seed=0) == expected()
 

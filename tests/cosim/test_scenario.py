@@ -115,74 +115,43 @@ def test_an_fmu_path_is_relative_to_the_scenario_file(tmp_path):
     assert Scenario.load(tmp_path / "mine.toml").plant.fmu == str(tmp_path / "my.fmu")
 
 
-BAD = {
-    "unknown preset": (
-        "papr",
-        None,
-        ["unknown scenario 'papr'", "did you mean 'paper'", "nominal"],
-    ),
-    "missing file": ("none.toml", None, ["none.toml", "does not exist"]),
-    "not TOML": ("x.toml", "a = = 1", ["x.toml", "not valid TOML", "line 1"]),
-    "not text": ("x.toml", b"\xff\xfe\x00", ["x.toml", "UTF-8"]),
-    "empty": ("x.toml", "", ["schema", "is missing", "more problems"]),
-    "wrong schema": ("x.toml", 'extends="paper"\nschema = 2', ["schema", "must be 1", "not 2"]),
-    "wrong type": (
-        "x.toml",
-        'extends="paper"\nsampling_time = "60"',
-        ["x.toml", "sampling_time", "must be a number", "not '60'"],
-    ),
-    "unknown field": (
-        "x.toml",
-        'extends="paper"\n[plant]\nstate = ["X2"]',
-        ["plant.state", "unknown field", "did you mean 'states'", "stage_cost"],
-    ),
-    "not finite": (
-        "x.toml",
-        'extends="paper"\n[penalty]\nlinear = [nan, 1.0]',
-        ["penalty.linear[0]", "must be finite"],
-    ),
-    "negative": (
-        "x.toml",
-        'extends="paper"\nsampling_time = -1.0',
-        ["sampling_time", "must be greater than 0"],
-    ),
-    "wrong size": (
-        "x.toml",
-        'extends="paper"\n[bounds]\nstate_lower = [25.0]',
-        ["bounds.state_lower", "one entry per state (plant.states has 2), not 1"],
-    ),
-    "bounds crossed": (
-        "x.toml",
-        'extends="paper"\n[bounds]\naction_lower = [500.0, 100.0]',
-        ["bounds.action_lower", "below action_upper"],
-    ),
-    "law that is not mapped": (
-        "x.toml",
-        'extends="paper"\n[plant.mapping]\nlaw_codes = {uniform = "one"}',
-        ["plant.mapping.law_codes.uniform", "whole number"],
-    ),
-    "name twice": (
-        "x.toml",
-        'extends="paper"\n[plant]\nactions = ["P100", "X2"]',
-        ["plant", "'X2' twice"],
-    ),
-    "extends a number": ("x.toml", "extends = 3", ["extends", "not 3"]),
-    "extends itself": ("x.toml", 'extends = "x.toml"', ["extends leads back to itself"]),
+# What follows `extends = "paper"`, and the name of the entry that is refused.
+WRONG = {
+    "wrong schema": ("schema = 2", "schema"),
+    "wrong type": ('sampling_time = "60"', "sampling_time"),
+    "negative": ("sampling_time = -1.0", "sampling_time"),
+    "unknown field": ('[plant]\nstate = ["X2"]', "did you mean 'states'"),
+    "name twice": ('[plant]\nactions = ["P100", "X2"]', "'X2' twice"),
+    "not finite": ("[penalty]\nlinear = [nan, 1.0]", "penalty.linear[0]"),
+    "wrong size": ("[bounds]\nstate_lower = [25.0]", "bounds.state_lower"),
+    "bounds crossed": ("[bounds]\naction_lower = [500.0, 100.0]", "bounds.action_lower"),
+    "law": ('[plant.mapping]\nlaw_codes = {uniform = "one"}', "plant.mapping.law_codes.uniform"),
+}
+BAD = {name: (f'extends = "paper"\n{text}', said) for name, (text, said) in WRONG.items()} | {
+    "not TOML": ("a = = 1", "line 1"),
+    "not text": (b"\xff\xfe\x00", "UTF-8"),
+    "empty": ("", "schema"),
+    "extends a number": ("extends = 3", "extends"),
+    "extends itself": ('extends = "x.toml"', "extends"),
+    "missing file": (None, "does not exist"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_documents_are_refused_in_one_clear_line(case, tmp_path, monkeypatch):
-    source, text, expected = BAD[case]
-    monkeypatch.chdir(tmp_path)
+def test_bad_documents_are_refused_in_one_clear_line(case, tmp_path):
+    text, said = BAD[case]
+    path = tmp_path / "x.toml"
     if text is not None:
-        (tmp_path / source).write_bytes(text if isinstance(text, bytes) else text.encode())
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ScenarioError) as error:
-        Scenario.load(source)
+        Scenario.load(path)
     message = str(error.value)
-    assert "\n" not in message
-    for part in expected:
-        assert part in message
+    assert "x.toml" in message and said in message and "\n" not in message
+
+
+def test_an_unknown_preset_is_told_the_nearest_one():
+    with pytest.raises(ScenarioError, match="did you mean 'paper'"):
+        Scenario.load("papr")
 
 
 def test_a_seed_draws_the_same_random_plant_for_ever():
@@ -229,11 +198,6 @@ def test_a_scenario_can_extend_a_random_plant(tmp_path):
 
 
 PENALTY = Penalty([25, 40], [100, 80], [1e5, 2e5], [1.0, 3.0])
-
-
-def test_is_zero_on_and_within_the_bounds():
-    for state in ([25.0, 40.0], [100.0, 80.0], [50.0, 60.0]):
-        assert PENALTY(state) == 0.0
 
 
 def test_is_linear_plus_quadratic_in_each_violation():

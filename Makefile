@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One process a core; tests of one file share what they build.
 PYTEST := $(BIN)/python -m pytest -n auto
 
-.PHONY: demo test check docs campaign clean
+.PHONY: demo test check docs campaign sanitised clean
 
 demo: $(VENV)/installed
 	$(BIN)/cosim demo --out demo
@@ -31,6 +31,10 @@ docs: $(VENV)/installed-dev
 # What takes many minutes a test and is run by hand.
 campaign: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m campaign
+
+# The exported C, of plants and controllers, under AddressSanitizer and UBSan: once per release.
+sanitised: $(VENV)/installed
+	$(PYTEST) -m sanitised
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

@@ -8,7 +8,8 @@
 #define SECONDS 60.0 /* in a minute */
 
 static void evaluate(double v[N_VARIABLES]) {
-    const double k = v[VR_k0] * exponential(-v[VR_E] / v[VR_T]); /* 1/min */
+    const double exponent = v[VR_E] / v[VR_T]; /* no reaction where the temperature is none */
+    const double k = exponent >= 0.0 && exponent < 700.0 ? v[VR_k0] * exponential(-exponent) : 0.0;
     const double rate = k * v[VR_cA];
     const double dilution = v[VR_q] / v[VR_V];
     v[VR_der_cA] = (dilution * (v[VR_cAf] - v[VR_cA]) - rate) / SECONDS;

@@ -24,6 +24,7 @@ FLAGS = (
 
 
 @pytest.mark.slow
+@pytest.mark.sanitised
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 def test_nothing_is_allocated_or_broken_while_it_steps(tmp_path: Path, hessian: str) -> None:
     if shutil.which(COMPILER) is None:

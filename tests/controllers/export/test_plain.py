@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,6 +125,34 @@ def test_two_controllers_link_into_one_program(exported, tmp_path):
     built(tmp_path)
     with pytest.raises(ControllerError, match="no name for C"):
         plain_c(core(controller.problem, controller.parameters), "1x", scenario)
+
+
+SANITISED = (
+    "-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.sanitised
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+def test_sanitizers_find_nothing_and_change_no_bit(tmp_path, hessian):
+    """Good and wild states and θ, automatic and manual; scratch static and on the stack."""
+    scenario = Scenario.load("paper")
+    controller = tuned(scenario)
+    exported = core(controller.problem, controller.parameters, hessian)
+    files = plain_c(exported, "soaked", scenario)
+    for file in ("soaked.c", "soaked.h"):
+        (tmp_path / file).write_text(files[file])
+    shutil.copy(Path(__file__).with_name("soak.c"), tmp_path)
+    lines = []
+    for flags in (("-O2",), SANITISED, (*SANITISED, "-DQP_SCRATCH=")):
+        result = subprocess.run(
+            [built(tmp_path, *flags), "20000"], capture_output=True, text=True, check=False
+        )
+        assert result.returncode == 0, result.stderr
+        lines.append(result.stdout)
+    assert lines[1:] == lines[:1] * 2
+    assert 0 < int(lines[0].split()[1]) < 20000
 
 
 @pytest.mark.slow

@@ -66,7 +66,7 @@ static void damage(unsigned char bytes[sizeof(State)]) {
         case 0: bytes[below(sizeof(State))] ^= (unsigned char)(1 << below(8)); return;
         case 1:
             memcpy(&state, bytes, sizeof state);
-            if (below(2)) state.v[below(2) ? VR_X2 : below(N_VARIABLES)] = any_double();
+            if (below(2)) state.v[below(2) ? STATE_REFERENCES[0] : below(N_VARIABLES)] = any_double();
             if (rarely()) state.mode = (int32_t)next_random();
             if (rarely()) state.sample = (int64_t)next_random();
             if (rarely()) state.stop_time = any_double();

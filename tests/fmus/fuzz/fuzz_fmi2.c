@@ -90,11 +90,11 @@ static int any_call(Instance *c, void **state) {
         case 30: return fmi2NewDiscreteStates(c, rarely() ? NULL : &info);
         case 31: return fmi2CompletedIntegratorStep(c, 1, i, flag);
         case 32: return fmi2SetTime(c, rarely() ? value[0] : any_time(c) + any_step());
-        case 33: return fmi2SetContinuousStates(c, x, rarely() ? n : 2);
-        case 34: return fmi2GetDerivatives(c, x, rarely() ? n : 2);
+        case 33: return fmi2SetContinuousStates(c, x, rarely() ? n : N_STATES);
+        case 34: return fmi2GetDerivatives(c, x, rarely() ? n : N_STATES);
         case 35: return fmi2GetEventIndicators(c, x, n % 2);
-        case 36: return fmi2GetContinuousStates(c, x, rarely() ? n : 2);
-        case 37: return fmi2GetNominalsOfContinuousStates(c, x, rarely() ? n : 2);
+        case 36: return fmi2GetContinuousStates(c, x, rarely() ? n : N_STATES);
+        case 37: return fmi2GetNominalsOfContinuousStates(c, x, rarely() ? n : N_STATES);
         case 38: case 39: return fmi2DoStep(c, any_time(c), any_step(), 1);
         case 40: return fmi2CancelStep(c);
         case 41: return fmi2GetRealStatus(c, (fmi2StatusKind)below(5), x);

@@ -98,11 +98,11 @@ static int any_call(Instance *c, void **state) {
         case 34: return fmi3UpdateDiscreteStates(c, flag, truth, truth, truth, truth, x);
         case 35: return fmi3CompletedIntegratorStep(c, true, flag, truth);
         case 36: return fmi3SetTime(c, rarely() ? value[0] : any_time(c) + any_step());
-        case 37: return fmi3SetContinuousStates(c, x, rarely() ? n : 2);
-        case 38: return fmi3GetContinuousStateDerivatives(c, x, rarely() ? n : 2);
+        case 37: return fmi3SetContinuousStates(c, x, rarely() ? n : N_STATES);
+        case 38: return fmi3GetContinuousStateDerivatives(c, x, rarely() ? n : N_STATES);
         case 39: return fmi3GetEventIndicators(c, x, n % 2);
-        case 40: return fmi3GetContinuousStates(c, x, rarely() ? n : 2);
-        case 41: return fmi3GetNominalsOfContinuousStates(c, x, rarely() ? n : 2);
+        case 40: return fmi3GetContinuousStates(c, x, rarely() ? n : N_STATES);
+        case 41: return fmi3GetNominalsOfContinuousStates(c, x, rarely() ? n : N_STATES);
         case 42: return fmi3GetNumberOfContinuousStates(c, rarely() ? NULL : &size);
         case 43: case 44:
             return fmi3DoStep(c, any_time(c), any_step(), true, flag, truth, truth, x);

@@ -52,44 +52,32 @@ def _written(path, data):
     return path
 
 
+def _changed(path, old, new):
+    return edited(fmus.path(), path, lambda text: text.replace(old, new))
+
+
 REFUSED = {
-    "text": (lambda p: _written(p, b"not a zip"), ["corrupt or not an FMU", "build it again"]),
-    "no description": (lambda p: _zip(p, [("a", "b")]), ["no modelDescription.xml"]),
-    "description is no XML": (
-        lambda p: _zip(p, [("modelDescription.xml", "hello")]),
-        ["unreadable model description"],
-    ),
-    "description breaks the schema": (
-        lambda p: edited(fmus.path(), p, lambda text: text.replace("<ModelVariables>", "<Mod>", 1)
-                         .replace("</ModelVariables>", "</Mod>", 1)),
-        ["invalid model description", "Mod"],
-    ),
-    "FMI 1": (
-        lambda p: edited(fmus.path(), p, lambda t: t.replace('fmiVersion="2.0"', 'fmiVersion="9"')),
-        ["9"],
-    ),
-    "parent folder": (
-        lambda p: _zip(p, [("../evil", "x")]),
-        ["'../evil'", "leads outside"],
-    ),
-    "absolute": (lambda p: _zip(p, [("/etc/evil", "x")]), ["leads outside"]),
-    "backslash": (lambda p: _zip(p, [("..\\evil", "x")]), ["leads outside"]),
-    "drive": (lambda p: _zip(p, [("C:evil", "x")]), ["leads outside"]),
-    "link": (_link, ["'resources/passwd' is a link"]),
-}  # fmt: skip
+    "text": (lambda p: _written(p, b"not a zip"), "not an FMU"),
+    "no description": (lambda p: _zip(p, [("a", "b")]), "no modelDescription.xml"),
+    "no XML": (lambda p: _zip(p, [("modelDescription.xml", "hello")]), "unreadable"),
+    "schema": (lambda p: _changed(p, "ModelVariables>", "Mod>"), "invalid model description"),
+    "FMI 9": (lambda p: _changed(p, 'fmiVersion="2.0"', 'fmiVersion="9"'), "9"),
+    "parent folder": (lambda p: _zip(p, [("../evil", "x")]), "leads outside"),
+    "absolute": (lambda p: _zip(p, [("/etc/evil", "x")]), "leads outside"),
+    "backslash": (lambda p: _zip(p, [("..\\evil", "x")]), "leads outside"),
+    "drive": (lambda p: _zip(p, [("C:evil", "x")]), "leads outside"),
+    "link": (_link, "is a link"),
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_no_honest_fmu_is_refused_in_one_line(case, tmp_path):
-    make, words = REFUSED[case]
+    make, said = REFUSED[case]
     path = make(tmp_path / "bad.fmu")
     with pytest.raises(PlantError) as error:
         unpack(path)
     message = str(error.value)
-    assert "bad.fmu" in message
-    assert "\n" not in message
-    for word in words:
-        assert word in message
+    assert "bad.fmu" in message and said in message and "\n" not in message
     assert not list(tmp_path.glob("**/evil"))
 
 

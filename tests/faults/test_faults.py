@@ -17,10 +17,11 @@ from controllers import Parameters, Problem, QpError, RtiNmpc
 from controllers.factories import naive
 from controllers.qp import DaqpBackend
 from cosim import FmuPlant, Scenario, simulate
+from learning.training import run_training
 from tests.helpers.command import run_cosim
 from tests.helpers.drawing import skip_without_driver
 from tests.helpers.tank import build_tank, write_scenario
-from tests.helpers.training import make_run, train
+from tests.helpers.training import make_run
 
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2
 TRAIN = "train --algorithm q-learning --samples 600 --log-every 200 --evaluate-every 600"
@@ -210,7 +211,7 @@ def test_a_run_goes_on_through_solver_failures_and_counts_each(unreliable, tmp_p
 def test_training_goes_on_through_solver_failures_and_counts_each(unreliable, monkeypatch):
     monkeypatch.setattr("controllers.rti.nmpc.make_backend", lambda name: unreliable())
     every = {"log_every": 1000, "evaluate_every": 2000, "checkpoint_every": 2000}
-    result = train(make_run(samples=2000, evaluation_steps=1, **every))
+    result = run_training(make_run(samples=2000, evaluation_steps=1, **every))
     assert result.status == "finished"
     failures = result.rows[-1]["failures"]
     # One-sample evaluations may fail too, and are not counted among the samples.

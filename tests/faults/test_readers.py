@@ -25,7 +25,8 @@ from cosim.trajectory import read_csv
 from fmus import path as shipped
 from learning import checkpoint
 from learning.errors import CheckpointError
-from tests.helpers.training import make_run, train
+from learning.training import run_training
+from tests.helpers.training import make_run
 
 # A recording and an FMU cost much more to read than a page of text.
 EXAMPLES = {"recording": 6, "fmu": 8}
@@ -89,7 +90,7 @@ def good(tmp_path_factory):
         recorder = RerunRecorder(folder / "run.rrd")
         run = simulate(plant, naive(PAPER), 20, 0, recorder=recorder)
     run.write_csv(folder / "trajectory.csv")
-    train(make_run(), folder)
+    run_training(make_run(), folder)
     (folder / "scenario.toml").write_text(PAPER.to_toml())
     (folder / "plant.fmu").write_bytes(shipped().read_bytes())
     Parameters.naive(PROBLEM).save(folder / "theta.toml")

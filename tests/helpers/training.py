@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from controllers.rti import RtiNmpc
 from cosim import Scenario
 from learning.algorithm import Algorithm, load_algorithm
 from learning.loop import TrainingLoop
-from learning.training import LogRow, Training, TrainingRun, run_training
+from learning.training import Training, TrainingRun, run_training
 
 
 class Killed(BaseException):
@@ -41,18 +41,6 @@ def make_run(
     return TrainingRun(algorithm=algorithm, scenario=loaded, **{**values, **changes})
 
 
-def train(
-    run: TrainingRun,
-    out: Path | None = None,
-    *,
-    rule: type[Algorithm] | None = None,
-    resume: bool = False,
-    progress: Callable[[int, LogRow], None] | bool = False,
-) -> Training:
-    """Train to the end without an optimum, by another rule than the run's where one is given."""
-    return run_training(run, out, rule=rule, resume=resume, progress=progress)
-
-
 def killed_and_resumed(
     run: TrainingRun, out: Path, at: int, rule: type[Algorithm] | None = None
 ) -> Training:
@@ -63,8 +51,8 @@ def killed_and_resumed(
             raise Killed
 
     with pytest.raises(Killed):
-        train(run, out, rule=rule, progress=die)
-    return train(run, out, rule=rule, resume=True)
+        run_training(run, out, rule=rule, progress=die)
+    return run_training(run, out, rule=rule, resume=True)
 
 
 def looped(

@@ -73,25 +73,15 @@ def test_solved_to_convergence_it_settles_too(nominal):
     settle(nominal, controller, STARTS[5], steps=400)
 
 
-def long_run(plant, backend, steps):
-    """One QP a sample, each solved to a residual of 1e-6, none failed."""
-    problem = Problem.from_scenario(plant.scenario)
+@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
+@pytest.mark.parametrize("steps", [1000, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_thousands_of_samples_take_one_qp_each_solved_to_a_millionth(backend, steps, paper):
+    problem = Problem.from_scenario(paper.scenario)
     controller = RtiNmpc(problem, Parameters.naive(problem), backend=lambda: Counting(backend))
     Counting.solved = 0
-    trajectory = simulate(plant, controller, steps, 1)
+    trajectory = simulate(paper, controller, steps, 1)
     assert Counting.solved == steps
     assert trajectory.summary()["failures"] == 0
     assert trajectory["residual"].max() <= 1e-6
     assert set(trajectory.status) == {"solved"}
     assert trajectory["violation"].max() > 0.1
-
-
-@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
-def test_a_thousand_samples_take_one_solved_qp_each(backend, paper):
-    long_run(paper, backend, 1000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
-def test_ten_thousand_samples_take_one_solved_qp_each(backend, paper):
-    long_run(paper, backend, 10_000)

@@ -34,23 +34,11 @@ def test_nothing_is_allocated_or_broken_while_it_steps(tmp_path: Path, hessian: 
         system = sampled_controller(tuned(scenario), scenario, plant.units)
     for name, data in sampled_sources(system, 2).items():
         (tmp_path / name).write_bytes(data)
-    program = _compiled(tmp_path, "soak", COMPILER, *FLAGS)
-    steps, failures, _ = _run(program, "20000")
+    program, headers = tmp_path / "soak", Path(fmpy.__file__).parent / "c-code"
+    folders = ["-isystem", headers, "-I", tmp_path]
+    subprocess.run([COMPILER, *FLAGS, *folders, SOAK, "-o", program, "-lm"], check=True)
+    result = subprocess.run([program, "20000"], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    steps, failures, _ = result.stdout.split()
     assert steps == "20000"
     assert 0 < int(failures) < 20000
-
-
-def _compiled(folder: Path, name: str, *command: str) -> Path:
-    headers = Path(fmpy.__file__).parent / "c-code"
-    program = folder / name
-    subprocess.run(
-        [*command, "-isystem", headers, "-I", folder, SOAK, "-o", program, "-lm"], check=True
-    )
-    return program
-
-
-def _run(*command: str | Path) -> list[str]:
-    """Steps, failures and digest."""
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    return result.stdout.split()

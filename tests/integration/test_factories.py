@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controllers import Parameters, Problem
-from controllers.factories import from_file, naive
+from controllers.factories import naive
 from cosim import Scenario
 
 
@@ -36,12 +36,6 @@ def test_backend_and_hessian_are_the_scenarios(paper):
     assert first.feedback(s).value == pytest.approx(naive(paper).feedback(s).value, rel=1e-6)
     assert type(first._backend).__name__ == "QpsolversBackend"
     assert first.feedback(s).prepared.spectrum is not None
-
-
-def test_a_file_gives_the_same_controller(paper, tmp_path):
-    parameters = Parameters.naive(Problem.from_scenario(paper)).replace({"x_l": [26, 40]})
-    controller = from_file(paper, parameters.save(tmp_path / "theta.toml"))
-    assert controller.parameters.hash == parameters.hash
 
 
 def test_the_scenario_says_how_many_qps_a_sample_has(paper):

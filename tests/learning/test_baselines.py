@@ -14,9 +14,9 @@ from cosim import FmuPlant, Scenario, simulate
 from learning.algorithm import load_algorithm
 from learning.policy_search import Coordinates
 from learning.prediction_errors import OneStepModel
-from learning.training import begin, to_csv
+from learning.training import begin, run_training, to_csv
 from tests.helpers import training
-from tests.helpers.training import killed_and_resumed, train
+from tests.helpers.training import killed_and_resumed
 
 SETTINGS = {
     "backoff": {},
@@ -44,7 +44,7 @@ def make_run(name, scenario="paper", **changes):
 )
 def test_a_baseline_resumed_after_a_kill_ends_in_the_same_digits(name, tmp_path):
     run = make_run(name)
-    whole = train(run)
+    whole = run_training(run)
 
     resumed = killed_and_resumed(run, tmp_path, 250)
     assert to_csv(resumed.rows) == to_csv(whole.rows)
@@ -77,7 +77,7 @@ def test_the_last_digits_of_the_start_choose_nothing(problem, tmp_path):
     for size in (0.0, 1e-10):
         theta = tuned.theta * (1 + size * rng.uniform(-1, 1, tuned.theta.size))
         start = tuned.with_theta(theta).save(tmp_path / "start.toml")
-        J.append(train(make_run("backoff", "fouled", samples=2000, start=str(start))).J)
+        J.append(run_training(make_run("backoff", "fouled", samples=2000, start=str(start))).J)
     assert J[1] == pytest.approx(J[0], rel=1e-6)
 
 
@@ -87,9 +87,9 @@ def test_the_last_digits_of_the_start_choose_nothing(problem, tmp_path):
 def test_tuned_with_back_off_is_within_a_thousandth_of_the_optimum(scenario, seed):
     from controllers.factories import optimal
 
-    run = make_run("backoff-simulator", scenario, samples=8000, seed=seed)
-    run = dataclasses.replace(run, log_every=500, evaluate_every=8000, checkpoint_every=8000)
-    theta = train(run).parameters
+    every = {"log_every": 500, "evaluate_every": 8000, "checkpoint_every": 8000}
+    run = make_run("backoff-simulator", scenario, samples=8000, seed=seed, **every)
+    theta = run_training(run).parameters
     problem = Problem.from_scenario(run.scenario)
     with FmuPlant(run.scenario) as plant:
         J = [
@@ -100,12 +100,9 @@ def test_tuned_with_back_off_is_within_a_thousandth_of_the_optimum(scenario, see
 
 
 def test_offset_free_predicts_without_bias_under_a_wrong_model():
-    run = make_run("offset-free", "fouled", samples=600)
-    run = dataclasses.replace(
-        run,
-        configuration=load_algorithm("offset-free").Configuration.from_dict({"back_off": False}),
-    )
-    theta = train(run).parameters
+    configuration = load_algorithm("offset-free").Configuration.from_dict({"back_off": False})
+    run = make_run("offset-free", "fouled", samples=600, configuration=configuration)
+    theta = run_training(run).parameters
     problem = Problem.from_scenario(run.scenario)
     assert np.array_equal(theta["x_l"], problem.state_lower), "no back-off was asked for"
     with FmuPlant(run.scenario) as plant:
@@ -133,7 +130,7 @@ def test_in_operation_it_goes_on_and_backs_off_by_its_own_errors(name, scenario)
 
 def test_identification_finds_the_fouled_condenser_and_tunes_with_it():
     run = make_run("identified", "fouled", samples=1200)
-    theta = train(run).parameters
+    theta = run_training(run).parameters
     assert theta["p"] == pytest.approx([5.2], rel=0.01)
     problem = Problem.from_scenario(run.scenario)
     model = problem.model
@@ -156,7 +153,7 @@ def test_identification_again_and_again_follows_a_parameter():
         {"back_off": False, "every": 150}
     )
     run = make_run("identified", scenario=scenario, configuration=configuration, start="naive")
-    rows = train(run).rows
+    rows = run_training(run).rows
     law = Fouling.of(scenario).heat_transfer
     for row in rows[3::3]:
         # The fit is of the 150 samples before it, that is of their middle.
@@ -165,13 +162,13 @@ def test_identification_again_and_again_follows_a_parameter():
         assert fitted == pytest.approx(float(law((last - 75) / 1440)), rel=0.03)
 
 
-def test_the_policy_search_hands_over_the_mean_and_improves(scenario, problem):
-    run = make_run("policy-search-simulator", samples=13 * 60 * 3, start="naive")
+def test_the_policy_search_hands_over_the_mean_and_improves():
     configuration = load_algorithm("policy-search").Configuration.from_dict({"episode": 60})
-    run = dataclasses.replace(
-        run, configuration=configuration, log_every=780, evaluate_every=2340, checkpoint_every=2340
-    )
-    result = train(run)
+    every = {"log_every": 780, "evaluate_every": 2340, "checkpoint_every": 2340}
+    result = run_training(
+        make_run("policy-search-simulator", samples=2340, start="naive",
+                 configuration=configuration, **every)
+    )  # fmt: skip
     assert result.rows[0]["updates"] == 13
     costs = [row["J"] for row in result.rows]
     assert costs[2] < costs[0]

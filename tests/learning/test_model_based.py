@@ -10,8 +10,8 @@ from controllers.functions import find_compiler
 from learning import model_based
 from learning.empirical_model import EmpiricalModel, Features, Rollout
 from learning.model_based import BackOffs, ExpectedCosts, ModelBased
-from learning.training import to_csv
-from tests.helpers.training import killed_and_resumed, make_run, train
+from learning.training import run_training, to_csv
+from tests.helpers.training import killed_and_resumed, make_run
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, 
         monkeypatch.setattr(model_based, name, value)
     every = {"samples": 60, "log_every": 20, "evaluate_every": 60, "checkpoint_every": 20}
     run = make_run("model-based", scenario, {"first_update": 15}, start="tuned", **every)
-    whole = train(run)
+    whole = run_training(run)
     assert whole.asks_for == "operation"
     resumed = killed_and_resumed(run, tmp_path, 40)
     assert to_csv(resumed.rows) == to_csv(whole.rows)

@@ -11,9 +11,9 @@ from cosim.simulation import indicators_of
 from learning.algorithm import Update, load_algorithm
 from learning.errors import CheckpointError
 from learning.q_learning import QLearning
-from learning.training import HELD_OUT, to_csv
+from learning.training import HELD_OUT, run_training, to_csv
 from tests.helpers import training
-from tests.helpers.training import killed_and_resumed, train
+from tests.helpers.training import killed_and_resumed
 
 SETTINGS = {
     "q-learning": {"prior_samples": 20, "step_every": 20},
@@ -31,24 +31,17 @@ def make_run(scenario, name, **changes):
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, name, tmp_path):
     run = make_run(scenario, name)
-    whole = train(run)
+    whole = run_training(run)
     resumed = killed_and_resumed(run, tmp_path, 350)
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
     assert to_csv(resumed.rows) == to_csv(whole.rows)
     assert resumed.evaluation == whole.evaluation
-    assert not np.array_equal(whole.parameters.theta, train_start(run))
-
-
-def train_start(run):
-    from controllers.problem import Problem
-    from learning.training import starting_parameters
-
-    return starting_parameters(Problem.from_scenario(run.scenario), run.configuration).theta
+    assert not np.array_equal(whole.parameters.theta, whole.start.theta)
 
 
 def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(scenario):
     run = make_run(scenario, "q-learning")
-    result = train(run)
+    result = run_training(run)
     assert [row["samples"] for row in result.rows] == list(range(50, 451, 50))
     evaluated = [row["samples"] for row in result.rows if not np.isnan(row["greedy_J"])]
     assert evaluated == [100, 200, 300, 400, 450]
@@ -58,18 +51,18 @@ def test_the_log_has_a_row_each_interval_and_the_greedy_figures_each_evaluation(
 
 def test_a_diverged_run_ends_with_its_own_theta(scenario, tmp_path):
     run = make_run(scenario, "actor-critic", divergence=1e-3)
-    result = train(run, tmp_path)
+    result = run_training(run, tmp_path)
     assert result.status.startswith("diverged: greedy J")
     assert "at sample 200" in result.status, "the second evaluation in a row"
     last = result.rows[-1]
     assert last["samples"] == 200
     own = last.parameters.theta.tolist()
     assert result.parameters.theta.tolist() == own
-    assert not np.array_equal(result.parameters.theta, train_start(run))
+    assert not np.array_equal(result.parameters.theta, result.start.theta)
     assert result.evaluation["J"] == last["greedy_J"]
 
 
-def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
+def test_a_step_that_is_not_finite_stops_the_run(scenario):
     run = make_run(scenario, "q-learning")
 
     class Broken(QLearning):
@@ -77,11 +70,11 @@ def test_a_step_that_is_not_finite_stops_the_run(scenario, monkeypatch):
             cost = float("nan") if sample.number > 200 else sample.cost
             return super().observe(sample._replace(cost=cost))
 
-    result = train(run, rule=Broken)
+    result = run_training(run, rule=Broken)
     assert result.status.startswith("diverged: the step of θ is not finite")
     assert result.rows[-1]["samples"] == 220, "the row of the sample at which it broke"
     assert result.rows[-1]["greedy_J"] == result.evaluation["J"]
-    assert not np.array_equal(result.parameters.theta, train_start(run))
+    assert not np.array_equal(result.parameters.theta, result.start.theta)
 
 
 class Reporting(QLearning):
@@ -99,7 +92,7 @@ class Reporting(QLearning):
 
 def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tmp_path):
     run = make_run(scenario, "q-learning", samples=200)
-    result = train(run, tmp_path, rule=Reporting)
+    result = run_training(run, tmp_path, rule=Reporting)
     stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
     assert 25.0 < result.parameters["x_l"][0] < 26.0
     assert np.array_equal(stored.theta, result.parameters.theta)
@@ -124,7 +117,7 @@ class Trying(QLearning):
 
 def test_no_run_ends_as_diverged_by_a_candidate_that_is_tried(scenario, tmp_path):
     run = make_run(scenario, "q-learning", samples=200, divergence=1.01)
-    result = train(run, tmp_path, rule=Trying)
+    result = run_training(run, tmp_path, rule=Trying)
     assert result.status == "finished" and result.rows[-1]["J"] > 2 * result.J
     for row in result.rows:
         assert np.array_equal(row.parameters.theta, result.start.theta)
@@ -133,16 +126,14 @@ def test_no_run_ends_as_diverged_by_a_candidate_that_is_tried(scenario, tmp_path
 
 
 def test_the_runs_seed_reaches_the_algorithm(scenario):
-    ends = [
-        train(make_run(scenario, "q-learning", samples=50, seed=seed), rule=Reporting).parameters
-        for seed in (3, 3, 4)
-    ]
-    assert ends[0].hash == ends[1].hash != ends[2].hash
+    runs = [make_run(scenario, "q-learning", samples=50, seed=seed) for seed in (3, 3, 4)]
+    ends = [run_training(run, rule=Reporting).parameters.hash for run in runs]
+    assert ends[0] == ends[1] != ends[2]
 
 
 def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):
     run = make_run(scenario, "q-learning", samples=300)
-    whole = train(run, rule=Reporting)
+    whole = run_training(run, rule=Reporting)
     resumed = killed_and_resumed(run, tmp_path, 250, Reporting)
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
 
@@ -152,9 +143,9 @@ FADING = load_algorithm("actor-critic").Configuration(batch_size=100)
 
 def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
     run = make_run(scenario, "q-learning", samples=400)
-    whole = train(run)
-    train(make_run(scenario, "q-learning", samples=200), tmp_path)
-    more = train(run, tmp_path, resume=True)
+    whole = run_training(run)
+    run_training(make_run(scenario, "q-learning", samples=200), tmp_path)
+    more = run_training(run, tmp_path, resume=True)
     assert to_csv(more.rows) == to_csv(whole.rows)
     assert np.array_equal(more.parameters.theta, whole.parameters.theta)
 
@@ -175,7 +166,7 @@ def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
 )
 def test_a_run_that_began_otherwise_is_given_no_more_samples(scenario, tmp_path, first, message):
     run = first(scenario)
-    train(run, tmp_path)
+    run_training(run, tmp_path)
     longer = dataclasses.replace(run, samples=400)
     with pytest.raises(CheckpointError, match=message):
-        train(longer, tmp_path, resume=True)
+        run_training(longer, tmp_path, resume=True)

@@ -17,11 +17,11 @@ from learning.training import (
     FIGURES,
     HELD_OUT,
     Judge,
-    TrainingRun,
     drift,
+    run_training,
     starting_parameters,
 )
-from tests.helpers.training import make_run, train
+from tests.helpers.training import make_run
 
 
 def test_the_papers_theta_is_the_naive_guess(problem):
@@ -126,18 +126,15 @@ def test_the_log_of_a_plant_that_jumps_shows_the_parameter_as_it_is():
 def test_the_log_shows_it_at_the_end_of_each_row(name, more):
     every = {"log_every": 30, "evaluate_every": 60, "checkpoint_every": 60}
     run = make_run("offset-free", name, {"back_off": False}, samples=60, **every)
-    rows = train(run).rows
+    rows = run_training(run).rows
     assert list(rows[0]) == [*COLUMNS, *more]
     if more:
         at = drift(run.scenario)
         assert [row["UA2"] for row in rows] == [at(t)["UA2"] for t in (1800.0, 3600.0)]
 
 
-def judge(plant, parameters, divergence=1.5, optimum=None):
-    run = TrainingRun(
-        "q-learning", plant.scenario, 100, 0, QLearning.Configuration(), divergence=divergence,
-        evaluation_seeds=1, evaluation_steps=30,
-    )  # fmt: skip
+def judge(plant, parameters, optimum=None):
+    run = make_run("q-learning", plant.scenario, divergence=1.5, evaluation_steps=30)
     return Judge(run, plant, parameters, optimum)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import fmpy
+from attr import asdict
 
 from fmus import BuildError
 from fmus.build import write_archive
@@ -28,11 +29,13 @@ def write_ssp(
     """Write a loop of two FMI 2.0 FMUs (System Structure and Parameterization); the bytes repeat.
 
     The controller is stepped first. `states` go from the plant to it, `actions` back, by their
-    names in both; `starts` are the plant's start values with their FMI 2.0 types, `Real`,
-    `Integer`, `Boolean` or `Enumeration`. Raises BuildError where an FMU is not FMI 2.0.
+    names in both and with their units; `starts` are the plant's start values with their FMI 2.0
+    types, `Real`, `Integer`, `Boolean` or `Enumeration`. Raises BuildError where an FMU is not FMI
+    2.0.
     """
     members = {"resources/plant.ssv": _parameter_set("plant", starts).encode()}
     components = []
+    units: dict[str, dict[str, float]] = {}
     for name, fmu, inputs, outputs in (
         ("controller", controller, states, actions),
         ("plant", plant, actions, states),
@@ -43,7 +46,14 @@ def write_ssp(
                 f"{fmu} is not an FMI 2.0 FMU for co-simulation, which SSP 1.0 asks for"
             )
         members[f"resources/{name}.fmu"] = fmu.read_bytes()
-        connectors = [*(("input", each) for each in inputs), *(("output", e) for e in outputs)]
+        known = {u.name: asdict(u.baseUnit) for u in description.unitDefinitions if u.baseUnit}
+        unit_of = {v.name: v.unit for v in description.modelVariables if v.unit in known}
+        units |= {unit: known[unit] for name in (*inputs, *outputs) if (unit := unit_of.get(name))}
+        connectors = [
+            (kind, name, {"unit": unit_of.get(name)})
+            for kind, names in (("input", inputs), ("output", outputs))
+            for name in names
+        ]
         components.append(({"name": name, "starts": name == "plant"}, connectors))
     connections = [
         {"start": (one, name), "end": (other, name)}
@@ -55,6 +65,7 @@ def write_ssp(
         name="loop",
         components=components,
         connections=connections,
+        units=units,
         stop_time=float(stop_time),
     ).encode()
     return write_archive(members, Path(target))

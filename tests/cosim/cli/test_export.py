@@ -8,13 +8,16 @@ import sys
 import zipfile
 from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
+import attr
 import fmpy
 import numpy as np
 import pytest
 from fmpy import fmi2
 from typer.testing import CliRunner
 
+import fmus
 from benchmarks import importers
 from controllers.factories import naive, tuned
 from cosim import FmuPlant, Scenario, simulate
@@ -78,6 +81,23 @@ def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
         expected = simulate(plant, tuned(scenario), SAMPLES, 5)
     for column, name in enumerate(("X2", "P2", "P100", "F200"), start=1):
         np.testing.assert_allclose(rows[:, column], expected[name], rtol=0, atol=ACTION)
+
+
+def test_both_ends_of_a_connection_have_the_plants_unit(exported):
+    with zipfile.ZipFile(exported[1]) as container:
+        root = ElementTree.fromstring(container.read("SystemStructure.ssd"))
+    units = [
+        (each.get("name"), each.find("{*}Real").get("unit")) for each in root.iter("{*}Connector")
+    ]
+    plant = fmpy.read_model_description(str(fmus.path("evaporator")))
+    expected = {(v.name, v.unit) for v in plant.modelVariables if v.name in dict(units)}
+    assert set(units) == expected
+    assert len(units) == 2 * len(expected)
+    defined = {each.get("name"): each.find("{*}BaseUnit").attrib for each in root.iter("{*}Unit")}
+    for unit in (u for u in plant.unitDefinitions if u.name in dict(expected).values()):
+        given = {key: float(value) for key, value in defined.pop(unit.name).items()}
+        assert given == attr.asdict(unit.baseUnit)
+    assert not defined
 
 
 def master(*words):

@@ -22,7 +22,6 @@ import fmpy
 from cosim.files import replacing, temporary_folder
 from fmus import PLATFORMS, UNIVERSAL, BuildError, Platform, present
 from fmus.model import (
-    C_IDENTIFIER,
     FmiVersion,
     Model,
     Variable,
@@ -256,7 +255,7 @@ def _model(description: bytes) -> tuple[str, str]:
             f"not {len(identifiers)}"
         )
     identifier = identifiers.pop()
-    if not C_IDENTIFIER.fullmatch(identifier):
+    if not (identifier.isascii() and identifier.isidentifier()):
         raise BuildError(
             f"modelDescription.xml: modelIdentifier {identifier!r} is not a C identifier"
         )

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 FmiVersion = Literal[2, 3]
-C_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class Kind(StrEnum):

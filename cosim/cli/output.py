@@ -74,7 +74,7 @@ class Output:
         """Print a line on standard error, above a bar, unless JSON was asked for."""
         if not self.as_json:
             with self._aside():
-                self.console().print(text, highlight=False, soft_wrap=True, markup=False)
+                print(text, file=sys.stderr)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """Print a table, columns of numbers right justified and the others left.

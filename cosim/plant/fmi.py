@@ -31,7 +31,6 @@ import fmus
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import cache_folder, temporary_folder
 from fmus import platforms_of, present
-from fmus.model import C_IDENTIFIER
 
 SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
 DESCRIPTION = "modelDescription.xml"
@@ -192,7 +191,7 @@ def library_path(fmu: UnpackedFmu) -> Path:
     this platform by its own first bytes.
     """
     identifier = str(fmu.description.coSimulation.modelIdentifier)
-    if not C_IDENTIFIER.fullmatch(identifier):
+    if not (identifier.isascii() and identifier.isidentifier()):
         raise PlantError(
             f"FMU '{fmu.path}' is refused: modelIdentifier {identifier!r} is not a C identifier"
         )

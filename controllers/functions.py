@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import casadi as ca
-import filelock
 import numpy as np
 
 from controllers.errors import ControllerError
-from cosim.files import cache_folder, temporary_folder
+from cosim.files import cache_folder, lock, temporary_folder
 from cosim.processes import run_child
 from cosim.protocols import Vector
 
@@ -159,13 +158,13 @@ def library(sources: Mapping[str, str | bytes], entry: Sequence[str]) -> Path | 
         if not path.is_file():
             _compile([compiler, *FLAGS, "-o", "library", *entry, "-lm"], files, path)
         os.utime(path)
-    except (OSError, subprocess.SubprocessError, filelock.Timeout):
+    except (OSError, subprocess.SubprocessError):
         return None
     return path
 
 
 def _compile(command: Sequence[str], files: Mapping[str, bytes], path: Path) -> None:
-    with filelock.FileLock(path.with_suffix(".lock"), timeout=PATIENCE):
+    with lock(path.with_suffix(".lock"), PATIENCE):
         if path.is_file():
             return
         with temporary_folder(".partial-", path.parent) as folder:

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 import platformdirs
 
 if TYPE_CHECKING:
+    import filelock
     from numpy.typing import NDArray
 
-# NumPy is imported where arrays are read: `cosim --help` has no use for it.
+# NumPy and filelock are imported where they are needed: `cosim --help` has no use for them.
 
 _inputs: set[tuple[int, int]] = set()
 
@@ -85,6 +86,23 @@ def write_atomically(path: str | Path, data: bytes | str) -> Path:
     with replacing(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)
     return Path(path)
+
+
+def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy:
+    """Take a lock file within `timeout` seconds; a context whose end gives it back.
+
+    Raises filelock.Timeout where another process holds it; OSError where it cannot be written, or
+    its file system gives no locks.
+    """
+    import filelock  # noqa: PLC0415
+
+    try:
+        return filelock.FileLock(path, timeout=timeout).acquire()
+    except OSError as error:
+        if not error.filename and error.strerror:  # not from opening it, and no Timeout
+            what = f"its file system gives no locks ({error.strerror}): choose another folder"
+            error = OSError(error.errno, f"{what}, by {CACHE_VARIABLE} for the cache", str(path))
+        raise error from None
 
 
 CACHE_VARIABLE = "COSIM_CACHE"

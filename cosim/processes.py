@@ -17,7 +17,7 @@ from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from cosim.errors import CosimError, PlantError
-from cosim.files import temporary_folder
+from cosim.files import lock, temporary_folder
 
 # psutil and filelock are imported where they are needed: every command imports this file.
 if TYPE_CHECKING:
@@ -216,9 +216,8 @@ def hold(folder: Path) -> None:
     folder = folder.resolve()
     if folder in _held:
         return
-    lock = filelock.FileLock(folder / LOCK, blocking=False)
     try:
-        lock.acquire()
+        _held[folder] = lock(folder / LOCK, 0).lock
     except filelock.Timeout:
         who = "another process"
         with suppress(OSError, ValueError):
@@ -226,7 +225,6 @@ def hold(folder: Path) -> None:
         raise CosimError(
             f"folder '{folder}' is being written by {who}; wait for it or choose another --out"
         ) from None
-    _held[folder] = lock
     since = datetime.now(UTC).isoformat(timespec="seconds")
     command = " ".join(["cosim", *sys.argv[1:]])
     holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
@@ -237,12 +235,12 @@ def release() -> list[Path]:
     """Give back every lock that this process holds, and leave no trace of them; the folders."""
     folders = list(_held)
     while _held:
-        folder, lock = _held.popitem()
+        folder, held = _held.popitem()
         # Removed while it is held: whoever opens it meanwhile finds it gone and makes another.
         for name in (HOLDER, LOCK):
             with suppress(OSError):
                 (folder / name).unlink()
-        lock.release()
+        held.release()
     return folders
 
 

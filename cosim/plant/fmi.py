@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 import fmus
 from cosim.errors import CapabilityError, PlantError
-from cosim.files import cache_folder, temporary_folder
+from cosim.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
 
 SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
@@ -151,13 +151,11 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
     ends with this process. Raises OSError and what zipfile raises where the archive cannot be
     unpacked.
     """
-    from filelock import FileLock  # noqa: PLC0415 - `cosim --help` has no use for it
-
     cache = cache_folder("fmus")
     folder = cache / sha256
     if _holds(folder, archive):
         return folder
-    with FileLock(cache / f"{sha256}.lock", timeout=60):
+    with lock(cache / f"{sha256}.lock", 60):
         if not _holds(folder, archive):
             # What runs from a damaged folder keeps its open files.
             shutil.rmtree(folder, ignore_errors=True)

@@ -1,5 +1,6 @@
 """Files are whole or not there; caches are the user's alone; temporary folders end."""
 
+import errno
 import os
 import stat
 
@@ -9,6 +10,7 @@ from cosim import files
 from cosim.files import (
     LARGEST,
     cache_folder,
+    lock,
     read_json,
     read_toml,
     replacing,
@@ -17,6 +19,26 @@ from cosim.files import (
 )
 
 posix = pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
+
+
+def test_a_lock_is_given_back_at_its_end(tmp_path):
+    for _ in range(2):
+        with lock(tmp_path / "lock", 0), pytest.raises(TimeoutError):
+            lock(tmp_path / "lock", 0)
+
+
+@posix
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
+    import fcntl
+
+    def flock(descriptor, operation):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(OSError, match="locks") as caught:
+        lock(tmp_path / "lock", 0)
+    assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "lock"))
 
 
 def test_what_stood_there_survives_a_failure(tmp_path, monkeypatch):

@@ -29,6 +29,7 @@ from fmus.model import (
     c_header,
     model_description,
     render,
+    terminals,
 )
 
 PACKAGE = Path(__file__).parent
@@ -314,6 +315,7 @@ def assemble(
     members = {
         "documentation/index.html": page.encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
+        **(terminals(model) if version == 3 else {}),
         **(files or {}),
     }
     token = token_of([model_description(version, "", model)], written)

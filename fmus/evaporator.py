@@ -30,6 +30,7 @@ from fmus.model import (
     model_description,
     read_variables,
     render,
+    terminals,
 )
 
 _EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
@@ -58,6 +59,7 @@ EVAPORATOR = Model(
     step_size=60.0,
     model_exchange=True,
     derivatives=True,
+    terminal=("X2", "P2", "P100", "F200"),
 )
 
 
@@ -131,10 +133,7 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
     token, record = model_token(), _build_record(every_platform)
     icons = {
         2: {"model.png": "icon.png"},
-        3: {
-            "terminalsAndIcons/icon.png": "icon.png",
-            "terminalsAndIcons/terminalsAndIcons.xml": "terminalsAndIcons.xml",
-        },
+        3: {"terminalsAndIcons/icon.png": "icon.png"},
     }
     built = []
     for version, name in FILE_NAMES.items():
@@ -142,6 +141,8 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
         files = {member: (RESOURCES / path).read_bytes() for member, path in resources.items()}
         files["documentation/index.html"] = documentation_page(version).encode()
         files[BUILD_FILE] = record
+        if version == 3:
+            files |= terminals(EVAPORATOR, icon=True)
         built.append(
             build_fmu(
                 folder / name,

@@ -118,6 +118,8 @@ class Model:
     the default experiment's; `model_exchange` and `derivatives` (directional, in FMI 3.0 adjoint,
     too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the multiples of
     `step_size` alone: its outputs are discrete, and no communication step may pass over a sample.
+    `terminal` names the variables of FMI 3.0's terminal ``loop``, which a plant and its controller
+    connect by their names.
     """
 
     name: str
@@ -131,6 +133,7 @@ class Model:
     model_exchange: bool = False
     derivatives: bool = False
     sampled: bool = False
+    terminal: tuple[str, ...] = ()
 
     @cached_property
     def by_name(self) -> dict[str, Variable]:
@@ -257,6 +260,12 @@ def model_description(version: FmiVersion, token: str, model: Model) -> str:
         ],
         structure=_structure(version, model),
     )
+
+
+def terminals(model: Model, icon: bool = False) -> dict[str, bytes]:
+    """FMI 3.0's terminalsAndIcons.xml by its path, if the `model` has a terminal; with an icon."""
+    text = render("terminalsAndIcons.xml", model=model, icon=icon)
+    return {"terminalsAndIcons/terminalsAndIcons.xml": text.encode()} if model.terminal else {}
 
 
 def build_description(version: FmiVersion, model: Model) -> str:

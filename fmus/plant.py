@@ -122,6 +122,7 @@ def plant_model(
         stop_time=100 * sampling_time,
         step_size=sampling_time,
         model_exchange=True,
+        terminal=tuple(s.name for s in (*states, *inputs)),
     )
 
 

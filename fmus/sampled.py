@@ -24,7 +24,8 @@ class SampledSystem:
     real variables, or Boolean inputs: the inputs, then the outputs, then the tunable parameters;
     every output depends on every input and parameter. `sources` are C headers by name, of which
     ``core.h`` defines what ``sampled_sources/model_state.h`` lists; the arrays it is given and
-    fills are ordered like the signals. Raises BuildError on names that are taken twice.
+    fills are ordered like the signals. `terminal` is its model's. Raises BuildError on names that
+    are taken twice.
     """
 
     name: str
@@ -33,6 +34,7 @@ class SampledSystem:
     sampling_time: float
     signals: tuple[Variable, ...]
     sources: Mapping[str, bytes]
+    terminal: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check what the model description and the C header rely on."""
@@ -61,6 +63,7 @@ class SampledSystem:
             stop_time=_SAMPLES * self.sampling_time,
             step_size=self.sampling_time,
             sampled=True,
+            terminal=self.terminal,
         )
 
 

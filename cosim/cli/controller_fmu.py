@@ -104,6 +104,7 @@ def sampled_controller(
         sampling_time=scenario.sampling_time,
         signals=tuple(signals),
         sources=exported.sources,
+        terminal=tuple(name for name, _ in (*states, *actions)),
     )
 
 

@@ -88,7 +88,7 @@ def write_atomically(path: str | Path, data: bytes | str) -> Path:
     return Path(path)
 
 
-def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy:
+def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:
     """Take a lock file within `timeout` seconds; a context whose end gives it back.
 
     Raises filelock.Timeout where another process holds it; OSError where it cannot be written, or

@@ -168,11 +168,12 @@ def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) 
 @contextmanager
 def _progress(out_: cli.Output) -> Iterator[Callable[[Progress], None]]:
     """Show the round and the closing bounds on standard error."""
-    console = out_.console()
-    if out_.as_json or not console.is_terminal:
+    if not out_.live:
         yield lambda _: None
         return
-    with console.status("dynamic programming") as status:
+    from rich.console import Console
+
+    with Console(stderr=True).status("dynamic programming") as status:
         yield lambda p: status.update(
             f"grid {p.level} ({p.states} states), round {p.round}: "
             f"{p.lower:.1f} ≤ J* ≤ {p.upper:.1f}"

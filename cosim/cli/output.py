@@ -18,8 +18,6 @@ from cosim.files import write_atomically
 from cosim.processes import Terminated, hold, output_turned_aside, release, watch
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from cosim.scenario import Scenario
 
 MOST = 100_000_000
@@ -63,12 +61,6 @@ class Output:
     def live(self) -> bool:
         """Whether progress is shown: on a terminal, unless JSON was asked for."""
         return not self.as_json and sys.stderr.isatty()
-
-    def console(self) -> Console:
-        """Console of standard error, for progress and notes."""
-        from rich.console import Console
-
-        return Console(stderr=True)
 
     def note(self, text: str) -> None:
         """Print a line on standard error, above a bar, unless JSON was asked for."""

@@ -21,7 +21,9 @@ from learning.algorithm import Privilege
 
 SEEDS, STEPS = range(3_000_000, 3_000_005), 2000
 """Noise of the entries, which no study and no training may meet, and samples on each."""
-Text = Annotated[str, Field(pattern=r"^[^|<>\[\]\\`\r\n]+$")]
+MOST_FILES, MOST_BYTES = 20, 2_000_000
+"""Of an entry: runs of all seeds take half of it."""
+Text = Annotated[str, Field(pattern=r"^[^|<>\[\]\\`\r\n]+$", max_length=100)]
 
 
 class Entry(Table):
@@ -29,7 +31,7 @@ class Entry(Table):
 
     name: Text
     authors: Text
-    link: Annotated[str, Field(pattern=r"^(https?://[^\s|<>()]+)?$")] = ""
+    link: Annotated[str, Field(pattern=r"^(https?://[^\s|<>()]+)?$", max_length=200)] = ""
     scenario: Annotated[str, Field(pattern=r"^[\w-]+$")]
     asks_for: Literal["nothing"] | Privilege
     samples: Annotated[int, Field(ge=0)]
@@ -37,6 +39,9 @@ class Entry(Table):
 
 def read_entry(folder: Path) -> tuple[Entry, pd.DataFrame]:
     """A board's entry and its judged runs, those in `runs` played back; raises CosimError."""
+    sizes = [each.stat().st_size for each in folder.rglob("*") if each.is_file()]
+    if len(sizes) > MOST_FILES or sum(sizes) > MOST_BYTES:
+        raise ResultsError(f"'{folder}' has over {MOST_FILES} files or {MOST_BYTES} bytes")
     path, origin = folder / "entry.toml", f"'{folder / 'entry.toml'}'"
     entry = validated(Entry, read_toml(path, origin, ResultsError), origin, ResultsError)
     scenario = Scenario.load(entry.scenario)

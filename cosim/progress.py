@@ -27,7 +27,8 @@ def told(
     # No thread that watches the bar, and no lock between processes: one process draws it.
     tqdm.monitor_interval = 0
     tqdm.set_lock(RLock())
-    looks = {"unit": " samples", "unit_scale": True, "miniters": 1, "dynamic_ncols": True}
+    form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{remaining}{postfix}]"
+    looks = {"bar_format": form, "unit_scale": True, "miniters": 1, "dynamic_ncols": True}
     with tqdm(total=total, desc=label, **looks) as bar:
 
         def update(*news: object) -> None:

@@ -46,14 +46,8 @@ if TYPE_CHECKING:
 
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
-SHOWN = (
-    ("J", "J", 1, ".0f"),
-    ("greedy_J", "greedy", 1, ".0f"),
-    ("regret", "regret %", 100, ".3g"),
-    ("td_error", "TD", 1, ".3g"),
-    ("smallest_eigenvalue", "λmin", 1, ".2g"),
-)
-"""Columns of the log behind the progress bar: name, text, scale, format."""
+SHOWN = {"J": "J", "greedy_J": "greedy J", "regret": "regret", "td_error": "TD"}
+"""Columns of the log behind the progress bar, with their text there."""
 EVERY = ("log_every", "evaluate_every", "checkpoint_every")
 LEAST = {"seed": 0} | dict.fromkeys(
     ("samples", *EVERY, "evaluation_seeds", "evaluation_steps", "rest_after"), 1
@@ -610,17 +604,12 @@ def run_training(
         )
 
 
-class _Remark:
-    """What is shown behind the bar: the last value that the log has of each of its figures."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, float] = {}
+class _Remark(dict[str, float]):
+    """The last value of each column of the log; called, it says some of them behind a bar."""
 
     def __call__(self, done: int, row: LogRow) -> tuple[int, str]:
-        last = self._last
-        last.update({name: value for name, value in row.items() if not isnan(value)})
-        shown = [f"{t} {scale * last[n]:{form}}" for n, t, scale, form in SHOWN if n in last]
-        return done, "  ".join(shown)
+        self.update({name: value for name, value in row.items() if not isnan(value)})
+        return done, "  ".join(f"{SHOWN[name]} {self[name]:.4g}" for name in SHOWN if name in self)
 
 
 class _Session:

@@ -55,7 +55,6 @@ class Output:
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
         self._stdout: int | None = None
-        self._aside: Callable[[], AbstractContextManager[None]] = nullcontext
 
     @property
     def live(self) -> bool:
@@ -65,7 +64,8 @@ class Output:
     def note(self, text: str) -> None:
         """Print a line on standard error, above a bar, unless JSON was asked for."""
         if not self.as_json:
-            with self._aside():
+            tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)  # who may be drawing a bar
+            with tqdm.external_write_mode() if tqdm else nullcontext():
                 print(text, file=sys.stderr)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -110,20 +110,11 @@ class Output:
         elif self.as_json:
             sys.stdout.write(text)
 
-    @contextmanager
-    def progress(self, label: str, total: int) -> Iterator[Callable[..., None]]:
-        """Progress bar on standard error; yields a function of the number done and a remark."""
+    def progress(self, label: str, total: int) -> AbstractContextManager[Callable[..., None]]:
+        """Progress bar on standard error: a function of the number done and a remark."""
         from cosim.progress import told
 
-        with told(self.live, label, total) as show:
-            if self.live:
-                from tqdm import tqdm
-
-                self._aside = tqdm.external_write_mode
-            try:
-                yield show
-            finally:
-                self._aside = nullcontext
+        return told(self.live, label, total)
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""

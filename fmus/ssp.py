@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import fmpy
-from attr import asdict
+from attrs import asdict
 
 from fmus import BuildError
 from fmus.build import write_archive
@@ -48,11 +48,11 @@ def write_ssp(
         members[f"resources/{name}.fmu"] = fmu.read_bytes()
         known = {u.name: asdict(u.baseUnit) for u in description.unitDefinitions if u.baseUnit}
         unit_of = {v.name: v.unit for v in description.modelVariables if v.unit in known}
-        units |= {unit: known[unit] for name in (*inputs, *outputs) if (unit := unit_of.get(name))}
+        units |= {unit: known[unit] for each in (*inputs, *outputs) if (unit := unit_of.get(each))}
         connectors = [
-            (kind, name, {"unit": unit_of.get(name)})
+            (kind, each, {"unit": unit_of.get(each)})
             for kind, names in (("input", inputs), ("output", outputs))
-            for name in names
+            for each in names
         ]
         components.append(({"name": name, "starts": name == "plant"}, connectors))
     connections = [

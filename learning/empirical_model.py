@@ -112,12 +112,13 @@ class EmpiricalModel:
                 np.outer(deviation, np.append(1.0, slopes)).reshape(-1),
             ]
         )
-        residuals, size = target - target.mean(axis=0), ((y / h) ** 2).mean(axis=0)
+        residuals = target - target.mean(axis=0)
+        least = EXACT**2 * ((y / h) ** 2).mean(axis=0)
         for _ in range(ROUNDS):
             known = np.concatenate([residuals, older])
             noise = known.T @ known / len(known)
             variance = np.diag(noise)
-            noise = noise + np.diag(np.maximum(EXACT**2 * size - variance, 1e-9 * variance))
+            noise = noise + np.diag(np.maximum(least - variance, 1e-9 * variance))
             whiten = np.linalg.inv(np.linalg.cholesky(noise))
             rows = (whiten @ design).reshape(-1, design.shape[2]) * prior
             precision = rows.T @ rows + np.eye(prior.size)

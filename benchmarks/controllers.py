@@ -14,7 +14,7 @@ import qpsolvers
 from benchmarks.ipopt import IpoptNmpc
 from benchmarks.measuring import clock, figure
 from controllers import Problem, RtiNmpc, compile_functions
-from controllers.factories import naive_parameters
+from controllers.factories import naive
 from controllers.qp import DaqpBackend, qpsolvers_problem
 from cosim import FmuPlant
 from cosim.simulation import spawn_seeds
@@ -55,7 +55,7 @@ def measure(scenario, steps):
 def rti_controller(scenario, backend):
     """The naive RTI-NMPC of a scenario with a QP backend."""
     problem = Problem.from_scenario(scenario)
-    parameters, hessian = naive_parameters(scenario, problem), scenario.controller.hessian
+    parameters, hessian = naive(scenario).parameters, scenario.controller.hessian
     return RtiNmpc(problem, parameters, hessian=hessian, backend=backend)
 
 
@@ -147,7 +147,7 @@ def cold_qp(scenario, visits):
 def ipopt(scenario, visits):
     """IPOPT on the nonlinear programme, started at the RTI's guess."""
     problem = Problem.from_scenario(scenario)
-    parameters = naive_parameters(scenario, problem)
+    parameters = naive(scenario).parameters
     solver = IpoptNmpc(problem, parameters.blocks, IPOPT)
     seconds = []
     for point, s, *_ in visits:

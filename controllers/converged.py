@@ -104,7 +104,6 @@ class ConvergedNmpc(RtiNmpc):
         tolerance: float = 1e-9,
         iterations: int = 100,
     ) -> None:
-        """Build the functions; see the class."""
         self._tolerance, self._patience = tolerance, iterations
         self._merit = merit(problem, parameters.blocks)
         super().__init__(problem, parameters, hessian="exact", backend=backend)

@@ -47,14 +47,11 @@ def value_offset(scenario: Scenario, problem: Problem) -> float:
     return problem.value_level() if discounted else problem.reference_cost
 
 
-def naive_parameters(scenario: Scenario, problem: Problem) -> Parameters:
-    """The paper's naive θ, with c_λ as the scenario says."""
-    return Parameters.naive(problem, value_offset=value_offset(scenario, problem))
-
-
-def naive(scenario: Scenario) -> RtiNmpc:
-    """RTI-NMPC with the paper's naive guess: baseline (a)."""
-    return nmpc(scenario, naive_parameters(scenario, Problem.from_scenario(scenario)))
+def naive(scenario: Scenario, kind: str = "rti") -> RtiNmpc:
+    """NMPC with the paper's naive guess, c_λ as the scenario says: baseline (a)."""
+    problem = Problem.from_scenario(scenario)
+    found = Parameters.naive(problem, value_offset=value_offset(scenario, problem))
+    return nmpc(scenario, found, kind)
 
 
 def from_file(scenario: Scenario, path: str | Path) -> RtiNmpc:
@@ -86,8 +83,7 @@ def pi(scenario: Scenario) -> PiLoops:
 
 def converged(scenario: Scenario) -> RtiNmpc:
     """NMPC solved to convergence with the paper's naive guess."""
-    parameters = naive_parameters(scenario, Problem.from_scenario(scenario))
-    return nmpc(scenario, parameters, "converged")
+    return naive(scenario, "converged")
 
 
 def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:

@@ -127,11 +127,9 @@ class ThetaBlocks:
         return tuple(names)
 
     def __iter__(self) -> Iterator[ThetaBlock]:
-        """The blocks, in order."""
         return iter(self.blocks)
 
     def __contains__(self, name: str) -> bool:
-        """Whether θ has a block of this name."""
         return name in self.slices
 
     def block(self, name: str) -> ThetaBlock:
@@ -221,7 +219,6 @@ class Parameters(Shown):
         object.__setattr__(self, "theta", theta)
 
     def __getitem__(self, name: str) -> Vector:
-        """Unpacked value of a block."""
         return self.blocks.block(name).unpack(self.theta[self.blocks.slices[name]])
 
     def _facts(self) -> dict[str, object]:
@@ -370,7 +367,6 @@ class SymbolicTheta:
     model_parameters: ca.SX
 
     def __getitem__(self, name: str) -> ca.SX:
-        """Unpacked symbol of a block."""
         return self.unpacked[name]
 
     @classmethod

@@ -41,7 +41,6 @@ class RunSignals:
         return path.parent.name or path.stem if path.stem in ("trajectory", "run") else path.stem
 
     def __len__(self) -> int:
-        """Return the number of samples K."""
         return max((len(signal.values) for signal in self.signals.values()), default=0)
 
 

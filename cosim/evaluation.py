@@ -48,7 +48,6 @@ def evaluate(
     seeds: int | Sequence[int],
     steps: int,
     *,
-    burn_in: int = 0,
     folder: str | Path | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
@@ -67,11 +66,10 @@ def evaluate(
     Parameters
     ----------
     controllers : by name a factory(scenario) -> Controller, importable where the workers run, or
-        what `cosim.plugins.build_controller` takes; or only such texts, a file by its stem. The
+        what `cosim.plugins.build_controller` takes; or only such texts, or `NAME=…`. The
         one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
     seeds : the seeds, or their number S for 0 … S−1.
-    steps : samples per run that count.
-    burn_in : samples run before them; 0 starts at the scenario's initial state.
+    steps : samples per run, from the scenario's initial state on.
     folder : where finished runs are kept and found again; None keeps none.
     jobs : worker processes; 1 works in this process.
     scheduler : address of a Dask scheduler, used in place of `jobs`.
@@ -81,8 +79,8 @@ def evaluate(
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     numbers = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
-    named = _named(controllers)
-    _check(named, numbers, steps, burn_in)
+    named = named_controllers(controllers)
+    _check(named, numbers, steps)
     wanted = list(named)
     if OPTIMAL not in named and (optimum := stored_optimum(scenario)) is not None:
         named[OPTIMAL] = optimum
@@ -97,8 +95,8 @@ def evaluate(
         "scenario_hash": scenario.hash,
         "fmu_sha256": fmu,
         "command": command,
-    } | ({"burn_in": burn_in} if burn_in else {})
-    noise = {EVALUATION: Noise(numbers, steps, burn_in)}
+    }
+    noise = {EVALUATION: Noise(numbers, steps)}
     runs, parameters = [], {}
     for name, item in named.items():
         controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
@@ -143,21 +141,28 @@ def _qualified(factory: Factory) -> str:
     return f"{inner.__module__}:{getattr(inner, '__qualname__', type(inner).__name__)}{arguments}"
 
 
-def _named(controllers: Mapping[str, Factory | str] | Sequence[str]) -> dict[str, Factory | str]:
-    """Controllers by name; raises EvaluationError where two have one name."""
+def named_controllers(
+    controllers: Mapping[str, Factory | str] | Sequence[str],
+) -> dict[str, Factory | str]:
+    """Controllers by name, of texts SPEC or NAME=SPEC; raises EvaluationError where one is none."""
     if isinstance(controllers, Mapping):
         return dict(controllers)
-    named = {Path(text).stem if text.endswith(".toml") else text: text for text in controllers}
-    if isinstance(controllers, str) or len(named) < len(controllers):
-        raise EvaluationError(
-            "controllers must be a list of different names, or a mapping that gives each one"
-        )
-    return dict(named)
+    if isinstance(controllers, str):
+        raise EvaluationError("controllers must be a list of names, or a mapping, not a text")
+    named: dict[str, Factory | str] = {}
+    for item in controllers:
+        name, equals, text = (part.strip() for part in item.partition("="))
+        source = text if equals else name
+        name = Path(name).stem if name.endswith(".toml") else name
+        if not name or not source:
+            raise EvaluationError(f"controllers: '{item}' is not NAME=CONTROLLER")
+        if name in named:
+            raise EvaluationError(f"two controllers are called '{name}'; write NAME=… for one")
+        named[name] = source
+    return named
 
 
-def _check(
-    controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps: int, burn_in: int
-) -> None:
+def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps: int) -> None:
     if not controllers:
         raise EvaluationError("no controller to evaluate")
     own = controllers.get(OPTIMAL, OPTIMAL)
@@ -169,8 +174,8 @@ def _check(
         raise EvaluationError("seeds must be distinct and not negative")
     if max(seeds) >= 1 << 64:
         raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
-    if steps < 1 or burn_in < 0:
-        raise EvaluationError(f"steps must be at least 1, not {steps}; burn-in at least 0")
+    if steps < 1:
+        raise EvaluationError(f"steps must be at least 1, not {steps}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -68,7 +68,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     except BaseException as error:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno and not error.filename2:
+        if isinstance(error, OSError) and error.errno:
             error.filename = str(path)
         raise
 
@@ -97,7 +97,8 @@ def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:
     import filelock  # noqa: PLC0415
 
     try:
-        return filelock.FileLock(path, timeout=timeout).acquire()
+        # All may write it who may write the folder: no user's lock is to outlive its process.
+        return filelock.FileLock(path, timeout, 0o666, fallback_to_soft=False).acquire()
     except OSError as error:
         if not error.filename and error.strerror:  # not from opening it, and no Timeout
             what = f"its file system gives no locks ({error.strerror}): choose another folder"

@@ -25,10 +25,8 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
-CONTROLLERS, FILES, ALGORITHMS = "cosim.controllers", "cosim.controller_files", "cosim.algorithms"
-"""Groups of entry points: factory(scenario), factory(scenario, path) by suffix, algorithms."""
-PARAMETERS = {"toml": "controllers.factories:from_file"}
-"""What a parameters file is read by, unless another package registers its own reader."""
+CONTROLLERS, ALGORITHMS = "cosim.controllers", "cosim.algorithms"
+"""Groups of entry points: factory(scenario), and algorithms."""
 TARGET = re.compile(r"\w[\w.]*:\w[\w.]*")
 OURS = ("fmus", "cosim", "controllers", "learning")
 """The packages of this distribution; any other is a user's."""
@@ -118,19 +116,16 @@ def blamed(cause: BaseException) -> str:
 def build_controller(name: str, scenario: Scenario) -> Controller:
     """Build a controller for a scenario; raises ControllerLookupError and the controller's own.
 
-    `name` is an entry point of the group `cosim.controllers`; the path of a file, θ of the RTI-NMPC
-    (TOML) or one whose suffix is an entry point, factory(scenario, path), of the group
-    `cosim.controller_files`; or a `module:factory` with factory(scenario) -> Controller.
+    `name` is an entry point of the group `cosim.controllers`; the path of a TOML file, θ of the
+    RTI-NMPC; or a `module:factory` with factory(scenario) -> Controller.
     """
     known = registered(CONTROLLERS)
     if name in known:
         return _made(name, known[name], scenario)
-    suffix = Path(name).suffix.removeprefix(".")
-    files = PARAMETERS | registered(FILES)
-    if suffix in files:
-        read = load_plugin(files[suffix], f"the reader of .{suffix}", ControllerLookupError)
-        controller: Controller = read(scenario, name)
-        return _named(controller, Path(name).stem)
+    if name.endswith(".toml"):
+        # By name: `cosim` itself imports no controller here.
+        read = load_plugin("controllers.factories:from_file", "θ", ControllerLookupError)
+        return _named(read(scenario, name), Path(name).stem)
     if ":" in name:
         return _made(name, name, scenario)
     raise ControllerLookupError(

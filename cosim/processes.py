@@ -17,7 +17,7 @@ from types import FrameType
 from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from cosim.errors import CosimError, PlantError
-from cosim.files import lock, temporary_folder
+from cosim.files import lock, temporary_folder, write_atomically
 
 # psutil and filelock are imported where they are needed: every command imports this file.
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ def hold(folder: Path) -> None:
     since = datetime.now(UTC).isoformat(timespec="seconds")
     command = " ".join(["cosim", *sys.argv[1:]])
     holder = f"process {os.getpid()} on {socket.gethostname()} ({command}) since {since}"
-    (folder / HOLDER).write_text(holder, "utf-8", "backslashreplace")
+    write_atomically(folder / HOLDER, holder.encode("utf-8", "backslashreplace"))
 
 
 def release() -> list[Path]:

@@ -135,11 +135,9 @@ class SampleBlock:
     predicted_actions: Array | None = None
 
     def __len__(self) -> int:
-        """Return the number of samples K."""
         return len(self.status)
 
     def __getitem__(self, name: str) -> Array:
-        """Values of a declared signal."""
         return self.columns[name]
 
 

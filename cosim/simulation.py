@@ -76,6 +76,7 @@ def simulate(
         recorder.start(plant.scenario, controller, seed, steps, plant.units)
     loop: CompiledLoop | None = None
     drives = recorder is None and hasattr(type(plant), "drive")
+    drives = drives and getattr(plant, "drivable", False)
     if drives and hasattr(type(controller), "compiled_loop"):
         # Their own, not a wrapper's.
         loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
@@ -291,10 +292,10 @@ def measure(
 
 
 def indicators_of(
-    plant: Plant, controller: Controller, seeds: Sequence[int], steps: int, burn_in: int = 0
+    plant: Plant, controller: Controller, seeds: Sequence[int], steps: int
 ) -> dict[str, Array]:
     """`indicators` of a controller on each of S seeds by name, (S,) each."""
-    found = [measure(plant, controller, seed, steps, burn_in)[0] for seed in seeds]
+    found = [measure(plant, controller, seed, steps)[0] for seed in seeds]
     return {name: np.array([figures[name] for figures in found]) for name in found[0]}
 
 

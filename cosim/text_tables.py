@@ -56,7 +56,6 @@ class Shown:
         return None
 
     def __repr__(self) -> str:
-        """The facts in one line."""
         facts = ", ".join(f"{key}={_short(value)}" for key, value in self._facts().items())
         return f"{type(self).__name__}({facts})"
 

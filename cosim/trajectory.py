@@ -36,7 +36,6 @@ class NoSolution:
     """Stands where the controller failed: whatever a signal asks of it is NaN."""
 
     def __getattr__(self, name: str) -> float:
-        """NaN."""
         return nan
 
 
@@ -242,11 +241,9 @@ class Trajectory(Shown):
                 )
 
     def __len__(self) -> int:
-        """Return the number of samples K."""
         return len(self.status)
 
     def __getitem__(self, name: str) -> Array:
-        """Values of a signal by name, (K,)."""
         if name not in self.signals:
             raise TrajectoryError(f"no signal '{name}'; there are {', '.join(self.signals)}")
         return self.signals[name].values

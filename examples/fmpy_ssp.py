@@ -23,18 +23,16 @@ for component in components:
     instantiate_fmu(component, folder, start_time=0.0, parameter_set=starts)
 step = float(read_model_description(f"{folder}/{components[0].source}").defaultExperiment.stepSize)
 
-print("time,X2,P2,P100,F200")
+controller = components[0]
+names = [connector.name for connector in controller.connectors]  # the states, then the actions
+print(",".join(["time", *names]))
 for k in range(samples):
-    row = [k * step]
     for component in components:
         for start, end in get_connections(system):
             if end.parent is component:
                 set_value(component, end.name, get_value(start.parent, start.name))
-                if component.name == "controller":
-                    row.append(get_value(start.parent, start.name))
         component.fmu.doStep(currentCommunicationPoint=k * step, communicationStepSize=step)
-    row += [get_value(components[0], name) for name in ("P100", "F200")]
-    print(",".join(map(repr, row)))
+    print(",".join(repr(x) for x in (k * step, *(get_value(controller, n) for n in names))))
 for component in components:
     free_fmu(component)
 shutil.rmtree(folder)

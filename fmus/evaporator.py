@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import re
 import zipfile
 from pathlib import Path
 
@@ -24,27 +22,22 @@ from fmus.model import (
     LICENSE,
     FmiVersion,
     Model,
-    Unit,
     build_description,
     c_header,
     model_description,
     read_variables,
     render,
     terminals,
+    unit,
 )
-
-_EXPONENT = re.compile(r"([A-Za-z]+)(-?\d+)")
-
 
 UNITS = tuple(
-    Unit(
-        row["name"],
-        float(row["factor"]),
-        float(row["offset"]),
-        tuple((base, int(power)) for base, power in _EXPONENT.findall(row["exponents"])),
+    unit(name)
+    for name in (
+        "1", "s", "d", "1/d", "%", "%/s", "kg", "kPa", "kPa/s", "kg/min", "kg/kPa", "degC", "K",
+        "K/kPa", "K/%", "kW", "kW/K", "kW.min/kg", "kW.min/(kg.K)",
     )
-    for row in csv.DictReader((RESOURCES / "units.csv").read_text(encoding="utf-8").splitlines())
-)
+)  # fmt: skip
 
 VARIABLES = tuple(read_variables(RESOURCES / "evaporator.csv"))
 

@@ -7,10 +7,12 @@ import hashlib
 import html
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from fractions import Fraction
 from functools import cache, cached_property
 from importlib.metadata import version as version_of
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any, Literal
 
@@ -96,18 +98,52 @@ def read_variables(file: Path) -> list[Variable]:
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit and its SI form: value_SI = factor · value + offset, with exponents of base units."""
+    """A unit and its SI form: value_SI = factor · value + offset, with exponents of base units.
+
+    Where the SI form is not known `exponents` are None.
+    """
 
     name: str
     factor: float = 1.0
     offset: float = 0.0
-    exponents: tuple[tuple[str, int], ...] = ()
+    exponents: tuple[tuple[str, int], ...] | None = ()
 
     def si(self) -> dict[str, object]:
         """The attributes of FMI's BaseUnit."""
         factor = self.factor if self.factor != 1.0 else None
         offset = self.offset if self.offset != 0.0 else None
-        return {**dict(self.exponents), "factor": factor, "offset": offset}
+        return {**dict(self.exponents or ()), "factor": factor, "offset": offset}
+
+
+_TABLE = (Path(__file__).parent / "resources" / "units.csv").read_text(encoding="utf-8")
+_SIMPLE = {row["name"]: row for row in csv.DictReader(_TABLE.splitlines())}
+_QUOTIENT = re.compile(r"[^/()]*(/(\([^/()]*\)|[^/().]*))*")
+_POWER = re.compile(r"(1|[A-Za-z%]+)(-?\d+)?")
+_BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+
+@cache
+def unit(name: str) -> Unit:
+    """The unit `name` with its SI form, as far as it is made of those in `resources/units.csv`.
+
+    They are written as in FMI: ``kg/min``, ``1/s``, ``cm3/(V.s)``. An offset has only a unit that
+    stands alone.
+    """
+    if not _QUOTIENT.fullmatch(name):
+        return Unit(name, exponents=None)
+    factor, powers = Fraction(1), dict.fromkeys(_BASE, 0)
+    for place, part in enumerate(name.split("/")):
+        for each in part.strip("()").split(".") if part else ():
+            found = _POWER.fullmatch(each)
+            if found is None or found[1] not in _SIMPLE:
+                return Unit(name, exponents=None)
+            power = int(found[2] or 1) * (-1 if place else 1)
+            factor *= Fraction(_SIMPLE[found[1]]["factor"]) ** power
+            for base, exponent in re.findall(r"([A-Za-z]+)(-?\d+)", _SIMPLE[found[1]]["exponents"]):
+                powers[base] += power * int(exponent)
+    offset = Fraction(_SIMPLE[name]["offset"] if name in _SIMPLE else 0)
+    exponents = tuple((base, power) for base, power in powers.items() if power)
+    return Unit(name, float(factor), float(offset), exponents)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +154,9 @@ class Model:
     the default experiment's; `model_exchange` and `derivatives` (directional, in FMI 3.0 adjoint,
     too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the multiples of
     `step_size` alone: its outputs are discrete, and no communication step may pass over a sample.
-    `terminal` names the variables of FMI 3.0's terminal ``loop``, which a plant and its controller
-    connect by their names.
+    Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
+    variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
+    names.
     """
 
     name: str
@@ -136,9 +173,20 @@ class Model:
     terminal: tuple[str, ...] = ()
 
     @cached_property
+    def arrays(self) -> dict[str, list[Variable]]:
+        """The elements of FMI 3.0's arrays, in table order, by the arrays' names."""
+        found: dict[str, list[Variable]] = {}
+        for variable in self.variables if self.sampled else ():
+            name, bracket, _ = variable.name.partition("[")
+            if bracket and variable.type is Type.REAL:
+                found.setdefault(name, []).append(variable)
+        return found
+
+    @cached_property
     def by_name(self) -> dict[str, Variable]:
-        """Each variable by its name."""
-        return {variable.name: variable for variable in self.variables}
+        """Each variable by its name, an array's first element by the array's, too."""
+        firsts = {name: elements[0] for name, elements in self.arrays.items()}
+        return firsts | {variable.name: variable for variable in self.variables}
 
     def value_reference(self, name: str) -> int:
         """The value reference of variable `name`; KeyError when there is none."""
@@ -151,11 +199,20 @@ class Model:
     def exported(self, version: FmiVersion) -> list[Variable]:
         """The variables of the table that FMI `version` shows.
 
-        FMI 3.0 has the whole seed in one variable; FMI 2.0 shows no time: FMI Library refuses it.
+        FMI 3.0 has the whole seed in one variable, and an array in place of its elements; FMI 2.0
+        shows no time: FMI Library refuses it.
         """
         if version == 2:
             return [v for v in self.variables if v.kind is not Kind.INDEPENDENT]
-        return [v for v in self.variables if v.type not in (Type.SEED_HIGH, Type.LAW_NUMBER)]
+        shown = {v: v for v in self.variables if v.type not in (Type.SEED_HIGH, Type.LAW_NUMBER)}
+        for name, elements in self.arrays.items():
+            texts = [v.description for v in elements]
+            about = commonprefix(texts).rstrip(", ")  # noqa: RUF071 (no paths)
+            order = " ".join(v.name.removeprefix(name) for v in elements)
+            shown[elements[0]] = replace(elements[0], name=name, description=f"{about}: {order}")
+            for element in elements[1:]:
+                del shown[element]
+        return list(shown.values())
 
 
 @cache
@@ -307,6 +364,9 @@ def _type(version: FmiVersion, variable: Variable, model: Model) -> tuple[str, A
         value = getattr(variable, key)
         if value is not None and not (key == "nominal" and value == 0.0):
             attributes[key] = float(value)
+    if variable.start is not None and variable.name in model.arrays:
+        starts = [v.start or 0.0 for v in model.arrays[variable.name]]
+        attributes["start"] = " ".join(str(float(start)) for start in starts)
     if variable.kind is Kind.DERIVATIVE:
         state = variable.name.removeprefix("der(").removesuffix(")")
         attributes["derivative"] = _numbering(version, model)(state)
@@ -333,7 +393,7 @@ _UNKNOWNS = (
 def _structure(version: FmiVersion, model: Model) -> list[tuple[str, str, list[Attributes]]]:
     """The unknowns of ModelStructure, group by group, and what they depend on."""
     number = _numbering(version, model)
-    shown = {variable.name for variable in model.exported(version)}
+    shown = {model.by_name[variable.name].name for variable in model.exported(version)}
 
     def unknown(name: str, dependencies: Sequence[str]) -> Attributes:
         numbers = [str(number(n)) for n in dependencies if n in shown]
@@ -348,7 +408,7 @@ def _structure(version: FmiVersion, model: Model) -> list[tuple[str, str, list[A
     return [
         (tag, group, [unknown(name, dependencies(name, model)) for name in names])
         for tag, group, kinds, dependencies in _UNKNOWNS
-        if (names := model.names(*kinds))
+        if (names := [name for name in model.names(*kinds) if name in shown])
     ]
 
 

@@ -13,7 +13,7 @@ from math import inf
 from pathlib import Path
 
 from fmus.build import PACKAGE, RESOURCES, SOURCES, assemble, files_of, sources_of
-from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable, read_variables, render
+from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable, read_variables, render, unit
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (
@@ -118,7 +118,7 @@ def plant_model(
         version="1.0.0",
         description=description,
         variables=tuple(table),
-        units=tuple(Unit(u, exponents=(("s", 1),) if u == "s" else ()) for u in units),
+        units=tuple(unit(name) for name in units),
         stop_time=100 * sampling_time,
         step_size=sampling_time,
         model_exchange=True,
@@ -186,7 +186,10 @@ def model(name: str) -> Model:
                 )
             )  # fmt: skip
     description, sampling_time = PLANTS[name]
-    return plant_model(name, description=description, sampling_time=sampling_time, **signals)
+    table = plant_model(name, description=description, sampling_time=sampling_time, **signals)
+    # Stored results name the shipped files by their bytes: units without their SI forms.
+    units = [Unit(u.name, exponents=u.exponents if u.name == "s" else ()) for u in table.units]
+    return replace(table, units=tuple(units))
 
 
 def equations(name: str) -> bytes:

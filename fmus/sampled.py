@@ -9,9 +9,8 @@ from functools import cached_property
 from pathlib import Path
 
 from fmus import BuildError
-from fmus.build import assemble, files_of, sources_of
-from fmus.evaporator import UNITS
-from fmus.model import FmiVersion, Kind, Model, Unit, Variable, render
+from fmus.build import SOURCES, assemble, files_of, sources_of
+from fmus.model import FmiVersion, Kind, Model, Variable, render, unit
 
 _SAMPLES = 100
 
@@ -45,13 +44,10 @@ class SampledSystem:
 
     @cached_property
     def model(self) -> Model:
-        """The table of variables with its units; one that `fmus.evaporator` does not know has no
-        SI form.
-        """
+        """The table of variables with its units."""
         time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
         known = tuple(v.name for v in self.signals if v.settable)
         table = (time, *(v if v.settable else replace(v, uses=known) for v in self.signals))
-        units = {unit.name: unit for unit in UNITS}
         names = dict.fromkeys(variable.unit for variable in table)
         return Model(
             name=self.name,
@@ -59,7 +55,7 @@ class SampledSystem:
             version="1.0.0",
             description=self.description,
             variables=table,
-            units=tuple(units.get(name, Unit(name)) for name in names if name),
+            units=tuple(unit(name) for name in names if name),
             stop_time=_SAMPLES * self.sampling_time,
             step_size=self.sampling_time,
             sampled=True,
@@ -78,6 +74,8 @@ def sampled_sources(system: SampledSystem, version: FmiVersion) -> dict[str, byt
         sampling_time=float(system.sampling_time),
     )
     own = files_of("sampled_sources") | {**system.sources, "system.h": header.encode()}
+    if version == 3:
+        own |= _array_sources(system.model)
     # The C checks every variable against a range.
     largest = sys.float_info.max
     rows = [
@@ -87,6 +85,19 @@ def sampled_sources(system: SampledSystem, version: FmiVersion) -> dict[str, byt
         for v in system.model.variables
     ]
     return sources_of(system.model, version, own, rows)
+
+
+def _array_sources(model: Model) -> dict[str, bytes]:
+    """FMI 3.0's face, which knows scalars, and what puts the model's arrays behind it."""
+    elements = dict.fromkeys(range(len(model.variables)), (1, 0))
+    for array in model.arrays.values():
+        own = [model.value_reference(variable.name) for variable in array]
+        for k, vr in enumerate(own):
+            elements[vr] = (0 if k else len(own), own[(k + 1) % len(own)])
+    table = render("arrays.h", model=model, elements=elements.values()).encode()
+    last = b'#include "snapshot.h"\n'
+    face = (SOURCES / "fmi3.c").read_bytes().replace(last, last + b'#include "arrays.h"\n')
+    return {"arrays.h": table, "fmi3.c": face}
 
 
 def build_sampled(

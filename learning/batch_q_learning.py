@@ -187,7 +187,6 @@ class ReplayBuffer:
         self._gradient = np.zeros((capacity, self._theta.size))
 
     def __len__(self) -> int:
-        """Number of transitions kept."""
         return self._count
 
     def clear(self) -> None:

@@ -116,12 +116,14 @@ def arrays_of(state: Any) -> dict[str, Array]:
 def take_up(state: Any, arrays: Mapping[str, Array]) -> None:
     """Set what an object keeps to what `arrays_of` gave; a number keeps its present type.
 
-    In the order of `KEPT`; what is None now stays so. Raises KeyError where one is missing,
-    TypeError or ValueError where it has another form.
+    In the order of `KEPT`; what is None now stays so; a part that can `restore` does. Raises
+    KeyError where one is missing, TypeError or ValueError where it has another form.
     """
     for name in _kept(state):
         present = getattr(state, name)
-        if _has_parts(present):
+        if hasattr(present, "restore"):
+            present.restore(group(arrays, f"{name} "))
+        elif _has_parts(present):
             take_up(present, group(arrays, f"{name} "))
         elif isinstance(present, dict):
             setattr(state, name, group(arrays, f"{name} "))

@@ -11,13 +11,17 @@ of its disturbances.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.resources import files
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as fisher
 
 from controllers.export.core import core
 from controllers.functions import c_source, library
@@ -26,6 +30,8 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim.protocols import Array, recover
+from learning.algorithm import Transition
+from learning.checkpoint import group, take_up
 
 PARAMETER_DEVIATION = 0.15
 """Prior standard deviation of a parameter's error, as a share of its value."""
@@ -37,6 +43,14 @@ EXACT = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
 ROUNDS = 2
 """Fits, each with the residuals' covariance of the one before."""
+ALARM = 1e-7
+"""Probability below which the mean error since the last fit speaks of another plant."""
+WINDOWS = (15, 60, 240, 960)
+"""Latest samples of which that mean is taken, every `WINDOWS[0]` samples."""
+FORETOLD, EVIDENCE = 240, 3.0
+"""Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
+POOL = 480
+"""Number of residuals up to which those from before a change are kept."""
 
 
 class Features:
@@ -140,6 +154,11 @@ class EmpiricalModel:
         row: Array = _design(G, (inputs - self.centre) / self.unit)[:, -1].mean(axis=0)
         return row
 
+    @cached_property
+    def noise(self) -> Array:
+        """Covariance of the residuals, (K, K)."""
+        return np.cov(self.residuals.T)
+
     @property
     def coefficients(self) -> tuple[Array, Array]:
         """c (p,) and W (K, 1+n+m) for inputs in their own units."""
@@ -147,6 +166,97 @@ class EmpiricalModel:
         W = W.reshape(self.features.outputs, -1)
         slopes = W[:, 1:] / self.unit
         return c, np.column_stack([W[:, 0] - slopes @ self.centre, slopes])
+
+
+class PlantData:
+    """The latest transitions of a plant in operation, and the `model` of the plant as it is now.
+
+    `count` samples so far, `era` of them before the present plant's, `fitted` at the last fit.
+    """
+
+    KEPT = ("_rows", "_pool", "count", "era", "fitted", "model")
+
+    def __init__(self, features: Features, memory: int) -> None:
+        self.features = features
+        self.model: EmpiricalModel | None = None
+        self.count, self.era, self.fitted = 0, 0, 0
+        # A ring of transitions (s, a, s₊, ℓ), and the residuals from before the last change.
+        self._rows = np.zeros((memory, features.inputs + features.outputs))
+        self._pool = np.zeros((0, features.outputs))
+
+    def add(self, transition: Transition) -> None:
+        """Keep a transition in place of the oldest one."""
+        row = (transition.s, transition.a, transition.next_s, [transition.stage_cost])
+        self._rows[self.count % len(self._rows)] = np.concatenate(row)
+        self.count += 1
+
+    def latest(self, count: int) -> tuple[Array, Array]:
+        """Inputs (s, a) and outputs (s₊, ℓ) of so many of the latest samples, oldest first."""
+        count = min(count, self.count, len(self._rows))
+        rows = self._rows[np.arange(self.count - count, self.count) % len(self._rows)]
+        return rows[:, : self.features.inputs], rows[:, self.features.inputs :]
+
+    @property
+    def present(self) -> tuple[Array, Array]:
+        """Inputs and outputs of the plant as it is now."""
+        return self.latest(self.count - self.era)
+
+    def fit(self) -> EmpiricalModel:
+        """Fit the model to the plant as it is now; data that spoil its predictions are dropped."""
+        inputs, outputs = self.present
+        if outdated := self._outdated(inputs, outputs):
+            self.era = self.count - len(inputs) + outdated
+            inputs, outputs = self.present
+        pool = self._pool[: max(POOL - len(inputs), 0)]
+        self.model = model = EmpiricalModel.fit(self.features, inputs, outputs, pool)
+        self.fitted = self.count
+        return model
+
+    def _outdated(self, inputs: Array, outputs: Array) -> int:
+        """Number of oldest samples without which the model foretells the latest quarter better."""
+        latest = len(inputs) // 4
+        if latest < FORETOLD:
+            return 0
+        older, losses = (len(inputs) - latest) // 2, []
+        models = [
+            EmpiricalModel.fit(self.features, inputs[first:-latest], outputs[first:-latest])
+            for first in (0, older)
+        ]
+        precision = np.linalg.pinv(models[1].noise)
+        for model in models:
+            predicted, h, _ = model.predict(inputs[-latest:])
+            errors = (outputs[-latest:] - predicted) / h
+            losses.append(float(np.einsum("mi,ij,mj->", errors, precision, errors)) / 2)
+        return older if losses[0] - losses[1] > EVIDENCE else 0
+
+    def errors(self) -> tuple[Array, Array, Array, Array]:
+        """Predictions, h, errors over h and designs of the latest samples since the fit."""
+        assert self.model is not None
+        inputs, outputs = self.latest(min(self.count - self.fitted, WINDOWS[-1]))
+        predicted, h, designs = self.model.predict(inputs)
+        return predicted, h, (outputs - predicted) / h, designs
+
+    def changed(self, errors: Array, designs: Array, alarm: float = ALARM) -> bool:
+        """Whether the mean of the latest `errors` (T, K) is improbable, with their designs.
+
+        The data of the present plant begin with them then.
+        """
+        model = self.model
+        assert model is not None
+        M, K = model.residuals.shape
+        mean, design = errors.mean(axis=0), designs.mean(axis=0)
+        covariance = model.noise / len(errors) + design @ model.covariance @ design.T
+        statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
+        if fisher.sf(statistic, K, M - K) >= alarm:
+            return False
+        self.era, self._pool = self.count - len(errors), model.residuals[-POOL:]
+        return True
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take back what a checkpoint has of this."""
+        take_up(self, state)
+        if model := group(state, "model "):
+            self.model = EmpiricalModel(self.features, **model)
 
 
 class Rollout:
@@ -178,13 +288,20 @@ class Rollout:
         self.compiled = None if path is None else ctypes.CDLL(str(path)).rollout
 
     def __call__(
-        self, theta: Array, start: Array, model: EmpiricalModel, picks: NDArray[np.int32]
-    ) -> tuple[Array, Array, Array]:
-        """Inputs (s, a), predictions of (s₊, ℓ) without r, and h, (T, …) each, of T samples.
+        self, thetas: Sequence[Array], start: Array, model: EmpiricalModel, picks: NDArray[np.int32]
+    ) -> list[tuple[Array, Array, Array]]:
+        """For each θ inputs (s, a), predictions of (s₊, ℓ) without r, and h, (T, …) each.
 
         θ (n_θ,); `start` (n,); `picks` (T,) says which of the model's residuals each sample meets.
         Where the QP fails the last action is repeated. Fewer samples where a state is not finite.
+        The compiled rollouts of several θ run at once, in threads.
         """
+        with ThreadPoolExecutor(1 if self.compiled is None else None) as pool:
+            return list(pool.map(lambda theta: self._one(theta, start, model, picks), thetas))
+
+    def _one(
+        self, theta: Array, start: Array, model: EmpiricalModel, picks: NDArray[np.int32]
+    ) -> tuple[Array, Array, Array]:
         shape, steps = (len(picks), self._features.outputs), len(picks)
         inputs = np.empty((steps, self._features.inputs))
         predicted, h = np.empty(shape), np.empty(shape)

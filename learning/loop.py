@@ -70,7 +70,7 @@ class TrainingLoop:
 
     def __init__(
         self,
-        plant: FmuPlant,
+        plant: FmuPlant | PlantInOperation,
         controller: RtiNmpc,
         algorithm: Algorithm,
         strategy: Strategy,
@@ -79,9 +79,12 @@ class TrainingLoop:
         algorithm_rng: np.random.Generator | None = None,
     ) -> None:
         scenario = plant.scenario
-        simulator = algorithm.asks_for == "simulator"
-        self._simulator = plant if simulator else None
-        self._plant = plant if simulator else PlantInOperation(plant)
+        self._simulator: FmuPlant | None = None
+        self._plant = plant
+        if not isinstance(plant, PlantInOperation):
+            simulator = algorithm.asks_for == "simulator"
+            self._simulator = plant if simulator else None
+            self._plant = plant if simulator else PlantInOperation(plant)
         self.controller, self.algorithm, self.rng = controller, algorithm, rng
         self._strategy = strategy
         self._generators = {"exploration": rng}

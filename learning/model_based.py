@@ -15,7 +15,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import f as fisher
 
 from controllers.economic import tune
 from controllers.errors import TuningError
@@ -23,9 +22,8 @@ from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.penalty import Penalty
 from learning.algorithm import Algorithm, Transition, Update
-from learning.checkpoint import group
 from learning.configuration import Configuration, Count
-from learning.empirical_model import EmpiricalModel, Features, Rollout
+from learning.empirical_model import ALARM, WINDOWS, EmpiricalModel, Features, PlantData, Rollout
 from learning.prediction_errors import SortedErrors, expected_penalties
 from learning.step import moved
 
@@ -35,8 +33,8 @@ BURN, COARSE, FINE = 300, 1800, 5300
 """Samples of a rollout before it counts, of one on the grid, and of one about its best point."""
 LEVELS = (0.0, 2.0, 3.0, 7.0, 18.0, 50.0)
 """Back-offs of the grid, in standard deviations of the one-step error."""
-FACTORS = ((0.72, 0.85, 1.18, 1.4), (0.93, 1.07))
-"""Of a back-off, in the two sweeps about the best point of the grid."""
+FACTORS = ((0.72, 0.85, 1.18, 1.4), (0.93, 1.07), (0.97, 1.03))
+"""Of a back-off, in the three sweeps about the best point of the grid."""
 ROOM = 0.45
 """Largest back-off, as a share of the distance of the bounds."""
 DOUBT = 1.0
@@ -47,22 +45,14 @@ WORTH = 1e-6
 """Share of the cost that the penalty of a bound must reach for its back-off to be searched."""
 TAIL, TAIL_SAMPLES = 0.1, 120
 """The errors' tails are widened by `TAIL` √(`TAIL_SAMPLES` / their number)."""
-ALARM = 1e-7
-"""Probability below which the mean error since the last fit speaks of another plant."""
 SUSPICION = 1e-4
-"""That probability where the promise is broken as well."""
-WINDOWS = (15, 60, 240, 960)
-"""Latest samples of which that mean and the mean cost are taken, every `WINDOWS[0]` samples."""
+"""Probability of the mean error that speaks of another plant where the promise is broken too."""
 SETTLING = 30
 """Samples after an update that do not break its promise, which is of a loop that has settled."""
 BROKEN = 1.5
 """Excess of such a mean cost, over that of the promise's dearest window, that breaks a promise."""
 REACH = 2.0
 """Ranges of the latest states by which a rollout's mean may differ from theirs."""
-FORETOLD, EVIDENCE = 240, 3.0
-"""Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
-POOL = 480
-"""Number of residuals up to which those from before a change are kept."""
 CAUTION = 120
 """Samples of the present plant below which back-offs only grow; errors below which none tells."""
 SHRINKS = 0.7
@@ -97,10 +87,7 @@ class ModelBased(Algorithm):
     """
 
     Configuration = ModelBasedConfiguration
-    KEPT = (
-        *("_rows", "back_off", "_pool", "_due", "_count", "_era", "_updated", "model_samples"),
-        *("_model", "_limits"),
-    )
+    KEPT = ("back_off", "_due", "model_samples", "_limits", "_data")
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
 
@@ -111,16 +98,11 @@ class ModelBased(Algorithm):
         self._base = base = _tuned(problem, start)
         self._features = Features(problem)
         self._rollout = Rollout(problem, start, self._features)
-        self._model: EmpiricalModel | None = None
-        n = problem.n_states
-        # A ring of transitions (s, a, s₊, ℓ), and the residuals from before the last change.
-        self._rows = np.zeros((settings.memory, self._features.inputs + n + 1))
-        self._pool = np.zeros((0, n + 1))
+        self._data = PlantData(self._features, settings.memory)
         backed = np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]])
         self.back_off: Array = np.maximum(backed, 0.0)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
-        # Samples so far, at the last update, at the next one, and before the present plant's.
-        self._count, self._updated, self._due, self._era = 0, 0, settings.first_update, 0
+        self._due = settings.first_update  # samples at the next update
         self._limits: Array = np.full(len(WINDOWS), np.inf)  # of the mean cost, for each window
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
@@ -128,61 +110,34 @@ class ModelBased(Algorithm):
     @property
     def explores(self) -> bool:
         """Whether the samples explore now."""
-        return self._count - self._era < self.configuration.exploration_samples
+        return self._data.count - self._data.era < self.configuration.exploration_samples
 
     def observe(self, transition: Transition) -> Update | None:
         """Keep a transition; move θ where it is time."""
-        row = (transition.s, transition.a, transition.next_s, [transition.stage_cost])
-        self._rows[self._count % len(self._rows)] = np.concatenate(row)
-        self._count += 1
-        if self._model is not None and (self._count - self._updated) % WINDOWS[0] == 0:
-            self._watch(self._model)
-        return self._update() if self._count >= self._due else None
-
-    def _latest(self, count: int) -> tuple[Array, Array]:
-        """Inputs (s, a) and outputs (s₊, ℓ) of the latest samples, oldest first."""
-        rows = self._rows[np.arange(self._count - count, self._count) % len(self._rows)]
-        return rows[:, : self._features.inputs], rows[:, self._features.inputs :]
+        data = self._data
+        data.add(transition)
+        if data.model is not None and (data.count - data.fitted) % WINDOWS[0] == 0:
+            self._watch(data.model)
+        return self._update() if data.count >= self._due else None
 
     def _watch(self, model: EmpiricalModel) -> None:
         """Make an update due where the promise is broken or, on new data, the plant is another."""
-        (M, K), noise = model.residuals.shape, np.cov(model.residuals.T)
-        if M < CAUTION:
+        data = self._data
+        since = data.count - data.fitted
+        if len(model.residuals) < CAUTION:
             return
-        inputs, outputs = self._latest(min(self._count - self._updated, WINDOWS[-1]))
-        predicted, h, designs = model.predict(inputs)
-        errors = (outputs - predicted) / h
+        predicted, h, errors, designs = data.errors()
         costs = ExpectedCosts(self._problem, model)(predicted, h)[0]
         for window, limit in zip(WINDOWS, self._limits, strict=True):
-            if window > len(inputs):
+            if window > since:
                 return
-            broken = len(inputs) > SETTLING and costs[-window:].mean() > limit
-            if broken:
-                self._due = self._count
-            mean, design = errors[-window:].mean(axis=0), designs[-window:].mean(axis=0)
-            covariance = noise / window + design @ model.covariance @ design.T
-            statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
-            if fisher.sf(statistic, K, M - K) < (SUSPICION if broken else ALARM):
-                self._era, self._due = self._count - window, self._count
-                self._pool = model.residuals[-POOL:]
+            broken = since > SETTLING and costs[-window:].mean() > limit
+            alarm = SUSPICION if broken else ALARM
+            changed = data.changed(errors[-window:], designs[-window:], alarm)
+            if broken or changed:
+                self._due = data.count
+            if changed:
                 return
-
-    def _outdated(self, inputs: Array, outputs: Array) -> int:
-        """Number of oldest samples without which the model foretells the latest quarter better."""
-        latest = len(inputs) // 4
-        if latest < FORETOLD:
-            return 0
-        older, losses = (len(inputs) - latest) // 2, []
-        models = [
-            EmpiricalModel.fit(self._features, inputs[first:-latest], outputs[first:-latest])
-            for first in (0, older)
-        ]
-        precision = np.linalg.pinv(np.cov(models[1].residuals.T))
-        for model in models:
-            predicted, h, _ = model.predict(inputs[-latest:])
-            errors = (outputs[-latest:] - predicted) / h
-            losses.append(float(np.einsum("mi,ij,mj->", errors, precision, errors)) / 2)
-        return older if losses[0] - losses[1] > EVIDENCE else 0
 
     def _least(self, inputs: Array) -> Array:
         """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
@@ -199,40 +154,28 @@ class ModelBased(Algorithm):
         return least
 
     def _update(self) -> Update:
-        inputs, outputs = self._latest(min(self._count - self._era, len(self._rows)))
-        if outdated := self._outdated(inputs, outputs):
-            inputs, outputs = inputs[outdated:], outputs[outdated:]
-            self._era = self._count - len(inputs)
-        age = self._count - self._era
-        self._model = EmpiricalModel.fit(
-            self._features, inputs, outputs, self._pool[: max(POOL - age, 0)]
-        )
-        self._updated = self._count
-        interval = max(age, self.configuration.first_update)
-        self._due = self._count + min(interval, self.configuration.longest_interval)
-        latest, _ = self._latest(min(self._count, RECENT, len(self._rows)))
-        search = BackOffs(self._problem, self._rollout, self._base, self._model, latest, self.rng)
+        data = self._data
+        model = data.fit()
+        inputs, _ = data.present
+        interval = max(data.count - data.era, self.configuration.first_update)
+        self._due = data.count + min(interval, self.configuration.longest_interval)
+        latest, _ = data.latest(RECENT)
+        search = BackOffs(self._problem, self._rollout, self._base, model, latest, self.rng)
         found = search.best(self.back_off, self._least(inputs))
         present = self.controller.parameters
         new = search.theta(found)
         search.draw(FINE)
-        promise, kept = search.promise(new), search.promise(present.theta)
+        promise, kept = search.promises([new, present.theta])
         better = search.excess(promise, kept) <= 0
         self._limits = (promise if better else kept).limits
         if not np.isfinite(self._limits).all():
-            self._due = min(self._due, self._count + WINDOWS[-2])
+            self._due = min(self._due, data.count + WINDOWS[-2])
         if better:
             self.back_off = found
             self.controller.theta = new
         self.model_samples += search.samples
         end = self.controller.theta
         return moved(present.blocks, present.theta, end, refused=not better)
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
-        super().restore(state)
-        if model := group(state, "_model "):
-            self._model = EmpiricalModel(self._features, **model)
 
 
 class Promise(NamedTuple):
@@ -314,14 +257,17 @@ class BackOffs:
         moved = {"x_l": base["x_l"] + delta[:n], "x_u": base["x_u"] - delta[n:]}
         return base.replace(moved).theta
 
-    def promise(self, theta: Array) -> Promise:
-        """What the model promises of a θ; infinite cost where the rollout is lost."""
-        picks, model = self._picks, self._model
-        parts = self._rollout(theta, self._start, model, picks)
+    def promises(self, thetas: Sequence[Array]) -> list[Promise]:
+        """What the model promises of each θ; infinite cost where the rollout is lost."""
+        rollouts = self._rollout(thetas, self._start, self._model, self._picks)
+        return [self._promise(*parts) for parts in rollouts]
+
+    def _promise(self, *parts: Array) -> Promise:
+        model = self._model
         self.samples += len(parts[0])
         inputs, predicted, h = (part[BURN:] for part in parts)
         lost = Promise(np.inf, np.zeros_like(model.mean), np.full(len(WINDOWS), np.inf))
-        if len(inputs) < len(picks) - BURN or not np.isfinite(predicted).all():
+        if len(inputs) < len(self._picks) - BURN or not np.isfinite(predicted).all():
             return lost
         costs, penalties = self._costs(predicted, h)
         stage, cost = float(predicted[:, -1].mean()), float(costs.mean())
@@ -379,7 +325,7 @@ class BackOffs:
 
     def _least(self, points: Sequence[Array]) -> Array:
         distinct = list({tuple(point): point for point in points}.values())
-        promises = [self.promise(self.theta(point)) for point in distinct]
+        promises = self.promises([self.theta(point) for point in distinct])
         least = min(promises, key=lambda promise: promise.cost)
         told = [self.excess(promise, least) <= DOUBT for promise in promises]
         close = [point for point, like in zip(distinct, told, strict=True) if like]

@@ -88,7 +88,6 @@ class SortedErrors:
         self._squares = np.concatenate([zero, np.cumsum(self._sorted**2, axis=0)])
 
     def __len__(self) -> int:
-        """Number of errors, M."""
         return len(self._sorted)
 
     def beyond(self, i: int, threshold: Vector, *, above: bool = False) -> tuple[Vector, Vector]:

@@ -231,9 +231,9 @@ class PairedComparison:
     def compare(self, theta: Vector, *, patient: bool = False) -> Step:
         """Whether θ takes the base's place: cheaper on the same noise by a standard error.
 
-        It is given up as soon as it is dearer over the blocks that it has run, if `patient` only
-        where those to come could not make good for it; to win it must run all, since a slow state
-        shows late what a policy does to it.
+        Stops once θ's summed cost exceeds the base's; with `patient`, once the remaining blocks can
+        no longer make up for it. To win, θ must run all blocks: a slow state shows late what a
+        policy does to it.
         """
         costs = self.base.costs
         patience = _patience(costs) if patient else 0.0

@@ -8,6 +8,8 @@ import shutil
 import signal
 import tempfile
 
+import numpy as np
+import pytest
 from hypothesis import settings
 
 # The same examples in every run, so that a failure is the change's.
@@ -33,3 +35,15 @@ if OWN:
 def pytest_unconfigure():
     if OWN:
         shutil.rmtree(os.environ["COSIM_CACHE"], ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def paper():
+    from cosim import Scenario
+
+    return Scenario.load("paper")
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20200513)

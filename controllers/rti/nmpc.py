@@ -409,7 +409,6 @@ class RtiNmpc:
         backend: str | Callable[[], QpBackend] = "daqp",
         iterations: int = 1,
     ) -> None:
-        """Build the CasADi functions and the workspace of the backend; see the class."""
         if iterations < 1:
             raise ControllerError(f"iterations must be at least 1, not {iterations}")
         self.iterations = iterations

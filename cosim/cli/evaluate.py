@@ -30,9 +30,6 @@ def evaluate(
     seeds: Annotated[int, cli.count("--seeds", most=1_000_000, text="Number of seeds.")] = 10,
     first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first seed.")] = 0,
     steps: cli.StepsOption = 1000,
-    burn_in: Annotated[
-        int, cli.count("--burn-in", least=0, text="Samples run before those that count.")
-    ] = 0,
     out: cli.OutOption = Path("cosim-evaluation"),
     trajectories: Annotated[
         Path | None,
@@ -56,20 +53,20 @@ def evaluate(
         from loky import cpu_count
 
         from cosim.evaluation import evaluate as run
+        from cosim.evaluation import named_controllers
         from cosim.files import write_atomically
 
         task = cli.load_scenario(scenario)
         if trajectories is not None:
             _judge(task, trajectories, cli.open_folder(out), out_)
             return
-        names = ",".join(controllers)
+        names = [name for text in controllers for name in text.split(",") if name.strip()]
         named = named_controllers(names)
-        words = ["--scenario", scenario, "--controllers", names, "--seeds", str(seeds)]
+        words = ["--scenario", scenario, "--controllers", ",".join(names), "--seeds", str(seeds)]
         words += ["--first-seed", str(first_seed)] * (first_seed > 0) + ["--steps", str(steps)]
-        words += ["--burn-in", str(burn_in)] * (burn_in > 0)
         folder = cli.open_folder(out)
         out_.announce(task.plant.fmu)
-        total = (len(named) + ("optimal" not in named)) * seeds * (burn_in + steps)
+        total = (len(named) + ("optimal" not in named)) * seeds * steps
         with cli.resumable(), out_.progress(f"samples on {task.name}", total) as progress:
 
             def report(samples: int, line: str) -> None:
@@ -82,7 +79,6 @@ def evaluate(
                 named,
                 range(first_seed, first_seed + seeds),
                 steps,
-                burn_in=burn_in,
                 folder=folder,
                 jobs=jobs or cpu_count(),
                 scheduler=scheduler,
@@ -122,33 +118,11 @@ def _judge(scenario: Scenario, trajectories: Path, folder: Path, output: cli.Out
     output.json(summary, folder)
 
 
-def named_controllers(text: str) -> dict[str, str]:
-    """Read `A,B,NAME=SPEC`: what to build, by the name to show; raises EvaluationError."""
-    from cosim.errors import EvaluationError
-
-    named: dict[str, str] = {}
-    for item in filter(None, (part.strip() for part in text.split(","))):
-        name, equals, spec = item.partition("=")
-        name, spec = (name.strip(), spec.strip()) if equals else (item, item)
-        if name.endswith(".toml"):
-            name = Path(name).stem
-        if not name or not spec:
-            raise EvaluationError(f"--controllers: '{item}' is not NAME=CONTROLLER")
-        if name in named:
-            raise EvaluationError(f"--controllers names '{name}' twice; write NAME=… for one")
-        named[name] = spec
-    if not named:
-        raise EvaluationError("--controllers is empty")
-    return named
-
-
 def show(summary: dict[str, Any], output: cli.Output) -> None:
     """Print the table of controllers and the paired comparisons."""
     from cosim.statistics import shown
 
     found, timing = summary["controllers"], summary["timing"]
-    burn_in = summary.get("burn_in", 0)
-    after = f" after {burn_in}" if burn_in else ""
     columns = {
         "controller": list(found),
         "J": [shown(row["J"], digits=6) for row in found.values()],
@@ -163,7 +137,7 @@ def show(summary: dict[str, Any], output: cli.Output) -> None:
     }
     header = [name for name, cells in columns.items() if any(cells)]  # what is known of any
     rows = list(zip(*(columns[name] for name in header), strict=True))
-    title = f"{summary['scenario']}, {summary['steps']} samples{after}"
+    title = f"{summary['scenario']}, {summary['steps']} samples"
     output.table(f"{title} × {len(summary['seeds'])} seeds", header, rows)
     if summary["optimum"] is not None:
         output.note(

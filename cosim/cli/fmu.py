@@ -9,6 +9,9 @@ import typer
 
 from cosim.cli.output import JsonOption, output, writable_folder
 
+SHOWN = 1000
+"""Variables of a table at most: a table of 200 000 takes minutes to print."""
+
 app = typer.Typer(help="Look into an FMU, check it, build ours.")
 
 FileArgument = Annotated[
@@ -63,7 +66,8 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
              *(_short(v[key]) for key in ("start", "min", "max")))
             for v in found["variables"]
         ]  # fmt: skip
-        out_.table(f"{len(rows)} variables", header, rows)
+        more = f", the first {SHOWN} here, all with --json" if len(rows) > SHOWN else ""
+        out_.table(f"{len(rows)} variables{more}", header, rows[:SHOWN])
         out_.json(found | {"refusals": refused})
 
 

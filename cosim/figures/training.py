@@ -43,7 +43,6 @@ def training_figure(
     *,
     title: str,
     start: float = float("nan"),
-    optimum: str = "optimal",
 ) -> Figure:
     """Cost, violation, TD error and θ over a training's samples.
 
@@ -51,10 +50,10 @@ def training_figure(
     training samples since the row before, `greedy_J` and `greedy_violating_share` of the policy,
     `td_error`; `start` is the greedy J before the first. `theta` maps a block's name to its
     increments since the start in units of its learning scale, (K, entries). `baselines` are J by
-    controller on the greedy policy's noise; the one called `optimum` is J*, and costs are then
+    controller on the greedy policy's noise; `optimal` is J*, and costs are then
     shown as regret (J − J*)/|J*|.
     """
-    best = baselines.get(optimum)
+    best = baselines.get("optimal")
     norms = {name: np.linalg.norm(values, axis=1) for name, values in theta.items()}
     order = sorted((n for n in norms if norms[n].any()), key=lambda n: -float(norms[n][-1]))
     panels = ["regret %" if best is not None else "J per sample"]

@@ -257,7 +257,7 @@ ITERATIONS = 40
 TIGHT, LOOSE = 1e-10, 1e-6
 """Residuals, as shares of the scales: where Newton stops, and what it may end with."""
 PATIENCE = 5000
-"""Samples that a plant which starts where it likes is given to settle."""
+"""Samples to wait for a plant without a settable initial state to settle."""
 
 
 def nearest_steady_state(

@@ -69,8 +69,9 @@ def unpack(fmu: str | Path) -> UnpackedFmu:
         if not path.is_file():
             raise PlantError(f"FMU '{path}' does not exist or is not a file")
         status = path.stat()
-    except OSError as error:
-        raise PlantError(f"FMU '{path}' cannot be read: {error.strerror}") from None
+    except (OSError, RuntimeError) as error:  # RuntimeError: Python 3.11's of links in a circle
+        why = getattr(error, "strerror", None) or error
+        raise PlantError(f"FMU '{path}' cannot be read: {why}") from None
     key = (path, status.st_mtime_ns, status.st_size)
     with _lock:
         if key not in _unpacked or not _unpacked[key].folder.is_dir():
@@ -227,21 +228,29 @@ _construction_lock = threading.Lock()
 _alive: Counter[str] = Counter()
 
 
-class StartValue(NamedTuple):
-    """A start value to write at every reset: value reference and FMI type of its variable."""
+class Place(NamedTuple):
+    """Where a number is in an FMU: value reference and FMI type of its variable; of an array, which
+    element, row by row, and the values that all its elements start from.
+    """
 
     reference: int
     type: str
-    value: float
+    element: int = 0
+    starts: tuple[float, ...] = (0.0,)
 
 
 class Wiring(NamedTuple):
-    """Value references of what a plant exchanges with its FMU."""
+    """Places of what a plant exchanges with its FMU; `starts` with the value at every reset."""
 
-    inputs: Sequence[int]
-    outputs: Sequence[int]
-    states: Sequence[int]
-    starts: Sequence[StartValue]
+    inputs: Sequence[Place]
+    outputs: Sequence[Place]
+    states: Sequence[Place]
+    starts: Sequence[tuple[Place, float]]
+
+
+def _as(buffer: Any, value: float) -> float:
+    """A number as a buffer of a C type takes it: an integer is the nearest one."""
+    return value if buffer._type_ in (ctypes.c_double, ctypes.c_float) else round(value)
 
 
 class Native(ctypes.Structure):
@@ -293,18 +302,20 @@ class Instance(ABC):
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._functions: dict[str, Any] = {}
+        self._places = (wiring.inputs, wiring.outputs, wiring.states)
+        self.drivable = all(map(self._all_real, self._places))
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
-        self.inputs, _, self._set_inputs = self._exchange(wiring.inputs)
-        self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs)
-        self.states, self.states_view, self._get_states = self._exchange(wiring.states)
-        self._set_values = self._function(f"Set{self.real}")
-        self._get_values = self._function(f"Get{self.real}")
+        self.inputs, _, self._set_inputs = self._exchange(wiring.inputs, "Set")
+        self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs, "Get")
+        self.states, self.states_view, self._get_states = self._exchange(wiring.states, "Get")
         self._do_step = self._function("DoStep")
-        self._starts: list[tuple[str, tuple[Any, ...]]] = []
-        self._slots: dict[tuple[str, int], tuple[Any, int]] = {}
-        for kind in dict.fromkeys(start.type for start in wiring.starts):
-            self._add_starts([start for start in wiring.starts if start.type == kind])
+        places = [place for place, _ in wiring.starts]
+        # FMI 2 counts value references anew for each type.
+        keys = (place[:3] for place in places)
+        self._starts = dict(zip(keys, self._parts(places), strict=True))
+        for place, value in wiring.starts:
+            self.change_start(place, value)
 
     @abstractmethod
     def _instantiate(self, **where: Any) -> Any:
@@ -327,8 +338,10 @@ class Instance(ABC):
                 )
             # fmpy raises bare Exception when the library does not load or instantiate.
             except Exception as error:
+                tool = self._interface.needsExecutionTool
+                hint = "; it needs the tool that made it (needsExecutionTool)" if tool else ""
                 raise PlantError(
-                    f"FMU '{self.fmu.path}' cannot be instantiated: {error}{self._log()}"
+                    f"FMU '{self.fmu.path}' cannot be instantiated: {error}{hint}{self._log()}"
                 ) from None
             finally:
                 os.chdir(folder)
@@ -349,66 +362,94 @@ class Instance(ABC):
         """Reset (if started before), write the start values, initialise and read the states."""
         if started:
             self._call("Reset", self._component)
-        for name, arguments in self._starts:
-            self._call(name, *arguments)
+        for suffix, arguments, *_ in self._starts.values():
+            self._call(f"Set{suffix}", *arguments)
         for name, arguments in self._begin:
             self._call(name, self._component, *arguments)
-        self._call(f"Get{self.real}", *self._get_states)
+        self._get_states()
 
     def advance(self, time: float) -> None:
         """Write the inputs, read the outputs at `time`, step, and read the states after it."""
         self._time.value = time
-        if (status := self._set_values(*self._set_inputs)) not in ACCEPTED:
-            self.fail(f"Set{self.real}", status)
-        if (status := self._get_values(*self._get_outputs)) not in ACCEPTED:
-            self.fail(f"Get{self.real}", status)
+        self._set_inputs()
+        self._get_outputs()
         if (status := self._do_step(*self._step_arguments)) not in ACCEPTED:
             self.fail("DoStep", status)
-        if (status := self._get_values(*self._get_states)) not in ACCEPTED:
-            self.fail(f"Get{self.real}", status)
+        self._get_states()
 
     def _exchange(
-        self, references: Sequence[int]
-    ) -> tuple[Any, NDArray[np.float64], tuple[Any, ...]]:
-        """A buffer for real variables, NumPy's view of it, the arguments to set or get them."""
-        buffer = (ctypes.c_double * len(references))()
+        self, places: Sequence[Place], verb: str
+    ) -> tuple[Any, NDArray[np.float64], Callable[[], None]]:
+        """A buffer for numbers, NumPy's view of it, and a function that sets or gets them all."""
+        buffer = (ctypes.c_double * len(places))()
         view: NDArray[np.float64] = np.frombuffer(memoryview(buffer), dtype=np.float64)
-        return buffer, view, self._arguments(references, buffer)
+        if self._all_real(places):
+            name = f"{verb}{self.real}"
+            function = self._function(name)
+            arguments = self._arguments([place.reference for place in places], buffer)
 
-    def _add_starts(self, starts: list[StartValue]) -> None:
-        suffix, ctype = self.setters[starts[0].type]
-        convert = float if ctype in (ctypes.c_double, ctypes.c_float) else int
-        buffer = (ctype * len(starts))(*(convert(start.value) for start in starts))
-        arguments = self._arguments([start.reference for start in starts], buffer)
-        self._starts.append((f"Set{suffix}", arguments))
-        # FMI 2 counts value references anew for each type.
-        self._slots |= {(s.type, s.reference): (buffer, i) for i, s in enumerate(starts)}
+            def exchange() -> None:
+                if (status := function(*arguments)) not in ACCEPTED:
+                    self.fail(name, status)
 
-    def change_start(self, type_: str, reference: int, value: float) -> None:
-        """Replace the start value of a variable, by type and reference, for the next reset."""
-        buffer, index = self._slots[type_, reference]
-        buffer[index] = value
+            return buffer, view, exchange
+        parts = self._parts(places)
 
-    def writer(self, references: Sequence[int], values: Sequence[float]) -> Callable[[], None]:
-        """A function that writes values to real variables between two steps."""
-        buffer, _, arguments = self._exchange(references)
+        def convert() -> None:
+            for i, (suffix, arguments, typed, k) in enumerate(parts):
+                if verb == "Set":
+                    typed[k] = _as(typed, buffer[i])
+                self._call(f"{verb}{suffix}", *arguments)
+                if verb == "Get":
+                    buffer[i] = typed[k]
+
+        return buffer, view, convert
+
+    def _parts(self, places: Sequence[Place]) -> list[tuple[str, tuple[Any, ...], Any, int]]:
+        """For each place the end of a call's name, its arguments, their buffer and the index in it;
+        elements of one array share them.
+        """
+        made: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
+        for place in places:
+            if place[:2] not in made:
+                suffix, ctype = self.setters[place.type]
+                buffer = (ctype * len(place.starts))()
+                buffer[:] = [_as(buffer, value) for value in place.starts]
+                made[place[:2]] = suffix, self._arguments([place.reference], buffer), buffer
+        return [(*made[place[:2]], place.element) for place in places]
+
+    def change_start(self, place: Place, value: float) -> None:
+        """Replace the start value of a place of the wiring's for the next reset."""
+        *_, buffer, index = self._starts[place[:3]]
+        buffer[index] = _as(buffer, value)
+
+    def writer(self, places: Sequence[Place], values: Sequence[float]) -> Callable[[], None]:
+        """A function that writes values between two steps."""
+        buffer, _, write = self._exchange(places, "Set")
         buffer[:] = values
-        return lambda: self._call(f"Set{self.real}", *arguments)
+        return write
+
+    def _all_real(self, places: Iterable[Place]) -> bool:
+        """Whether they are FMI's reals, none in an array: compiled code can exchange those."""
+        return all(place.type == self.real and len(place.starts) == 1 for place in places)
 
     @cached_property
     def native(self) -> Native:
         """The instance's functions and buffers for compiled code, which calls them directly."""
-        exchanged = (self._set_inputs, self._get_outputs, self._get_states)
-        references = [each[1] for each in exchanged]
-        values = (self.inputs, self.outputs, self.states)
-        calls = (self._set_values, self._get_values, self._do_step)
+        buffers = (self.inputs, self.outputs, self.states)
+        # Kept: compiled code has but their addresses.
+        self._references = [
+            self._arguments([place.reference for place in places], buffer)[1]
+            for places, buffer in zip(self._places, buffers, strict=True)
+        ]
+        calls = (f"Set{self.real}", f"Get{self.real}", "DoStep")
         return Native(
             int(self.prefix[-1]),
-            *(ctypes.cast(call, ctypes.c_void_p) for call in calls),
+            *(ctypes.cast(self._function(call), ctypes.c_void_p) for call in calls),
             self._component,
-            *(ctypes.cast(each, ctypes.c_void_p) for each in references),
-            *(len(each) for each in values),
-            *(ctypes.cast(each, ctypes.c_void_p) for each in values),
+            *(ctypes.cast(each, ctypes.c_void_p) for each in self._references),
+            *(len(each) for each in buffers),
+            *(ctypes.cast(each, ctypes.c_void_p) for each in buffers),
             self._step_size.value,
         )
 
@@ -428,7 +469,7 @@ class Instance(ABC):
     def load(self, handle: ctypes.c_void_p) -> None:
         """Set the FMU's state from a handle and read the plant's states."""
         self._call(f"Set{self._state}", self._component, handle)
-        self._call(f"Get{self.real}", *self._get_states)
+        self._get_states()
 
     def serialise(self, handle: ctypes.c_void_p) -> bytes:
         """Return a saved state as bytes that any instance of this FMU can read."""
@@ -591,9 +632,9 @@ class Fmi3Instance(Instance):
         return slave
 
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
-        count = ctypes.c_size_t(len(references))
         pointers = (ctypes.c_uint * len(references))(*references)
-        return (self._component, pointers, count, values, count)
+        counts = ctypes.c_size_t(len(references)), ctypes.c_size_t(len(values))
+        return (self._component, pointers, counts[0], values, counts[1])
 
     def advance(self, time: float) -> None:
         """Step as in FMI 2.0; an FMU that ends the step early is an error."""

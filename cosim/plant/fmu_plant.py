@@ -6,7 +6,7 @@ import ctypes
 import operator
 import struct
 from collections.abc import Iterator, Sequence
-from math import ceil, inf, isfinite
+from math import ceil, inf, isfinite, prod
 from pathlib import Path
 from typing import Any, NoReturn, Self
 
@@ -18,7 +18,7 @@ from cosim.plant.fmi import (
     Fmi2Instance,
     Fmi3Instance,
     Instance,
-    StartValue,
+    Place,
     UnpackedFmu,
     Wiring,
     library_path,
@@ -28,7 +28,7 @@ from cosim.protocols import Array, CompiledLoop, Step
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
-_REAL = ("Real", "Float64")
+_REAL = ("Real", "Float64", "Float32")
 
 
 def refusals(fmu: UnpackedFmu) -> Iterator[str]:
@@ -43,23 +43,18 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
         others = ", ".join(words for words, face in faces.items() if face is not None)
         yield f"{name} has no co-simulation interface (it has: {others or 'none'})"
     else:
-        if simulation.needsExecutionTool:
-            yield (
-                f"{name} needs the tool that made it to run (needsExecutionTool); export it as an "
-                "FMU that stands alone"
-            )
         try:
             library_path(fmu)
         except PlantError as error:
             yield str(error)
-    scalars = [v for v in description.modelVariables if v.type in _REAL and not v.dimensions]
-    if not any(v.causality == "input" or v.variability == "tunable" for v in scalars):
+    numbers = [v for v in description.modelVariables if v.type not in _NO_NUMBERS]
+    if not any(v.causality == "input" or v.variability == "tunable" for v in numbers):
         yield (
-            f"{name} has no scalar real input and no tunable parameter: there is nothing for a "
-            "controller to act on"
+            f"{name} has no input and no tunable parameter that is a number: there is nothing for "
+            "a controller to act on"
         )
-    if not any(v.causality in ("output", "local") for v in scalars):
-        yield f"{name} has no scalar real output: there is nothing for a controller to see"
+    if not any(v.causality in ("output", "local") for v in numbers):
+        yield f"{name} has no output that is a number: there is nothing for a controller to see"
 
 
 def check_step(fmu: UnpackedFmu, sampling_time: float) -> None:
@@ -79,6 +74,7 @@ def check_step(fmu: UnpackedFmu, sampling_time: float) -> None:
 
 
 _WIDE = ("Int64", "UInt64")
+_NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
 
 
 def has_start(variable: Any) -> bool:
@@ -104,46 +100,40 @@ class Wirer:
         plant = self._scenario.plant
         outputs = (plant.stage_cost, *plant.disturbances)
         return Wiring(
-            inputs=[self._input(name) for name in plant.actions],
-            outputs=[self._real(name, "plant") for name in outputs],
-            states=[self._real(name, "plant.states") for name in plant.states],
+            inputs=[self._written(name, "plant.actions") for name in plant.actions],
+            outputs=[self._number(name, "plant") for name in outputs],
+            states=[self._number(name, "plant.states") for name in plant.states],
             starts=self._starts(),
         )
 
-    def changes(self) -> dict[int, tuple[list[int], list[float]]]:
-        """By the number of a sample the value references to write at its start, and the values."""
+    def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
+        """By the number of a sample the places to write at its start, and the values."""
         scenario = self._scenario
-        found: dict[int, tuple[list[int], list[float]]] = {}
+        found: dict[int, tuple[list[Place], list[float]]] = {}
         for change in scenario.plant.changes or ():
-            references, values = found.setdefault(
-                ceil(change.time / scenario.sampling_time), ([], [])
-            )
+            places, values = found.setdefault(ceil(change.time / scenario.sampling_time), ([], []))
             for name, value in change.parameters.items():
-                reference = self._real(name, "plant.changes")
-                variable = self._variables[name]
-                if variable.variability != "tunable" and variable.causality != "input":
-                    raise self._misfit(name, "plant.changes", "is not tunable")
-                references.append(reference)
+                places.append(self._written(name, "plant.changes"))
                 values.append(value)
         return found
 
-    def seeds(self) -> list[tuple[str, int]]:
-        """FMI type and value reference of the variables that take the seed, low word first."""
+    def seeds(self) -> list[Place]:
+        """Places of the variables that take the seed, low word first."""
         words = []
         for name in self._scenario.plant.mapping.seed:
             variable = self._find(name, "plant.mapping.seed")
             if variable.type not in (*_WIDE, "Integer", "Int32", "UInt32"):
                 what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
                 raise self._misfit(name, "plant.mapping.seed", what)
-            words.append((str(variable.type), int(variable.valueReference)))
+            words.append(self._place(name, "plant.mapping.seed"))
             if variable.type in _WIDE:
                 break
         return words
 
-    def initial_states(self) -> list[int]:
-        """Value references of the states' start parameters; none if the scenario names none."""
+    def initial_states(self) -> list[Place]:
+        """Places of the states' start parameters; none if the scenario names none."""
         names = self._scenario.plant.mapping.initial_state
-        return [self._real(name, "plant.mapping.initial_state") for name in names]
+        return [self._number(name, "plant.mapping.initial_state") for name in names]
 
     def state_range(self) -> tuple[Array, Array]:
         """Least and greatest value, (n,), that the FMU declares for the states; else infinite."""
@@ -158,7 +148,7 @@ class Wirer:
         names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
         return {name: _unit(self._find(name, "plant")) for name in names}
 
-    def _starts(self) -> list[StartValue]:
+    def _starts(self) -> list[tuple[Place, float]]:
         scenario, mapping = self._scenario, self._scenario.plant.mapping
         law, codes = scenario.disturbance, mapping.law_codes
         fields: dict[str, tuple[str | Sequence[str] | None, Sequence[float]]] = {
@@ -177,42 +167,55 @@ class Wirer:
                 starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
         for name, value in scenario.plant.parameters.items():
             starts.append(self._start_value(name, float(value), "plant.parameters"))
-        return starts + [StartValue(reference, kind, 0.0) for kind, reference in self.seeds()]
+        return starts + [(place, 0.0) for place in self.seeds()]
 
-    def _start_value(self, name: str, value: float, table: str) -> StartValue:
+    def _start_value(self, name: str, value: float, table: str) -> tuple[Place, float]:
         variable = self._find(name, table)
         if variable.type not in self._interface.setters:
             raise self._misfit(name, table, f"is {_a(variable.type)}, which cannot be set here")
-        if variable.type not in ("Real", "Float64", "Float32") and value != int(value):
+        if variable.type not in _REAL and value != int(value):
             raise self._misfit(name, table, f"is {_a(variable.type)} and cannot take {value}")
-        if variable.variability == "constant":
-            raise self._misfit(name, table, "is a constant")
         if not has_start(variable):
             raise self._misfit(name, table, f"is {_a(variable.causality)} without a start to set")
-        return StartValue(int(variable.valueReference), variable.type, value)
+        return self._place(name, table), value
 
-    def _input(self, name: str) -> int:
-        reference = self._real(name, "plant.actions")
-        variable = self._variables[name]
-        if variable.causality != "input" and variable.variability != "tunable":
-            raise self._misfit(name, "plant.actions", f"is {_a(variable.causality)}, not an input")
-        return reference
-
-    def _real(self, name: str, table: str) -> int:
+    def _written(self, name: str, table: str) -> Place:
         variable = self._find(name, table)
-        if variable.type != self._interface.real or variable.shape:
-            kind = f"{variable.type} array" if variable.shape else variable.type
-            raise self._misfit(name, table, f"is {_a(kind)}, not a scalar {self._interface.real}")
-        return int(variable.valueReference)
+        if variable.causality != "input" and variable.variability != "tunable":
+            what = f"is {_a(variable.causality)}, not an input, and is not tunable"
+            raise self._misfit(name, table, what)
+        return self._number(name, table)
+
+    def _number(self, name: str, table: str) -> Place:
+        if (variable := self._find(name, table)).type in _NO_NUMBERS:
+            raise self._misfit(name, table, f"is {_a(variable.type)}, not a number")
+        return self._place(name, table)
+
+    def _place(self, name: str, table: str) -> Place:
+        """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is."""
+        variable = self._find(name, table)
+        shape, index = tuple(variable.shape or ()), 0
+        if shape:
+            try:
+                indices = name.removeprefix(variable.name).removeprefix("[").removesuffix("]")
+                index = int(np.ravel_multi_index([int(i) for i in indices.split(",")], shape))
+            except ValueError:
+                last = ",".join(str(n - 1) for n in shape)
+                what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
+                raise self._misfit(name, table, what) from None
+        stated = ["0"] if variable.type in _NO_NUMBERS else str(variable.start or 0).split()
+        starts = tuple(map(float, stated)) * (prod(shape) // len(stated))
+        return Place(int(variable.valueReference), str(variable.type), index, starts)
 
     def _find(self, name: str, table: str) -> Any:
-        if name not in self._variables:
+        array = self._variables.get(name.partition("[")[0])
+        if name not in self._variables and not (array is not None and array.shape):
             raise PlantError(
                 f"FMU '{self._fmu.path.name}' has no variable '{name}'"
                 f"{suggestion(name, self._variables)}, which {table} of scenario "
                 f"'{self._scenario.name}' names"
             )
-        return self._variables[name]
+        return self._variables.get(name, array)
 
     def _misfit(self, name: str, table: str, what: str) -> PlantError:
         return PlantError(
@@ -230,8 +233,8 @@ def _unit(variable: Any) -> str:
     return str(variable.unit or declared or "")
 
 
-def seed_words(seed: int, variables: Sequence[tuple[str, int]]) -> list[tuple[str, int, int]]:
-    """A seed's words, each with type and value reference, for variables of `Wirer.seeds`.
+def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
+    """A seed's words for the `places` of `Wirer.seeds`, each with its own.
 
     Raises PlantError for anything but an integer in [0, 2⁶⁴).
     """
@@ -242,9 +245,9 @@ def seed_words(seed: int, variables: Sequence[tuple[str, int]]) -> list[tuple[st
     if not 0 <= number < 1 << 64:
         raise PlantError(f"seed must be an integer in [0, 2^64), not {seed!r}")
     words, shift = [], 0
-    for kind, reference in variables:
-        bits = 64 if kind in _WIDE else 32
-        words.append((kind, reference, number >> shift & (1 << bits) - 1))
+    for place in places:
+        bits = 64 if place.type in _WIDE else 32
+        words.append((place, number >> shift & (1 << bits) - 1))
         shift += bits
     return words
 
@@ -262,13 +265,10 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
         (int(variable.valueReference), variable.type): variable.name
         for variable in fmu.description.modelVariables
     }
-    found = {
-        names[start.reference, start.type]: (start.type, start.value)
-        for start in wirer.wiring().starts
-    }
-    for kind, reference, value in seed_words(plant_seed, wirer.seeds()):
-        signed = value - (1 << 32) if value >= 1 << 31 and kind == "Integer" else value
-        found[names[reference, kind]] = (kind, signed)
+    found = {names[place[:2]]: (place.type, value) for place, value in wirer.wiring().starts}
+    for place, value in seed_words(plant_seed, wirer.seeds()):
+        signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
+        found[names[place[:2]]] = (place.type, signed)
     return found
 
 
@@ -292,7 +292,6 @@ class Snapshot:
         self.k = k
 
     def __del__(self) -> None:
-        """Give the memory back to the plant."""
         self.plant.recycle(self.handle)
 
 
@@ -340,6 +339,7 @@ class FmuPlant:
         self._started = False
         self._penalty_now = 0.0
         self._fmi = interface(archive, wiring, self._h)
+        self.drivable = self._fmi.drivable  # what `drive` can step
         self._changes = {k: self._fmi.writer(*change) for k, change in wirer.changes().items()}
         self._advance = self._fmi.advance
         self._inputs = self._fmi.inputs
@@ -370,8 +370,8 @@ class FmuPlant:
         written anew, so that nothing of an earlier episode remains.
         """
         fmi = self._instance
-        for word in seed_words(seed, self._seeds):
-            fmi.change_start(*word)
+        for place, word in seed_words(seed, self._seeds):
+            fmi.change_start(place, word)
         if initial_state is not None or self._elsewhere:
             self._start_from(fmi, initial_state)
         self._k = _NOT_STARTED
@@ -493,11 +493,9 @@ class FmuPlant:
         fmi.close(self._handles)
 
     def __enter__(self) -> Self:
-        """Return the plant itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the plant."""
         self.close()
 
     def __del__(self) -> None:
@@ -527,8 +525,8 @@ class FmuPlant:
             raise PlantError(
                 f"initial_state must be {len(table.states)} finite numbers ({names}), not {state}"
             )
-        for reference, value in zip(self._initial, values.tolist(), strict=True):
-            fmi.change_start(fmi.real, reference, value)
+        for place, value in zip(self._initial, values.tolist(), strict=True):
+            fmi.change_start(place, value)
         self._elsewhere = state is not None
 
     def _refuse_unstarted(self) -> NoReturn:

@@ -110,11 +110,9 @@ class Stream:
         self._bounded(partial(self._stream.save, self._partial, default_blueprint=layout))
 
     def __enter__(self) -> Self:
-        """Return itself."""
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        """Close the file, or discard it after an exception."""
         if kind is None:
             self.close()
         else:

@@ -76,6 +76,8 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
             client.open(str(path.resolve()))
             _wait(lambda: not client.get_state().loading, deadline, f"loading {path}")
             recordings = client.get_state().recordings
+            if not recordings:
+                raise RecordingError(f"{path} holds no recording")
             known = {line.name for recording in recordings for line in recording.timelines}
             if at is not None and TIME in known:
                 client.set_time(TIME, duration=at, play_state="paused")

@@ -64,27 +64,6 @@ class CurvesTable(Table):
     """Samples of each of them."""
 
 
-class OnlineTable(Table):
-    """What the runs themselves cost, exploration and all, beside controllers on the same noise.
-
-    Controllers run on the noise of every training seed, for as many samples as the longest
-    training, and regret is taken seed by seed.
-    """
-
-    block: Count
-    """Samples of a mean: a point of the figure, and a row of each training's log."""
-    period: Count
-    """Samples of a column of the table, a multiple of `block`."""
-    signals: list[Source] = []
-    """Columns of the logs that the figure shows above the regret; their cases stand in `logs`."""
-
-    @model_validator(mode="after")
-    def _is_made_of_blocks(self) -> Self:
-        if self.period % self.block:
-            raise ValueError(f"period: must be a multiple of block = {self.block}")
-        return self
-
-
 class OperationTable(Table):
     """Learning in operation: every training runs from one plant sample to the next, without reset.
 
@@ -209,8 +188,6 @@ class StudyTable(Table):
     """Table `[evaluation]`."""
     curves: CurvesTable = CurvesTable()
     """Table `[curves]`."""
-    online: OnlineTable | None = None
-    """Table `[online]`: what the runs themselves cost; not measured, if left out."""
     operation: OperationTable | None = None
     """Table `[operation]`: runs are judged at given times of operation."""
     theta: ThetaTable | None = None

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter
 
-from cosim.errors import StudyError
 from cosim.figures.style import (
     DASHED,
     FLOOR,
@@ -22,7 +21,6 @@ from cosim.figures.style import (
     cost_lines,
     dot_rows,
     figure,
-    label,
     label_ends,
     percent,
     plain,
@@ -30,9 +28,8 @@ from cosim.figures.style import (
     samples_axis,
 )  # fmt: skip
 from cosim.protocols import Array
-from cosim.statistics import LEVEL, regret_terms, regrets
-from cosim.studies.operation import Course, Judged
-from cosim.validation import instead
+from cosim.statistics import LEVEL, regrets
+from cosim.studies.operation import Judged
 
 BANDED = 6
 """Curves of a panel, at most, that have bands: more bands cannot be told apart."""
@@ -164,66 +161,6 @@ def _band(below: Sequence[Array]) -> tuple[Array, Array]:
     draws /= sum(map(len, below))
     low, high = np.quantile(draws, (0.5 - LEVEL / 2, 0.5 + LEVEL / 2), axis=0)
     return low, high
-
-
-def online_figure(
-    courses: Mapping[str, Course],
-    logs: Mapping[str, pd.DataFrame],
-    looks: Mapping[str, Look],
-    settings: Mapping[str, Any],
-    optimum: str,
-) -> Figure:
-    """A panel for each signal of the logs; below the mean regret of each block and since the start.
-
-    `logs` are those of the first training seed by case. Vertical lines stand at multiples of the
-    period. Raises StudyError for a signal that no log has.
-    """
-    names = list(settings["signals"]) if logs else []
-    known = list(dict.fromkeys(column for log in logs.values() for column in log))
-    for name in names:
-        if name not in known:
-            raise StudyError(f"online.signals: no log has a column '{name}'{instead(name, known)}")
-    courses = {case: course for case, course in courses.items() if case != optimum}
-    blocks = {
-        case: np.mean([100 * regret_terms(a, b) for a, b in zip(own, best, strict=True)], axis=0)
-        for case, (_, own, best) in courses.items()
-    }
-    so_far = {c: np.cumsum(v) / np.arange(1, len(v) + 1) for c, v in blocks.items()}
-    with figure(1.25 * (len(names) + 2) + 1.2) as drawn:
-        ratios = [1.0] * len(names) + [1.7, 1.7]
-        panels = drawn.subplots(len(ratios), 1, sharex=True, height_ratios=ratios)
-        end = max(float(samples[-1]) for samples, *_ in courses.values())
-        for axes in panels:
-            for edge in np.arange(settings["period"], end, settings["period"]):
-                axes.axvline(edge, color=REFERENCE, linewidth=0.6, linestyle=(0, (1, 2)))
-        for axes, name in zip(panels, names, strict=False):
-            _signal(axes, name, {c: log for c, log in logs.items() if name in log}, looks)
-        titles = ("regret % of the block", "regret % since the start")
-        for axes, means, title in zip(panels[-2:], (blocks, so_far), titles, strict=True):
-            for case, values in means.items():
-                color, line = looks[case]
-                axes.plot(courses[case][0], values, color=color, linestyle=line, linewidth=1.2)
-            regret_axis(axes, "y", np.concatenate([[0.0], *means.values()]), 0.1)
-            axes.set_ylabel(title)
-        samples_axis(panels[-1], end, "samples of the run")
-        ends = [EndLabel(plain(c), float(so_far[c][-1]), looks[c].color) for c in so_far]
-        label_ends(drawn, [(panels[-1], ends)])
-    return drawn
-
-
-def _signal(
-    axes: Axes, name: str, logs: Mapping[str, pd.DataFrame], looks: Mapping[str, Look]
-) -> None:
-    """A line for each case, or one where the signal is the same in all."""
-    lines = {case: log[["samples", name]].dropna().to_numpy().T for case, log in logs.items()}
-    first = next(iter(lines.values()))
-    if all(np.array_equal(line, first) for line in lines.values()):
-        axes.plot(*first, color=REFERENCE, linewidth=1.2)
-    else:
-        for case, line in lines.items():
-            color, style = looks[case]
-            axes.plot(*line, color=color, linestyle=style, linewidth=1.2)
-    axes.set_ylabel(label(name.removeprefix("theta "), ""))
 
 
 def operation_figure(

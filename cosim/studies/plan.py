@@ -408,8 +408,6 @@ class Study:
         between = max(1, samples // self.table.curves.points)
         rows = -(-between // ROW)
         log_every = max(1, between // rows)
-        if (online := self.table.online) is not None:
-            log_every, rows = online.block, max(1, between // online.block)
         own = {"seed": seed, "controller": case.nmpc, "start": case.start}
         if twice := sorted(own.keys() & case.training):
             raise ConfigurationError(f"training: {twice[0]} is given by the study itself")
@@ -478,8 +476,9 @@ def plan(study: Study) -> Plan:
         noise |= {greedy_file(mark): at_mark._replace(mark=mark) for mark in marks}
         traces = _traces(study, case, name, seed)
         noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in traces}
-        if training is None and (beside := _online(study, case, name)) is not None:
-            noise[ONLINE] = beside
+        if training is None and case.name == study.optima.get(name) and (ends := study.marks(name)):
+            seeds = {seed for case in _on(study, name) for seed in case.training_seeds}
+            noise[ONLINE] = Noise(tuple(sorted(seeds)), ends[-1], block=gcd(*ends))
         key = RunKey(name, case.name, seed)
         found = Run(key, case, scenario, case.controller, training, facts, noise, traces, marks)
         runs.append(found)
@@ -514,19 +513,6 @@ def _traces(
         for table in study.table.trajectory
         if case.name in (table.cases or [case.name]) and scenario in (table.scenarios or [scenario])
     )
-
-
-def _online(study: Study, controller: Case, scenario: str) -> Noise | None:
-    """Noise of the trainings that a controller of the study, or the optimum, runs beside."""
-    trained = [case for case in _on(study, scenario) if case.algorithm]
-    best = controller.name == study.optima.get(scenario)
-    seeds = tuple(sorted({seed for case in trained for seed in case.training_seeds}))
-    if best and trained and (marks := study.marks(scenario)):
-        return Noise(seeds, marks[-1], block=gcd(*marks))
-    if study.table.online is None or not trained or not (best or controller in study.cases):
-        return None
-    longest = max(case.samples for case in trained)
-    return Noise(seeds, longest, block=study.table.online.block)
 
 
 def _check_names(study: Study) -> None:

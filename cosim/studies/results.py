@@ -29,7 +29,7 @@ from cosim.statistics import (
     two_way,
 )
 from cosim.studies import figures, operation, pictures, report, store, theta
-from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, NAIVE, ONLINE, Plan, safe
+from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, NAIVE, Plan, safe
 from cosim.studies.report import COLUMNS, SHORT
 from cosim.studies.store import CURVE, INDICATORS, KEYS, STATE, TIMING, WHERE, read_table, to_csv
 from cosim.text_tables import Shown, Table, markdown_table
@@ -37,7 +37,7 @@ from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
-THETA, LOGS, OPERATION = "theta.csv", "logs", "operation.csv"
+THETA, OPERATION = "theta.csv", "operation.csv"
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -122,8 +122,6 @@ class StudyResults(Shown):
             SUMMARY: self.summary,
             TIMING: store.timing(plan, out),
         }
-        if self.about["online"] is not None:
-            tables[ONLINE] = operation.block_costs(runs, self.curves, out)
         if self.about.get("operation"):
             tables[OPERATION], tables[GREEDY] = operation.collected(runs, out)
         if "theta" in self.about:
@@ -341,18 +339,6 @@ class StudyResults(Shown):
         """A copy of `runs`, a row for each run."""
         return self.runs.copy()
 
-    def log(self, case: str, scenario: str) -> pd.DataFrame | None:
-        """Log of a case's first training seed, None where it was not kept; raises StudyError."""
-        path = self.folder / LOGS / f"{safe(scenario)}-{safe(case)}.csv"
-        return read_table(path) if path.is_file() else None
-
-    @cached_property
-    def online(self) -> pd.DataFrame | None:
-        """Mean costs of the blocks of each run, None where the study does not measure them."""
-        if self.about.get("online") is None:
-            return None
-        return read_table(self.folder / ONLINE)
-
     def lines(
         self, scenario: str, columns: Sequence[str] | None = None
     ) -> tuple[Sequence[str], list[list[str]]]:
@@ -392,11 +378,6 @@ class StudyResults(Shown):
     def further(self) -> list[Table]:
         """Title, header and rows of the tables that the study asks for beside its summary."""
         found = []
-        if self.online is not None:
-            for scenario in self.scenarios:
-                optimum = self.about["optimum"].get(scenario, "")
-                own = self.online[self.online.scenario == scenario]
-                found.append(operation.online_table(own, scenario, optimum, self.about["online"]))
         against = {name: case.get("against") for name, case in self.cases.items()}
         for scenario, about in (self.about.get("operation") or {}).items():
             judged, seconds = self._judged(scenario), self._seconds(scenario)
@@ -413,7 +394,7 @@ class StudyResults(Shown):
         return report.paper_table(self.scenarios, self.trained, self.indicator)
 
     def figure(self, name: str) -> Figure:
-        """Draw `curves`, `regret`, `profile` or `online` of a scenario: `curves-paper`, say.
+        """Draw `curves`, `regret`, `profile` or `operation` of a scenario: `curves-paper`, say.
 
         `profile` alone is that of all scenarios. Raises StudyError for another name, and where
         there is nothing to draw.
@@ -430,7 +411,6 @@ class StudyResults(Shown):
         return {
             "curves": self._curves,
             "regret": self._regret,
-            "online": self._online,
             "operation": self._operation,
             "profile": self._profile,
         }
@@ -496,17 +476,6 @@ class StudyResults(Shown):
         shown = (lambda level: float(100 * regrets(np.array(level), best))) if known else float
         drawn = {name: shown(marks[name]) for name in chosen}
         return figures.curves_figure(curves, drawn, self._looks, relative=bool(known))
-
-    def _online(self, scenario: str) -> Figure | None:
-        if self.online is None:
-            return None
-        own = self.online[self.online.scenario == scenario]
-        optimum = self.about["optimum"].get(scenario, "")
-        courses = operation.courses(own, optimum)
-        if not courses:
-            return None
-        logs = {case: log for case in courses if (log := self.log(case, scenario)) is not None}
-        return figures.online_figure(courses, logs, self._looks, self.about["online"], optimum)
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
@@ -629,7 +598,6 @@ def document(plan: Plan) -> dict[str, Any]:
         "optimum": definition.optima,
         "naive": dict.fromkeys(scenarios, definition.named(NAIVE)),
         "curves": {name: [len(noise.seeds), noise.steps] for name, noise in curves.items()},
-        "online": None if definition.table.online is None else definition.table.online.model_dump(),
         "runs": len(plan.runs),
         "tables": list(definition.table.tables),
         "pictures": [],

@@ -7,10 +7,10 @@ import sys
 import pytest
 
 from controllers import ControllerError, Parameters, RtiNmpc, functions
-from controllers.functions import description, find_compiler, library
+from controllers.functions import description, library
+from tests.helpers.compiler import needs_compiler
 from tests.helpers.sampling import evaporator_problem
 
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 SOURCES = {"answer.c": '#include "answer.h"\nint answer(void) { return ANSWER; }\n'}
 
 

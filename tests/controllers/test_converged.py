@@ -141,16 +141,6 @@ def test_value_gradients_are_those_of_the_rti_in_the_limit(
     assert_close(solution.costates[0], expected.costates[0], WHOLE, "dV/ds", 1e-8)
 
 
-def test_its_predictions_follow_the_nonlinear_model(converged, problem, blocks):
-    theta, s, _ = sample(problem, blocks, 6)
-    solution = solved(converged, theta, s)
-    # Linearised at its own solution, the QP's model touches the nonlinear one there.
-    point = solution.prepared.point
-    np.testing.assert_allclose(solution.predicted_states[:-1], point.x, rtol=1e-9)
-    np.testing.assert_allclose(solution.predicted_actions, point.u, rtol=1e-9)
-    assert solution.residual < 1e-9
-
-
 def test_too_few_iterations_raise_and_the_qp_is_carried(problem):
     converged = ConvergedNmpc(problem, Parameters.naive(problem), iterations=1)
     with pytest.raises(QpError) as caught:

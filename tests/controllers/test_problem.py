@@ -23,7 +23,6 @@ BAD = {
     "no linear penalty": {"penalty_linear": [0, 1]},
     "no horizon": {"horizon": 0},
     "discount above one": {"discount": 1.01},
-    "endless time": {"sampling_time": np.inf},
     "no steps": {"substeps": 0},
     "no cost": {"reference_cost": np.nan},
 }

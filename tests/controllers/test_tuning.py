@@ -7,14 +7,7 @@ import pytest
 import scipy.linalg
 
 from controllers import LinearisationPoint, Model, Quantity, RtiNmpc
-from controllers.economic import (
-    convexify,
-    optimal_steady_state,
-    rotation,
-    solve_conic,
-    svec,
-    tune,
-)
+from controllers.economic import convexify, optimal_steady_state, rotation, solve_conic, svec, tune
 from controllers.errors import TuningError
 from controllers.model import discretise, economic_cost
 from tests.helpers.sampling import evaporator_problem
@@ -23,12 +16,6 @@ from tests.helpers.sampling import evaporator_problem
 def random_symmetric(rng, size):
     root = rng.normal(size=(size, size))
     return root + root.T
-
-
-@pytest.mark.parametrize("size", [1, 2, 4])
-def test_svec_keeps_the_inner_product(rng, size):
-    a, b = random_symmetric(rng, size), random_symmetric(rng, size)
-    assert svec(a) @ svec(b) == pytest.approx(np.trace(a @ b), rel=1e-13)
 
 
 def test_the_nearest_semidefinite_matrix_is_the_clipped_one(rng):
@@ -102,19 +89,6 @@ def test_steady_state_is_the_papers():
     assert steady.active == ("X2 ≥ 25 %",)
     np.testing.assert_allclose(steady.multipliers, [60.29, 0, 0, 0], atol=2e-3)
     np.testing.assert_allclose(steady.gradient, steady.multipliers, atol=1e-6)
-
-
-def test_jacobians_are_those_of_the_sampled_model():
-    problem = PROBLEMS["paper"]
-    steady = optimal_steady_state(problem)
-    model = problem.model
-    x, u, d, p = model.symbols()
-    ode = ca.Function("ode", [x, u, d, p], [ca.jacobian(model.ode(x, u, d, p), ca.vertcat(x, u))])
-    F = ode(steady.x, steady.u, model.nominal_disturbance, model.nominal_parameters).full()
-    block = np.zeros((4, 4))
-    block[:2] = F
-    exact = scipy.linalg.expm(block)[:2]
-    np.testing.assert_allclose(np.hstack([steady.A, steady.B]), exact, rtol=2e-3, atol=1e-6)
 
 
 def test_certificate_holds(tuning):

@@ -2,12 +2,7 @@ import sys
 
 import pytest
 
-from cosim import FmuPlant, Scenario
-
-
-@pytest.fixture(scope="session")
-def paper():
-    return Scenario.load("paper")
+from cosim import FmuPlant
 
 
 @pytest.fixture(params=["evaporator", "evaporator_fmi3"])

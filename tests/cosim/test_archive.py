@@ -24,16 +24,6 @@ def test_a_shipped_fmu_is_found_by_name_and_unpacked_once():
     assert unpack(fmus.path("evaporator")).folder == first.folder
 
 
-def test_a_rewritten_file_is_unpacked_anew(tmp_path):
-    path = tmp_path / "copy.fmu"
-    path.write_bytes(fmus.path("evaporator").read_bytes())
-    first = unpack(path)
-    path.write_bytes(fmus.path("evaporator_fmi3").read_bytes())
-    second = unpack(path)
-    assert first.sha256 != second.sha256
-    assert second.description.fmiVersion == "3.0"
-
-
 def _zip(path, entries):
     with zipfile.ZipFile(path, "w") as target:
         for name, data in entries:

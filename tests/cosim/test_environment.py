@@ -24,13 +24,6 @@ def test_passes_the_checker(env):
     check_env(env.unwrapped)
 
 
-@pytest.mark.parametrize("wrong", [150.0, [150.0], [150.0, 200.0, 200.0], [[150.0, 200.0]]])
-def test_an_action_of_another_shape_is_refused(env, wrong):
-    env.reset(seed=0)
-    with pytest.raises(PlantError, match=r"an action has shape \(2,\), not"):
-        env.unwrapped.step(np.array(wrong))
-
-
 def test_an_episode_is_rendered_from_its_first_state_on():
     env = gymnasium.make("cosim/Evaporator-v0", render_mode="rgb_array")
     env.reset(seed=0)

@@ -28,7 +28,7 @@ def test_a_lock_is_given_back_at_its_end(tmp_path):
 
 
 @posix
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
 def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
     import fcntl
 

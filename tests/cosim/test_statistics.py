@@ -47,14 +47,6 @@ def test_intervals_of_a_ratio_cover_the_truth_at_their_level(method):
     assert 88 <= covered <= 100
 
 
-def test_pairing_makes_a_ratio_of_proportional_columns_exact():
-    base = np.array([10.0, 40.0, 20.0, 90.0])
-    estimate = ratio(0.21 * base, base)
-    assert estimate.value == pytest.approx(0.21)
-    assert estimate.t == pytest.approx((0.21, 0.21), abs=1e-12)
-    assert estimate.bootstrap == pytest.approx((0.21, 0.21), abs=1e-12)
-
-
 def test_one_seed_has_no_interval():
     estimate = mean(np.array([3.0]))
     assert (estimate.value, estimate.t, estimate.bootstrap) == (3.0, None, None)

@@ -7,7 +7,6 @@ import cosim
 from cosim.errors import CosimError
 from cosim.files import write_atomically
 from cosim.text_tables import csv_text, read_csv
-from learning.errors import ConfigurationError
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +43,6 @@ def test_frames_hold_the_values(run, training):
     np.testing.assert_array_equal(
         training.parameters.to_pandas()["theta"], training.parameters.theta
     )
-
-
-def test_an_unknown_option_of_a_training_is_refused_by_name():
-    with pytest.raises(ConfigurationError, match="did you mean 'evaluate_every'"):
-        cosim.train("q-learning", evaluate_evry=10)
 
 
 def test_a_table_reads_back(tmp_path):

@@ -1,7 +1,5 @@
 """The scripts that drive the FMU with fmpy alone run as their docstrings say."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -8,25 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim import Scenario, StudyResults, evaluate
+from cosim import StudyResults, evaluate
 from examples.outsiders import policy
 
 FOLDER = Path(__file__).parents[2] / "examples" / "outsiders"
 
 
-@pytest.fixture
-def paper():
-    return Scenario.load("paper")
-
-
 def weights(path, W, last="none"):
     np.savez(path, layers=1, between="tanh", last=last, W0=W, b0=np.zeros(2))
     return path
-
-
-def test_a_network_that_gives_nothing_holds_the_middle_of_the_box(paper, tmp_path):
-    agent = policy.NeuralPolicy(paper, weights(tmp_path / "zero.npz", np.zeros((2, 2))))
-    np.testing.assert_allclose(agent.feedback(np.array([30.0, 60.0])).action, [250.0, 250.0])
 
 
 def test_actions_stay_in_the_box(paper, tmp_path):

@@ -141,28 +141,12 @@ def tank(tmp_path_factory):
     return build_tank(tmp_path_factory.mktemp("tank"), saves=True)
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        (1, "returned x = nan at step 0"),
-        (5, "SIGABRT"),
-    ],
-)
-def test_a_failing_plant_ends_the_run_in_one_line(tmp_path, tank, fault, words):
+@pytest.mark.parametrize(("fault", "reason"), [(1, "returned x = nan at step 0"), (5, "SIGABRT")])
+def test_a_failing_plant_ends_the_run_in_one_line(tmp_path, tank, fault, reason):
     scenario = write_scenario(tmp_path, tank, fault=fault)
-    command = [
-        "simulate",
-        "-s",
-        str(scenario),
-        "-c",
-        "tests.helpers.loop:hold",
-        "-n",
-        "5",
-        "--out",
-        "out",
-    ]
-    said = refused(command_line(tmp_path, *command))
-    assert words in said
+    words = f"simulate -s {scenario} -c tests.helpers.loop:hold -n 5 --out out"
+    said = refused(command_line(tmp_path, *words.split()))
+    assert reason in said
     assert not list((tmp_path / "out").glob("*"))
 
 

@@ -1,7 +1,5 @@
 """Instances of the shipped evaporator, for both versions of FMI."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

@@ -18,9 +18,8 @@ from benchmarks import importers
 from fmus import build, check, evaporator
 from fmus.build import compilers
 from tests.helpers import crosscheck
+from tests.helpers.compiler import needs_compiler
 
-HAS_COMPILER = shutil.which(os.environ.get("CC", "cc")) is not None
-needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="there is no C compiler")
 needs_zig = pytest.mark.skipif(
     importlib.util.find_spec("ziglang") is None, reason="the extra 'cross' is not installed"
 )

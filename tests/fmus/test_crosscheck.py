@@ -1,9 +1,5 @@
 """The stored reference signals: reproduced bit for bit, and right by an independent integration."""
 
-from __future__ import annotations
-
-import csv
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -51,16 +47,3 @@ def test_stored_states_solve_the_differential_equations() -> None:
             start = stored["X2"][k], stored["P2"][k]
             end = solve_ivp(rates, (0, 1), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
             np.testing.assert_allclose(end, (stored["X2"][k + 1], stored["P2"][k + 1]), rtol=1e-9)
-
-
-@pytest.mark.parametrize("case", crosscheck.CASES)
-def test_files_follow_the_cross_check_format(case: str) -> None:
-    folder = crosscheck.FOLDER / case
-    assert len(crosscheck.load(case)) <= 500
-    assert crosscheck.load(case).dtype.names == ("time", *crosscheck.OUTPUTS)
-    assert np.array_equal(crosscheck.load(case, "in"), crosscheck.input_signals())
-    with (folder / "evaporator_ref.opt").open() as file:
-        options = {key: float(value) for key, value in csv.reader(file)}
-    assert set(options) == {"StartTime", "StopTime", "StepSize", "RelTol", "OutputIntervalLength"}
-    with (folder / "start_values.csv").open() as file:
-        assert dict(csv.reader(file)) == crosscheck.CASES[case]

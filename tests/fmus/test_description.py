@@ -1,6 +1,7 @@
 """Every FMU and SSP that we make, against the standards' own XML schemas, which fmpy carries."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -22,6 +23,7 @@ from fmus.model import (
     initial_dependencies,
     model_description,
     terminals,
+    unit,
 )
 from fmus.plant import Signal, plant_model
 from fmus.sampled import build_sampled
@@ -34,48 +36,10 @@ def description(version: int):
     return fmpy.read_model_description(str(fmus.path(NAMES[version])))
 
 
-def test_capabilities(description, version: int) -> None:
-    for interface in (description.coSimulation, description.modelExchange):
-        assert interface.canGetAndSetFMUstate
-        assert interface.canSerializeFMUstate
-        assert interface.providesAdjointDerivatives == (version == 3)
-        assert not interface.canBeInstantiatedOnlyOncePerProcess
-    assert description.coSimulation.canHandleVariableCommunicationStepSize
-    assert not description.coSimulation.fixedInternalStepSize
-    name = "providesDirectionalDerivative" + ("s" if version == 3 else "")
-    root = ElementTree.fromstring(model_description(version, "", EVAPORATOR))
-    assert [root.find(t).get(name) for t in ("CoSimulation", "ModelExchange")] == ["true", "true"]
-
-
-def test_versions_differ_only_in_time_and_seed() -> None:
-    two, three = (
-        {v.name for v in fmpy.read_model_description(str(fmus.path(n))).modelVariables}
-        for n in NAMES.values()
-    )
-    assert two ^ three == {"time", "seedHigh", "law_number"}
-
-
-def test_table_and_description_agree(description) -> None:
-    described = {v.name: v for v in description.modelVariables}
-    for row in (v for v in VARIABLES if v.type is Type.REAL and v.kind is not Kind.INDEPENDENT):
-        shown = described[row.name]
-        assert (float(shown.min), float(shown.max)) == (row.min, row.max)
-        assert shown.unit == row.unit
-        assert row.start is None or float(shown.start) == row.start
-
-
 def test_every_initial_unknown_has_explicit_dependencies(description) -> None:
     for unknown in (*description.initialUnknowns, *description.outputs, *description.derivatives):
         assert unknown.dependencies is not None
         assert len(unknown.dependencies) == len(unknown.dependenciesKind)
-
-
-def test_dependencies_of_the_file_are_those_of_the_table(description, version: int) -> None:
-    shown = {v.name for v in EVAPORATOR.exported(version)}
-    for unknown in description.initialUnknowns:
-        names = [v.name for v in unknown.dependencies]
-        expected = initial_dependencies(unknown.variable.name, EVAPORATOR)
-        assert names == [n for n in expected if n in shown]
 
 
 UNKNOWNS = [v.name for v in VARIABLES if v.kind in (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT)]
@@ -165,17 +129,36 @@ def test_extreme_normal_draws_stay_within_the_declared_range() -> None:
         assert BY_NAME[name].max >= nominal.max + largest * spread.max
 
 
-def test_derived_units_follow_from_their_parts() -> None:
-    """kg/kPa, K/kPa and K/% agree with the units that they are made of."""
-    units = {unit.name: unit for unit in UNITS}
-    for quotient in ("kg/kPa", "K/kPa", "K/%", "kPa/s", "%/s", "kW/K"):
-        over, under = (units[part] for part in quotient.split("/"))
-        exponents: dict[str, int] = dict(over.exponents)
-        for base, exponent in under.exponents:
-            exponents[base] = exponents.get(base, 0) - exponent
-        exponents = {base: exponent for base, exponent in exponents.items() if exponent}
-        assert dict(units[quotient].exponents) == exponents
-        assert units[quotient].factor == pytest.approx(over.factor / under.factor)
+SI = {
+    "kW.min/(kg.K)": (60_000, 0, {"m": 2, "s": -2, "K": -1}),
+    "degC": (1, 273.15, {"K": 1}),
+    "degC/s": (1, 0, {"K": 1, "s": -1}),
+    "degF": (5 / 9, 273.15 - 32 * 5 / 9, {"K": 1}),
+    "bar": (1e5, 0, {"kg": 1, "m": -1, "s": -2}),
+    "cm3/(V.s)": (1e-6, 0, {"kg": -1, "m": 1, "s": 2, "A": 1}),
+    "mol/L/s": (1000, 0, {"mol": 1, "m": -3, "s": -1}),
+    "%": (0.01, 0, {}),
+    "rpm": (2 * np.pi / 60, 0, {"s": -1, "rad": 1}),
+}
+
+
+@pytest.mark.parametrize("name", SI)
+def test_the_si_form_of_units(name):
+    factor, offset, exponents = SI[name]
+    found = unit(name)
+    assert (found.factor, found.offset) == pytest.approx((factor, offset), rel=1e-15)
+    assert dict(found.exponents) == exponents
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_unit_without_si_form_is_no_plain_number(version):
+    """BaseUnit without attributes says that the unit is 1."""
+    names = ("furlong", "kW/kg.K", "bar")
+    model = replace(EVAPORATOR, units=tuple(map(unit, names)))
+    root = ElementTree.fromstring(model_description(version, "", model))
+    forms = {u.get("name"): u.find("BaseUnit") for u in root.iter("Unit")}
+    assert [name for name in names if forms[name] is None] == ["furlong", "kW/kg.K"]
+    assert forms["bar"].attrib == {"kg": "1", "m": "-1", "s": "-2", "factor": "100000.0"}
 
 
 def members(model) -> dict[str, str]:
@@ -233,7 +216,7 @@ def test_the_shipped_fmus(name, version):
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_plant_of_ones_own(version):
-    signal = Signal("x", "m", 1.0, 0.0, 10.0, "level", 0.1)
+    signal = Signal("x", "furlong", 1.0, 0.0, 10.0, "level", 0.1)
     model = plant_model(
         "tank",
         states=[signal],

@@ -1,7 +1,3 @@
-from __future__ import annotations
-
-import os
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -11,13 +7,11 @@ import pytest
 
 from fmus import PLATFORMS, BuildError, present
 from fmus.build import build_folder
-from fmus.model import Kind
 from fmus.plant import Signal, build_plant, plant_model
+from tests.helpers.compiler import needs_compiler
 from tests.helpers.platforms import MARKS as CROSS
 
-pytestmark = pytest.mark.skipif(
-    shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
-)
+pytestmark = needs_compiler
 EQUATIONS = """
 #ifndef EQUATIONS_H
 #define EQUATIONS_H
@@ -41,14 +35,6 @@ def model(disturbances: int = 0):
         parameters=[Signal("gain", "1", 1.0, 0.0, 10.0, "gain")],
         sampling_time=0.5,
     )
-
-
-def test_the_table_has_what_the_layer_adds() -> None:
-    table = model(1)
-    assert table.names(Kind.STATE) == ["x"]
-    assert table.names(Kind.DERIVATIVE) == ["der(x)"]
-    assert table.names(Kind.OUTPUT) == ["d0", "y"]
-    assert {"x_start", "d0_nominal", "d0_range", "seed", "law"} <= set(table.by_name)
 
 
 @pytest.mark.parametrize("version", [2, 3])

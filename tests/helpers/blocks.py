@@ -6,7 +6,7 @@ from cosim.protocols import SampleBlock
 from cosim.trajectory import SIGNALS
 
 
-def random_block(scenario, rng, first=0, samples=10, predicts=True, status="solved"):
+def random_block(scenario, rng, first=0, samples=10):
     columns = {}
     for kind in SIGNALS:
         shape = (samples, len(kind.names(scenario))) if kind.vector else samples
@@ -18,7 +18,7 @@ def random_block(scenario, rng, first=0, samples=10, predicts=True, status="solv
     return SampleBlock(
         first=first,
         columns=columns,
-        status=[status] * samples,
-        predicted_states=rng.normal(size=(samples, 4, n)) if predicts else None,
-        predicted_actions=rng.normal(size=(samples, 3, m)) if predicts else None,
+        status=["solved"] * samples,
+        predicted_states=rng.normal(size=(samples, 4, n)),
+        predicted_actions=rng.normal(size=(samples, 3, m)),
     )

@@ -1,7 +1,5 @@
 """Fenced code blocks of a Markdown page, and how each kind is executed."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import json

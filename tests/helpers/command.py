@@ -1,7 +1,5 @@
 """The command line in a process of its own; waiting for what it does, and for its end."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

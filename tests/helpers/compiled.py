@@ -1,7 +1,5 @@
 """The exported controller and its QP solver as libraries of this machine, called by ctypes."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shutil

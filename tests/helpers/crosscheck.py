@@ -5,8 +5,6 @@ Each case is a folder with ``evaporator_in.csv`` (inputs), ``evaporator_ref.csv`
 ``python -m tests.helpers.crosscheck`` writes them anew.
 """
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

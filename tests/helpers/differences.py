@@ -1,7 +1,5 @@
 """Finite differences of one and the same feedback step, and how near a gradient must come."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -126,10 +126,7 @@ class Instance:
         return (fmu.deSerializeFMUstate if self.version == 2 else fmu.deserializeFMUState)(data)
 
     def directional(self, unknowns: list[str], knowns: list[str], seed: list[float]) -> list[float]:
-        arguments = (
-            [self.reference(n) for n in unknowns],
-            [self.reference(n) for n in knowns],
-        )
+        arguments = ([self.reference(n) for n in unknowns], [self.reference(n) for n in knowns])
         return list(self.fmu.getDirectionalDerivative(*arguments, seed))
 
     def start_continuous_time(self) -> float | None:

@@ -86,7 +86,6 @@ def build_kind(
     reals=REALS,
     more="",
     separator="/",
-    place=None,
     data=None,
 ):
     """Write an FMU whose description differs from the plain kind's as told; return its path."""
@@ -97,7 +96,7 @@ def build_kind(
         f"{structure(version, reals)}</fmiModelDescription>"
     )
     target = folder / f"kind{version}.fmu"
-    entry = separator.join(["binaries", place or present().folder(f"{version}.0"), "kinds.so"])
+    entry = separator.join(["binaries", present().folder(f"{version}.0"), "kinds.so"])
     with zipfile.ZipFile(target, "w") as archive:
         archive.writestr("modelDescription.xml", text)
         archive.writestr(entry, library(version) if data is None else data)
@@ -105,8 +104,8 @@ def build_kind(
     return target
 
 
-def scenario_for(folder, fmu, *, sampling_time=0.5, fault=0, parameters="", seed=True, plant=""):
+def scenario_for(folder, fmu, *, sampling_time=0.5, fault=0, parameters=""):
     """Write a scenario for a kind; return its path."""
-    mapping = 'mapping = { initial_state = ["x_start"]' + (', seed = ["seed"]' if seed else "")
-    lines = [f"parameters = {{ fault = {fault}{parameters} }}", mapping + " }", plant]
-    return write_one_state(folder / "kind.toml", fmu, "\n".join(lines), sampling_time)
+    plant = f"parameters = {{ fault = {fault}{parameters} }}\n"
+    plant += 'mapping = { initial_state = ["x_start"], seed = ["seed"] }'
+    return write_one_state(folder / "kind.toml", fmu, plant, sampling_time)

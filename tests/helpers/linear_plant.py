@@ -1,7 +1,5 @@
 """Linear plants with quadratic cost, whose optimum the Riccati equation gives."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import scipy.linalg

@@ -1,7 +1,5 @@
 """FMUs run on the platforms that this machine can run: natively, under qemu, under wine."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

@@ -1,33 +1,16 @@
 """Random problems for tests: parameters, linearisation points, states and actions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
 from controllers import LinearisationPoint, Parameters, Problem, ThetaBlocks
-from controllers.evaporator import model
+from cosim import Scenario
 
 
 def evaporator_problem(**changes: object) -> Problem:
-    """The evaporator's problem of scenario `paper`, independent of the package cosim."""
-    problem = Problem(
-        model=model(),
-        sampling_time=60.0,
-        horizon=10,
-        discount=0.99,
-        state_lower=[25, 40],
-        state_upper=[100, 80],
-        action_lower=[100, 100],
-        action_upper=[400, 400],
-        penalty_linear=[1e5, 1e5],
-        penalty_quadratic=[1, 1],
-        reference_state=[25, 49.74297463837443],
-        reference_action=[191.71322465335396, 215.88843973473226],
-        reference_cost=6210.384509575885,
-    )
-    return replace(problem, **changes)
+    """The evaporator's problem of scenario `paper`."""
+    return replace(Problem.from_scenario(Scenario.load("paper")), **changes)
 
 
 def random_parameters(

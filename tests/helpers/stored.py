@@ -3,8 +3,6 @@
 `python -m benchmarks.record_qps` regenerates it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from functools import cache, lru_cache
 from pathlib import Path

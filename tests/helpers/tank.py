@@ -1,6 +1,5 @@
 """Builds FMUs that are not ours: a tank from C, and ours with parts of them changed."""
 
-import re
 import subprocess
 import zipfile
 from pathlib import Path
@@ -79,14 +78,3 @@ def edited(source, target, change):
                 data = change(data.decode()).encode()
             new.writestr(entry.filename, data)
     return target
-
-
-def without_attribute(*names):
-    """A change that drops attributes from a model description."""
-
-    def change(text):
-        for name in names:
-            text = re.sub(rf'\s{name}="\w+"', "", text)
-        return text
-
-    return change

@@ -70,10 +70,7 @@ def document(**changes):
         "training_seeds": {"first": 0, "count": 2},
         "evaluation": {"seeds": 3, "steps": 30},
         "curves": {"points": 4, "seeds": 2, "steps": 20},
-        "case": [
-            case("grow", settings={"rate": [1.0, 2.0]}),
-            {"controller": ["naive", "optimal"]},
-        ],
+        "case": [case("grow", settings={"rate": [1.0, 2.0]}), {"controller": ["naive", "optimal"]}],
     } | changes
 
 

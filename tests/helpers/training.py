@@ -1,7 +1,5 @@
 """Short trainings, whole, and killed and resumed; a rule in its loop."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

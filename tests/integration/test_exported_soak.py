@@ -1,7 +1,5 @@
 """The exported controller under AddressSanitizer and UBSan, with good and wild states and θ."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,15 +1,20 @@
-import numpy as np
 import pytest
 
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.scenario import Scenario
+from cosim import FmuPlant
 from tests.helpers.linear_quadratic import LinearQuadratic
 
 
 @pytest.fixture(scope="session")
-def scenario():
-    return Scenario.load("paper")
+def scenario(paper):
+    return paper
+
+
+@pytest.fixture(scope="module")
+def plant(scenario):
+    with FmuPlant(scenario) as plant:
+        yield plant
 
 
 @pytest.fixture(scope="session")
@@ -20,11 +25,6 @@ def problem(scenario):
 @pytest.fixture(scope="session")
 def parameters(problem):
     return Parameters.naive(problem)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(20200513)
 
 
 @pytest.fixture(scope="session")

@@ -38,23 +38,9 @@ def feed(actor, carrier, rng, slope, action, *, noise=0.0, clip=None):
         a = a if clip is None else np.minimum(a, clip)
         s = rng.normal(size=2)
         cost = 6000.0 + slope @ (a - action) + noise * rng.normal()
-        update = actor.observe(
-            Transition(
-                number,
-                s,
-                a,
-                True,
-                solution,
-                solution,
-                cost,
-                cost,
-                rng.normal(size=2),
-                0.0,
-                solution,
-                None,
-                None,
-            )
-        )
+        before = (number, s, a, True, solution, solution, cost, cost)
+        after = (rng.normal(size=2), 0.0, solution, None, None)
+        update = actor.observe(Transition(*before, *after))
     return update
 
 

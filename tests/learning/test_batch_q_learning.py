@@ -14,55 +14,6 @@ from learning.training import TrainingRun, begin, starting_parameters
 from tests.helpers.training import looped
 
 
-class Bench:
-    """BatchQLearning on the linear-quadratic task, batch after batch."""
-
-    def __init__(self, task, controller=None, noise=0.3, **settings):
-        configuration = BatchQLearning.Configuration.from_dict(
-            {
-                "parametrisation": "paper",
-                "value_offset": "stage-cost",
-                "exploration_deviation": (1.0,),
-                "batch_size": 20,
-                **settings,
-            }
-        )
-        self.controller = controller or RtiNmpc(task.problem, task.wrong())
-        self.interaction = looped(
-            BatchQLearning, task.plant(noise), self.controller, configuration, exploration=2, seed=3
-        )
-        self.algorithm = self.interaction.algorithm
-
-    def update(self):
-        """Samples until θ moves."""
-        for _ in range(1000):
-            sample, _ = self.interaction.next()
-            update = None if sample is None else self.algorithm.observe(sample)
-            if update is not None:
-                self.interaction.renew()
-                return update
-        raise AssertionError("θ never moved")
-
-
-class FailsNow(RtiNmpc):
-    """Fails at Q where told to, like a solver."""
-
-    failing = False
-
-    def feedback(self, s, a=None):
-        if self.failing and a is not None:
-            raise QpError("told to fail", status="failed")
-        return super().feedback(s, a)
-
-
-def test_an_update_counts_the_qps_that_failed_in_its_replay(linear_quadratic):
-    controller = FailsNow(linear_quadratic.problem, linear_quadratic.wrong())
-    bench = Bench(linear_quadratic, controller, exploration_probability=0.5)
-    assert bench.update().failures == 0
-    controller.failing = True
-    assert 0 < bench.update().failures <= 40
-
-
 def test_a_first_batch_has_its_own_length_and_a_start_may_keep_its_offset(scenario, problem):
     algorithm = BatchQLearning
     settings = {"first_batch": 60, "batch_size": 20}
@@ -137,10 +88,11 @@ def test_replay_sees_the_present_theta(scenario, collected):
 
 
 class Counting:
-    """A controller that counts its feedbacks."""
+    """A controller that counts its feedbacks, and may fail at every one, like a solver."""
 
-    def __init__(self, controller, *, memoryless=True):
-        self._controller, self.memoryless, self.feedbacks = controller, memoryless, 0
+    def __init__(self, controller, *, memoryless=True, fails=False):
+        self._controller, self.memoryless, self.fails = controller, memoryless, fails
+        self.feedbacks = 0
 
     @property
     def theta(self):
@@ -155,6 +107,8 @@ class Counting:
 
     def feedback(self, *arguments):
         self.feedbacks += 1
+        if self.fails:
+            raise QpError("told to fail", status="failed")
         return self._controller.feedback(*arguments)
 
 
@@ -176,6 +130,15 @@ def test_what_the_loop_solved_is_not_solved_again(scenario, collected):
     found = buffer.replay(average_cost(scenario))
     assert counting.feedbacks == sum(sample.explored for sample in samples)
     assert_same(found, replayed(controller, samples, average_cost(scenario)))
+
+
+def test_qps_that_fail_are_counted_and_their_rows_left_out(scenario, collected):
+    controller, samples = collected
+    buffer = filled(Counting(controller, fails=True), samples)
+    found = buffer.replay(average_cost(scenario))
+    explored = [sample.explored for sample in samples]
+    assert found.failures == sum(explored) > 0
+    assert found.rows.tolist() == np.flatnonzero(np.logical_not(explored)).tolist()
 
 
 def test_another_theta_and_a_new_batch_know_nothing_of_the_one_before(scenario, collected):

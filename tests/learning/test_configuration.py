@@ -61,12 +61,6 @@ def test_what_acts_nowhere_is_refused(algorithm, assignment, message):
         load_algorithm(algorithm).Configuration.from_assignments(assignment.split())
 
 
-@pytest.mark.parametrize("cls", CLASSES)
-def test_a_configuration_survives_json(cls):
-    configuration = cls.Configuration()
-    assert cls.Configuration.from_dict(configuration.model_dump(mode="json")) == configuration
-
-
 LOWER, UPPER = np.array([100.0, 100.0]), np.array([400.0, 400.0])
 POLICY = np.array([190.0, 215.0])
 
@@ -83,10 +77,6 @@ def test_additive_noise_has_the_moments_asked_for(rng):
     actions = draws(make("additive", deviation=(10.0, 3.0)), rng)
     assert actions.mean(axis=0) == pytest.approx(POLICY, abs=0.3)
     assert actions.std(axis=0) == pytest.approx([10.0, 3.0], rel=0.03)
-
-
-def test_literal_reading_always_ends_in_the_lower_corner(rng):
-    assert (draws(make("literal"), rng, count=100) == LOWER).all()
 
 
 @pytest.mark.parametrize("action", [POLICY, np.array([100.0, 395.0]), np.array([104.0, 400.0])])

@@ -17,12 +17,6 @@ from learning.loop import PlantInOperation, TrainingLoop
 from learning.training import HELD_OUT, TrainingRun, begin, run_training, starting_parameters
 
 
-@pytest.fixture(scope="module")
-def plant(scenario):
-    with FmuPlant(scenario) as plant:
-        yield plant
-
-
 class Idle:
     """An algorithm that learns nothing."""
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from controllers.factories import tuned
-from controllers.functions import find_compiler
 from learning import model_based
-from learning.empirical_model import EmpiricalModel, Features, Rollout
+from learning.empirical_model import EmpiricalModel, Features, PlantData, Rollout
 from learning.model_based import BackOffs, ExpectedCosts, ModelBased
 from learning.training import run_training, to_csv
+from tests.helpers.compiler import needs_compiler
 from tests.helpers.training import killed_and_resumed, make_run
 
 
@@ -73,33 +73,34 @@ def test_the_deviation_of_the_mean_cost_is_what_the_fits_scatter(features, rng):
 
 
 @pytest.mark.slow  # compiles the controller
-@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@needs_compiler
 def test_the_compiled_rollout_is_the_interpreted_one(
     problem, base, features, fitted, rng, monkeypatch
 ):
     monkeypatch.setenv("COSIM_COMPILE", "now")
     rollout = Rollout(problem, base, features)
     assert rollout.compiled is not None
-    theta = base.replace({"x_l": base["x_l"] + [2.0, 0.0]}).theta
+    thetas = [base.replace({"x_l": base["x_l"] + [delta, 0.0]}).theta for delta in (0.0, 2.0, 3.0)]
     picks = rng.integers(2000, size=40, dtype=np.int32)
-    compiled = rollout(theta, np.array([30.0, 78.0]), fitted, picks)
+    compiled = rollout(thetas, np.array([30.0, 78.0]), fitted, picks)
     rollout.compiled = None
-    interpreted = rollout(theta, np.array([30.0, 78.0]), fitted, picks)
+    interpreted = rollout(thetas, np.array([30.0, 78.0]), fitted, picks)
     for one, other in zip(compiled, interpreted, strict=True):
-        assert np.allclose(one, other, rtol=1e-9, atol=0.0)
+        for part, like in zip(one, other, strict=True):
+            assert np.allclose(part, like, rtol=1e-9, atol=0.0)
 
 
 def riding(problem, base, n, slope):
     """A rollout of a loop whose first state rides its lower bound, at `slope` of cost a unit."""
     where = base.blocks.slices["x_l"].start
 
-    def rollout(theta, start, model, picks):
+    def one(theta, picks):
         predicted = np.tile([theta[where], 60.0, 0.0], (len(picks), 1))
         predicted[:, 2] = 6000.0 + slope * (theta[where] - problem.state_lower[0])
         inputs = np.tile([theta[where], 60.0, 220.0, 230.0], (len(picks), 1))
         return inputs, predicted, np.ones((len(picks), n + 1))
 
-    return rollout
+    return lambda thetas, start, model, picks: [one(theta, picks) for theta in thetas]
 
 
 @pytest.fixture
@@ -125,38 +126,43 @@ def test_the_back_off_of_a_known_loop_is_found(search):
 
 
 def test_a_loop_that_goes_where_the_plant_has_not_been_promises_nothing(search):
-    costs = [search.promise(search.theta(np.array([delta, 0, 0, 0]))).cost for delta in (14, 20)]
-    assert np.isfinite(costs).tolist() == [True, False]
+    promises = search.promises([search.theta(np.array([delta, 0, 0, 0])) for delta in (14, 20)])
+    assert np.isfinite([promise.cost for promise in promises]).tolist() == [True, False]
 
 
-def test_back_offs_shrink_little_further_than_the_plant_has_been(scenario, base, rng):
-    run = make_run("model-based", scenario)
+@pytest.fixture
+def rule(scenario, base, rng):
     controller = SimpleNamespace(parameters=base, theta=base.theta)
-    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+    configuration = make_run("model-based", scenario).configuration
+    return ModelBased(controller, scenario, configuration, 1000, None, rng)
+
+
+def test_back_offs_shrink_little_further_than_the_plant_has_been(rule):
     rule.back_off = np.array([2.0, 0.0, 0.0, 5.0])
     inputs = np.tile([26.0, 77.0, 220.0, 230.0], (200, 1))
     assert rule._least(inputs) == pytest.approx([0.7, 0.0, 0.0, 2.1])
     assert rule._least(inputs[:50]) == pytest.approx([2.0, 0.0, 0.0, 5.0])
 
 
-def test_a_change_of_the_plant_is_seen_and_its_absence_not(scenario, base, features, fitted, rng):
-    run = make_run("model-based", scenario)
-    controller = SimpleNamespace(parameters=base, theta=base.theta)
-    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+def filled(rule, inputs, outputs, model):
+    """The rule's data with these samples, all since the fit of the model."""
+    data = rule._data
+    data._rows[: len(inputs)] = np.column_stack([inputs, outputs])
+    data.count, data.era, data.model = len(inputs), 0, model
+    return data
+
+
+def test_a_change_of_the_plant_is_seen_and_its_absence_not(rule, features, fitted, rng):
     error = np.zeros(features.count)
     error[0] = -0.2
     for offset, window in ((0.0, 0), (0.3, 15)):
         inputs, outputs = plant_data(features, rng, 240, error, offset)
-        rule._rows[:240] = np.column_stack([inputs, outputs])
-        rule._count = 240
+        data = filled(rule, inputs, outputs, fitted)
         rule._watch(fitted)
-        assert rule._count - rule._era == (window or 240)
+        assert data.count - data.era == (window or 240)
 
 
-def test_data_from_before_a_slow_change_are_dropped(scenario, base, features, rng):
-    run = make_run("model-based", scenario)
-    controller = SimpleNamespace(parameters=base, theta=base.theta)
-    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+def test_data_from_before_a_slow_change_are_dropped(features, rng):
     error = np.zeros(features.count)
     parts = []
     for _ in range(4):
@@ -164,24 +170,21 @@ def test_data_from_before_a_slow_change_are_dropped(scenario, base, features, rn
         error[0] -= 0.01
     inputs, outputs = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     same = np.concatenate([parts[0][0]] * 4), np.concatenate([parts[0][1]] * 4)
-    assert (rule._outdated(inputs, outputs), rule._outdated(*same)) == (750, 0)
+    data = PlantData(features, 2000)
+    assert (data._outdated(inputs, outputs), data._outdated(*same)) == (750, 0)
 
 
-def test_a_plant_that_nears_its_bound_breaks_the_promise(scenario, base, features, fitted, rng):
-    run = make_run("model-based", scenario)
-    controller = SimpleNamespace(parameters=base, theta=base.theta)
-    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+def test_a_plant_that_nears_its_bound_breaks_the_promise(rule, features, fitted, rng):
     error = np.zeros(features.count)
     error[0] = -0.2
     inputs, outputs = plant_data(features, rng, 240, error)
     cost = ExpectedCosts(rule._problem, fitted)(*fitted.predict(inputs)[:2])[0].mean()
-    rule._rows[:240] = np.column_stack([inputs, outputs])
-    rule._count = 240
+    data = filled(rule, inputs, outputs, fitted)
     rule._due = 960
     for factor, due in ((1.01, 960), (0.99, 240)):
         rule._limits = np.array([np.inf, np.inf, factor * cost, np.inf])
         rule._watch(fitted)
-        assert (rule._due, rule._era) == (due, 0)
+        assert (rule._due, data.era) == (due, 0)
 
 
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from controllers.rti import RtiNmpc
-from cosim import FmuPlant
 from learning import QLearning
 from learning.q_learning import AverageCost, KalmanRegression
 from learning.step import Fit
@@ -33,12 +32,6 @@ class Bench:
         self.controller = RtiNmpc(problem, starting_parameters(problem, configuration))
         self.interaction = looped(QLearning, plant, self.controller, configuration, seed=11)
         self.algorithm = self.interaction.algorithm
-
-
-@pytest.fixture(scope="module")
-def plant(scenario):
-    with FmuPlant(scenario) as plant:
-        yield plant
 
 
 def test_the_papers_rule_takes_the_closed_form_step(plant, problem):

@@ -22,12 +22,6 @@ def learner(plant, rule, samples=1500):
     return begin(run, Search, plant)
 
 
-@pytest.fixture(scope="module")
-def plant(scenario):
-    with FmuPlant(scenario) as plant:
-        yield plant
-
-
 @pytest.mark.parametrize("rule", SETTINGS)
 def test_what_is_handed_over_is_the_incumbent_and_its_trials_are_greedy(plant, rule):
     made = learner(plant, rule)
@@ -75,19 +69,3 @@ def test_a_restored_search_goes_on_as_the_first_one(scenario, rule):
             assert np.array_equal(whole.s, resumed.s)
         assert np.array_equal(whole.controller.theta, resumed.controller.theta)
         assert np.array_equal(whole.parameters.theta, resumed.parameters.theta)
-
-
-def test_the_last_comparison_begins_a_new_episode(plant):
-    made, seeds = learner(plant, "none"), []
-    begin_episode = made.start
-
-    def start(s):
-        seeds.append(made.counts.number)
-        begin_episode(s)
-        assert np.array_equal(made.s, plant.scenario.initial_state)
-
-    made.start = start
-    for _ in range(1500):
-        made.advance()
-    assert len(seeds) == 1
-    assert 0.6 * 1500 < seeds[0] < 0.8 * 1500

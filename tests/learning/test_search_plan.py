@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 
 from controllers.theta import Parameters
-from learning.search import (
-    Block,
-    Learn,
-    Learned,
-    PairedComparison,
-    SearchPlan,
-    Settle,
-    Trial,
-)
+from learning.search import Block, Learn, Learned, PairedComparison, SearchPlan, Settle, Trial
 
 BLOCKS = 8
 

@@ -30,9 +30,9 @@ def make_run(scenario, name, **changes):
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, name, tmp_path):
-    run = make_run(scenario, name)
+    run = make_run(scenario, name, samples=250)
     whole = run_training(run)
-    resumed = killed_and_resumed(run, tmp_path, 350)
+    resumed = killed_and_resumed(run, tmp_path, 150)
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
     assert to_csv(resumed.rows) == to_csv(whole.rows)
     assert resumed.evaluation == whole.evaluation
@@ -123,12 +123,6 @@ def test_no_run_ends_as_diverged_by_a_candidate_that_is_tried(scenario, tmp_path
         assert np.array_equal(row.parameters.theta, result.start.theta)
     stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
     assert np.array_equal(stored.theta, result.start.theta)
-
-
-def test_the_runs_seed_reaches_the_algorithm(scenario):
-    runs = [make_run(scenario, "q-learning", samples=50, seed=seed) for seed in (3, 3, 4)]
-    ends = [run_training(run, rule=Reporting).parameters.hash for run in runs]
-    assert ends[0] == ends[1] != ends[2]
 
 
 def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):

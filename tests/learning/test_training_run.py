@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from controllers.economic import tune
 from controllers.optimum import QuasiStaticPolicy
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
@@ -22,15 +21,6 @@ from learning.training import (
     starting_parameters,
 )
 from tests.helpers.training import make_run
-
-
-def test_the_papers_theta_is_the_naive_guess(problem):
-    theta = starting_parameters(
-        problem, Configuration(parametrisation="paper", value_offset="stage-cost")
-    )
-    assert "w_sigma" not in theta.blocks
-    assert theta["c_lambda"] == pytest.approx(problem.reference_cost)
-    assert np.array_equal(theta["B_l"], np.eye(4))
 
 
 def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(problem):
@@ -62,14 +52,6 @@ def test_what_the_user_sets_stands_against_the_scenario(scenario):
         0.7,
     )
     assert configuration.exploration == "literal"
-
-
-def test_a_tuned_start_has_the_configured_slack_weights_and_level(problem):
-    start = starting_parameters(problem, Configuration(), "tuned")
-    expected = tune(problem, start.blocks).parameters
-    assert np.array_equal(start["B_l"], expected["B_l"])
-    assert start["w_sigma"].tolist() == [100.0, 100.0]
-    assert start["c_lambda"] == pytest.approx(100 * problem.reference_cost)
 
 
 def test_a_file_keeps_its_blocks_and_gets_those_it_lacks(problem, tmp_path):
@@ -109,10 +91,6 @@ def test_the_reference_is_that_of_the_present_heat_transfer(drifting):
     assert fouled["UA2"] == pytest.approx(6.84 * (0.7 + 0.3 * np.exp(-1.8)), rel=1e-3)
     assert fouled["reference_J"] > clean["reference_J"] + 150.0
     assert at(6 * 86400.0) == clean
-
-
-def test_a_plant_that_stays_as_it_is_has_none():
-    assert drift(Scenario.load("fouled")) is None
 
 
 def test_the_log_of_a_plant_that_jumps_shows_the_parameter_as_it_is():

@@ -12,7 +12,7 @@ from learning.training import starting_parameters
 from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
 from tests.helpers.training import Carrier, looped
 
-SAMPLES = 240
+SAMPLES = 160
 SETTINGS = {
     QLearning: {"prior_samples": 100, "step_every": 20},
     BatchQLearning: {"first_batch": 100, "batch_size": 50},

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 PRESETS = {"paper", "nominal", "fast-sampling", "fouled", "mismatched", "drifting", "jump"}
-PRESETS |= {"reactor", "tanks"}
+PRESETS |= {"reactor", "tanks", "holdup", "slow-sampling"}
 
 
 # Other people's tools may warn; what is installed may not.

@@ -41,17 +41,6 @@ def test_multilinear_functions_are_interpolated_exactly():
     )
 
 
-def test_weights_are_a_row_of_a_stochastic_matrix_inside_and_outside():
-    x = 3.0 * states() - 1.0
-    corners = GRID.weights(list(x.T))
-    weights = np.stack([weight for _, weight in corners])
-    assert (weights >= 0).all()
-    np.testing.assert_allclose(weights.sum(axis=0), 1.0, rtol=1e-14)
-    indices = np.stack([index for index, _ in corners])
-    assert indices.min() >= 0
-    assert indices.max() < GRID.size
-
-
 def test_states_outside_are_served_by_the_nearest_state_of_the_box():
     values = np.random.default_rng(1).normal(size=GRID.size)
     inside, outside = np.array([[2.0, -1.0, 0.3]]), np.array([[7.0, -3.0, 0.3]])
@@ -123,15 +112,6 @@ def test_moments_up_to_twice_the_nodes_are_those_of_scipy(kind):
         assert rule.weights @ rule.nodes[:, 0] ** degree == pytest.approx(
             distribution.moment(degree), rel=1e-12
         )
-
-
-@pytest.mark.parametrize("kind", ["uniform", "normal", "none"])
-def test_draws_have_the_laws_moments(kind):
-    law = DisturbanceLaw(kind, np.array([5.0, -1.0]), np.array([1.0, 0.0]))
-    draws = law.draw(np.random.default_rng(1), 40_000)
-    variance = {"uniform": 1 / 3, "normal": 1.0, "none": 0.0}[kind]
-    np.testing.assert_allclose(draws.mean(axis=0), [5.0, -1.0], atol=0.02)
-    np.testing.assert_allclose(draws.var(axis=0), [variance, 0.0], atol=0.02)
 
 
 def test_refinement_reproduces_polynomials_of_the_coarse_degree():
@@ -214,19 +194,6 @@ def minimise(function, start, size=0.5, iterations=200, precision=1e-12):
         iterations=iterations,
         precision=precision,
     )
-
-
-def test_each_of_many_quadratics_is_minimised():
-    generator = np.random.default_rng(0)
-    roots = generator.normal(size=(50, 2, 2)) + 1.5 * np.eye(2)
-    centres = generator.uniform(-3, 3, (50, 2))
-
-    def function(rows, points):
-        return np.square(np.einsum("bij,bj->bi", roots[rows], points - centres[rows])).sum(axis=1)
-
-    points, values = minimise(function, np.zeros((50, 2)))
-    np.testing.assert_allclose(points, centres, atol=1e-4)
-    assert values.max() < 1e-10
 
 
 def test_box_constrained_quadratic_agrees_with_scipy():

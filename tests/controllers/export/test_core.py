@@ -1,7 +1,5 @@
 """The exported controller against `RtiNmpc` in the loop with the plant."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -16,9 +16,10 @@ from controllers.export import core, plain_c
 from controllers.factories import tuned
 from cosim import FmuPlant, Scenario, simulate
 from tests.helpers.command import run_cosim
+from tests.helpers.compiler import needs_compiler
 
 CC = os.environ.get("CC", "cc")
-pytestmark = pytest.mark.skipif(shutil.which(CC) is None, reason="there is no C compiler")
+pytestmark = needs_compiler
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-ffp-contract=off")
 
 

@@ -1,7 +1,5 @@
 """The C solver on random and degenerate QPs: by its residual, and against DAQP and ProxQP."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -5,11 +5,11 @@ import pytest
 
 from controllers import Parameters, Problem, QpError, RtiNmpc, ThetaBlocks, functions
 from controllers.factories import tuned
-from controllers.functions import find_compiler
 from cosim import FmuPlant, Scenario, simulate
+from tests.helpers.compiler import needs_compiler
 from tests.helpers.sampling import evaporator_problem, random_parameters
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+pytestmark = needs_compiler
 
 BOUNDS = {
     "action": 1e-10,

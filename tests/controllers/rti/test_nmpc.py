@@ -76,16 +76,6 @@ def test_prepare_shifts_the_last_solution(nmpc, rng):
     np.testing.assert_allclose(costates[:-1], last.costates[2:] / 0.99, rtol=1e-15)
 
 
-def test_two_feedbacks_use_the_same_linearisation(nmpc, problem, rng):
-    unsettled(nmpc, rng)
-    nmpc.prepare()
-    s, point = random_state(problem, rng), nmpc.linearisation_point
-    first = nmpc.feedback(s)
-    nmpc.feedback(random_state(problem, rng), random_action(problem, rng))
-    assert bits(nmpc.feedback(s)) == bits(first)
-    assert nmpc.linearisation_point is point
-
-
 def test_repeated_iterations_at_one_state_converge(nmpc):
     s = np.array([27.0, 52.0])
     for _ in range(40):
@@ -123,20 +113,6 @@ def test_replay_gives_the_same_bits_whatever_was_solved_before(nmpc, problem, rn
         point, s, a, expected = stored[k]
         nmpc.prepare_at(point)
         assert bits(nmpc.feedback(s, a)) == expected
-
-
-def test_reset_makes_a_run_repeat_itself(nmpc, problem, rng):
-    states = [random_state(problem, rng) for _ in range(10)]
-
-    def run():
-        nmpc.reset()
-        found = []
-        for s in states:
-            nmpc.prepare()
-            found.append(bits(nmpc.feedback(s)))
-        return found
-
-    assert run() == run()
 
 
 # θ --------------------------------------------------------------------------------------------

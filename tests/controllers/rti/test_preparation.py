@@ -7,7 +7,6 @@ import pytest
 from controllers import ThetaBlocks
 from controllers.model import discretise
 from controllers.rti.preparation import embedding, preparation, readout, sampled_jacobian
-from controllers.theta import SymbolicTheta
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point, random_state
 
 N, n, m = 10, 2, 2
@@ -72,16 +71,6 @@ def test_the_variational_steps_give_the_jacobian_of_the_discrete_map(problem, rn
         value, jacobian = ours(point.x[0], point.u[0])
         np.testing.assert_allclose(np.array(value), np.array(f(*arguments)), rtol=1e-14)
         np.testing.assert_allclose(np.array(jacobian), np.array(exact(*arguments)), atol=1e-13)
-
-
-def test_model_parameters_in_theta_replace_the_nominal_ones(problem, blocks):
-    symbols = SymbolicTheta.of(problem, blocks)
-    values = ca.Function("p", [symbols.theta], [symbols.model_parameters])
-    theta = np.zeros(blocks.size)
-    theta[blocks.slices["p"]] = 7.0, 0.2
-    expected = problem.model.nominal_parameters
-    expected[problem.model.parameter_indices(("UA2", "h"))] = 7.0, 0.2
-    np.testing.assert_array_equal(np.array(values(theta)).ravel(), expected)
 
 
 def test_the_linear_model_touches_the_nonlinear_one_at_its_point(functions, case, problem):

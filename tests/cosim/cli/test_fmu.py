@@ -1,25 +1,10 @@
 """`cosim fmu`: exit codes, tables and JSON of its commands."""
 
 import json
-import os
-import shutil
-
-import pytest
 
 import fmus
+from tests.helpers.compiler import needs_compiler
 from tests.helpers.kinds import build_kind
-
-needs_compiler = pytest.mark.skipif(
-    shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
-)
-
-
-def test_info_shows_variables_with_units(cosim):
-    code, out, err = cosim("fmu", "info")
-    assert code == 0
-    assert "economic_cost" in out
-    assert "kW.min/(kg.K)" in out
-    assert "FMI 2.0: co-simulation, model exchange" in err
 
 
 def test_info_as_json(cosim):

@@ -64,17 +64,7 @@ def test_an_interrupted_command_says_how_it_goes_on(tmp_path, command, number):
     assert (process.returncode, said) == (code, f"{word}{how.format(out=out)}\n")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "export tuned -o ",
-        "study run study.toml --out ",
-        "view ",
-        "simulate -c ",
-        "evaluate --scheduler ",
-        "",
-    ],
-)
+@pytest.mark.parametrize("words", ["export tuned -o ", "view ", "simulate -c ", ""])
 def test_an_empty_word_is_refused_by_every_command(cosim, words, tmp_path):
     code, out, err = cosim(*words.split(" "))
     assert (code, out) == (2, "")

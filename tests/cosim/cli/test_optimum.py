@@ -4,9 +4,7 @@ import json
 
 import pytest
 
-from controllers import factories
 from controllers import optimum as store
-from cosim import Scenario
 
 
 def test_stored_optimum_as_json(cosim):
@@ -55,14 +53,3 @@ def test_the_tunings_certificate_as_json(cosim):
     assert abs(document["active"]["X2 ≥ 25 %"] - 60.29) < 0.01
     assert document["economic_eigenvalues"][0] < 0 < document["convexified_eigenvalues"][0]
     assert document["gain_error"] < 1e-8
-
-
-def test_tuned_parameters_are_a_controller(cosim, tmp_path):
-    path = tmp_path / "tuned.toml"
-    code, _, err = cosim("tuning", "--out", path)
-    assert code == 0
-    assert str(path) in err.replace("\n", "")
-    scenario = Scenario.load("paper")
-    assert factories.from_file(scenario, path).parameters.hash == (
-        factories.tuned(scenario).parameters.hash
-    )

@@ -1,6 +1,5 @@
 import io
 import os
-import re
 import subprocess
 import sys
 
@@ -24,19 +23,6 @@ def printed(monkeypatch):
         return stream.getvalue()
 
     return text
-
-
-def test_a_file_gets_every_cell_whole(printed):
-    text = printed(terminal=False)
-    assert [cell for cell in (*HEADER, *ROW) if cell not in text] == []
-
-
-def test_numbers_are_never_broken_on_a_narrow_terminal(printed):
-    rows = [("actor-critic", *(f"{k}234.56 [1.23, 4.56]" for k in range(1, 8)))]
-    text = printed(True, "t", ("case", *(f"regret {k}" for k in range(7))), rows)
-    plain = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    assert max(map(len, plain.splitlines())) <= 60
-    assert all(cell in text for cell in rows[0])
 
 
 def test_brackets_are_text(printed):

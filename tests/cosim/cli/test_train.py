@@ -54,15 +54,6 @@ def test_the_same_command_and_seed_give_the_same_bytes(cosim, trained, tmp_path)
         assert (tmp_path / "again" / file).read_bytes() == (trained[0] / file).read_bytes()
 
 
-def test_training_starts_from_tuned_and_from_a_file(cosim, undrawn):
-    slow = (*SHORT, "--set", "prior_width=1e-3")
-    code, out, _ = cosim(*slow, "--start", "tuned", "--out", "one", "--json")
-    assert code == 0 and json.loads(out)["start"] == "tuned"
-    assert cosim(*slow, "--start", "one/parameters.toml", "--out", "two", "--json")[0] == 0
-    code, _, err = cosim(*SHORT, "--start", "none.toml", "--out", "three")
-    assert code == 2 and "does not exist" in err
-
-
 def test_explain_lists_every_hyperparameter(cosim):
     code, out, _ = cosim("train", "-a", "actor-critic", "--explain", "--json")
     assert code == 0

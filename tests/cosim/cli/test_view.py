@@ -19,12 +19,6 @@ def test_json_tells_properties_and_ranges(cosim, recording, paper):
     assert content["signals"]["P2"]["unit"] == "kPa"
 
 
-def test_the_cursor_needs_a_png(cosim, recording):
-    code, _, err = cosim("view", recording, "--at", 60)
-    assert code == 2
-    assert "--png" in err
-
-
 @pytest.mark.slow
 def test_png_draws_the_recording(cosim, recording, tmp_path):
     code, _, err = cosim("view", recording, "--png", "run.png", "--at", 600)

@@ -5,11 +5,7 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.figures import (
-    overlay_figure,
-    save,
-    trajectory_figure,
-)
+from cosim.figures import overlay_figure, save, trajectory_figure
 from cosim.figures.style import figure
 from cosim.figures.training import training_figure
 from tests.helpers.loop import Failing, Proportional
@@ -54,17 +50,6 @@ def test_an_overlay_shows_each_run_and_its_cost(trajectory):
     assert [J in text for text in legend] == [True, True, False]
 
 
-def test_runs_side_by_side_have_the_same_axes(trajectory, paper):
-    with FmuPlant(paper) as plant:
-        other = simulate(plant, Proportional(paper), 120, 1)
-    both = [
-        axes_by_label(trajectory_figure(run, paper, beside=[trajectory, other]))
-        for run in (trajectory, other)
-    ]
-    for name, axes in both[0].items():
-        assert axes.get_ylim() == pytest.approx(both[1][name].get_ylim(), rel=1e-9), name
-
-
 def test_a_trajectory_of_one_sample_draws(tmp_path, paper):
     with FmuPlant(paper) as plant:
         run = simulate(plant, Proportional(paper), 1, 0)
@@ -98,7 +83,6 @@ def test_the_users_settings_neither_matter_nor_change(tmp_path):
 
 
 SAMPLES = np.array([1000.0, 2000.0, 3000.0, 4000.0])
-UNKNOWN = np.full(4, np.nan)
 LOG = {
     "samples": SAMPLES,
     "J": np.array([300.0, 200.0, 150.0, 120.0]),
@@ -124,11 +108,3 @@ def test_costs_are_shown_as_regret_where_the_optimum_is_known():
     assert np.allclose(greedy.get_ydata(), [300.0, 50.0, 10.0])
     assert [line.get_ydata()[0] for line in axes.lines[2:]] == pytest.approx([100.0, 0.0])
     assert {text.get_text() for text in axes.texts} == {"training", "greedy", "naive", "optimal"}
-
-
-def test_what_was_not_measured_has_no_panel(tmp_path):
-    log = LOG | {"td_error": UNKNOWN, "greedy_J": UNKNOWN, "greedy_violating_share": UNKNOWN}
-    still = {"x_l": np.zeros((4, 2))}
-    figure = training_figure(log, still, {}, title="$t")
-    assert list(panels(figure)) == ["J per sample"]
-    assert save(figure, tmp_path / "a.png").stat().st_size > 5000

@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario
@@ -33,8 +32,3 @@ def foreign(paper):
     document["penalty"] = {"linear": [1.0], "quadratic": [1.0]}
     document["controller"] |= {"reference_state": [0.5], "reference_action": [0.0]}
     return Scenario.from_dict(document)
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(7)

@@ -1,13 +1,11 @@
 """What a recording holds, read back: runs, trainings, overlays; files of other kinds."""
 
 import hashlib
-from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rerun as rr
-from hypothesis import given
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
@@ -23,7 +21,7 @@ from cosim.recording import (
     summarise,
 )
 from cosim.recording.read import telling_moment
-from cosim.recording.stream import Channel, Stream, drawable
+from cosim.recording.stream import drawable
 from cosim.trajectory import Signal, read_csv
 from tests.helpers.blocks import random_block
 from tests.helpers.loop import Proportional
@@ -55,22 +53,6 @@ def test_signals_equal_the_csv_bit_for_bit(tmp_path, paper):
     assert np.array_equal(recording.time, csv.time)
 
 
-def test_times_are_those_of_the_loop_and_predictions_those_of_the_controller(
-    tmp_path, paper, rng, units
-):
-    blocks = [random_block(paper, rng, first, 700) for first in range(0, 4900, 700)]
-    recording = recorded(tmp_path / "run.rrd", paper, blocks, units, 4900)
-    for name in ("prepare_time", "feedback_time"):
-        expected = np.concatenate([block[name] for block in blocks])
-        assert recording.signals[name].tobytes() == expected.tobytes()
-    states = np.concatenate([block.predicted_states for block in blocks])
-    actions = np.concatenate([block.predicted_actions for block in blocks])
-    for i, name in enumerate(paper.plant.states):
-        assert np.array_equal(recording.signals[f"prediction/{name}"], states[:, :, i])
-    for i, name in enumerate(paper.plant.actions):
-        assert np.array_equal(recording.signals[f"prediction/{name}"], actions[:, :, i])
-
-
 def test_a_block_that_the_loop_overwrites_is_recorded_as_it_was(tmp_path, paper, rng):
     block = random_block(paper, rng)
     before = {name: np.array(values) for name, values in block.columns.items()}
@@ -99,14 +81,6 @@ def test_a_run_that_breaks_off_leaves_the_samples_it_made(tmp_path, paper):
     assert len(read_recording(tmp_path / "run.rrd").samples) == 500
 
 
-def test_properties_say_what_was_run(tmp_path, paper, rng):
-    properties = recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng)]).properties
-    assert properties["scenario_hash"] == paper.hash
-    assert properties["seed"] == "5"
-    assert properties["theta_hash"] == "0123456789abcdef"
-    assert properties["controller"] == "mine"
-
-
 def test_names_and_units_of_any_spelling_come_back(tmp_path, foreign, rng):
     block = random_block(foreign, rng)
     units = {"tank[1].level": "m³", "der(x)/dt": "∇"}
@@ -116,17 +90,6 @@ def test_names_and_units_of_any_spelling_come_back(tmp_path, foreign, rng):
     assert recording.units["tank[1].level"] == "m³"
     assert recording.units["der(x)/dt"] == "∇"
     assert drawable("X2 [kg/min] θ µ °C\n∇水") == "X2 [kg/min] θ µ °C\n??"
-
-
-def test_the_layout_comes_before_the_data(tmp_path, paper, rng):
-    recorded(tmp_path / "run.rrd", paper, [random_block(paper, rng)])
-    reader = RrdReader(tmp_path / "run.rrd")
-    (recording,) = reader.recordings()
-    layouts = reader.blueprints()
-    assert {layout.application_id for layout in layouts} == {recording.application_id}
-    content = (tmp_path / "run.rrd").read_bytes()
-    first = min(content.find(layout.recording_id.encode()) for layout in layouts)
-    assert 0 < first < content.find(recording.recording_id.encode())
 
 
 def test_the_file_is_whole_or_not_there(tmp_path, paper, rng):
@@ -141,29 +104,6 @@ def test_the_file_is_whole_or_not_there(tmp_path, paper, rng):
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     recorder.close()
     assert hashlib.sha256(path.read_bytes()).hexdigest() == digest
-
-
-def test_samples_are_sent_block_by_block(tmp_path, paper, monkeypatch):
-    """A call to Rerun takes 30 µs, whatever it sends: one a sample would double the step."""
-    sent = []
-    columns = Stream.columns
-    monkeypatch.setattr(
-        Stream,
-        "columns",
-        lambda self, entity, *rest: sent.append(entity) or columns(self, entity, *rest),
-    )
-    with FmuPlant(paper) as plant:
-        recorder = RerunRecorder(tmp_path / "run.rrd")
-        simulate(plant, Proportional(paper), 2000, 0, recorder=recorder)
-    assert max(Counter(sent).values()) == 4
-
-
-@given(st.lists(numbers, min_size=1), numbers, st.floats(1e-3, 1e6))
-def test_the_window_holds_all_values_seen(values, lower, width):
-    channel = Channel("x", "x", bounds=(lower, lower + width)).see(np.array(values))
-    low, high = channel.window()
-    assert low < min(values)
-    assert max(values) < high
 
 
 def test_a_training_comes_back_as_its_log_and_the_change_of_each_block(tmp_path, rng):
@@ -213,17 +153,6 @@ def test_the_summary_has_units_and_ranges(tmp_path, paper, rng, units):
         "maximum": block["states"][:, 0].max(),
     }
     assert summary["signals"]["residual"]["minimum"] is None
-
-
-@pytest.mark.parametrize(("violation", "sample"), [(0.0, 9), (1e-9, 9), (0.5, 4)])
-def test_a_run_is_shown_at_its_worst_violation_or_at_its_end(
-    tmp_path, paper, rng, violation, sample
-):
-    block = random_block(paper, rng)
-    block["violation"][:] = 0.0
-    block["violation"][4] = violation
-    recorded(tmp_path / "run.rrd", paper, [block])
-    assert telling_moment(tmp_path / "run.rrd") == pytest.approx(sample * paper.sampling_time)
 
 
 def _text(path):

@@ -81,14 +81,6 @@ def test_without_a_graphics_driver_the_message_says_what_to_install(
     assert not (tmp_path / "a.png").exists()
 
 
-def test_without_a_display_the_message_says_how_to_draw(recording, monkeypatch):
-    monkeypatch.setattr(viewer.sys, "platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(RecordingError, match=r"no display .*--png"):
-        open_viewer(recording)
-
-
 @contextmanager
 def no_process(command, **_):
     """In place of a viewer that is started."""

@@ -29,7 +29,7 @@ CASES = [
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    return run_toy(folder, case=CASES, scenarios=["paper", "fast-sampling"])
+    return run_toy(folder, case=CASES)
 
 
 @pytest.fixture(scope="module")
@@ -57,14 +57,9 @@ def test_the_page_holds_every_row_figure_and_definition(results, page):
 
 def test_a_study_of_baselines_alone_draws_no_course_of_learning(tmp_path):
     baselines = [{**case, "group": "baselines"} for case in CASES[:1]]
-    drawn = run_toy(tmp_path, case=baselines).draw(tmp_path)
+    drawn = run_toy(tmp_path, case=baselines, training_seeds={"count": 1}).draw(tmp_path)
     assert [name for name in drawn["paper"] if name.startswith("curves")] == []
     assert [name for name in drawn["paper"] if name.startswith("regret")] != []
-
-
-def test_the_markdown_has_the_same_tables(results, page):
-    text = (results.folder / "report.md").read_text("utf-8")
-    assert all(results.table(scenario) in text for scenario in results.scenarios)
 
 
 @pytest.mark.slow
@@ -75,7 +70,7 @@ def test_the_report_repeats_its_bytes(results, page, tmp_path):
 
 def test_tables_are_read_and_written_to_the_same_bytes(results):
     again = StudyResults.load(results.folder)
-    for name in ("runs", "evaluation", "curves", "summary", "aggregate"):
+    for name in ("runs", "evaluation", "curves", "summary"):
         written = (results.folder / f"{name}.csv").read_text()
         assert to_csv(getattr(again, name)) == written, name
 
@@ -118,12 +113,6 @@ def test_the_worst_is_of_all_runs_and_the_interval_encloses_the_middle(results):
         if len(regrets) > 1:
             assert row.regret_iqm_low <= row.regret_iqm <= row.regret_iqm_high
             assert row.regret_median == pytest.approx(sum(regrets) / 2, rel=1e-9)
-
-
-def test_cases_are_compared_over_all_scenarios(results):
-    found = results.aggregate.set_index("case")
-    assert found.runs["grow(rate=45.0)"] == 4
-    assert found.regret_iqm["optimal"] == 0.0
 
 
 def test_an_unfinished_study_is_reported_with_what_it_has(results, tmp_path, monkeypatch):

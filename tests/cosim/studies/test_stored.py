@@ -8,11 +8,7 @@ from typer.testing import CliRunner
 
 from cosim.cli.main import app
 from cosim.studies.store import read_table
-from cosim.studies.stored import (
-    differences,
-    load_tolerances,
-    stored_studies,
-)
+from cosim.studies.stored import differences, load_tolerances, stored_studies
 
 STORED = Path(__file__).parents[3] / "results"
 MINIMAL = """\

@@ -177,7 +177,12 @@ def test_a_mistake_is_refused_before_any_work(changes, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "damage"),
-    [("learning.csv", "torn"), ("parameters.toml", "edited"), ("evaluation.csv", "gone")],
+    [
+        ("learning.csv", "torn"),
+        ("parameters.toml", "edited"),
+        ("evaluation.csv", "gone"),
+        ("run.json", "torn"),
+    ],
 )
 def test_a_finished_run_s_damaged_file_is_named_and_made_again(whole, tmp_path, name, damage):
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
@@ -190,17 +195,8 @@ def test_a_finished_run_s_damaged_file_is_named_and_made_again(whole, tmp_path, 
     lines = []
     run_toy(tmp_path, report=lambda _, line: lines.append(line))
     assert any(str(path) in line for line in lines)
-    assert path.read_bytes() == content
-    assert contents(tmp_path) == contents(whole)
-
-
-def test_a_torn_run_json_is_named_and_the_run_made_again(whole, tmp_path):
-    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
-    path = tmp_path / "runs" / "paper" / "naive" / "run.json"
-    path.write_text("{")
-    lines = []
-    run_toy(tmp_path, report=lambda _, line: lines.append(line))
-    assert any(str(path) in line for line in lines)
+    # run.json holds how long the run took.
+    assert name == "run.json" or path.read_bytes() == content
     assert contents(tmp_path) == contents(whole)
 
 

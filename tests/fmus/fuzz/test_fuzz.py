@@ -1,7 +1,5 @@
 """Both faces of every plant under AddressSanitizer and UBSan: random calls in random order."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

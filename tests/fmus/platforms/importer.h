@@ -99,19 +99,30 @@ static int step(double time, double size) {
     return FMI3(DoStep)(instance, time, size, true, &event, &end, &early, &last);
 }
 
+/* How many values FMI 3.0 gives for a reference: 1, an array's length, or 0 for its further elements; found by trying. */
+static size_t count_of(unsigned vr) {
+    static size_t counts[N_VARIABLES]; /* one more than the count */
+    double values[N_VARIABLES];
+    if (counts[vr]) return counts[vr] - 1;
+    for (counts[vr] = 2; counts[vr] <= N_VARIABLES; counts[vr]++)
+        if (FMI3(GetFloat64)(instance, &vr, 1, values, counts[vr] - 1) == fmi3OK)
+            return counts[vr] - 1;
+    counts[vr] = 1;
+    return 0;
+}
+
 static uint64_t hash_outputs(uint64_t hash) {
     for (unsigned vr = 0; vr < N_VARIABLES; vr++) {
         const VariableKind kind = VARIABLES[vr].kind;
-        double value;
-        unsigned char byte[sizeof value];
+        double values[N_VARIABLES];
+        size_t count = 1;
         if (kind != STATE && kind != DERIVATIVE && kind != OUTPUT) continue;
         if (version == 2)
-            CHECK(FMI2(GetReal)(instance, &vr, 1, &value) == fmi2OK);
-        else
-            CHECK(FMI3(GetFloat64)(instance, &vr, 1, &value, 1) == fmi3OK);
-        memcpy(byte, &value, sizeof value);
-        for (size_t i = 0; i < sizeof value; i++)
-            hash = (hash ^ byte[i]) * UINT64_C(1099511628211);
+            CHECK(FMI2(GetReal)(instance, &vr, 1, values) == fmi2OK);
+        else if ((count = count_of(vr)) > 0)
+            CHECK(FMI3(GetFloat64)(instance, &vr, 1, values, count) == fmi3OK);
+        for (size_t i = 0; i < count * sizeof *values; i++)
+            hash = (hash ^ ((const unsigned char *)values)[i]) * UINT64_C(1099511628211);
     }
     return hash;
 }

@@ -1,7 +1,5 @@
 """A sampled system of a few lines: y = gain·u + the sum of the inputs of earlier samples."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Instances in every state of the standards' state machines, and the check of one call there."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Access to variables: what is refused, with which status and message, and that nothing changes."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -45,12 +43,6 @@ def test_a_saturating_input_acts_at_its_bound(open_fmu, version: int, value, act
     plain.initialise().set(P100=acting)
     assert saturating.get("P100") == [acting]
     assert saturating.run(2) == plain.run(2)
-
-
-def test_a_saturating_plant_refuses_parameters_out_of_range_and_no_numbers(refused, plant) -> None:
-    plant.initialise(saturate=True)
-    assert refused(plant, lambda: plant.set(M=0.0))[0] == DISCARD
-    assert refused(plant, lambda: plant.set(P100=math.nan))[0] == ERROR
 
 
 @pytest.mark.parametrize("name", REAL_SETTABLE)

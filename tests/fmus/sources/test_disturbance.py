@@ -48,17 +48,6 @@ def test_override_takes_the_given_disturbances_even_when_stochastic(plant) -> No
     assert plant.get("X1") == [4.0]
 
 
-def test_override_of_the_recorded_disturbances_repeats_the_trajectory(open_fmu, version) -> None:
-    recorded = open_fmu(version).initialise(seed=9)
-    replayed = open_fmu(version).initialise(override=True, seed=1)
-    for k in range(20):
-        given = dict(zip((f"{n}_in" for n in NAMES), recorded.get(*NAMES), strict=True))
-        replayed.set(**given)
-        recorded.step(60.0 * k, 60.0)
-        replayed.step(60.0 * k, 60.0)
-        assert recorded.get("X2", "P2") == replayed.get("X2", "P2")
-
-
 def test_draws_are_held_and_right_continuous(plant) -> None:
     plant.initialise(seed=6)
     first = plant.get("X1")

@@ -1,21 +1,16 @@
 """The elementary functions against 50 digits of `decimal`."""
 
-from __future__ import annotations
-
 import ctypes
 import math
-import os
-import shutil
 from decimal import Decimal, getcontext, localcontext
 
 import numpy as np
 import pytest
 
 from fmus.build import SOURCES, local_compiler
+from tests.helpers.compiler import needs_compiler
 
-pytestmark = pytest.mark.skipif(
-    shutil.which(os.environ.get("CC", "cc")) is None, reason="there is no C compiler"
-)
+pytestmark = needs_compiler
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494")
 WRAPPER = b"""
 #include "elementary.h"

@@ -1,7 +1,5 @@
 """Model exchange: time events, states and derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
@@ -63,14 +61,6 @@ def test_override_switched_off_at_an_event_draws_the_current_sample(open_fmu, ve
     assert model.start_continuous_time() == 180.0
     expected = open_fmu(version).initialise(start=130.0, seed=8).get("X1")
     assert model.get("X1") == expected
-
-
-def test_states_are_readable_nominal_and_settable_by_reference(model) -> None:
-    model.initialise(X2_start=30.0)
-    model.start_continuous_time()
-    suffix = "Real" if model.version == 2 else "Float64"
-    getattr(model.fmu, f"set{suffix}")([1, 2], [26.0, 51.0])
-    assert model.get("X2", "P2") == [26.0, 51.0]
 
 
 def test_trial_times_past_the_stop_time_pass_but_steps_do_not(model) -> None:

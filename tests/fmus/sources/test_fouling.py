@@ -1,9 +1,6 @@
 """The law by which the condenser fouls and is cleaned."""
 
-from __future__ import annotations
-
 import numpy as np
-import pytest
 
 DAY = 86400.0
 ON = {"fouling_rate": 0.3, "fouling_floor": 0.7, "cleaning_period": 6.0}
@@ -31,13 +28,6 @@ def test_follows_the_law_over_three_cleanings(plant) -> None:
     values = run(plant, 220)
     np.testing.assert_allclose(values, law(np.arange(221), FAST), rtol=1e-14)
     assert np.flatnonzero(np.diff(values) > 0).tolist() == [71, 143, 215]
-
-
-def test_loses_a_quarter_in_six_days(plant) -> None:
-    plant.initialise(start=6 * DAY - 60.0, **ON)
-    assert plant.get("UA2_present")[0] / 6.84 == pytest.approx(0.75, abs=1e-3)
-    plant.step(6 * DAY - 60.0, 60.0)
-    assert plant.get("UA2_present") == [6.84]
 
 
 def test_every_cleaning_is_seen_where_the_period_is_not_a_binary_number(plant) -> None:
@@ -83,15 +73,6 @@ def test_model_exchange_changes_it_at_time_events_alone(open_fmu, version: int) 
         plant.step(60.0 * k, 60.0)
     model.start_continuous_time()
     assert model.get("UA2_present") == plant.get("UA2_present")
-
-
-def test_parameters_act_at_once(plant) -> None:
-    plant.initialise(start=3 * DAY, stochastic=False)
-    before = plant.get("der(P2)")[0]
-    plant.set(**ON)
-    assert plant.get("der(P2)")[0] > before
-    plant.set(fouling_rate=0.0)
-    assert plant.get("der(P2)", "UA2_present") == [before, 6.84]
 
 
 def test_derivatives_in_all_that_the_law_names(plant) -> None:

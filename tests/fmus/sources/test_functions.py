@@ -1,7 +1,5 @@
 """Which function is allowed in which state, what is not offered; making an instance, and reset."""
 
-from __future__ import annotations
-
 from ctypes import byref, c_bool, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 
 import pytest
@@ -126,19 +124,8 @@ def test_each_function_is_allowed_in_its_states_alone(complaint, state, fmi: int
     ("function", "arguments"),
     [
         ("EnterConfigurationMode", ()),
-        ("ExitConfigurationMode", ()),
-        ("EnterStepMode", ()),
         ("GetNumberOfVariableDependencies", (1, byref(c_size_t()))),
-        ("GetVariableDependencies", (1, None, None, None, None, zero)),
-        ("GetOutputDerivatives", (none, zero, None, None, zero)),
         ("ActivateModelPartition", (1, moment)),
-        ("GetIntervalDecimal", (none, zero, None, None)),
-        ("GetIntervalFraction", (none, zero, None, None, None)),
-        ("GetShiftDecimal", (none, zero, None)),
-        ("GetShiftFraction", (none, zero, None, None)),
-        ("SetIntervalDecimal", (none, zero, None)),
-        ("SetIntervalFraction", (none, zero, None, None)),
-        ("SetShiftDecimal", (none, zero, None)),
         ("SetShiftFraction", (none, zero, None, None)),
     ],
 )
@@ -152,12 +139,6 @@ def test_what_is_not_offered_is_refused_with_a_message(open_fmu, function, argum
     assert call(None, *arguments) == ERROR
 
 
-def test_time_is_a_variable(open_fmu) -> None:
-    instance = open_fmu(3).initialise(start=30.0)
-    instance.step(30.0, 60.0)
-    assert instance.get("time") == [90.0]
-
-
 def test_seed_survives_all_64_bits(open_fmu) -> None:
     instance = open_fmu(3)
     for seed in (0, 2**32, 2**64 - 1):
@@ -169,14 +150,6 @@ def test_seed_survives_all_64_bits(open_fmu) -> None:
         )
         assert (status, value[0]) == (0, seed)
         instance.fmu.reset()
-
-
-def test_last_successful_time(open_fmu) -> None:
-    instance = open_fmu(2).initialise()
-    instance.step(0.0, 90.0)
-    time = c_double()
-    instance.fmu.dll.fmi2GetRealStatus(instance.handle, 2, byref(time))
-    assert time.value == 90.0
 
 
 def test_null_instance_is_an_error_without_a_crash(plant) -> None:

@@ -1,7 +1,5 @@
 """The co-simulation step: its arguments, the stop time, and instances beside each other."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -42,28 +40,6 @@ def test_step_of_too_many_integration_steps_is_discarded_at_once(refused, plant)
     assert status == DISCARD
     assert "integration steps" in text
     plant.step(0.0, 86400.0)
-
-
-def test_instances_do_not_touch_each_other(open_fmu, version: int) -> None:
-    alone = open_fmu(version).initialise(seed=1).run(10)
-    first, second = open_fmu(version).initialise(seed=1), open_fmu(version).initialise(seed=2)
-    rows = [first.run(0)[0]]
-    for k in range(10):
-        first.step(60.0 * k, 60.0)
-        second.step(60.0 * k, 60.0)
-        rows += first.run(0)
-    assert rows == alone
-
-
-def test_inputs_act_from_the_communication_point_on(plant) -> None:
-    plant.initialise(stochastic=False)
-    cost = plant.get("economic_cost")[0]
-    states = plant.get("X2", "P2")
-    plant.set(P100=250.0)
-    assert plant.get("X2", "P2") == states
-    assert plant.get("economic_cost")[0] > cost
-    plant.step(0.0, 60.0)
-    assert plant.get("X2")[0] > states[0]
 
 
 def test_parameters_that_make_the_integration_diverge_are_an_error(refused, plant) -> None:

@@ -7,8 +7,6 @@ import sys
 import numpy as np
 import pytest
 
-ERROR = 3
-
 
 def stepped(plant, steps: int = 7, **values: float):
     plant.initialise(**values)
@@ -71,16 +69,6 @@ def test_flipped_bit_in_a_serialised_state_is_an_error(refused, plant, position:
     plant.free(plant.deserialise(bytes(data)))
 
 
-def test_state_of_one_fmi_version_continues_in_the_other(open_fmu) -> None:
-    two, three = stepped(open_fmu(2), seed=4), open_fmu(3)
-    state = two.save()
-    copy = three.deserialise(two.serialise(state))
-    three.restore(copy)
-    assert three.run(10, start=420.0) == two.run(10, start=420.0)
-    two.free(state)
-    three.free(copy)
-
-
 STATES = ("X2", "P2")
 
 
@@ -120,20 +108,3 @@ def test_accumulated_clock_draws_the_same_disturbances(open_fmu, version: int) -
         time += 0.1
     assert time != 3600.0
     np.testing.assert_allclose(plant.get(*STATES), exact.get(*STATES), rtol=1e-9)
-
-
-def test_grid_starts_at_time_zero_whatever_the_start_time(open_fmu, version: int) -> None:
-    from_zero = open_fmu(version).initialise(seed=3)
-    from_zero.step(0.0, 120.0)
-    from_thirty = open_fmu(version).initialise(start=90.0, seed=3)
-    from_thirty.step(90.0, 30.0)
-    assert from_zero.get("X1") == from_thirty.get("X1")
-
-
-def test_sampling_time_that_no_second_divides(open_fmu, version: int) -> None:
-    sampling_time = 100.0 / 7.0
-    whole = run(open_fmu(version), [0.0, 700.0], sampling_time=sampling_time)
-    split = run(
-        open_fmu(version), [k * sampling_time for k in range(50)], sampling_time=sampling_time
-    )
-    assert split == whole

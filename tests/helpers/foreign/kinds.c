@@ -1,6 +1,7 @@
 /* A foreign FMU of many kinds, FMI 2.0 or 3.0 by VERSION: x' = u - x, one Euler step each doStep.
    Real variables 0 to 4 are u, x, cost, x_start, range; 5 (FMI 3.0) is an array of three. Integers are
-   seed and fault: 0 and 1 in FMI 2.0, whose references count anew for each type, 20 and 21 in 3.0.
+   seed, fault and level: 0 to 2 in FMI 2.0, whose references count anew for each type, 20 to 22 in 3.0.
+   The level, the array's second element and single 30, a Float32, act as u does, all added.
    A fault makes doStep misbehave. Functions that are not here are added as stubs that refuse. */
 #include <signal.h>
 #include <stdbool.h>
@@ -14,14 +15,21 @@
 
 typedef struct {
     double real[8];
-    int64_t integer[2];
+    int64_t integer[3];
+    float single;
 } Model;
 
-enum { U, X, COST, X_START, RANGE, SEED = 0, FAULT = 1 };
+enum { U, X, COST, X_START, RANGE, PROFILE, SEED = 0, FAULT = 1, LEVEL = 2 };
+
+static double input(const Model *m) {
+    return m->real[U] + m->real[PROFILE + 1] + (double)m->integer[LEVEL] + m->single;
+}
 
 static void set_defaults(Model *m) {
     memset(m, 0, sizeof *m);
     m->real[X_START] = 1.0;
+    m->real[PROFILE] = 0.25;
+    m->real[PROFILE + 2] = 0.75;
 }
 
 static int step(Model *m, double h) {
@@ -36,11 +44,11 @@ static int step(Model *m, double h) {
         case 12: for (;;) sleep(1);
         default: break;
     }
-    m->real[X] += h * (m->real[U] - m->real[X]) + m->real[RANGE] * (double)m->integer[SEED];
+    m->real[X] += h * (input(m) - m->real[X]) + m->real[RANGE] * (double)m->integer[SEED];
     return 0;
 }
 
-static void refresh(Model *m) { m->real[COST] = m->real[U] * m->real[U]; }
+static void refresh(Model *m) { m->real[COST] = input(m) * input(m); }
 
 #if VERSION == 2
 #include "fmi2FunctionTypes.h"
@@ -124,6 +132,13 @@ fmi3Status fmi3GetInt32(Model *m, const fmi3ValueReference vr[], size_t n, fmi3I
                         size_t nv) {
     for (size_t i = 0; i < n; i++) v[i] = (fmi3Int32)m->integer[vr[i] - 20];
     return fmi3OK;
+}
+fmi3Status fmi3SetFloat32(Model *m, const fmi3ValueReference vr[], size_t n, const float v[],
+                          size_t nv) {
+    return m->single = v[0], n == 1 && nv == 1 && vr[0] == 30 ? fmi3OK : fmi3Error;
+}
+fmi3Status fmi3GetFloat32(Model *m, const fmi3ValueReference vr[], size_t n, float v[], size_t nv) {
+    return v[0] = m->single, n == 1 && nv == 1 && vr[0] == 30 ? fmi3OK : fmi3Error;
 }
 fmi3Status fmi3DoStep(fmi3Instance c, double t, double h, bool b, bool *event, bool *end,
                       bool *early, double *last) {

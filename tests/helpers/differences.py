@@ -37,12 +37,16 @@ def activity(solution: RtiSolution) -> bytes:
 
 
 def value_error(solution: RtiSolution) -> float:
-    """Rounding, and what the slack's slope w makes of rows not quite at their limit."""
-    qp, v = solution.qp, solution.multipliers.v
-    _, at_limit, _ = solution.multipliers.active(qp)
+    """Rounding, and what the slope of the cost makes of limits that v does not quite meet.
+
+    The slope is w at a row, by the slack, and |ν| at a bound or an enforced action.
+    """
+    qp, v, nu = solution.qp, solution.multipliers.v, solution.multipliers.nu
+    held, at_limit, _ = solution.multipliers.active(qp)
+    gap = np.minimum(np.abs(v - qp.lower), np.abs(v - qp.upper))
     slack = np.maximum(np.maximum(qp.row_lower - qp.rows @ v, qp.rows @ v - qp.row_upper), 0.0)
     rounding = 64 * np.finfo(float).eps * abs(solution.value)
-    return rounding + float((qp.w * slack)[at_limit].sum())
+    return rounding + float((qp.w * slack)[at_limit].sum() + (np.abs(nu) * gap)[held].sum())
 
 
 def derivative(

@@ -17,7 +17,7 @@ import numpy as np
 
 from controllers.errors import ControllerError
 from cosim.files import cache_folder, lock, temporary_folder
-from cosim.processes import run_child
+from cosim.processes import child_process
 from cosim.protocols import Vector
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
@@ -170,8 +170,9 @@ def _compile(command: Sequence[str], files: Mapping[str, bytes], path: Path) -> 
         with temporary_folder(".partial-", path.parent) as folder:
             for name, content in files.items():
                 (folder / name).write_bytes(content)
-            if run_child(command, timeout=PATIENCE, folder=folder, log=subprocess.DEVNULL):
-                raise OSError("the compiler failed")
+            with child_process(command, folder=folder, log=subprocess.DEVNULL) as compiler:
+                if compiler.wait(PATIENCE):
+                    raise OSError("the compiler failed")
             (folder / "library").replace(path)
 
 

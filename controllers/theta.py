@@ -8,18 +8,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
 import tomli_w
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from controllers.errors import ModelError, ParameterError
 from controllers.problem import Problem
 from cosim.files import read_toml, write_atomically
 from cosim.protocols import Vector
+from cosim.scenario import Names, Table
 from cosim.text_tables import Shown
+from cosim.validation import validated
 
 
 @cache
@@ -193,8 +196,13 @@ class ThetaBlocks:
         return cls(tuple(blocks))
 
 
-SCHEMA = 1
-KEYS = ("schema", "hash", "theta", "model_parameters")
+class _File(Table):
+    """A parameters file."""
+
+    schema_version: Annotated[Literal[1], Field(alias="schema")]
+    hash: str | None = None
+    theta: dict[str, Any]
+    model_parameters: Names = ()
 
 
 @dataclass(frozen=True, repr=False)
@@ -299,7 +307,7 @@ class Parameters(Shown):
     def to_toml(self) -> str:
         """θ as TOML with schema version and hash."""
         values = {block.name: self[block.name].tolist() for block in self.blocks}
-        document: dict[str, Any] = {"schema": SCHEMA, "hash": self.hash, "theta": values}
+        document: dict[str, Any] = {"schema": 1, "hash": self.hash, "theta": values}
         if "p" in self.blocks:
             document["model_parameters"] = list(self.blocks.block("p").labels)
         return tomli_w.dumps(document)
@@ -316,26 +324,11 @@ class Parameters(Shown):
         adds a key or a block, or where its values do not match its hash.
         """
         document = read_toml(path, f"parameters file '{path}'", ParameterError)
-        if document.get("schema") != SCHEMA:
-            raise ParameterError(
-                f"{path}: schema is {document.get('schema')!r}; this version reads schema = "
-                f"{SCHEMA}"
-            )
-        if unknown := [repr(key) for key in document if key not in KEYS]:
-            raise ParameterError(
-                f"{path}: not known: {', '.join(unknown)}; a parameters file holds "
-                f"{', '.join(KEYS)}"
-            )
-        values, names = document.get("theta"), document.get("model_parameters", [])
-        if not isinstance(values, dict):
-            raise ParameterError(f"{path}: there is no table [theta]")
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ParameterError(f"{path}: model_parameters must be a list of names")
+        file = validated(_File, document, f"parameters file '{path}'", ParameterError)
+        values, names = file.theta, file.model_parameters
         slack_weights = "w_sigma" in values or "W_sigma" in values
         try:
-            blocks = ThetaBlocks.of(
-                problem, slack_weights=slack_weights, model_parameters=tuple(names)
-            )
+            blocks = ThetaBlocks.of(problem, slack_weights=slack_weights, model_parameters=names)
             missing = [name for name in blocks.slices if name not in values]
             unknown = [name for name in values if name not in blocks]
             if missing or unknown:
@@ -346,10 +339,10 @@ class Parameters(Shown):
             parameters = cls(blocks, np.zeros(blocks.size)).replace(values)
         except (ModelError, ParameterError) as error:
             raise ParameterError(f"{path}: {error}") from error
-        if document.get("hash", parameters.hash) != parameters.hash:
+        if file.hash not in (None, parameters.hash):
             raise ParameterError(
                 f"{path}: the values have hash {parameters.hash}, the file says "
-                f"{document['hash']}; delete its line `hash` if the values were edited on purpose"
+                f"{file.hash}; delete its line `hash` if the values were edited on purpose"
             )
         return parameters
 

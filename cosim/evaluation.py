@@ -24,7 +24,8 @@ from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret,
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, check_folders
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING, to_csv
-from cosim.text_tables import Shown
+from cosim.text_tables import Result, markdown_table
+from cosim.validation import known_keywords
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,6 +43,7 @@ COLUMNS = [
 ]  # fmt: skip
 
 
+@known_keywords
 def evaluate(
     scenario: Scenario | str | Path,
     controllers: Mapping[str, Factory | str] | Sequence[str],
@@ -179,7 +181,7 @@ def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Evaluation(Shown):
+class Evaluation(Result):
     """Indicators of controllers × seeds on common random numbers.
 
     `columns` and `timing` hold, by controller, what was measured: a frame with a row for each
@@ -199,9 +201,6 @@ class Evaluation(Shown):
             known["J*"] = float(self.optimal.mean())
         facts = {name: self.facts[name] for name in ("scenario", "steps")}
         return facts | {"seeds": len(self.seeds)} | known
-
-    def _picture(self) -> Figure | None:
-        return self.figure()
 
     @property
     def optimum(self) -> str | None:
@@ -265,11 +264,12 @@ class Evaluation(Shown):
             optimal=None if self.optimum is None else self.optimal,
         )
 
-    def plot(self, path: str | Path) -> Path:
-        """Draw `figure` to a PNG or SVG file; raises FigureError where it cannot be written."""
-        from cosim.figures.style import save  # noqa: PLC0415 - matplotlib
-
-        return save(self.figure(), path)
+    def table(self) -> str:
+        """Means over the seeds by controller, as a Markdown table; a regret of 1 is 100 %."""
+        names = ["J", "regret", "economic_cost", "violating_share", "failures"]
+        means = self.to_pandas().groupby("controller", sort=False)[names].mean()
+        rows = [[str(row[0]), *(f"{value:.6g}" for value in row[1:])] for row in means.itertuples()]
+        return markdown_table(("controller", *names), rows)
 
     def write(self, folder: Path) -> None:
         """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""

@@ -185,21 +185,6 @@ def _end(child: subprocess.Popen[bytes]) -> None:
     child.wait()
 
 
-def run_child(
-    command: Sequence[str],
-    *,
-    timeout: float,
-    folder: Path | None = None,
-    log: IO[bytes] | int | None = None,
-) -> int:
-    """Exit code of a command that is run as `child_process` does.
-
-    Raises subprocess.TimeoutExpired after `timeout` seconds, and OSError.
-    """
-    with child_process(command, folder=folder, log=log) as child:
-        return child.wait(timeout)
-
-
 LOCK = ".cosim.lock"
 HOLDER = ".cosim.lock.holder"
 _held: dict[Path, filelock.BaseFileLock] = {}

@@ -20,7 +20,7 @@ from cosim.files import replacing, write_atomically
 from cosim.penalty import VIOLATING
 from cosim.protocols import Array, Solution, Step
 from cosim.scenario import Scenario
-from cosim.text_tables import Shown, csv_text
+from cosim.text_tables import Result, csv_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -209,7 +209,7 @@ class Signal:
 
 
 @dataclass(frozen=True, repr=False)
-class Trajectory(Shown):
+class Trajectory(Result):
     """The K samples of a closed-loop run on a scenario.
 
     Signals, each (K,): `time` [s]; the scenario's states, actions and disturbances under their
@@ -258,9 +258,6 @@ class Trajectory(Shown):
         names = ("samples", "J", "economic_cost", "violating_share", "failures")
         about = {"scenario": self.scenario.name, "controller": self.controller, "seed": self.seed}
         return about | {name: found[name] for name in names}
-
-    def _picture(self) -> Figure | None:
-        return self.figure()
 
     def to_pandas(self) -> Any:
         """The signals as a pandas data frame, a row for each sample, a column for each signal."""

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from itertools import islice
 from math import inf, isfinite, isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,8 +30,8 @@ from cosim.protocols import Array, Controller, Plant, Vector, functions_of
 from cosim.scenario import Scenario
 from cosim.simulation import indicators_of, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
-from cosim.text_tables import Shown, csv_text
-from cosim.validation import suggestion
+from cosim.text_tables import Result, csv_text
+from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up
@@ -113,17 +113,9 @@ class TrainingRun:
         return back_off(starting_parameters(problem, self.configuration, "tuned"), self.scenario)
 
 
-class Options(TypedDict, total=False):
-    """The fields of `TrainingRun` that `train` takes as further keywords."""
-
-    controller: str
-    log_every: int
-    evaluate_every: int
-    checkpoint_every: int
-    evaluation_seeds: int
-    evaluation_steps: int
-    divergence: float
-    rest_after: int | None
+OPTIONS = {one.name for one in fields(TrainingRun)} - {"algorithm", "configuration"}
+OPTIONS -= {"samples", "scenario"}
+"""Fields of `TrainingRun` that are options of `train` and of the command by their own names."""
 
 
 def prepare(
@@ -138,10 +130,9 @@ def prepare(
     Raises AlgorithmLookupError; ConfigurationError on settings or options that make no run.
     """
     found = load_algorithm(algorithm)
-    known = [option.name for option in fields(TrainingRun)]
     for name in options:
-        if name not in known:
-            raise ConfigurationError(f"training has no option '{name}'{suggestion(name, known)}")
+        if name not in OPTIONS:
+            raise ConfigurationError(f"training has no option '{name}'{suggestion(name, OPTIONS)}")
     if not isinstance(settings, Configuration):
         settings = found.Configuration.from_dict(dict(settings or {}))
     return TrainingRun(
@@ -375,7 +366,7 @@ class Judge:
 
 
 @dataclass(frozen=True, repr=False)
-class Training(Shown):
+class Training(Result):
     """A training that has ended.
 
     `parameters` are θ as the run hands it over, `rows` its log. `evaluation` is the greedy policy
@@ -413,9 +404,6 @@ class Training(Shown):
             "regret": self.regret,
         }
 
-    def _picture(self) -> Figure | None:
-        return self.figure() if self.rows else None
-
     def to_pandas(self) -> Any:
         """The training's log as a pandas data frame."""
         import pandas as pd  # noqa: PLC0415 - half a second
@@ -439,8 +427,7 @@ class Training(Shown):
 
     def log(self) -> dict[str, Array]:
         """The columns of the training's log, (K,) each, NaN where not measured."""
-        rows = self.rows
-        return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+        return {name: np.array([row[name] for row in self.rows]) for name in self.rows[0]}
 
     def theta(self) -> dict[str, Array]:
         """Increments of θ since the start by block, (K, entries) each."""
@@ -448,11 +435,9 @@ class Training(Shown):
         return {name: moved[:, where] for name, where in self.parameters.blocks.slices.items()}
 
     def figure(self) -> Figure:
-        """Cost, violations, TD error and θ over the samples; LearningError without a log."""
+        """Cost, violations, TD error and θ over the samples."""
         from cosim.figures.training import training_figure  # noqa: PLC0415 - matplotlib
 
-        if not self.rows:
-            raise ConfigurationError("this training's log has no row: there is nothing to draw")
         blocks, run = self.parameters.blocks, self.run
         scale = {name: blocks.scale[where] for name, where in blocks.slices.items()}
         greedy, end = shown(self.J, digits=6), self.status.partition(":")[0]
@@ -465,12 +450,6 @@ class Training(Shown):
             f"{Path(run.start).stem}, seed {run.seed}: {end}, J = {greedy}",
         )
 
-    def plot(self, path: str | Path) -> Path:
-        """Draw `figure` to a PNG or SVG file; raises FigureError where it cannot be written."""
-        from cosim.figures.style import save  # noqa: PLC0415 - matplotlib
-
-        return save(self.figure(), path)
-
     def save(self, folder: str | Path) -> Path:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""
         folder = Path(folder)
@@ -478,14 +457,13 @@ class Training(Shown):
         write_atomically(folder / LOG, to_csv(self.rows))
         self.parameters.save(folder / PARAMETERS)
         write_atomically(folder / "scenario.toml", self.run.scenario.to_toml())
-        if self.rows:
-            self.plot(folder / FIGURE)
+        self.plot(folder / FIGURE)
         return folder
 
     def summary(self) -> dict[str, Any]:
         """The training as a JSON document: settings, the greedy policy's figures, how it ended."""
         run = self.run
-        last: Mapping[str, float] = self.rows[-1] if self.rows else {}
+        last = self.rows[-1]
         return {
             "version": version("rti-cosim"),
             "algorithm": run.algorithm,
@@ -494,7 +472,7 @@ class Training(Shown):
             "scenario_hash": run.scenario.hash,
             "controller": run.controller,
             "start": run.start,
-            "samples": int(last.get("samples", 0)),
+            "samples": int(last["samples"]),
             "plant_samples": self.plant_samples,
             "seed": run.seed,
             "status": self.status,
@@ -503,26 +481,34 @@ class Training(Shown):
             "evaluation_seeds": run.evaluation_seeds,
             "evaluation_steps": run.evaluation_steps,
             **self.evaluation,
-            "smallest_eigenvalue": last.get("smallest_eigenvalue"),
-            "td_error": last.get("td_error"),
-            "training_failures": last.get("failures"),
-            "weakly_active": last.get("weakly_active"),
-            "licq_failed": last.get("licq_failed"),
+            "smallest_eigenvalue": last["smallest_eigenvalue"],
+            "td_error": last["td_error"],
+            "training_failures": last["failures"],
+            "weakly_active": last["weakly_active"],
+            "licq_failed": last["licq_failed"],
         }
 
 
+@known_keywords
 def train(
     algorithm: str,
     scenario: Scenario | str | Path = "paper",
     samples: int | None = None,
     *,
     seed: int = 0,
-    start: str | Path = "naive",
+    start: str | Path = TrainingRun.start,
     settings: Mapping[str, Any] | Configuration | None = None,
+    controller: str = TrainingRun.controller,
+    log_every: int = TrainingRun.log_every,
+    evaluate_every: int = TrainingRun.evaluate_every,
+    checkpoint_every: int = TrainingRun.checkpoint_every,
+    evaluation_seeds: int = TrainingRun.evaluation_seeds,
+    evaluation_steps: int = TrainingRun.evaluation_steps,
+    divergence: float = TrainingRun.divergence,
+    rest_after: int | None = TrainingRun.rest_after,
     out: str | Path | None = None,
     resume: bool = False,
     progress: Callable[[int, LogRow], None] | bool = False,
-    **options: Unpack[Options],
 ) -> Training:
     """Train a controller's θ on a scenario's plant; J* is that of its stored optimum, if any.
 
@@ -538,16 +524,17 @@ def train(
     seed : seed of noise and exploration.
     start : where θ starts: naive, tuned, commissioned or a parameters file.
     settings : hyperparameters by name; the algorithm's Configuration documents them.
+    controller … rest_after : what the options of `cosim train` of these names say.
     out : folder that the run's checkpoints are kept in; None keeps none. `Training.save` writes
         the rest.
     resume : go on from the checkpoint in `out`.
     progress : called with the samples done and the last row of the log; True draws a bar.
-    options : further fields of `TrainingRun`, `evaluate_every=1000` say; see `Options`.
     """
+    given = locals() | {"start": str(start)}
     if not isinstance(scenario, Scenario):
         scenario = Scenario.load(scenario)
-    fields = {"seed": seed, "start": str(start), **options}
-    run = prepare(algorithm, scenario, samples, settings, fields)
+    options = {name: given[name] for name in OPTIONS}
+    run = prepare(algorithm, scenario, samples, settings, options)
     optimum = stored_optimum(scenario)
     return run_training(run, out, resume=resume, optimum=optimum, progress=progress)
 

@@ -37,7 +37,8 @@ def demo(
         from cosim.cli.train import record_training
         from cosim.comparison import RunSignals
         from cosim.evaluation import evaluate
-        from cosim.figures import overlay_figure, save
+        from cosim.figures.style import save
+        from cosim.figures.trajectory import overlay_figure
         from cosim.files import temporary_folder
         from cosim.plant import FmuPlant
         from cosim.plugins import build_controller

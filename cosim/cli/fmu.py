@@ -25,13 +25,6 @@ def _path(name: str) -> Path:
     return fmus.path(name) if name in (*fmus.NAMES, *fmus.PLANTS) else Path(name)
 
 
-def _short(number: object) -> str:
-    try:
-        return "" if number is None else f"{float(str(number)):.8g}"
-    except ValueError:
-        return str(number)
-
-
 @app.command()
 def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
     """Show an FMU's interfaces, platforms, flags, variables, and what bars it as a plant."""
@@ -60,12 +53,8 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
         names = dict.fromkeys(name for face in faces for name in face)
         flags = [(name, *(face.get(name, "–") for face in faces)) for name in names]
         out_.table("capability flags", ("flag", *found["flags"]), flags)
-        header = ("variable", "causality", "unit", "start", "min", "max")
-        rows = [
-            (v["name"], v["causality"], v["unit"] or "",
-             *(_short(v[key]) for key in ("start", "min", "max")))
-            for v in found["variables"]
-        ]  # fmt: skip
+        header = ("name", "causality", "unit", "start", "min", "max")
+        rows = [[str(v[key] or "") for key in header] for v in found["variables"]]
         more = f", the first {SHOWN} here, all with --json" if len(rows) > SHOWN else ""
         out_.table(f"{len(rows)} variables{more}", header, rows[:SHOWN])
         out_.json(found | {"refusals": refused})

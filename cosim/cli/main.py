@@ -39,6 +39,14 @@ from cosim.processes import (
 OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
 """Options whose value names what a command writes."""
 
+COURSE = ("log_every", "evaluate_every", "checkpoint_every", "divergence", "resume")
+PANELS = {
+    **dict.fromkeys(("out", "overwrite", "record", "png", "ssp", "json"), "Files and output"),
+    **dict.fromkeys((*COURSE, "evaluation_seeds", "evaluation_steps"), "Log and evaluation"),
+    **dict.fromkeys(("jobs", "scheduler"), "Workers"),
+}
+"""Where the help shows an option; the others are under Options."""
+
 
 class _Commands(TyperGroup):
     """The commands, none of which takes an empty word."""
@@ -59,6 +67,11 @@ class _Commands(TyperGroup):
             import typer.rich_utils
 
             typer.rich_utils.RANGE_STRING = ""  # [1<=x<=100000000] takes a narrow terminal's room
+            commands: list[Any] = [*self.commands.values()]
+            for command in commands:
+                commands += getattr(command, "commands", {}).values()
+                for option in command.params:
+                    option.rich_help_panel = PANELS.get(option.name, option.rich_help_panel)
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -82,6 +95,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
+    epilog="Example: cosim demo --out demo",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 RUN, LEARN, BUILD = "Run, look and compare", "Learn", "Build and hand over"
@@ -99,14 +113,16 @@ for panel, function, example in (
     (RUN, study.reproduce, "reproduce --budget quick --out reproduction"),
 ):
     app.command(rich_help_panel=panel, epilog=f"Example: cosim {example}")(function)
-for panel, group, example in (
-    (BUILD, scenario.app, "scenario init mine.fmu --out mine.toml"),
-    (LEARN, study.app, "study run study.toml --out study"),
-    (LEARN, study.results, "results check quick"),
-    (BUILD, fmu.app, "fmu info mine.fmu"),
+for panel, group, name, *examples in (
+    (BUILD, scenario.app, "scenario", "show fouled", "init mine.fmu --out mine.toml"),
+    (LEARN, study.app, "study", "run mine.toml --out study", "plan mine.toml", "report study"),
+    (LEARN, study.results, "results", "check quick", "update quick", "board results/board"),
+    (BUILD, fmu.app, "fmu", "info mine.fmu", "check mine.fmu", "build plant --out plant.fmu"),
 ):
-    name = example.partition(" ")[0]
-    app.add_typer(group, name=name, rich_help_panel=panel, epilog=f"Example: cosim {example}")
+    texts = [f"Example: cosim {name} {example}" for example in examples]
+    app.add_typer(group, name=name, rich_help_panel=panel, epilog=texts[0])
+    for command, text in zip(group.registered_commands, texts, strict=True):
+        command.epilog = text
 for group in (app, scenario.app, study.app, study.results, fmu.app):
     for command in group.registered_commands:  # paragraphs as wide as the terminal
         paragraphs = (getdoc(command.callback) or "").split("\n\n")

@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -109,12 +109,6 @@ class Output:
             os.write(self._stdout, text.encode())
         elif self.as_json:
             sys.stdout.write(text)
-
-    def progress(self, label: str, total: int) -> AbstractContextManager[Callable[..., None]]:
-        """Progress bar on standard error: a function of the number done and a remark."""
-        from cosim.progress import told
-
-        return told(self.live, label, total)
 
     def announce(self, fmu: str) -> None:
         """Say which FMU's native code is about to run, and watch it, unless it is a shipped one."""

@@ -9,6 +9,9 @@ import typer
 
 from cosim.cli import output as cli
 
+DRAWN = 20_000
+"""Samples of the longest run that is drawn: more are a grey band, and take seconds."""
+
 
 def simulate(
     scenario: cli.ScenarioOption = "paper",
@@ -29,7 +32,8 @@ def simulate(
 ) -> None:
     """Run a controller on a scenario's plant.
 
-    Writes trajectory.csv, timing.csv, summary.json, scenario.toml and, with --record, run.rrd.
+    Writes trajectory.csv, trajectory.png (of a run of at most 20 000 samples), timing.csv,
+    summary.json, scenario.toml and, with --record, run.rrd.
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
     """
@@ -72,6 +76,10 @@ def simulate(
             (folder / "run.rrd").unlink(missing_ok=True)
         trajectory.write_csv(folder / "trajectory.csv")
         trajectory.write_timing_csv(folder / "timing.csv")
+        if steps <= DRAWN:
+            trajectory.plot(folder / "trajectory.png")
+        else:  # nor may a shorter run's stay
+            (folder / "trajectory.png").unlink(missing_ok=True)
         write_atomically(folder / "scenario.toml", loaded.to_toml())
         rows = [
             ("economic cost", f"{summary['economic_cost']:.3f}"),

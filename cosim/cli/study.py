@@ -21,9 +21,9 @@ ColumnsOption = Annotated[
     str | None,
     typer.Option(
         "--columns",
-        help="Columns of the printed tables, by comma, or `all`: case, samples, finished, regret, "
-        "worst, iqm, J, J-worst, gap, economic, violation, violating.",
-        show_default="case,regret,worst,finished,J",
+        help="Columns of the printed tables, by comma, or `all`: case, rank, samples, finished, "
+        "regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against, difference, "
+        "p; default: case,rank,regret,worst,finished.",
     ),
 ]
 FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
@@ -67,6 +67,7 @@ def _execute(
     from loky import cpu_count
 
     from cosim.errors import FailedRunsError
+    from cosim.progress import told
     from cosim.studies.plan import Study, plan
     from cosim.studies.run import study
 
@@ -75,7 +76,7 @@ def _execute(
     for scenario in definition.scenarios.values():
         out_.announce(scenario.plant.fmu)
     planned = plan(definition)
-    with cli.resumable(), out_.progress(definition.name, planned.samples) as bar:
+    with cli.resumable(), told(out_.live, definition.name, planned.samples) as bar:
 
         def report(state: State, line: str) -> None:
             bar(*state.short)

@@ -14,13 +14,9 @@ if TYPE_CHECKING:
     from learning.training import Training
 
 FILES = (
-    "checkpoint.npz",
-    "learning.csv",
-    "learning.png",
-    "parameters.toml",
-    "summary.json",
+    "checkpoint.npz", "learning.csv", "learning.png", "parameters.toml", "summary.json",
     "training.rrd",
-)
+)  # fmt: skip
 """What a training leaves in its folder; each belongs to the same run."""
 
 
@@ -97,10 +93,11 @@ def train(
     Exit code 1: learning diverged; the files hold the θ that the run ended with and the summary
     says why.
     """
+    given = locals()
     with cli.output(json) as out_:
         from controllers.optimum import stored_optimum
         from learning.algorithm import load_algorithm
-        from learning.training import CHECKPOINT, prepare, run_training
+        from learning.training import CHECKPOINT, OPTIONS, prepare, run_training
 
         found = load_algorithm(algorithm)
         if explain:
@@ -109,18 +106,7 @@ def train(
             out_.json({name: {"default": given, "meaning": text} for name, given, text in rows})
             return
         settings = found.Configuration.from_assignments(assignments or [])
-        options = {
-            "seed": seed,
-            "start": start,
-            "controller": controller,
-            "log_every": log_every,
-            "evaluate_every": evaluate_every,
-            "checkpoint_every": checkpoint_every,
-            "evaluation_seeds": evaluation_seeds,
-            "evaluation_steps": evaluation_steps,
-            "divergence": divergence,
-            "rest_after": rest_after,
-        }
+        options = {name: given[name] for name in OPTIONS}
         run = prepare(algorithm, cli.load_scenario(scenario), samples, settings, options)
         folder = cli.open_folder(out)
         there = [name for name in FILES if (folder / name).exists()]

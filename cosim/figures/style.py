@@ -16,7 +16,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from cosim.errors import FigureError
 from cosim.files import write_atomically
@@ -274,6 +273,8 @@ def spread(positions: Array, gap: float) -> Array:
     They minimise the sum of the squared moves, within [0, 1]: an isotonic regression of
     `positions[i] + i·gap`, clipped. Where K gaps do not fit, the lowest is at 0.
     """
+    from scipy.optimize import isotonic_regression  # noqa: PLC0415 - a third of a second
+
     steps = gap * np.arange(len(positions))
     placed: Array = isotonic_regression(positions + steps, increasing=False).x
     return np.clip(placed, steps[-1], max(1.0, steps[-1])) - steps

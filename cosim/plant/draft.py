@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import tomli_w
+from scipy.optimize import least_squares
 
 from cosim.errors import PlantError
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, unpack
@@ -253,9 +254,8 @@ def _mapping(
 
 DIFFERENCE = 1e-5
 """Finite differences, as a share of a variable's scale."""
-ITERATIONS = 40
 TIGHT, LOOSE = 1e-10, 1e-6
-"""Residuals, as shares of the scales: where Newton stops, and what it may end with."""
+"""Residuals, as shares of the scales: where the search stops, and what it may end with."""
 PATIENCE = 5000
 """Samples to wait for a plant without a settable initial state to settle."""
 
@@ -265,42 +265,30 @@ def nearest_steady_state(
 ) -> tuple[Array, Array, float]:
     """Steady state x = Φ(x, u) of the undisturbed plant near (state (n,), action (m,)).
 
-    Returns x, u and the stage cost there. Both x and u move, as little as need be in their scales,
-    within the actions' bounds: Newton with the least-norm step. A plant that starts where it
-    likes is left to settle under the action. Raises PlantError where there is no steady state.
+    Returns x, u and the stage cost there. Both x and u move in their scales, within the plant's
+    ranges, by least squares in a trust region. A plant that starts where it likes is left to
+    settle under the action. Raises PlantError where there is no steady state.
     """
     if not plant.scenario.plant.mapping.initial_state:
         return _settled(plant, action)
     lower, upper = plant.scenario.action_lower, plant.scenario.action_upper
-    scale = _scale(np.concatenate([state, action]))
-    n = len(state)
-    z = np.concatenate([state, np.clip(action, lower, upper)])
+    low, high = plant.state_range
+    bounds = np.concatenate([low, lower]), np.concatenate([high, upper])
+    start, n = np.concatenate([state, action]), len(state)
+    scale = _scale(start)
 
     def residual(z: Array) -> Array:
         plant.reset(0, z[:n])
         return (plant.step(z[n:]).s - z[:n]) / scale[:n]
 
-    r = residual(z)
-    for _ in range(ITERATIONS):
-        if np.max(np.abs(r)) < TIGHT:
-            break
-        columns = [
-            (residual(z + d) - residual(z - d)) / (2 * DIFFERENCE)
-            for d in np.diag(DIFFERENCE * scale)
-        ]
-        step = scale * np.linalg.lstsq(np.array(columns).T, -r, rcond=1e-9)[0]
-        for share in 0.5 ** np.arange(12):
-            trial = z + share * step
-            trial[n:] = np.clip(trial[n:], lower, upper)
-            if np.linalg.norm(after := residual(trial)) < np.linalg.norm(r):
-                z, r = trial, after
-                break
-        else:
-            break
-    if np.max(np.abs(r)) > LOOSE:
+    precise = {"diff_step": DIFFERENCE, "gtol": 1e-15, "ftol": None, "xtol": None}
+    start = np.clip(start, *bounds)
+    found = least_squares(residual, start, "3-point", bounds, x_scale=scale, **precise)
+    z, left = found.x, float(np.max(np.abs(found.fun)))
+    if left > LOOSE:
         raise PlantError(
             f"FMU '{plant.fmu_path.name}' has no steady state near its start values (a sample "
-            f"still moves a state by {np.max(np.abs(r)):.2g} of its scale); give other start "
+            f"still moves a state by {left:.2g} of its scale); give other start "
             "values by --state and --action"
         )
     plant.reset(0, z[:n])

@@ -12,8 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from cosim.figures import overlay_figure, parameters_figure, trajectory_figure
 from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, plain, save_set
+from cosim.figures.training import parameters_figure
+from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.files import write_atomically
 from cosim.penalty import VIOLATING
 from cosim.plugins import build_controller

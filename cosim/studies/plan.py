@@ -84,8 +84,7 @@ class Training:
 
     def prepare(self) -> TrainingRun:
         """The training run, checked; raises LearningError in one line."""
-        options = dict(self.options)
-        return prepare(self.algorithm, self.scenario, self.samples, self.settings, options)
+        return prepare(self.algorithm, self.scenario, self.samples, self.settings, self.options)
 
     def controller(self, parameters: str, theta: Sequence[float] = ()) -> Controller:
         """The greedy controller of the θ that a TOML text holds, or of another θ of its blocks."""

@@ -358,9 +358,11 @@ class StudyResults(Shown):
         header = [COLUMNS[name] for name in columns]
         return header, [[row[name] for name in columns] for row in texts]
 
-    def table(self, scenario: str) -> str:
-        """A scenario's table as Markdown, least J first."""
-        return markdown_table(*self.lines(scenario))
+    def table(self, scenario: str | None = None) -> str:
+        """A scenario's table as Markdown, least J first; without one those of all scenarios."""
+        if scenario is not None:
+            return markdown_table(*self.lines(scenario))
+        return "\n".join(f"{name}\n\n{self.table(name)}" for name in self.scenarios)
 
     def _facts(self) -> dict[str, object]:
         counted = {"scenarios": self.scenarios, "cases": self.cases, "runs": self.state}
@@ -393,17 +395,18 @@ class StudyResults(Shown):
         """Title, header and rows: the gains that the paper's text states, beside the study's."""
         return report.paper_table(self.scenarios, self.trained, self.indicator)
 
-    def figure(self, name: str) -> Figure:
+    def figure(self, name: str | None = None) -> Figure:
         """Draw `curves`, `regret`, `profile` or `operation` of a scenario: `curves-paper`, say.
 
-        `profile` alone is that of all scenarios. Raises StudyError for another name, and where
-        there is nothing to draw.
+        `profile` alone is that of all scenarios; None is the regret on the first one. Raises
+        StudyError for another name, and where there is nothing to draw.
         """
+        names = [f"{kind}-{scenario}" for scenario in self.scenarios for kind in self._makers]
+        name = name or f"regret-{self.scenarios[0]}"
         kind, _, scenario = name.partition("-")
-        known = kind in self._makers and scenario in (*self.scenarios, *[""] * (kind == "profile"))
-        drawn = self._makers[kind](scenario) if known else None
+        drawn = self._makers[kind](scenario) if name in (*names, "profile") else None
         if drawn is None:
-            raise StudyError(f"there is no figure '{name}' of this study")
+            raise StudyError(f"this study draws no figure '{name}'{instead(name, names)}")
         return drawn
 
     @property

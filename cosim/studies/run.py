@@ -37,6 +37,7 @@ from cosim.studies import operation
 from cosim.studies.plan import EVALUATION, Noise, Plan, Run, Study, Training, plan
 from cosim.studies.results import StudyResults
 from cosim.studies.store import CHECKPOINT, FAILURE, Measured, RunStore, Trained
+from cosim.validation import known_keywords
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 ANSWER_SECONDS = 10.0
@@ -475,6 +476,7 @@ def _line(error: BaseException) -> str:
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
+@known_keywords
 def study(
     source: Study | str | Path | Mapping[str, Any],
     out: str | Path,

@@ -12,7 +12,7 @@ import pytest
 
 from cosim import processes
 from cosim.errors import CosimError
-from cosim.processes import run_child
+from cosim.processes import child_process
 from tests.helpers.command import alive, eventually, run_cosim, start_cosim
 from tests.helpers.kinds import build_kind, scenario_for
 
@@ -46,10 +46,10 @@ def test_workers_end_with_the_parent(tmp_path):
 
 CHILD = (
     "import subprocess, sys\n"
-    "from cosim.processes import command_process, run_child\n"
+    "from cosim.processes import command_process, child_process\n"
     "words = [sys.executable, '-c', 'import os, time; print(os.getpid(), flush=True);'\n"
     "         'time.sleep(600)']\n"
-    "with command_process():\n    run_child(words, timeout=600.0)\n"
+    "with command_process(), child_process(words) as child:\n    child.wait(600.0)\n"
 )
 
 
@@ -78,15 +78,17 @@ def test_a_child_that_takes_too_long_is_ended_with_its_children(tmp_path):
         "pathlib.Path('number').write_text(str(child.pid))\n"
         "time.sleep(600)\n"
     )
-    with pytest.raises(subprocess.TimeoutExpired):
-        run_child([sys.executable, "-c", program], timeout=2.0, folder=tmp_path)
+    command, late = [sys.executable, "-c", program], subprocess.TimeoutExpired
+    with pytest.raises(late), child_process(command, folder=tmp_path) as child:
+        child.wait(2.0)
     number = int((tmp_path / "number").read_text())
     assert eventually(lambda: not alive(number))
 
 
 def test_a_child_has_its_exit_code_and_its_temporary_files_in_its_folder(tmp_path):
     program = "import sys, tempfile; open('here', 'w').write(tempfile.gettempdir()); sys.exit(3)"
-    assert run_child([sys.executable, "-c", program], timeout=60.0, folder=tmp_path) == 3
+    with child_process([sys.executable, "-c", program], folder=tmp_path) as child:
+        assert child.wait(60.0) == 3
     assert (tmp_path / "here").read_text() == str(tmp_path)
 
 

@@ -22,7 +22,7 @@ def training():
     return cosim.train("q-learning", samples=40, evaluation_seeds=1, evaluation_steps=10, **sizes)
 
 
-def test_every_result_is_one_short_line(run, training):
+def test_every_result_is_a_line_a_table_and_a_page(run, training, tmp_path):
     scenario = cosim.Scenario.load("paper")
     evaluation = cosim.evaluate(scenario, ["naive"], 2, 10)
     for result in (run, training, evaluation, scenario, training.parameters):
@@ -33,6 +33,23 @@ def test_every_result_is_one_short_line(run, training):
         assert f"<caption>{type(result).__name__}</caption>" in page
         drawn = result not in (scenario, training.parameters)
         assert ('src="data:image/png;base64,' in page) == drawn
+        if drawn:
+            assert page in result.report(tmp_path / "page.html").read_text("utf-8")
+            assert result.table().startswith("| ") and result.figure().axes
+
+
+@pytest.mark.parametrize(
+    ("function", "typo", "meant"),
+    [
+        (cosim.simulate, "recoder", "recorder"),
+        (cosim.train, "evaluate_evry", "evaluate_every"),
+        (cosim.evaluate, "step", "steps"),
+        (cosim.study, "job", "jobs"),
+    ],
+)
+def test_an_unknown_keyword_is_refused_with_the_one_that_is_meant(function, typo, meant):
+    with pytest.raises(cosim.errors.ArgumentError, match=f"'{typo}'.*'{meant}'"):
+        function(**{typo: 1})
 
 
 def test_frames_hold_the_values(run, training):

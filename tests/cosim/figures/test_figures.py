@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.figures import overlay_figure, save, trajectory_figure
-from cosim.figures.style import figure
+from cosim.figures.style import figure, save
 from cosim.figures.training import training_figure
+from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from tests.helpers.loop import Failing, Proportional
 
 

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.figures import palette
+from cosim.figures.style import palette
 from cosim.studies.figures import learning_curve, profile_figure
 from cosim.studies.pictures import density_figure, increments
 from tests.helpers.loop import Proportional

@@ -18,13 +18,14 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
 from cosim.progress import told
 from cosim.protocols import Array, Controller, Decision
+from cosim.result import Result
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, simulate
 from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, check_folders
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING, to_csv
-from cosim.text_tables import Result, markdown_table
+from cosim.text_tables import markdown_table
 from cosim.validation import known_keywords
 
 if TYPE_CHECKING:

@@ -19,8 +19,9 @@ from cosim.errors import TrajectoryError
 from cosim.files import replacing, write_atomically
 from cosim.penalty import VIOLATING
 from cosim.protocols import Array, Solution, Step
+from cosim.result import Result
 from cosim.scenario import Scenario
-from cosim.text_tables import Result, csv_text
+from cosim.text_tables import csv_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -27,10 +27,11 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, depends_on
 from cosim.progress import told
 from cosim.protocols import Array, Controller, Plant, Vector, functions_of
+from cosim.result import Result
 from cosim.scenario import Scenario
 from cosim.simulation import indicators_of, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
-from cosim.text_tables import Result, csv_text
+from cosim.text_tables import csv_text
 from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm

@@ -58,8 +58,7 @@ def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def checked(*args: P.args, **keywords: P.kwargs) -> R:
         for name in keywords.keys() - known.keys():
-            text = f"{function.__name__}() has no argument '{name}'"
-            raise ArgumentError(text + suggestion(name, known))
+            raise ArgumentError(f"no such argument: '{name}'{suggestion(name, known)}")
         return function(*args, **keywords)
 
     return checked

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from learning.search import Search as Search
     from learning.step import ConstrainedStep as ConstrainedStep
     from learning.step import td_step as td_step
+    from learning.training import Tracker as Tracker
     from learning.training import Training as Training
     from learning.training import TrainingRun as TrainingRun
     from learning.training import train as train
@@ -40,7 +41,7 @@ _HOMES = {
     "q_learning": "QLearning",
     "search": "Search",
     "step": "ConstrainedStep td_step",
-    "training": "Training TrainingRun train",
+    "training": "Tracker Training TrainingRun train",
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names.split()}
 __all__ = sorted(_HOME)  # noqa: PLE0605 - a list all the same

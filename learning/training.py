@@ -10,7 +10,7 @@ from importlib.metadata import version
 from itertools import islice
 from math import inf, isfinite, isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -114,8 +114,7 @@ class TrainingRun:
         return back_off(starting_parameters(problem, self.configuration, "tuned"), self.scenario)
 
 
-OPTIONS = {one.name for one in fields(TrainingRun)} - {"algorithm", "configuration"}
-OPTIONS -= {"samples", "scenario"}
+OPTIONS = {option.name for option in fields(TrainingRun)[3:]} - {"configuration"}
 """Fields of `TrainingRun` that are options of `train` and of the command by their own names."""
 
 
@@ -490,6 +489,19 @@ class Training(Result):
         }
 
 
+class Tracker(Protocol):
+    """Follows a training as the `progress` of `train`, which may be the second method alone."""
+
+    def start(self, run: TrainingRun) -> None:
+        """Take note of the run, before its first sample."""
+
+    def __call__(self, samples: int, row: LogRow) -> None:
+        """Take a row of the log, at so many samples."""
+
+    def end(self, training: Training) -> None:
+        """Take the result, finished or diverged."""
+
+
 @known_keywords
 def train(
     algorithm: str,
@@ -529,7 +541,8 @@ def train(
     out : folder that the run's checkpoints are kept in; None keeps none. `Training.save` writes
         the rest.
     resume : go on from the checkpoint in `out`.
-    progress : called with the samples done and the last row of the log; True draws a bar.
+    progress : called with the samples done and the last row of the log, or a `Tracker`; True draws
+        a bar.
     """
     given = locals() | {"start": str(start)}
     if not isinstance(scenario, Scenario):
@@ -558,6 +571,7 @@ def run_training(
     to be looked up by its name.
     """
     clock = time.perf_counter()
+    getattr(progress, "start", lambda _: None)(run)
     best = build_controller(optimum, run.scenario) if optimum else None
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -575,7 +589,7 @@ def run_training(
         with told(progress, run.algorithm, run.samples, _Remark()) as tell:
             status = session.run_to_the_end(judge, tell)
         parameters = session.loop.parameters
-        return Training(
+        training = Training(
             run=run,
             parameters=parameters,
             rows=session.rows,
@@ -590,6 +604,8 @@ def run_training(
             without_checkpoint=session.without_checkpoint,
             wall_seconds=time.perf_counter() - clock,
         )
+    getattr(progress, "end", lambda _: None)(training)
+    return training
 
 
 class _Remark(dict[str, float]):

@@ -212,6 +212,9 @@ def _run() -> None:
         sys.exit(EXIT_INTERRUPTED if stopped else EXIT_TERMINATED)
     except MemoryError as error:
         _fail(f"not enough memory ({error}); ask for fewer samples")
+    except ModuleNotFoundError as error:  # of a plug-in it is an error of its own
+        package = "rerun-sdk" if error.name == "rerun" else error.name
+        _fail(f"the package '{package}' is not installed: pip install {package}")
     except OSError as error:
         name = f"'{error.filename}': " if error.filename else ""
         _fail(f"{name}{error.strerror or error}")

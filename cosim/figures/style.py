@@ -33,18 +33,13 @@ INK = "#222222"
 END_SIZE = 6.5
 DASHED: Any = (0, (4, 2))
 _KNOWN = {
-    "naive": "#7F7F7F",
-    "tuned": "#E69F00",
-    "converged": "#CC79A7",
-    "optimal": "#111111",
-    "q-learning": "#0072B2",
-    "batch-q-learning": "#009E73",
-    "actor-critic": "#D55E00",
-    "search": "#882255",
-}
-_OTHERS = (
-    "#56B4E9", "#332288", "#999933", "#44AA99", "#AA4499", "#117733", "#661100", "#6699CC",
-)  # fmt: skip
+    "naive": "#7F7F7F", "tuned": "#E69F00", "converged": "#CC79A7", "optimal": "#111111",
+    "q-learning": "#0072B2", "batch-q-learning": "#009E73", "actor-critic": "#D55E00",
+    "search": "#882255", "held": "#999933", "model-based": "#44AA99", "dyna": "#332288",
+    "offset-free": "#AA4499", "identified": "#117733", "policy-search": "#661100",
+    "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9",
+}  # fmt: skip
+_OTHERS = ("#56B4E9", "#DDCC77", "#CC6677", "#6D9E1F", "#B04FD0", "#4477AA", "#E377C2", "#A6761D")
 _LINES: Any = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 _STYLE = Path(__file__).with_name("house.mplstyle")
 
@@ -117,10 +112,11 @@ def palette(names: Sequence[str]) -> dict[str, Look]:
     """A look for each controller or case, in the order given.
 
     Cases that differ in their settings only, `rule(start=naive)` and `rule(start=tuned)`, and
-    `search+rule` and `rule`, share a colour and differ in their line style. Known controllers and
-    rules have colours of their own.
+    `search+rule`, `rule-simulator` and `rule`, share a colour and differ in their line style. Known
+    controllers and rules have colours of their own, the same in all sets.
     """
-    head_of = {name: name.partition("(")[0].removeprefix("search+") for name in names}
+    plainly = {name: name.partition("(")[0].removeprefix("search+") for name in names}
+    head_of = {name: head.removesuffix("-simulator") for name, head in plainly.items()}
     heads = dict.fromkeys(head_of.values())
     others = cycle(_OTHERS)
     color = {head: _KNOWN.get(head) or next(others) for head in heads}

@@ -22,6 +22,7 @@ from cosim.figures.style import (
     dot_rows,
     figure,
     label_ends,
+    palette,
     percent,
     plain,
     regret_axis,
@@ -175,6 +176,7 @@ def operation_figure(
     named = {"hour": 1, "shift": 8, "day": 24, "week": 168}
     lives, h = found.lives, about["sampling_time"]
     lives = lives[lives.case.isin(about["drawn"] or lives.case)]
+    lines = palette(list(map(str, lives.case.unique())))
     with figure(3.4) as drawn:
         panels = drawn.subplots(1, 2, sharey=True)
         titles = ("of θ, run greedily", "of the run so far, exploration included")
@@ -183,7 +185,7 @@ def operation_figure(
             ends = []
             for case, rows in lives.groupby("case", sort=False):
                 runs = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
-                color, line = looks[str(case)]
+                color, line = looks[str(case)].color, lines[str(case)].line
                 known = case in baselines
                 axes.plot(
                     runs.index, runs["median"], color=color, linestyle=DASHED if known else line,

@@ -16,10 +16,36 @@ def run():
         return cosim.simulate(plant, cosim.build_controller("naive", scenario), 20, 0)
 
 
+class Followed:
+    """A tracker that keeps what it is told."""
+
+    def __init__(self):
+        self.told = []
+
+    def start(self, run):
+        self.told.append(run)
+
+    def __call__(self, samples, row):
+        self.told.append((samples, row["samples"]))
+
+    def end(self, training):
+        self.told.append(training)
+
+
 @pytest.fixture(scope="module")
-def training():
+def followed():
+    return Followed()
+
+
+@pytest.fixture(scope="module")
+def training(followed):
     sizes = {"log_every": 20, "evaluate_every": 40, "checkpoint_every": 40}
-    return cosim.train("q-learning", samples=40, evaluation_seeds=1, evaluation_steps=10, **sizes)
+    sizes |= {"evaluation_seeds": 1, "evaluation_steps": 10, "progress": followed}
+    return cosim.train("q-learning", samples=40, **sizes)
+
+
+def test_a_tracker_is_told_of_the_start_each_row_and_the_end(training, followed):
+    assert followed.told == [training.run, (20, 20), (40, 40), training]
 
 
 def test_every_result_is_a_line_a_table_and_a_page(run, training, tmp_path):

@@ -4,7 +4,7 @@ import re
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import PackageNotFoundError, files, requires
 from pathlib import Path
 
 import pytest
@@ -46,10 +46,10 @@ def locked(platform):
     return pins
 
 
-def closure():
-    """Everything that the installed project and its locked extras need, by canonical name."""
+def closure(locked=lambda extra: extra not in UNLOCKED):
+    """Everything that the installed project and its extras need, by canonical name."""
     seen = set()
-    left = [requirement for extra, requirement in direct() if extra not in UNLOCKED]
+    left = [requirement for extra, requirement in direct() if locked(extra)]
     while left:
         requirement = left.pop()
         name = canonicalize_name(requirement.name)
@@ -89,6 +89,13 @@ def test_the_lock_names_all_that_the_dependencies_bring():
     found = closure()
     assert len(found) > 40
     assert found - locked(sys.platform).keys() == set()
+
+
+def test_without_the_viewer_the_core_is_small():
+    core = closure(lambda extra: not extra) - {"rerun-sdk", "pyarrow"}
+    assert len(core) > 30
+    paths = [path.locate() for name in core for path in files(name) or ()]
+    assert sum(path.stat().st_size for path in paths if path.is_file()) < 0.9e9
 
 
 def test_what_is_installed_agrees():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import traceback
 from inspect import getdoc
 from itertools import pairwise
 from typing import Annotated, Any
@@ -210,17 +211,19 @@ def _run() -> None:
         notes = error.args if stopped else getattr(error, "__notes__", ())
         print("; ".join(["interrupted" if stopped else "terminated", *notes]), file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED if stopped else EXIT_TERMINATED)
-    except MemoryError as error:
-        _fail(f"not enough memory ({error}); ask for fewer samples")
-    except ModuleNotFoundError as error:  # of a plug-in it is an error of its own
-        package = "rerun-sdk" if error.name == "rerun" else error.name
-        _fail(f"the package '{package}' is not installed: pip install {package}")
-    except OSError as error:
-        name = f"'{error.filename}': " if error.filename else ""
-        _fail(f"{name}{error.strerror or error}")
     except BaseException as error:
-        names = [f"{kind.__module__}.{kind.__qualname__}" for kind in type(error).__mro__]
-        if set(names) & set(KNOWN):
+        # Libraries raise what they like over it, and the cross compiler has a word of its own.
+        if re.search("Too many open files|FdQuota", "".join(traceback.format_exception(error))):
+            _fail("too few files may be open at a time: raise the limit, by ulimit -n 1024 say")
+        if isinstance(error, MemoryError):
+            _fail(f"not enough memory ({error}); ask for fewer samples")
+        if isinstance(error, ModuleNotFoundError):  # of a plug-in it is an error of its own
+            package = "rerun-sdk" if error.name == "rerun" else error.name
+            _fail(f"the package '{package}' is not installed: pip install {package}")
+        if isinstance(error, OSError):
+            name = f"'{error.filename}': " if error.filename else ""
+            _fail(f"{name}{error.strerror or error}")
+        if {f"{kind.__module__}.{kind.__qualname__}" for kind in type(error).__mro__} & {*KNOWN}:
             _fail(str(error))
         _report(error)
 
@@ -233,7 +236,6 @@ def _fail(message: str) -> None:
 def _report(error: BaseException) -> None:
     """Leave the traceback in a file, and say in a line where and what to do with it."""
     import tempfile
-    import traceback
     from importlib.metadata import version
 
     with tempfile.NamedTemporaryFile(

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from cosim import Decision, FmuPlant, Scenario, simulate
 from cosim.comparison import compare, load_run
 from cosim.errors import CosimError, StudyError
 from cosim.files import check_target, protect, write_atomically
+from cosim.recording import RerunRecorder
 from cosim.studies.plan import RunKey
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Proportional
@@ -177,6 +179,21 @@ def test_a_file_system_that_says_no_leaves_the_old_file_and_no_other(
     assert error.value.filename == str(path)
     assert path.read_text() == "old"
     assert [file.name for file in tmp_path.iterdir()] == ["result.csv"]
+
+
+def test_a_recording_whose_folder_vanishes_in_mid_run_is_one_line(plant, tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+
+    def answer(k, s):
+        if k == 1:
+            shutil.rmtree(folder)
+        return Decision(np.array(GOOD))
+
+    with pytest.raises((CosimError, OSError)) as error:
+        simulate(plant, Plugin(answer), 3, 0, recorder=RerunRecorder(folder / "run.rrd"))
+    one_line(error)
+    assert not folder.exists()
 
 
 LINKS = {

@@ -54,9 +54,10 @@ def info(file: FileArgument = "evaporator", json: JsonOption = False) -> None:
         flags = [(name, *(face.get(name, "–") for face in faces)) for name in names]
         out_.table("capability flags", ("flag", *found["flags"]), flags)
         header = ("name", "causality", "unit", "start", "min", "max")
-        rows = [[str(v[key] or "") for key in header] for v in found["variables"]]
-        more = f", the first {SHOWN} here, all with --json" if len(rows) > SHOWN else ""
-        out_.table(f"{len(rows)} variables{more}", header, rows[:SHOWN])
+        rows = [[str(v[key] or "") for key in header] for v in found["variables"][:SHOWN]]
+        count = len(found["variables"])
+        more = f", the first {SHOWN} here, all with --json" if count > SHOWN else ""
+        out_.table(f"{count} variables{more}", header, rows)
         out_.json(found | {"refusals": refused})
 
 

@@ -102,7 +102,7 @@ class Output:
 
     def json(self, document: Mapping[str, Any], folder: Path | None = None) -> None:
         """Print the document if JSON was asked for; with a folder, write its summary.json too."""
-        text = dump(document)
+        text = dump(document) if self.as_json or folder else ""
         if folder is not None:
             write_atomically(folder / "summary.json", text)
         if self.as_json and self._stdout is not None:
@@ -172,11 +172,12 @@ def resumable(
 
 
 def dump(document: Mapping[str, Any]) -> str:
-    """JSON text with sorted keys; a number that is not finite becomes null."""
+    """JSON text with sorted keys, in one line where long; what is not finite becomes null."""
     from pydantic_core import to_json
 
-    plain = json.loads(to_json(dict(document), inf_nan_mode="null"))
-    return json.dumps(plain, indent=2, sort_keys=True) + "\n"
+    text = to_json(dict(document), inf_nan_mode="null")
+    indent = 2 if len(text) < 1 << 20 else None  # C code writes a line, Python what is indented
+    return json.dumps(json.loads(text), indent=indent, sort_keys=True) + "\n"
 
 
 def open_folder(folder: Path) -> Path:

@@ -1,6 +1,10 @@
 """`cosim fmu`: exit codes, tables and JSON of its commands."""
 
 import json
+import time
+import zipfile
+
+import pytest
 
 import fmus
 from tests.helpers.compiler import needs_compiler
@@ -12,6 +16,26 @@ def test_info_as_json(cosim):
     document = json.loads(out)
     assert (code, document["fmi_version"]) == (0, "3.0")
     assert {"name", "unit", "start", "min", "max"} <= set(document["variables"][0])
+
+
+@pytest.mark.slow
+def test_info_on_200_000_variables_takes_seconds(cosim, tmp_path):
+    variable = '<Float64 name="v{0}" valueReference="{0}" description="one"/>'
+    many = "".join(map(variable.format, range(100_000, 300_000)))
+    with (
+        zipfile.ZipFile(fmus.path("evaporator_fmi3")) as shipped,
+        zipfile.ZipFile(tmp_path / "big.fmu", "w", zipfile.ZIP_DEFLATED) as big,
+    ):
+        for name in shipped.namelist():
+            text = shipped.read(name)
+            if name == "modelDescription.xml":
+                text = text.replace(b"</ModelVariables>", f"{many}</ModelVariables>".encode())
+            big.writestr(name, text)
+    begin = time.process_time()
+    code, out, _ = cosim("fmu", "info", "big.fmu", "--json")
+    assert time.process_time() - begin < 20
+    assert code == 0
+    assert len(json.loads(out)["variables"]) > 200_000
 
 
 def test_check_runs_the_fmu_and_ends_with_0(cosim):

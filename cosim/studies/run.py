@@ -412,9 +412,7 @@ def _client(address: str) -> Iterator[tuple[Any, Any]]:
 @contextmanager
 def _translated(dask: Any, address: str) -> Iterator[None]:
     """Say in a line what becomes of a cluster."""
-    same = (
-        "install the same version of rti-cosim, and what the items need, on scheduler and workers"
-    )
+    same = "install the same rti-cosim, and what the items need, on scheduler and workers"
     try:
         yield
     except dask.KilledWorker as error:
@@ -516,7 +514,6 @@ def study(
     results = StudyResults.collect(planned, folder).write(planned, figures=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
-        more = len(runner.failures) - 1
-        others = f" ({more} more run{'s' if more > 1 else ''} failed)" if more else ""
+        others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""
         raise FailedRunsError(f"{name}: {failure.message}{others}; run again to try anew")
     return results

@@ -28,7 +28,7 @@ from cosim.studies.plan import EVALUATION, GREEDY, ONLINE, Plan, Run
 from cosim.text_tables import read_csv
 
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
-LOG, PARAMETERS = "learning.csv", "parameters.toml"
+TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
 FAILURE, TIMING = "failure.txt", "timing.csv"
 EVALUATED = "evaluated"
 OURS = (CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, ONLINE, TIMING)
@@ -151,19 +151,19 @@ class RunStore:
             return {}
         try:
             about = read_json(path, f"'{path}'", StudyError)
-            files = dict(about.get("files", {}))
+            about["files"] = dict(about.get("files", {}))
             dict(about["facts"])
         except (StudyError, KeyError, TypeError, ValueError):
             self.remarks.append(f"'{path}' is damaged; the run is done anew")
             return {}
-        for name, digest in files.items():
+        for name, digest in list(about["files"].items()):
             if _digest(self.folder / name) == digest:
                 continue
             self.remarks.append(f"'{self.folder / name}' is not as it was written; made anew")
-            if name in (LOG, PARAMETERS):
+            if name in TRAINED:
                 return {}
             (self.folder / name).unlink(missing_ok=True)
-            about["files"] = {}
+            del about["files"][name]
         if (before := about["facts"]) != self._facts:
             names = ", ".join(changed(before, self._facts))
             self.remarks.append(f"{names} changed since these runs; they are done anew")
@@ -208,6 +208,7 @@ class RunStore:
             samples=trained.samples,
             plant_samples=trained.plant_samples,
             timing={"wall_seconds": trained.wall_seconds, "processor_seconds": trained.clock},
+            files={name: _digest(self.folder / name) for name in TRAINED},
         )
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
@@ -280,9 +281,10 @@ class RunStore:
             self.note(files=files)
 
     def unseal(self) -> None:
-        """Forget the hashes before more is written."""
-        if self._about.get("files"):
-            self.note(files={})
+        """Forget the hashes before more is written, those of the training's own files excepted."""
+        files = self._about.get("files", {})
+        if files.keys() - TRAINED:
+            self.note(files={name: files[name] for name in files.keys() & TRAINED})
 
 
 def _ours(path: Path) -> bool:
@@ -292,10 +294,7 @@ def _ours(path: Path) -> bool:
 
 def _digest(path: Path) -> str:
     """SHA-256 of a file, empty where it is not there."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return ""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 # What the runs of a plan have finished, together

@@ -1,6 +1,6 @@
 """Endurance: a long learning run; memory, time, failures.
 
-    python -m benchmarks.endurance --samples 1000000 [--record] [--rule-alone]
+    python -m benchmarks.endurance --samples 1000000 [--log] [--rule-alone]
 
 Trains on one plant and looks at every tenth of the run. Exit code 1 where memory grew by more than
 --megabytes after the first tenth, the last tenth cost more than --drift times the first one's CPU
@@ -40,15 +40,15 @@ def resident() -> int:
 
 
 def endure(
-    samples: int, folder: Path, *, record: bool = False, alone: bool = False
+    samples: int, folder: Path, *, log: bool = False, alone: bool = False
 ) -> dict[str, object]:
     """Train for `samples` samples with checkpoints; figures of each tenth of the run.
 
     Each tenth ends with an evaluation and a checkpoint, so what happens once happens in the first.
-    Recorded, the log has a row for each thousandth of the run.
+    With `log`, the log has a row for each thousandth of the run.
     """
     tenth = samples // TENTHS
-    every = tenth // 100 if record else tenth
+    every = tenth // 100 if log else tenth
     scenario = Scenario.load("paper")
     run = TrainingRun(
         algorithm="q-learning" if alone else "search",
@@ -98,15 +98,13 @@ def main() -> int:
     """Run, print the figures as JSON, judge them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--samples", type=int, default=1_000_000)
-    parser.add_argument("--record", action="store_true", help="write a recording, too")
+    parser.add_argument("--log", action="store_true", help="a row of the log for each thousandth")
     parser.add_argument("--rule-alone", action="store_true", help="no search around the rule")
     parser.add_argument("--megabytes", type=float, default=5.0)
     parser.add_argument("--drift", type=float, default=1.25)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        figures = endure(
-            options.samples, Path(folder), record=options.record, alone=options.rule_alone
-        )
+        figures = endure(options.samples, Path(folder), log=options.log, alone=options.rule_alone)
     print(json.dumps(figures, indent=2))
     sound = (
         figures["status"] == "finished"

@@ -39,8 +39,9 @@ _KNOWN = {
     "offset-free": "#AA4499", "identified": "#117733", "policy-search": "#661100",
     "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9",
 }  # fmt: skip
-_OTHERS = ("#56B4E9", "#DDCC77", "#CC6677", "#6D9E1F", "#B04FD0", "#4477AA", "#E377C2", "#A6761D")
-_LINES: Any = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
+_OTHERS = ("#56B4E9", "#CC6677", "#A6761D", "#E377C2", "#6D9E1F", "#B04FD0", "#4477AA", "#DDCC77")
+_DASHES: Any = ((4, 1.5), (1, 1.2), (5, 1.5, 1, 1.5), (9, 2), (1, 3), (4, 1, 1, 1, 1, 1))
+_LINES: Any = ("-", *((0, dashes) for dashes in _DASHES))
 _STYLE = Path(__file__).with_name("house.mplstyle")
 
 
@@ -111,12 +112,13 @@ class Look(NamedTuple):
 def palette(names: Sequence[str]) -> dict[str, Look]:
     """A look for each controller or case, in the order given.
 
-    Cases that differ in their settings only, `rule(start=naive)` and `rule(start=tuned)`, and
-    `search+rule`, `rule-simulator` and `rule`, share a colour and differ in their line style. Known
-    controllers and rules have colours of their own, the same in all sets.
+    Cases of one rule, `rule(start=naive)`, `search+rule` and `rule-simulator`, share a colour and
+    differ in their line style. Known rules have colours of their own, the same in all sets.
     """
-    plainly = {name: name.partition("(")[0].removeprefix("search+") for name in names}
-    head_of = {name: head.removesuffix("-simulator") for name, head in plainly.items()}
+    head_of = {name: name.partition("(")[0].removeprefix("search+") for name in names}
+    for name, head in head_of.items():
+        rules = [known for known in _KNOWN if f"{head}-".startswith(f"{known}-")]
+        head_of[name] = max(rules, key=len, default=head.removesuffix("-simulator"))
     heads = dict.fromkeys(head_of.values())
     others = cycle(_OTHERS)
     color = {head: _KNOWN.get(head) or next(others) for head in heads}
@@ -226,7 +228,7 @@ def cost_lines(
     for level in levels.values():
         axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
     if relative:
-        regret_axis(axes, "y", np.concatenate([line.get_ydata() for line in axes.lines]))
+        regret_axis(axes, "y", np.array(axes.dataLim.intervaly))
     return labels
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import cycle
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FuncFormatter
 
 from cosim.figures.style import (
+    DASHED,
     SERIES,
     EndLabel,
     cost_lines,
@@ -151,6 +152,7 @@ def parameters_figure(
     the root mean square over the preceding `window` samples. Source: paper.tex, fig. nmpc_learn.
     """
     moving = {name: values for name, values in increments.items() if np.any(values)}
+    looks = [{"linestyle": line, "color": color} for line, color in product(("-", DASHED), SERIES)]
     columns = 4
     rows = -(-len(moving) // columns)
     with figure(1.3 * rows + 2.2) as drawn:
@@ -159,8 +161,8 @@ def parameters_figure(
         for i, (name, values) in enumerate(moving.items()):
             axes = drawn.add_subplot(grid[i // columns, i % columns], sharex=first)
             first = first or axes
-            for entry, color in zip(values.T, cycle(SERIES), strict=False):
-                axes.plot(samples, entry, color=color, linewidth=0.8)
+            for k, entry in enumerate(values.T):
+                axes.plot(samples, entry, linewidth=0.8, **looks[k % len(looks)])
             axes.set_title(rf"$\Delta$ {symbol(name)}", loc="left", fontsize=8.0)
             axes.tick_params(labelbottom=i + columns >= len(moving))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -168,17 +170,12 @@ def parameters_figure(
         axes = drawn.add_subplot(grid[rows, :], sharex=first)
         axes.plot(samples, td_error, color=SERIES[1], linewidth=1.0)
         samples_axis(axes, float(samples[-1]), "samples")
-        title = f"TD error, root mean square of the preceding {window} samples"
+        title = f"TD error in the stage cost's unit, r.m.s. of the preceding {window} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
         most = max((values.shape[1] for values in moving.values()), default=0)
         if most:
-            colors = SERIES[:most]
-            entries = [range(i, most, len(SERIES)) for i in range(len(colors))]
-            drawn.legend(
-                handles=[Line2D([], [], color=color, linewidth=1.2) for color in colors],
-                labels=[", ".join(str(entry + 1) for entry in each) for each in entries],
-                loc="outside lower center",
-                ncols=len(SERIES) + 1,
-                title="entry of its block",
-            )
+            shown = enumerate(looks[:most], 1)
+            handles = [Line2D([], [], linewidth=1.2, label=str(k), **look) for k, look in shown]
+            title = "entry of its block, in the block's own unit"
+            drawn.legend(handles=handles, loc="outside lower center", ncols=12, title=title)
     return drawn

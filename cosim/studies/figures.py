@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullFormatter
 
 from cosim.figures.style import (
     DASHED,
     FLOOR,
+    INK,
     REFERENCE,
     Dots,
     EndLabel,
@@ -39,12 +40,17 @@ BANDED = 6
 def regret_figure(rows: Sequence[Dots], looks: Mapping[str, Look]) -> Figure:
     """A row for each case: its runs, their interquartile mean and its 95 % interval.
 
-    A run that diverged is a cross; the axis is logarithmic above 0.01 %.
+    A run that diverged is a cross; an interval that goes on to the left of the axes ends in an
+    arrow. The least middle is first; the axis is logarithmic above 0.01 %.
     """
+    rows = sorted(rows, key=lambda row: row.middle)
     with figure(0.21 * len(rows) + 0.9) as drawn:
         axes = drawn.subplots()
         values = dot_rows(axes, rows, looks)
-        regret_axis(axes, "x", np.append(values, 0.0))
+        regret_axis(axes, "x", np.append(values, [0.0, *(row.high for row in rows)]))
+        left = axes.get_xlim()[0]
+        cut = [y for y, row in enumerate(rows) if row.low < left]
+        axes.plot([left] * len(cut), cut, "<", color=INK, markersize=3, clip_on=False)
         axes.set_xlabel("regret % of runs (crosses diverged); interquartile mean, 95 % interval")
     return drawn
 
@@ -134,15 +140,10 @@ def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Lo
             color, line = looks[name]
             below = [(stratum[:, None] <= axis).astype(float) for stratum in runs]
             share = np.concatenate(below).mean(axis=0)
-            axes.step(
-                axis, share, where="post", color=color, linestyle=line, linewidth=1.3,
-                label=plain(name),
-            )  # fmt: skip
+            axes.step(axis, share, where="post", c=color, ls=line, lw=1.3, label=plain(name))
             if len(strata) <= BANDED:
                 low, high = _band(below)
-                axes.fill_between(
-                    axis, low, high, step="post", color=color, alpha=0.15, linewidth=0
-                )
+                axes.fill_between(axis, low, high, step="post", color=color, alpha=0.15, lw=0)
         axes.set_xscale("log")
         axes.set_xlim(axis[0], axis[-1])
         axes.set_ylim(-0.02, 1.02)
@@ -187,27 +188,27 @@ def operation_figure(
                 runs = 100 * rows.groupby("samples")[name].agg(["min", "median", "max"])
                 color, line = looks[str(case)].color, lines[str(case)].line
                 known = case in baselines
-                axes.plot(
-                    runs.index, runs["median"], color=color, linestyle=DASHED if known else line,
-                    linewidth=0.9 if known else 1.5,
-                )  # fmt: skip
+                dashes, width = (DASHED, 0.9) if known else (line, 1.5)
+                axes.plot(runs.index, runs["median"], c=color, ls=dashes, lw=width)
                 if not known:
-                    axes.fill_between(
-                        runs.index, runs["min"], runs["max"], color=color, alpha=0.12, linewidth=0
-                    )
+                    band = runs["min"], runs["max"]
+                    axes.fill_between(runs.index, *band, color=color, alpha=0.12, lw=0)
                 ends.append(EndLabel(plain(str(case)), float(runs["median"].iloc[-1]), color))
             axes.set_xscale("log")
             first, end = float(lives.samples.min()), float(lives.samples.max())
             axes.set_xlim(first, end)
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.xaxis.set_minor_formatter(NullFormatter())
             regret_axis(axes, "y", reached)
             for text, hours in named.items():
                 if first <= (samples := hours * 3600.0 / h) <= end:
+                    part = np.log(samples / first) / np.log(end / first)
+                    side = "left" if part < 0.06 else "right" if part > 0.94 else "center"
                     axes.axvline(samples, color=REFERENCE, linewidth=0.7, linestyle=(0, (1, 2)))
                     axes.annotate(
                         text, (samples, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
-                        textcoords="offset points", ha="center", fontsize=6.5, color=REFERENCE,
+                        textcoords="offset points", ha=side, fontsize=6.5, color=REFERENCE,
                     )  # fmt: skip
             axes.set_title(title, pad=12)
             axes.set_xlabel("samples of the plant")

@@ -297,9 +297,7 @@ class PlantProblem:
 
     @classmethod
     def from_scenario(
-        cls,
-        scenario: Scenario,
-        overrides: Mapping[str, float | None] | None = None,
+        cls, scenario: Scenario, overrides: Mapping[str, float | None] | None = None
     ) -> PlantProblem:
         """What a scenario says of its plant; `overrides` replaces plant parameters by name.
 

@@ -12,8 +12,7 @@ def _ode(x: ca.SX, u: ca.SX, d: ca.SX, p: ca.SX) -> ca.SX:
     V, k0, E, heat, UA, *_ = ca.vertsplit(p)
     rate = k0 * ca.exp(-E / x[1]) * x[0]
     return ca.vertcat(
-        u[0] / V * (d[0] - x[0]) - rate,
-        u[0] / V * (d[1] - x[1]) + heat * rate + UA * (u[1] - x[1]),
+        u[0] / V * (d[0] - x[0]) - rate, u[0] / V * (d[1] - x[1]) + heat * rate + UA * (u[1] - x[1])
     )
 
 

@@ -97,12 +97,7 @@ class _Run:
     """One run, and the loop that fills its columns."""
 
     def __init__(
-        self,
-        plant: Plant,
-        controller: Controller,
-        steps: int,
-        seed: int,
-        residuals: bool,
+        self, plant: Plant, controller: Controller, steps: int, seed: int, residuals: bool
     ) -> None:
         self._plant, self._controller = plant, controller
         self._scenario: Scenario = plant.scenario

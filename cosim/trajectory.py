@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import nan
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import numpy as np
 
@@ -188,6 +190,7 @@ class SignalColumns:
 
 
 STATUS = "status"
+PART = 10_000
 QUANTILES = {"median_us": 0.5, "p95_us": 0.95, "p99_us": 0.99, "max_us": 1.0}
 FALLBACK = "fallback"
 
@@ -329,23 +332,38 @@ class Trajectory(Result):
             for quantiles in [1e6 * np.quantile(values, list(QUANTILES.values()))]
         }
 
-    def to_csv(self, path: Path | None = None) -> str:
-        """The signals and the status as CSV, text or a file; floats read back to the same bits."""
-        titles = {signal.name: signal.header for signal in self.signals.values()}
-        frame = self.to_pandas().astype(dict.fromkeys(whole(), int)).rename(columns=titles)
-        return str(frame.to_csv(path, index=False, lineterminator="\n", na_rep="nan"))
+    def to_csv(self) -> str:
+        """Return the signals and the status as CSV text; floats read back to the same bits."""
+        stream = io.StringIO()
+        self._write(stream)
+        return stream.getvalue()
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `to_csv` to a file, whole or not at all."""
-        with replacing(path) as partial:
-            self.to_csv(partial)
+        with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
+            self._write(stream)
         return Path(path)
 
     def write_timing_csv(self, path: str | Path) -> Path:
         """Write the wall-clock times in µs to a file of their own, one row per sample."""
         header = [f"{name} [us]" for name in self.timing]
-        rows = zip(*(1e6 * values for values in self.timing.values()), strict=True)
-        return write_atomically(path, csv_text(header, ([f"{v:.3f}" for v in row] for row in rows)))
+        rows = ([f"{1e6 * v:.3f}" for v in row] for row in _rows(list(self.timing.values())))
+        return write_atomically(path, csv_text(header, rows))
+
+    def _write(self, stream: TextIO) -> None:
+        signals, counted = list(self.signals.values()), whole()
+        text = [(lambda v: repr(int(v))) if s.name in counted else repr for s in signals]
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*(signal.header for signal in signals), STATUS])
+        numbers = _rows([signal.values for signal in signals])
+        for row, status in zip(numbers, self.status, strict=True):
+            writer.writerow([*(write(v) for write, v in zip(text, row, strict=True)), status])
+
+
+def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:
+    """Rows of equally long columns; a part at a time, since Python's numbers take more memory."""
+    for first in range(0, len(columns[0]) if columns else 0, PART):
+        yield from zip(*(column[first : first + PART].tolist() for column in columns), strict=True)
 
 
 def read_csv(path: str | Path, scenario: Scenario) -> Trajectory:

@@ -124,10 +124,7 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     token, record = model_token(), _build_record(every_platform)
-    icons = {
-        2: {"model.png": "icon.png"},
-        3: {"terminalsAndIcons/icon.png": "icon.png"},
-    }
+    icons = {2: {"model.png": "icon.png"}, 3: {"terminalsAndIcons/icon.png": "icon.png"}}
     built = []
     for version, name in FILE_NAMES.items():
         resources = icons[version] | {"documentation/licenses/license.txt": "license.txt"}

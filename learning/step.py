@@ -195,10 +195,7 @@ class ConstrainedStep:
     """
 
     def __init__(
-        self,
-        controller: RtiNmpc,
-        configuration: Configuration,
-        scale: Vector | None = None,
+        self, controller: RtiNmpc, configuration: Configuration, scale: Vector | None = None
     ) -> None:
         self._controller = controller
         self.blocks = controller.parameters.blocks

@@ -58,9 +58,7 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     a, b = jacobian[:, :n], jacobian[:, n:]
     offset = x_next - x_s - a @ (x - x_s) - b @ (u - u_s) + symbols["c_f"]
     return stage_function(
-        "linearise",
-        {"x": x, "u": u, "theta": symbols.theta},
-        {"A": a.T, "B": b.T, "r": offset},
+        "linearise", {"x": x, "u": u, "theta": symbols.theta}, {"A": a.T, "B": b.T, "r": offset}
     )
 
 

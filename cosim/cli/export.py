@@ -23,8 +23,7 @@ def export(
     ] = "fmu",
     fmi: Annotated[int, typer.Option("--fmi", help="FMI version: 2 or 3.", min=2, max=3)] = 2,
     local: Annotated[
-        bool,
-        typer.Option("--local", help="Build for this machine alone, by $CC or cc."),
+        bool, typer.Option("--local", help="Build for this machine alone, by $CC or cc.")
     ] = False,
     ssp: Annotated[
         Path | None,

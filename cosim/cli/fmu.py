@@ -102,12 +102,10 @@ def build(
         ),
     ] = "here",
     check: Annotated[
-        bool,
-        typer.Option("--check", help="Build for all and compare with the shipped files."),
+        bool, typer.Option("--check", help="Build for all and compare with the shipped files.")
     ] = False,
     in_place: Annotated[
-        bool,
-        typer.Option("--in-place", help="Developers: rebuild the shipped files and C header."),
+        bool, typer.Option("--in-place", help="Developers: rebuild the shipped files and C header.")
     ] = False,
     json: JsonOption = False,
 ) -> None:

@@ -29,13 +29,7 @@ from cosim.cli import (
 )
 from cosim.errors import CosimError
 from cosim.files import protect
-from cosim.processes import (
-    Finished,
-    Interrupted,
-    Terminated,
-    command_process,
-    unwound,
-)
+from cosim.processes import Finished, Interrupted, Terminated, command_process, unwound
 
 OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
 """Options whose value names what a command writes."""

@@ -41,8 +41,7 @@ JobsOption = Annotated[
     int | None, count("--jobs", "-j", most=1024, text="Processes; default: one per core.")
 ]
 SchedulerOption = Annotated[
-    str | None,
-    typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs."),
+    str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, in place of --jobs.")
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print a JSON summary on standard output, nothing else.")

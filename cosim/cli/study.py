@@ -167,8 +167,7 @@ def reproduce(
     budget: Annotated[
         Literal["quick", "full"],
         typer.Option(
-            "--budget",
-            help="quick: minutes on 2 cores; full: hours, with more seeds and samples.",
+            "--budget", help="quick: minutes on 2 cores; full: hours, with more seeds and samples."
         ),
     ] = "quick",
     out: cli.OutOption = Path("cosim-reproduction"),

@@ -22,8 +22,7 @@ FILES = (
 
 def train(
     algorithm: Annotated[
-        str,
-        typer.Option("--algorithm", "-a", help="A registered one or module:Class."),
+        str, typer.Option("--algorithm", "-a", help="A registered one or module:Class.")
     ],
     scenario: cli.ScenarioOption = "paper",
     samples: Annotated[
@@ -81,8 +80,7 @@ def train(
     rest_after: Annotated[
         int | None,
         cli.count(
-            "--rest-after",
-            text="Samples after which θ stays and nothing explores; default: never.",
+            "--rest-after", text="Samples after which θ stays and nothing explores; default: never."
         ),
     ] = None,
     record: cli.RecordOption = False,

@@ -11,16 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cosim.figures.style import (
-    BOUND,
-    DASHED,
-    REFERENCE,
-    SERIES,
-    figure,
-    label,
-    palette,
-    plain,
-)
+from cosim.figures.style import BOUND, DASHED, REFERENCE, SERIES, figure, label, palette, plain
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 

@@ -275,8 +275,7 @@ def view(
         axis_x=along,
         axis_y=rrb.ScalarAxis(range=shown) if shown else None,
         plot_legend=rrb.PlotLegend(
-            corner=rrb.Corner2D.RightTop,
-            visible=len(channels) > 1 if legend is None else legend,
+            corner=rrb.Corner2D.RightTop, visible=len(channels) > 1 if legend is None else legend
         ),
     )
 

@@ -142,9 +142,7 @@ def run_table(runs: pd.DataFrame) -> Rows:
 
 
 def paper_table(
-    scenarios: Sequence[str],
-    trained: Sequence[str],
-    indicator: Callable[[str, str, str], Array],
+    scenarios: Sequence[str], trained: Sequence[str], indicator: Callable[[str, str, str], Array]
 ) -> Table:
     """Title, header and rows: gains of each trained case's median run on every scenario.
 

@@ -6,7 +6,7 @@ import itertools
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -916,30 +916,30 @@ class Progress(NamedTuple):
 
 TOLERANCE = 5e-4
 """Relative distance within which the figures of a certificate must agree."""
-AGREEING = ("solution", "refinement", "simulation")
+NEEDED = ("solution", "refinement", "simulation")
 SEARCH = "policy search"
 
 
 def objection(certificate: Sequence[Figure]) -> str | None:
-    """Why a certified solution is not to be called J*; None where there is nothing against it."""
+    """Why a certified solution is not to be called J*; None where there is nothing against it.
+
+    All figures but that of a policy search must agree within `TOLERANCE`.
+    """
     made = {figure.name: figure for figure in certificate}
-    if missing := [name for name in AGREEING if name not in made]:
+    if missing := [name for name in NEEDED if name not in made]:
         return f"not made: {', '.join(missing)}"
-    agreeing = [made[name] for name in AGREEING]
-    values = [figure.value for figure in agreeing]
+    search = made.pop(SEARCH, None)
+    values = [figure.value for figure in made.values()]
     spread = (max(values) - min(values)) / abs(min(values))
     if spread > TOLERANCE:
-        return (
-            f"solution, refinement and simulation are {100 * spread:.3f} % apart, more "
-            f"than {100 * TOLERANCE:g} %"
-        )
+        return f"{', '.join(made)} are {100 * spread:.3f} % apart, more than {100 * TOLERANCE:g} %"
     allowed = TOLERANCE * abs(values[0])
-    for figure in agreeing:
+    for figure in made.values():
         if figure.upper - figure.lower > 2 * allowed:
             return f"the interval of the {figure.name} is wider than {2 * allowed:.3g}"
-    if SEARCH in made and made[SEARCH].upper < values[1] - allowed:
+    if search is not None and search.upper < made["refinement"].value - allowed:
         return (
-            f"a policy search found {made[SEARCH].value:.2f}, more than {100 * TOLERANCE:g} % "
+            f"a policy search found {search.value:.2f}, more than {100 * TOLERANCE:g} % "
             "below the refinement"
         )
     return None
@@ -1081,85 +1081,27 @@ def simulate_policy(
     return float(means.mean()), float(half_width)
 
 
-STABLE = 1e-3
-_MOST_GRIDS = 3
-
-
-@dataclass(frozen=True)
-class Row:
-    """A solution of the study; `change` is that of J* against what it refines, relative."""
-
-    name: str
-    optimum: Optimum
-    change: float | None = None
-
-    @property
-    def sizes(self) -> tuple[tuple[int, ...], ...]:
-        """Grid points a state, quadrature nodes and those of the penalty a disturbance."""
-        accuracy = self.optimum.accuracy
-        return self.optimum.grid.shape, accuracy.nodes, accuracy.penalty_nodes
-
-    def to_dict(self) -> dict[str, Any]:
-        """The row as JSON has it."""
-        found = self.optimum
-        return {
-            "name": self.name,
-            "J": found.gain,
-            "lower": found.lower,
-            "upper": found.upper,
-            "states": found.grid.shape,
-            "accuracy": asdict(found.accuracy),
-            "change": self.change,
-        }
-
-    @property
-    def stable(self) -> bool:
-        """Whether refining changed J* by no more than 0.1 %."""
-        return self.change is None or self.change <= STABLE
-
-
-def study(
+def certify(
     plant: PlantProblem,
     settings: Settings,
     optimum: Optimum,
     *,
+    paths: int = 2000,
+    steps: int = 5000,
     progress: Callable[[Progress], None] | None = None,
-) -> list[Row]:
-    """Refine a solution of `settings` until J* is stable to 0.1 %, then its quadrature once.
-
-    The grid is halved at least once and at most three times; the last row has the finer
-    quadrature and integrator on the first grid. `stable` of the last two rows is the verdict.
-    """
-    rows = [Row("solution", optimum)]
-    for level in range(settings.level + 1, settings.level + 1 + _MOST_GRIDS):
-        before = rows[-1].optimum
-        after = refine(plant, settings, before, level=level, progress=progress)
-        rows.append(Row("grid twice as fine", after, _change(before, after)))
-        if rows[-1].stable:
-            break
-    finer = optimum.accuracy.finer()
-    after = refine(plant, settings, optimum, accuracy=finer, progress=progress)
-    return [*rows, Row("quadrature finer", after, _change(optimum, after))]
-
-
-def certify(
-    plant: PlantProblem, rows: Sequence[Row], *, paths: int = 2000, steps: int = 5000
 ) -> Optimum:
-    """The first refinement of a study, with its certificate.
+    """The refinement of a solution, which is nearer to J* and is what is kept, certified.
 
-    It is what is kept, since it is nearer to J* than the solution that the study began with. The
-    certificate's figures are `solution`: the gain and its bounds on the grid; `refinement`: the
-    same on the grid of the next level; `simulation`: the mean cost of the refinement's policy on
+    The certificate's figures are `solution`: the gain and its bounds on the grid; `refinement`: the
+    same on the grid of the next level; `quadrature`: on the solution's grid with more quadrature
+    nodes and half the integration step; `simulation`: the mean cost of the refinement's policy on
     the plant's model, 95 %; and, where it is added, `policy search`: the best θ that a search
-    found, compared with that policy on the same noise.
+    found, compared with that policy on the same noise. Raises OptimumError as `solve` does.
     """
-    found = [row.optimum for row in rows[:2]]
-    mean, half_width = simulate_policy(plant, found[1], paths=paths, steps=steps)
-    bounds = [(each.gain, each.lower, each.upper) for each in found]
-    bounds.append((mean, mean - half_width, mean + half_width))
-    figures = (Figure(name, *numbers) for name, numbers in zip(AGREEING, bounds, strict=True))
-    return replace(found[1], certificate=tuple(figures))
-
-
-def _change(before: Optimum, after: Optimum) -> float:
-    return abs(after.gain - before.gain) / abs(after.gain)
+    refined = refine(plant, settings, optimum, level=settings.level + 1, progress=progress)
+    finer = refine(plant, settings, optimum, accuracy=optimum.accuracy.finer(), progress=progress)
+    mean, half_width = simulate_policy(plant, refined, paths=paths, steps=steps)
+    solved = {"solution": optimum, "refinement": refined, "quadrature": finer}
+    figures = [Figure(name, one.gain, one.lower, one.upper) for name, one in solved.items()]
+    figures.append(Figure("simulation", mean, mean - half_width, mean + half_width))
+    return replace(refined, certificate=tuple(figures))

@@ -35,10 +35,6 @@ class ActorCriticConfiguration(Configuration):
         0.04, description="trust region at the end, approached geometrically"
     )
 
-    def depends_on_samples(self) -> list[str]:
-        """The trust region shrinks over the run."""
-        return [] if self.radius == self.radius_end else ["radius"]
-
     def narrowed(self, width: float) -> Self:
         """Copy whose trust region is `width` times as wide."""
         return self.model_copy(

@@ -56,16 +56,8 @@ class GreedyConfiguration(Configuration):
         return dict.fromkeys([*explored, *stepped], "a rule that tries θ, not actions")
 
 
-class BackOffConfiguration(GreedyConfiguration):
-    """Settings of the back-off search."""
-
-    def depends_on_samples(self) -> list[str]:
-        """The shares of the samples that each round has."""
-        return ["samples (shared out among the stages)"]
-
-
 class OffsetFreeConfiguration(GreedyConfiguration):
-    """Settings of the offset-free baseline in operation."""
+    """Settings of the offset-free baseline."""
 
     back_off: BackOffToo = True
     update_every: Count = Field(10, description="samples between two steps of c_f")
@@ -74,12 +66,8 @@ class OffsetFreeConfiguration(GreedyConfiguration):
     )
 
 
-class OffsetFreeSimulatorConfiguration(OffsetFreeConfiguration, BackOffConfiguration):
-    """Settings of the offset-free baseline whose back-off is searched for."""
-
-
 class IdentifiedConfiguration(GreedyConfiguration):
-    """Settings of the identified baseline in operation."""
+    """Settings of the identified baseline."""
 
     back_off: BackOffToo = True
     model_parameters: tuple[str, ...] = Field(
@@ -96,10 +84,6 @@ class IdentifiedConfiguration(GreedyConfiguration):
         return self.model_parameters or model.uncertain
 
 
-class IdentifiedSimulatorConfiguration(IdentifiedConfiguration, BackOffConfiguration):
-    """Settings of the identified baseline whose back-off is searched for."""
-
-
 class BackOff(Algorithm):
     """One number κ a bound that binds, found by a line search: the engineer's first remedy.
 
@@ -109,7 +93,7 @@ class BackOff(Algorithm):
     found so far, whatever is being tried.
     """
 
-    Configuration: ClassVar[type[Configuration]] = BackOffConfiguration
+    Configuration: ClassVar[type[Configuration]] = GreedyConfiguration
     KEPT: ClassVar[tuple[str, ...]] = ("_count", "theta", "_search")
     budget: ClassVar[int] = 8000
 
@@ -256,7 +240,6 @@ class OffsetFree(Estimate):
 class OffsetFreeSimulator(OffsetFree):
     """`OffsetFree`, then a search of the back-off with the plant put back, c_f held."""
 
-    Configuration = OffsetFreeSimulatorConfiguration
     asks_for = "simulator"
 
 
@@ -335,7 +318,6 @@ class Identified(Estimate):
 class IdentifiedSimulator(Identified):
     """`Identified`, then a search of the back-off with the plant put back."""
 
-    Configuration = IdentifiedSimulatorConfiguration
     asks_for = "simulator"
 
 

@@ -46,7 +46,7 @@ def save(path: Path, checkpoint: Checkpoint) -> Path:
 
 
 def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
-    """Read a checkpoint; with `run`, refuse one of a run that differs in more than `samples`.
+    """Read a checkpoint; with `run`, refuse that of another run.
 
     Raises CheckpointError where the file is missing, damaged, of another schema or another run.
     """
@@ -69,7 +69,7 @@ def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
     if run is not None:
         # Both sides through JSON, where tuples are lists.
         there, here = _flat(found), _flat(json.loads(json.dumps(dict(run))))
-        for key in sorted((there.keys() | here.keys()) - {"samples"}):
+        for key in sorted(there.keys() | here.keys()):
             if there.get(key) != here.get(key):
                 raise CheckpointError(
                     f"{path}: the checkpoint is of another run: {key} is {there.get(key)!r} there "

@@ -172,10 +172,6 @@ class Configuration(BaseModel):
                 raise ValueError(f"{name}: has no part in {where}; leave it out")
         return self
 
-    def depends_on_samples(self) -> list[str]:
-        """Names of what the run's length alters: a longer run would not begin as this one."""
-        return []
-
     @classmethod
     def documentation(cls) -> list[tuple[str, str, str]]:
         """Name, default and meaning of each hyperparameter."""

@@ -575,10 +575,6 @@ class SearchConfiguration(Configuration):
         names = ("phase", "rule_settings", "q_learning_first") if self.rule == "none" else ()
         return dict.fromkeys(names, "a search without a rule")
 
-    def depends_on_samples(self) -> list[str]:
-        """The plan shares the samples out."""
-        return [*super().depends_on_samples(), "samples (shared out by the search)"]
-
     @model_validator(mode="after")
     def _take_over_from_the_rule(self) -> Self:
         """Explore as the rule would, unless told otherwise; refuse settings that it lacks."""

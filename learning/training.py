@@ -721,7 +721,6 @@ class _Session:
         path = self.out / CHECKPOINT
         found = checkpoint.load(path, self.identity)
         try:
-            self._require_same_beginning(path, int(found.run["samples"]))
             columns, arrays = found.state["columns"], found.arrays
             rows = zip(arrays["rows"].tolist(), arrays["row_thetas"], strict=True)
             self.rows = [
@@ -736,26 +735,3 @@ class _Session:
                 f"{path}: its content is not that of this run ({type(e).__name__}: {e}); start the "
                 "run anew"
             ) from None
-
-    def _require_same_beginning(self, path: Path, samples: int) -> None:
-        """Raise CheckpointError where a run of `samples` samples was no part of this one."""
-        run = self.run
-        if samples == run.samples:
-            return
-        if samples > run.samples:
-            raise CheckpointError(
-                f"{path}: the checkpoint is of a run of {samples} samples; it cannot be made a "
-                f"run of {run.samples}"
-            )
-        if schedules := run.configuration.depends_on_samples():
-            raise CheckpointError(
-                f"{path}: a run of {samples} samples cannot be given more, since "
-                f"{', '.join(schedules)} would have gone another way from the first one: train "
-                "anew, or in future without a schedule"
-            )
-        for name in ("evaluate_every", "checkpoint_every"):
-            if samples % (every := getattr(run, name)):
-                raise CheckpointError(
-                    f"{path}: a run of {samples} samples cannot be given more, since it ended "
-                    f"between two multiples of {name} = {every}, where a longer run does not stop"
-                )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,7 +61,7 @@ def optimum(
             return
         document = _solve(task, refine, against, recompute, out_)
         out_.json(document)
-    if refine and not document["stable"]:
+    if refine and document["objection"]:
         raise typer.Exit(1)
 
 
@@ -83,13 +83,12 @@ def _solve(
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
     from controllers.dynamic_programming import (
+        Figure,
         PlantProblem,
-        Row,
         Settings,
         certify,
         objection,
         solve,
-        study,
     )
 
     plant, settings = PlantProblem.from_scenario(task), Settings()
@@ -100,10 +99,8 @@ def _solve(
             found = store.read_optimum(path, key)
         else:
             found = solve(plant, settings, progress=show)
-        rows = [Row("stored" if found.certificate else "solution", found)]
         if refine:
-            rows = study(plant, settings, found, progress=show)
-            found = certify(plant, rows)
+            found = certify(plant, settings, found, progress=show)
             if against is not None:
                 searched = _search_figure(against, found, plant, task)
                 found = replace(found, certificate=(*found.certificate, searched))
@@ -111,20 +108,11 @@ def _solve(
     certificate = found.certificate
     why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
     kind = "reference" if why_not else "optimum"
-    shown = [
-        (
-            row.name,
-            *(f"{value:.4f}" for value in (row.optimum.gain, row.optimum.lower, row.optimum.upper)),
-            *("×".join(map(str, counts)) for counts in row.sizes),
-            "" if row.change is None else f"{100 * row.change:.5f} %",
-        )
-        for row in rows
-    ]
-    header = ("", "J", "J* ≥", "J* ≤", "states", "nodes", "penalty nodes", "change")
-    out_.table(f"{kind} of {task.name}", header, shown)
-    if certificate:
-        shown = [(f.name, *(f"{x:.2f}" for x in f[1:])) for f in certificate]
-        out_.table("certificate", ("", "J", "from", "to"), shown)
+    figures = certificate or [Figure("solution", found.gain, found.lower, found.upper)]
+    rows = [(name, *(f"{x:.4f}" for x in numbers)) for name, *numbers in figures]
+    states = " × ".join(map(str, found.grid.shape))
+    title = f"{kind} of {task.name}: J = {found.gain:.4f} on {states} states"
+    out_.table(title, ("", "J", "from", "to"), rows)
     if why_not is not None:
         out_.note(f"not called J*: {why_not}")
     return {
@@ -136,9 +124,9 @@ def _solve(
         "upper": found.upper,
         "edge_mass": found.edge_mass,
         "file": str(path),
-        "stable": why_not is None and all(row.stable for row in rows[-2:]),
         "certificate": [figure._asdict() for figure in certificate] or None,
-        "rows": [row.to_dict() for row in rows],
+        "states": found.grid.shape,
+        "accuracy": asdict(found.accuracy),
     }
 
 

@@ -41,9 +41,7 @@ def train(
     out: cli.OutOption = Path("cosim-train"),
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume", help="Go on from the folder's checkpoint, to more --samples if you like."
-        ),
+        typer.Option("--resume", help="Go on from the folder's checkpoint."),
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Begin anew where the folder holds another run.")

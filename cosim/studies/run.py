@@ -10,9 +10,8 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -358,103 +357,52 @@ def _begin(parent: int) -> None:
 def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome]]:
     """Do items on the workers of a scheduler that somebody else runs, in the order they end.
 
-    A scheduler that dies or is silent ends in EvaluationError, of one line.
+    Raises EvaluationError, in one line, where the scheduler is none, dies or is silent, where it
+    has no worker, and where a worker cannot do an item.
     """
-    with _client(address) as (dask, client), _translated(dask, address):
-        ended: SimpleQueue[Any] = SimpleQueue()
-        futures = client.map(perform, items, pure=False)
-        for future in futures:
-            future.add_done_callback(ended.put)
-        worked = time.monotonic()
-        for _ in items:
-            while True:
-                try:
-                    future = ended.get(timeout=ANSWER_SECONDS)
-                    break
-                except Empty:
-                    if asyncio.run(_identity(dask, address))["workers"]:
-                        worked = time.monotonic()
-                    elif time.monotonic() - worked > WORKER_SECONDS:
-                        raise _without_worker(address) from None
-            yield future.result()
-
-
-@contextmanager
-def _client(address: str) -> Iterator[tuple[Any, Any]]:
-    """Dask and a client of a scheduler that has just answered and has a worker."""
     try:
         dask: Any = import_module("distributed")
     except ImportError:
         raise EvaluationError(
             "a Dask scheduler needs the extra 'cluster': pip install 'rti-cosim[cluster]'"
         ) from None
-    with _quiet():
-        # A client made for an address where nobody answers can hang when it is dropped.
+    ended: SimpleQueue[Any] = SimpleQueue()
+    level = logging.root.manager.disable
+    logging.disable()  # the exception says what went wrong, once
+    try:
+        # Asked first: a client made for an address where nobody answers can hang when it ends.
+        if asyncio.run(_identity(dask, address)).get("type") != "Scheduler":
+            raise OSError("what answers is no scheduler")
+        client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
         try:
-            found = asyncio.run(_identity(dask, address))
-            if not isinstance(found, dict) or found.get("type") != "Scheduler":
-                raise ValueError("what answers is no scheduler")
-            client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)
-        except Exception as error:
-            raise EvaluationError(
-                f"the Dask cluster at '{address}' does not answer: {_line(error)}"
-            ) from None
-        try:
-            client.wait_for_workers(1, timeout=WORKER_SECONDS)
-            yield dask, client
-        except TimeoutError:
-            raise _without_worker(address) from None
+            for future in client.map(perform, items, pure=False):
+                future.add_done_callback(ended.put)
+            worked = time.monotonic()
+            for _ in items:
+                while True:
+                    with suppress(Empty):
+                        future = ended.get(timeout=ANSWER_SECONDS)
+                        break
+                    if asyncio.run(_identity(dask, address))["workers"]:
+                        worked = time.monotonic()
+                    elif time.monotonic() - worked > WORKER_SECONDS:
+                        raise OSError(f"it has had no worker for {WORKER_SECONDS:g} s")
+                yield future.result()
         finally:
             with suppress(Exception):
                 client.close(timeout=ANSWER_SECONDS)
-
-
-@contextmanager
-def _translated(dask: Any, address: str) -> Iterator[None]:
-    """Say in a line what becomes of a cluster."""
-    same = "install the same rti-cosim, and what the items need, on scheduler and workers"
-    try:
-        yield
-    except dask.KilledWorker as error:
-        text = f"workers of the cluster died again and again: {_line(error)}"
-    except ModuleNotFoundError as error:
-        text = f"a worker of the cluster cannot import '{error.name}'; {same}"
-    except (CancelledError, OSError, TimeoutError) as error:
-        text = (
-            f"the Dask cluster at '{address}' is gone or does not answer ({_line(error)}); what is "
-            "finished is stored: the same command goes on"
-        )
-    except RuntimeError as error:
-        if "deserialization" not in str(error):
-            raise
-        text = f"the Dask cluster at '{address}' cannot read its items; {same}"
-    else:
-        return
-    raise EvaluationError(text)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence Dask's log: the exception says what went wrong, once."""
-    names = [n for n in logging.Logger.manager.loggerDict if n.partition(".")[0] == "distributed"]
-    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
-    for logger in levels:
-        logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
+    except Exception as error:
+        text = f"no answer within {ANSWER_SECONDS:g} s" if type(error) is TimeoutError else error
+        said = " ".join(str(text).split())[:300] or type(error).__name__
+        raise EvaluationError(
+            f"the Dask cluster at '{address}' failed: {said}; what is finished is stored: give the "
+            "same command again, with the same rti-cosim and what the items need on all workers"
+        ) from None
     finally:
-        for logger, level in levels.items():
-            logger.setLevel(level)
+        logging.disable(level)
 
 
-def _without_worker(address: str) -> EvaluationError:
-    return EvaluationError(
-        f"the Dask cluster at '{address}' has had no worker for {WORKER_SECONDS:g} s; start some, "
-        f"with the same version of rti-cosim: dask worker {address}"
-    )
-
-
-async def _identity(dask: Any, address: str) -> Any:
+async def _identity(dask: Any, address: str) -> dict[str, Any]:
     """What a scheduler says of itself; raises TimeoutError where it says nothing."""
     connect = import_module("distributed.comm").connect
     async with asyncio.timeout(ANSWER_SECONDS):
@@ -462,16 +410,9 @@ async def _identity(dask: Any, address: str) -> Any:
         comm = await connect(address, timeout=ANSWER_SECONDS, **security)
         try:
             await comm.write({"op": "identity", "reply": True})
-            return await comm.read()
+            return dict(await comm.read())
         finally:
             comm.abort()
-
-
-def _line(error: BaseException) -> str:
-    """What an error says, or is, in at most a line."""
-    if isinstance(error, TimeoutError):
-        return f"no answer within {ANSWER_SECONDS:g} s"
-    return " ".join(str(error).split())[:300] or type(error).__name__
 
 
 @known_keywords

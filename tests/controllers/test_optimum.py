@@ -1,5 +1,4 @@
 from dataclasses import replace
-from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -7,7 +6,7 @@ import pytest
 import scipy.stats
 
 from controllers import OptimalPolicy, Quantity, evaporator, factories
-from controllers.dynamic_programming import PlantProblem, Settings, objection, solve, study
+from controllers.dynamic_programming import PlantProblem, Settings, certify, objection, solve
 from controllers.errors import OptimumError
 from controllers.optimum import SHIPPED, optimum_key, read_optimum
 from controllers.problem import Problem
@@ -131,10 +130,11 @@ def test_refinement_leaves_the_optimum_where_it_is():
     scenario = Scenario.load("fast-sampling")
     plant = PlantProblem.from_scenario(scenario)
     optimum = solve(plant)
-    rows = study(plant, Settings(), optimum)
-    sizes = [row.optimum.grid.size for row in rows]
-    assert all(fine > 1.5 * coarse for coarse, fine in pairwise(sizes[:-1]))
-    assert all(row.stable for row in rows)
+    certified = certify(plant, Settings(), optimum, paths=200, steps=500)
+    assert certified.grid.size > 1.5 * optimum.grid.size
+    J = {figure.name: figure.value for figure in certified.certificate}
+    for name in ("refinement", "quadrature"):
+        assert J[name] == pytest.approx(J["solution"], rel=1e-3)
 
 
 def test_a_plant_that_the_model_cannot_describe_is_refused():

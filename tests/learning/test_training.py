@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -8,8 +6,7 @@ from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
 from cosim import FmuPlant
 from cosim.simulation import indicators_of
-from learning.algorithm import Update, load_algorithm
-from learning.errors import CheckpointError
+from learning.algorithm import Update
 from learning.q_learning import QLearning
 from learning.training import HELD_OUT, run_training, to_csv
 from tests.helpers import training
@@ -130,37 +127,3 @@ def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):
     whole = run_training(run, rule=Reporting)
     resumed = killed_and_resumed(run, tmp_path, 250, Reporting)
     assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)
-
-
-FADING = load_algorithm("actor-critic").Configuration(batch_size=100)
-
-
-def test_a_finished_run_is_given_more_samples(scenario, tmp_path):
-    run = make_run(scenario, "q-learning", samples=400)
-    whole = run_training(run)
-    run_training(make_run(scenario, "q-learning", samples=200), tmp_path)
-    more = run_training(run, tmp_path, resume=True)
-    assert to_csv(more.rows) == to_csv(whole.rows)
-    assert np.array_equal(more.parameters.theta, whole.parameters.theta)
-
-
-@pytest.mark.parametrize(
-    ("first", "message"),
-    [
-        (
-            lambda s: make_run(s, "actor-critic", samples=200, configuration=FADING),
-            "radius would have gone another way",
-        ),
-        (
-            lambda s: make_run(s, "q-learning", samples=250),
-            "between two multiples of evaluate_every = 100",
-        ),
-        (lambda s: make_run(s, "q-learning", samples=500), "cannot be made a run of 400"),
-    ],
-)
-def test_a_run_that_began_otherwise_is_given_no_more_samples(scenario, tmp_path, first, message):
-    run = first(scenario)
-    run_training(run, tmp_path)
-    longer = dataclasses.replace(run, samples=400)
-    with pytest.raises(CheckpointError, match=message):
-        run_training(longer, tmp_path, resume=True)

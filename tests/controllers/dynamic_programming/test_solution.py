@@ -14,7 +14,6 @@ from controllers.dynamic_programming import (
     refine,
     simulate_policy,
     solve,
-    study,
 )
 from controllers.errors import OptimumError
 from tests.helpers.linear_plant import PLANE, SCALAR, LinearPlant
@@ -115,15 +114,15 @@ def test_the_simulated_mean_cost_is_the_linear_regulators(optimum):
     assert abs(mean - exact) < 2 * half_width
 
 
-def test_a_study_is_certified_by_what_it_found(optimum):
-    rows = study(PLANT, Settings(), optimum)
-    certified = certify(PLANT, rows, paths=200, steps=500)
-    figures = certified.certificate
-    assert [figure.name for figure in figures] == ["solution", "refinement", "simulation"]
-    assert certified.gain == rows[1].optimum.gain
-    assert [figure.value for figure in figures[:2]] == [optimum.gain, rows[1].optimum.gain]
+def test_a_solution_is_certified_by_its_refinements(optimum):
+    certified = certify(PLANT, Settings(), optimum, paths=200, steps=500)
+    figures = {figure.name: figure for figure in certified.certificate}
+    assert list(figures) == ["solution", "refinement", "quadrature", "simulation"]
+    assert certified.gain == figures["refinement"].value
+    assert figures["solution"].value == optimum.gain
+    assert figures["quadrature"].value == pytest.approx(optimum.gain, rel=1e-5)
     # So short a simulation cannot certify.
-    assert objection(figures) is not None
+    assert objection(certified.certificate) is not None
 
 
 def against(search=None, **values):

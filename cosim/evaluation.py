@@ -290,8 +290,7 @@ class Evaluation(Result):
         (J − J*)/|J*|, and where the naive controller is there too `gap_closed` =
         (J_naive − J)/(J_naive − J*). `comparisons`: for each pair, the paired difference
         controller − reference of each mean, and `gain_in_J`, (J_ref − J)/|J_ref|. Every interval
-        is of 95 %, paired over seeds, once by Student's t and once by BCa bootstrap. `optimal_J`
-        is J* on the same seeds.
+        is of 95 %, Student's, paired over seeds. `optimal_J` is J* on the same seeds.
         """
         return {
             **self.facts,
@@ -305,11 +304,11 @@ class Evaluation(Result):
                 for i, name in enumerate(self.controllers)
                 for reference in self.controllers[:i]
             ],
-            "timing": {name: self.timing[name].median().to_dict() for name in self.controllers},
+            "timing": {name: self.timing[name].median()._asdict() for name in self.controllers},
         }
 
     def _controller(self, name: str) -> dict[str, Any]:
-        estimates = {key: mean(self.column(name, key)).to_dict() for key in MEANS}
+        estimates = {key: mean(self.column(name, key))._asdict() for key in MEANS}
         document: dict[str, Any] = {key: one.pop("value") for key, one in estimates.items()}
         document |= {
             "failures": int(np.sum(self.column(name, "failures"))),
@@ -318,9 +317,9 @@ class Evaluation(Result):
         }
         cost, naive = self._cost(name), self._cost(self.naive)
         if self.optimum is not None:
-            document["regret"] = regret(cost, self.optimal).to_dict()
+            document["regret"] = regret(cost, self.optimal)._asdict()
         if self.optimum is not None and self.naive is not None:
-            document["gap_closed"] = gap_closed(cost, naive, self.optimal).to_dict()
+            document["gap_closed"] = gap_closed(cost, naive, self.optimal)._asdict()
         return document
 
     def _comparison(self, name: str, reference: str) -> dict[str, Any]:
@@ -328,10 +327,10 @@ class Evaluation(Result):
             "controller": name,
             "reference": reference,
             "differences": {
-                key: mean(self.column(name, key) - self.column(reference, key)).to_dict()
+                key: mean(self.column(name, key) - self.column(reference, key))._asdict()
                 for key in COMPARED
             },
-            "gain_in_J": gain(self._cost(name), self._cost(reference)).to_dict(),
+            "gain_in_J": gain(self._cost(name), self._cost(reference))._asdict(),
         }
 
 

@@ -1,17 +1,14 @@
 """The project's statistics: regret, gap closed, gain in J; means and intervals over seeds.
 
 Every figure that a table, a log or a summary shows under one of these names comes from here. All
-arrays are paired: entry s of each belongs to seed s. Intervals are of 95 %, by two independent
-methods.
+arrays are paired: entry s of each belongs to seed s. Intervals are of 95 %.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Sequence
 from math import floor, isfinite, log10
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -22,66 +19,33 @@ Interval = tuple[float, float] | None
 
 LEVEL = 0.95
 RESAMPLES = 9999
-RESAMPLED = 10_000
-"""Most seeds that are resampled; with more of them Student's interval stands alone."""
 AT_ONCE = RESAMPLES * 1000
 """Most values that are drawn at once."""
 TD_WINDOW = 10_000
 """Samples over which a TD error is averaged (paper.tex, fig. nmpc_learn)."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A value with its 95 % intervals, (low, high): `t` is Student's, `bootstrap` over seeds.
-
-    The intervals are None where one seed, or none of the two methods, can say anything, and the
-    bootstrap's for more than `RESAMPLED` seeds, where the two no longer differ. The bootstrap takes
-    much longer, and is drawn by `resample` when it is first asked for.
-    """
+class Estimate(NamedTuple):
+    """A value with its 95 % `interval` (low, high), None where nothing is known of its spread."""
 
     value: float
-    t: Interval = None
-    resample: Callable[[], Interval] = field(default=lambda: None, repr=False, compare=False)
-
-    @cached_property
-    def bootstrap(self) -> Interval:
-        """The bootstrap interval; the same at every call."""
-        return self.resample()
-
-    def to_dict(self) -> dict[str, Any]:
-        """As a JSON document."""
-        return {"value": self.value, "t": self.t, "bootstrap": self.bootstrap}
+    interval: Interval = None
 
 
 def mean(values: Array) -> Estimate:
-    """Mean of S independent values, (S,); without intervals where one is not finite."""
-    if not np.all(np.isfinite(values)):
-        return Estimate(float(np.mean(values)))
-    return Estimate(
-        float(np.mean(values)),
-        _t_interval(values, float(np.mean(values))),
-        lambda: _bootstrap((values,), lambda x, axis: np.mean(x, axis=axis)),
-    )
+    """Mean of S independent values, (S,), with Student's interval; none for one value."""
+    value = float(np.mean(values))
+    return Estimate(value, _t_interval(values, value))
 
 
 def ratio(numerator: Array, denominator: Array) -> Estimate:
-    """Ratio of the means of S paired values, (S,) each.
+    """Ratio of the means of S paired values, (S,) each; NaN where the denominator's mean is zero.
 
-    The t interval is that of the linearised ratio (delta method): residuals (aₛ − r bₛ)/mean(b).
-    NaN without intervals where the denominator's mean is zero.
+    The interval is Student's of the linearised ratio (delta method): residuals (aₛ − r bₛ)/mean(b).
     """
     below = float(np.mean(denominator))
     value = float(np.mean(numerator)) / below if below else float("nan")
-    if not np.isfinite(value):
-        return Estimate(value)
-    return Estimate(
-        value,
-        _t_interval((numerator - value * denominator) / below, value),
-        lambda: _bootstrap(
-            (numerator, denominator),
-            lambda a, b, axis: np.mean(a, axis=axis) / np.mean(b, axis=axis),
-        ),
-    )
+    return Estimate(value, _t_interval((numerator - value * denominator) / (below or 1.0), value))
 
 
 def regret(cost: Array, optimum: Array) -> Estimate:
@@ -146,8 +110,8 @@ def interquartile_mean(values: Array, axis: int = -1) -> Any:
 def over_runs(strata: Sequence[Array]) -> Estimate:
     """Interquartile mean over training runs, each of `strata` (R_i,) one scenario's.
 
-    The bootstrap interval resamples the runs of each stratum by themselves (percentiles); there is
-    no t interval. None where a run is not finite, or where there is only one.
+    The interval is a bootstrap's, which resamples the runs of each stratum by themselves, with a
+    fixed seed (percentiles). None where a run is not finite, or where there is only one.
     """
     value = float(interquartile_mean(np.concatenate(list(strata))))
     if any(len(runs) < 2 for runs in strata) or not all(np.isfinite(r).all() for r in strata):
@@ -156,7 +120,17 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
     def middle(*resampled: Array, axis: int) -> Any:
         return interquartile_mean(np.concatenate(resampled, axis=axis), axis)
 
-    return Estimate(value, None, lambda: _resampled(strata, middle, False, "percentile"))
+    low, high = stats.bootstrap(
+        tuple(strata),
+        middle,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=max(1, AT_ONCE // max(map(len, strata))),
+        confidence_level=LEVEL,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return Estimate(value, (float(low), float(high)))
 
 
 def td_error_mean(
@@ -207,42 +181,12 @@ def _magnitude(reference: Array) -> Array:
     return -reference if float(np.mean(reference)) < 0 else reference
 
 
-def _t_interval(residuals: Array, value: float) -> tuple[float, float] | None:
-    if len(residuals) < 2:
+def _t_interval(residuals: Array, value: float) -> Interval:
+    """Student's interval; None for fewer than two values, or where one is not finite."""
+    if len(residuals) < 2 or not np.isfinite(residuals).all():
         return None
     half = float(stats.t.ppf(0.5 + LEVEL / 2, len(residuals) - 1) * stats.sem(residuals))
     return value - half, value + half
-
-
-def _bootstrap(samples: Sequence[Array], statistic: Any) -> tuple[float, float] | None:
-    """BCa interval of paired samples, None where there are fewer than two."""
-    seeds = len(samples[0])
-    if not 2 <= seeds <= RESAMPLED:
-        return None
-    value = float(statistic(*samples, axis=-1))
-    jackknife = [statistic(*(np.delete(x, s) for x in samples), axis=-1) for s in range(seeds)]
-    # BCa is undefined for a statistic that no seed moves; its interval is the point.
-    if np.ptp(jackknife) <= 1e-12 * max(1.0, abs(value)):
-        return value, value
-    return _resampled(samples, statistic, True, "BCa")
-
-
-def _resampled(
-    samples: Sequence[Array], statistic: Any, paired: bool, method: str
-) -> tuple[float, float]:
-    """Bootstrap interval with a fixed seed: the same values give the same interval."""
-    interval = stats.bootstrap(
-        tuple(samples),
-        statistic,
-        paired=paired,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=max(1, AT_ONCE // max(map(len, samples))),
-        confidence_level=LEVEL,
-        method=method,
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return float(interval.low), float(interval.high)
 
 
 def two_way(cost: Array, optimum: Array) -> Interval:

@@ -17,7 +17,7 @@ import numpy as np
 from controllers import compile_functions
 from controllers.economic import tune
 from controllers.factories import nmpc
-from controllers.optimum import QuasiStaticPolicy, change_of, stored_optimum
+from controllers.optimum import stored_optimum
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
@@ -296,23 +296,6 @@ def _cell(value: float) -> str:
     return "" if isnan(value) else repr(int(value) if value == int(value) else value)
 
 
-def drift(scenario: Scenario) -> Callable[[float], dict[str, float]] | None:
-    """The parameters that change in a scenario's plant, and J*, by column, at a time in s.
-
-    For the log: the learner is not told. J* is NaN where none is stored; None of another plant.
-    """
-    law = change_of(scenario)
-    if law is None:
-        return None
-    known = QuasiStaticPolicy.stored(scenario)
-
-    def row(time: float) -> dict[str, float]:
-        reference = float("nan") if known is None else float(known.gain_at(time))
-        return law.present(time) | {"reference_J": reference}
-
-    return row
-
-
 class Judge:
     """Judges a run's θ by its greedy policy on the held-out seeds.
 
@@ -354,7 +337,7 @@ class Judge:
         return means | {
             "failures": int(costs["failures"].sum()),
             "regret": beyond.value if known else None,
-            "regret_interval": beyond.t,
+            "regret_interval": beyond.interval,
             "gap_closed": gap if known else None,
         }
 
@@ -628,7 +611,6 @@ class _Session:
         self.start = self.loop.start_parameters
         self.rows: list[LogRow] = []
         self.totals = Totals()
-        self.drift = drift(run.scenario)
         self.without_checkpoint: str | None = None
 
     def run_to_the_end(self, judge: Judge, progress: Callable[[int, LogRow], None]) -> str:
@@ -667,8 +649,6 @@ class _Session:
             ),
             "plant_samples": counts["number"],
         }
-        if self.drift is not None:
-            figures |= self.drift(self.plant.time)
         if judge is not None:
             verdict = judge.verdict(answer.theta)
             figures |= {f"greedy_{name}": verdict[name] for name in FIGURES}

@@ -112,8 +112,8 @@ def _judge(scenario: Scenario, trajectories: Path, folder: Path, output: cli.Out
         "scenario": scenario.name,
         "scenario_hash": scenario.hash,
         "seeds": table["seed"].tolist(),
-        "J": mean(cost).to_dict(),
-        "regret": regret(cost, optimum).to_dict(),
+        "J": mean(cost)._asdict(),
+        "regret": regret(cost, optimum)._asdict(),
         "violating_share": float(table["violating_share"].mean()),
     }
     output.json(summary, folder)
@@ -147,7 +147,7 @@ def show(summary: dict[str, Any], output: cli.Output) -> None:
         )
     if summary["comparisons"]:
         output.table(
-            "paired comparisons (95 % t interval over seeds)",
+            "paired comparisons (95 % interval over seeds)",
             ("controller against reference", "ΔJ", "gain in J %"),
             [
                 (
@@ -161,9 +161,9 @@ def show(summary: dict[str, Any], output: cli.Output) -> None:
 
 
 def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:
-    """An estimate of a summary with its t interval; nothing where it is undefined."""
+    """An estimate of a summary with its interval; nothing where it is undefined."""
     from cosim.statistics import shown
 
     if estimate is None or not isfinite(estimate["value"]):
         return ""
-    return shown(estimate["value"], estimate["t"], scale, 3)
+    return shown(estimate["value"], estimate["interval"], scale, 3)

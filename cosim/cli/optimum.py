@@ -146,10 +146,12 @@ def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) 
             for each in (factories.from_file(scenario, theta), OptimalPolicy(plant, found))
         ]
     difference = mean(np.array(J[0]) - np.array(J[1]))
-    assert difference.t is not None
+    assert difference.interval is not None
     base = next(figure for figure in found.certificate if figure.name == "simulation")
     value = base.value + difference.value
-    half_width = 0.5 * np.hypot(difference.t[1] - difference.t[0], base.upper - base.lower)
+    half_width = 0.5 * np.hypot(
+        difference.interval[1] - difference.interval[0], base.upper - base.lower
+    )
     return Figure(SEARCH, value, value - float(half_width), value + float(half_width))
 
 

@@ -66,7 +66,7 @@ def _rows(
         if optimal is not None:
             estimate, scale = regret(values, optimal), 100.0
             values = 100 * regret_terms(values, optimal)
-        ends = (scale * end for end in estimate.t or ())
+        ends = (scale * end for end in estimate.interval or ())
         finished = np.ones(len(values), dtype=bool)
         rows.append(Dots(name, values, finished, scale * estimate.value, *ends))
     values = dot_rows(axes, rows, looks)
@@ -115,4 +115,4 @@ def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[
 
 def _half_width(values: pd.Series[float]) -> float:
     estimate = mean_of(values.to_numpy())
-    return 0.0 if estimate.t is None else (estimate.t[1] - estimate.t[0]) / 2
+    return 0.0 if estimate.interval is None else (estimate.interval[1] - estimate.interval[0]) / 2

@@ -79,17 +79,6 @@ class OperationTable(Table):
     """Cases that the figure shows; all, if left out."""
 
 
-class ThetaTable(Table):
-    """Where the trainings led θ: how far it went, and how far cases are apart."""
-
-    without: list[Source] = []
-    """Blocks of θ that distances leave out, such as those that no action depends on."""
-    blocks: list[Source] = []
-    """Blocks whose entries have columns of their own."""
-    pairs: list[Annotated[list[Source], Field(min_length=2, max_length=2)]] = []
-    """Names of the two cases of each comparison; every two cases, if left out."""
-
-
 class CaseTable(Table):
     """A table `[[case]]`: an algorithm to train, or a controller to evaluate as it is.
 
@@ -190,8 +179,6 @@ class StudyTable(Table):
     """Table `[curves]`."""
     operation: OperationTable | None = None
     """Table `[operation]`: runs are judged at given times of operation."""
-    theta: ThetaTable | None = None
-    """Table `[theta]`: where θ went; not shown, if left out."""
     case: Annotated[list[CaseTable], Field(min_length=1)]
     """Tables `[[case]]`."""
     trajectory: list[TrajectoryTable] = []

@@ -176,7 +176,11 @@ def paper_table(
                     case,
                     f"{ratio:.3f}",
                     shown(float(cost[middle].mean()), None, 1.0, 6),
-                    *(shown(one.value, one.t, 100.0, 3) for each in gains.values() for one in each),
+                    *(
+                        shown(one.value, one.interval, 100.0, 3)
+                        for each in gains.values()
+                        for one in each
+                    ),
                     " and ".join(agrees),
                 ]
             )

@@ -28,7 +28,7 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import figures, operation, pictures, report, store, theta
+from cosim.studies import figures, operation, pictures, report, store
 from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, NAIVE, Plan, safe
 from cosim.studies.report import COLUMNS, SHORT
 from cosim.studies.store import CURVE, INDICATORS, KEYS, STATE, TIMING, WHERE, read_table, to_csv
@@ -37,7 +37,7 @@ from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
-THETA, OPERATION = "theta.csv", "operation.csv"
+OPERATION = "operation.csv"
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -124,8 +124,6 @@ class StudyResults(Shown):
         }
         if self.about.get("operation"):
             tables[OPERATION], tables[GREEDY] = operation.collected(runs, out)
-        if "theta" in self.about:
-            tables[THETA] = theta.collected(runs, out)
         if len(self.aggregate):
             tables[AGGREGATE] = self.aggregate
         for name, table in tables.items():
@@ -213,7 +211,7 @@ class StudyResults(Shown):
             for run, known in enumerate(state.to_dict("records")):
                 found = self.regret(case, scenario, [run])
                 cost = float(own["J"][run].mean())
-                row = known | _columns("regret", found.value, found.t)
+                row = known | _columns("regret", found.value, found.interval)
                 row["J"] = cost if np.isfinite(cost) else np.inf
                 row["gap_closed"] = self.gap_closed(case, scenario, [run]).value
                 row |= {name: float(own[name][run].mean()) for name in MEANS}
@@ -257,9 +255,9 @@ class StudyResults(Shown):
             "plant_samples": runs.plant_samples.max(),
             "finished": int((~runs.status.str.startswith("diverged")).sum()),
             "runs": len(runs),
-            **_columns("regret_median", median.value, median.t),
+            **_columns("regret_median", median.value, median.interval),
             "regret_worst": float(values[order[-1]]),
-            **_columns("regret_iqm", spread.value, spread.bootstrap),
+            **_columns("regret_iqm", spread.value, spread.interval),
             "J_median": float(np.median(cost)),
             "J_worst": float(cost[order[-1]]),
             "J_iqm": over_runs([cost[order]]).value,
@@ -331,7 +329,7 @@ class StudyResults(Shown):
             spread, everything = over_runs(strata), np.concatenate(strata)
             row = {"case": case, "scenarios": len(strata), "runs": len(everything)}
             row |= {"regret_median": np.median(everything), "regret_worst": everything.max()}
-            rows.append(row | _columns("regret_iqm", spread.value, spread.bootstrap))
+            rows.append(row | _columns("regret_iqm", spread.value, spread.interval))
         rows.sort(key=lambda row: float(row["regret_iqm"]))
         return pd.DataFrame(rows, columns=AGGREGATE_COLUMNS)
 
@@ -384,9 +382,6 @@ class StudyResults(Shown):
         for scenario, about in (self.about.get("operation") or {}).items():
             judged, seconds = self._judged(scenario), self._seconds(scenario)
             found += operation.tables(judged, scenario, about, against, seconds)
-        if self.about.get("theta") is not None:
-            frame = read_table(self.folder / THETA)
-            found += theta.tables(frame, self.runs, self.trained, **self.about["theta"])
         if "paper" in self.about["tables"]:
             found.append(self.paper())
         return found
@@ -617,7 +612,5 @@ def document(plan: Plan) -> dict[str, Any]:
             }
             for name, scenario in definition.scenarios.items()
         }
-    if (settings := definition.table.theta) is not None:
-        about["theta"] = {"settings": settings.model_dump(), "scales": theta.scales(plan)}
     found: dict[str, Any] = json.loads(json.dumps(about))
     return found

@@ -3,21 +3,17 @@
 import numpy as np
 import pytest
 
-from controllers.optimum import QuasiStaticPolicy
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
-from cosim import FmuPlant, Scenario
+from cosim import FmuPlant
 from cosim.simulation import indicators_of
 from learning import QLearning
 from learning.configuration import Configuration
 from learning.errors import ConfigurationError
 from learning.training import (
-    COLUMNS,
     FIGURES,
     HELD_OUT,
     Judge,
-    drift,
-    run_training,
     starting_parameters,
 )
 from tests.helpers.training import make_run
@@ -77,38 +73,6 @@ def test_a_file_keeps_its_own_slack_weights_and_model_parameters(problem, tmp_pa
     }
     with pytest.raises(ConfigurationError, match="parametrisation=extended"):
         starting_parameters(problem, Configuration(parametrisation="paper"), path)
-
-
-@pytest.fixture(scope="module")
-def drifting():
-    return Scenario.load("drifting")
-
-
-def test_the_reference_is_that_of_the_present_heat_transfer(drifting):
-    at, policy = drift(drifting), QuasiStaticPolicy.stored(drifting)
-    clean, fouled = at(0.0), at(6 * 86400.0 - 60.0)
-    assert clean == {"UA2": pytest.approx(6.84), "reference_J": policy.gains[-1][1]}
-    assert fouled["UA2"] == pytest.approx(6.84 * (0.7 + 0.3 * np.exp(-1.8)), rel=1e-3)
-    assert fouled["reference_J"] > clean["reference_J"] + 150.0
-    assert at(6 * 86400.0) == clean
-
-
-def test_the_log_of_a_plant_that_jumps_shows_the_parameter_as_it_is():
-    jump = Scenario.load("jump")
-    at, time = drift(jump), jump.plant.changes[0].time
-    assert [at(t)["UA2"] for t in (0.0, time, 1e9)] == [6.84, 5.2, 6.84]
-    assert at(time)["reference_J"] > at(0.0)["reference_J"]
-
-
-@pytest.mark.parametrize(("name", "more"), [("paper", []), ("drifting", ["UA2", "reference_J"])])
-def test_the_log_shows_it_at_the_end_of_each_row(name, more):
-    every = {"log_every": 30, "evaluate_every": 60, "checkpoint_every": 60}
-    run = make_run("offset-free", name, {"back_off": False}, samples=60, **every)
-    rows = run_training(run).rows
-    assert list(rows[0]) == [*COLUMNS, *more]
-    if more:
-        at = drift(run.scenario)
-        assert [row["UA2"] for row in rows] == [at(t)["UA2"] for t in (1800.0, 3600.0)]
 
 
 def judge(plant, parameters, optimum=None):

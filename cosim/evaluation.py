@@ -304,7 +304,7 @@ class Evaluation(Result):
                 for i, name in enumerate(self.controllers)
                 for reference in self.controllers[:i]
             ],
-            "timing": {name: self.timing[name].median()._asdict() for name in self.controllers},
+            "timing": {name: self.timing[name].median().to_dict() for name in self.controllers},
         }
 
     def _controller(self, name: str) -> dict[str, Any]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
-from itertools import cycle
+from itertools import chain, cycle
 from math import inf
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -18,6 +20,7 @@ from cosim.protocols import Array, Controller, SampleBlock, controller_name
 from cosim.recording.stream import (
     SAMPLE,
     SERIES,
+    TIME,
     Channel,
     Stream,
     about_view,
@@ -36,6 +39,7 @@ from cosim.trajectory import SIGNALS, SignalKind
 ALONE = ("states", "actions", "costs")
 """Groups with an entity for each signal; those of the others share one, which takes less space."""
 HELD = ("actions", "disturbances")
+FREE = (-inf, inf)
 _STATUS, _RESIDUAL = "solver/status", "solver/log_residual"
 _GOOD = "#3A9A5B"
 
@@ -190,7 +194,7 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
             name,
             unit,
             SERIES[1] if name in ("penalty", "feedback_time") else next(colors),
-            scenario.limits.get(name, (-inf, inf)) if kind.vector else (-inf, inf),
+            scenario.limits.get(name, FREE) if kind.vector else FREE,
             step=kind.name in HELD,
         )
         for name, unit in zip(kind.names(scenario), kind.units(scenario, units), strict=True)
@@ -212,6 +216,40 @@ penalty of violating the state bounds (red lines).
 """
 
 
+class Plot(NamedTuple):
+    """A view of what has ended: its title, and of each signal its channel, rows and values."""
+
+    title: str
+    signals: Sequence[tuple[Channel, list[rr.TimeColumn], Array]]
+
+
+def _record(
+    path: str | Path,
+    title: str,
+    tabs: Mapping[str, Sequence[Plot]],
+    along: rrb.TimeAxis,
+    about: str,
+    *,
+    timeline: str = TIME,
+    ends: list[rr.TimeColumn] | None = None,
+    properties: Mapping[str, object] = MappingProxyType({}),
+) -> None:
+    """Write a recording of plots in tabs; bounds are drawn between the two times `ends`."""
+    grids = []
+    for name, plots in tabs.items():
+        views = (view(p.title, [channel for channel, _, _ in p.signals], along) for p in plots)
+        grids += [rrb.Grid(*views, grid_columns=3, name=name)] * bool(plots)
+    shown = layout(rrb.Tabs(*grids, about_view("about")), timeline)
+    with Stream(path, title, shown) as stream:
+        if properties:
+            stream.properties(properties)
+        stream.about(about)
+        for plot in chain(*tabs.values()):
+            for channel, rows, values in plot.signals:
+                stream.bounds([channel], ends or [])
+                stream.send([channel], rows, values)
+
+
 def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str) -> None:
     """Write a recording of runs of one scenario by name, over each other; raises RecordingError.
 
@@ -219,57 +257,35 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
     `difference/<signal>`; bounds are those that the first run knows. `about` is Markdown.
     """
     first, *others = runs.values()
-    common = [n for n in first.signals if n != "time" and all(n in run.signals for run in others)]
-    overlaid = {
-        signal: [
-            Channel(
-                f"{escaped(name)}/{escaped(signal)}",
-                f"{name}/{signal}",
-                run.signals[signal].unit,
-                color,
-                first.bounds.get(signal, (-inf, inf)) if run is first else (-inf, inf),
-                labels=[name],
-            ).see(run.signals[signal].values)
-            for (name, run), color in zip(runs.items(), cycle(SERIES), strict=False)
-        ]
-        for signal in common
+    times_of = {
+        name: run.signals["time"].values if "time" in run.signals else np.arange(float(len(run)))
+        for name, run in runs.items()
     }
-    differences = {s: _difference(s, first, others[0]) for s in common if len(runs) == 2}
-    seconds = max((float(_time(run)[-1]) for run in runs.values() if len(run)), default=0.0)
-    along = axis(seconds=seconds)
-    plots = [
-        view(replace(channels[0], name=signal).title, channels, along)
-        for signal, channels in overlaid.items()
-    ]
-    deviations = [view(c.title, [c], along) for c, _ in differences.values()]
-    tabs = [rrb.Grid(*plots, grid_columns=3, name=" / ".join(runs))]
-    if deviations:
-        tabs.append(rrb.Grid(*deviations, grid_columns=3, name="difference"))
-    views = layout(rrb.Tabs(*tabs, about_view("about")))
-    with Stream(path, " / ".join(runs), views) as stream:
-        stream.about(about)
-        ends = times([0, max(map(len, runs.values())) - 1], np.array([0.0, seconds]))
-        for signal, channels in overlaid.items():
-            stream.bounds(channels, ends)
-            for channel, run in zip(channels, runs.values(), strict=True):
-                rows = times(np.arange(len(run)), _time(run))
-                stream.send([channel], rows, run.signals[signal].values)
-        for channel, values in differences.values():
-            rows = times(np.arange(len(values)), _time(first)[: len(values)])
-            stream.send([channel], rows, values)
-
-
-def _difference(signal: str, a: RunSignals, b: RunSignals) -> tuple[Channel, Array]:
-    x, y = a.signals[signal].values, b.signals[signal].values
-    length = min(len(x), len(y))
-    with np.errstate(invalid="ignore"):
-        values = x[:length] - y[:length]
-    name, unit = f"difference/{signal}", a.signals[signal].unit
-    return Channel(f"difference/{escaped(signal)}", name, unit, SERIES[3]).see(values), values
-
-
-def _time(run: RunSignals) -> Array:
-    return run.signals["time"].values if "time" in run.signals else np.arange(float(len(run)))
+    rows = {name: times(np.arange(len(time)), time) for name, time in times_of.items()}
+    overlaid, differences = [], []
+    for signal, own in first.signals.items():
+        if signal == "time" or not all(signal in run.signals for run in others):
+            continue
+        lines = []
+        for (name, run), color in zip(runs.items(), cycle(SERIES), strict=False):
+            entity, values = f"{escaped(name)}/{escaped(signal)}", run.signals[signal].values
+            bounds = first.bounds.get(signal, FREE) if run is first else FREE
+            line = Channel(entity, f"{name}/{signal}", own.unit, color, bounds, labels=[name])
+            lines.append((line.see(values), rows[name], values))
+        overlaid.append(Plot(replace(lines[0][0], name=signal).title, lines))
+        if len(runs) == 2:
+            common = min(len(values) for _, _, values in lines)
+            with np.errstate(invalid="ignore"):
+                values = lines[0][2][:common] - lines[1][2][:common]
+            entity, name = f"difference/{escaped(signal)}", f"difference/{signal}"
+            line = Channel(entity, name, own.unit, SERIES[3]).see(values)
+            time = next(iter(times_of.values()))[:common]
+            differences.append(Plot(line.title, [(line, times(np.arange(common), time), values)]))
+    seconds = max((float(time[-1]) for time in times_of.values() if len(time)), default=0.0)
+    title, last = " / ".join(runs), max(map(len, runs.values())) - 1
+    tabs = {title: overlaid, "difference": differences}
+    ends = times([0, last], np.array([0.0, seconds]))
+    _record(path, title, tabs, axis(seconds=seconds), about, ends=ends)
 
 
 def record_training(
@@ -287,36 +303,17 @@ def record_training(
 
     Raises RecordingError where the file cannot be written.
     """
-    samples = log["samples"]
-    blocks = {
-        name: Channel(
-            f"increment/{escaped(name)}", f"increment/{name}", labels=list(labels[name])
-        ).see(values)
-        for name, values in increments.items()
-    }
-    columns = {
-        name: Channel(
-            f"log/{escaped(name)}",
-            name,
-            color=SERIES[number % len(SERIES)],
-            points=bool(np.isnan(values).any()),
-        ).see(values)
-        for number, (name, values) in enumerate(log.items())
-    }
+    samples = log["samples"].astype(np.int64)
+    rows, theta, course = times(samples), [], []
+    for name, values in increments.items():
+        entity, own = f"increment/{escaped(name)}", list(labels[name])
+        block = Channel(entity, f"increment/{name}", labels=own).see(values)
+        theta.append(Plot(f"change of {name}", [(block, rows, values)]))
+    for (name, values), color in zip(log.items(), cycle(SERIES), strict=False):
+        rare = bool(np.isnan(values).any())
+        column = Channel(f"log/{escaped(name)}", name, color=color, points=rare).see(values)
+        course.append(Plot(name, [(column, rows, values)]))
     along = axis(samples=int(samples[-1]) if len(samples) else 0)
-    views = layout(
-        rrb.Tabs(
-            rrb.Grid(*(view(f"change of {n}", [b], along) for n, b in blocks.items()), name="θ"),
-            rrb.Grid(*(view(name, [c], along) for name, c in columns.items()), name="log"),
-            about_view("about this training"),
-        ),
-        SAMPLE,
-    )
-    with Stream(path, title, views) as stream:
-        stream.properties(properties)
-        stream.about(f"# {title}\n\n{table('training', properties)}\n")
-        rows = times(samples.astype(np.int64))
-        for name, block in blocks.items():
-            stream.send([block], rows, increments[name])
-        for name, column in columns.items():
-            stream.send([column], rows, log[name])
+    about = f"# {title}\n\n{table('training', properties)}\n"
+    tabs = {"θ": theta, "log": course}
+    _record(path, title, tabs, along, about, timeline=SAMPLE, properties=properties)

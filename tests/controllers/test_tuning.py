@@ -130,6 +130,7 @@ def test_without_the_active_constraint_there_is_no_solution():
         convexify(steady.A, steady.B, steady.hessian, none)
 
 
+@pytest.mark.slow
 def test_economic_gain_is_that_of_the_nonlinear_economic_problem():
     # The oracle is to have the tuning's integrator, not the controller's coarser one.
     problem = replace(PROBLEMS["paper"], substeps=8)

@@ -172,16 +172,16 @@ SHAPES = [
 def test_the_two_way_interval_covers_the_median_at_its_level(
     runs, seeds, by_run, by_noise, monkeypatch
 ):
-    """Random effects of run, noise seed and both; 2000 studies, with fewer resamples for speed."""
+    """Random effects of run, noise seed and both; 1000 studies, with fewer resamples for speed."""
     monkeypatch.setattr(statistics, "RESAMPLES", 299)
     rng, covered = np.random.default_rng(7), 0
-    for _ in range(2000):
+    for _ in range(1000):
         optimum = 100.0 + rng.normal(size=seeds)
         effects = rng.normal(0.0, by_run, (runs, 1)) + rng.normal(0.0, by_noise, seeds)
         cost = optimum + 2.0 + effects + rng.normal(0.0, by_noise, (runs, seeds))
         low, high = two_way(cost, optimum)
         covered += low <= 0.02 <= high
-    assert 0.92 < covered / 2000 < 0.98
+    assert 0.92 < covered / 1000 < 0.98
 
 
 @pytest.mark.parametrize("runs", [5, 10])

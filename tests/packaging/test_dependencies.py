@@ -91,6 +91,7 @@ def test_the_lock_names_all_that_the_dependencies_bring():
     assert found - locked(sys.platform).keys() == set()
 
 
+@pytest.mark.slow
 def test_without_the_viewer_the_core_is_small():
     core = closure(lambda extra: not extra) - {"rerun-sdk", "pyarrow"}
     assert len(core) > 30
@@ -98,6 +99,7 @@ def test_without_the_viewer_the_core_is_small():
     assert sum(path.stat().st_size for path in paths if path.is_file()) < 0.9e9
 
 
+@pytest.mark.slow
 def test_what_is_installed_agrees():
     result = subprocess.run([*PIP, "check"], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr

@@ -11,6 +11,7 @@ from cosim.studies.board import read_entry, write_board
 BOARD = Path(__file__).parents[3] / "results" / "board"
 
 
+@pytest.mark.slow
 def test_every_entry_holds_and_the_page_shows_it(tmp_path):
     shutil.copytree(BOARD, tmp_path, dirs_exist_ok=True)
     (tmp_path / "README.md").unlink()

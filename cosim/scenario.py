@@ -99,6 +99,8 @@ class PlantTable(Table):
     """State at k = 0, (n,)."""
     parameters: dict[str, float | bool] = {}
     """Further start values, by variable, that each reset writes."""
+    communication_step: Positive | None = None
+    """Steps in s by which the FMU goes through a sample, a divisor of the sampling time; else 1."""
     changes: Annotated[tuple[ChangeTable, ...], Field(strict=False)] | None = None
     """Tables `[[plant.changes]]`: what changes in mid run, times increasing."""
     model: Annotated[str, Field(pattern=r"^[\w.]+:\w+$")] | None = None
@@ -257,6 +259,9 @@ class Scenario(Shown, Table):
             upper = getattr(self.bounds, f"{kind}_upper")
             if not all(low < high for low, high in zip(lower, upper, strict=True)):
                 raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper in every entry")
+        steps = self.sampling_time / (plant.communication_step or self.sampling_time)
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
+            raise ValueError("plant.communication_step: must be a divisor of sampling_time")
         times = [change.time for change in plant.changes or ()]
         if any(first >= second for first, second in pairwise(times)):
             raise ValueError("plant.changes: must have increasing times")

@@ -1,4 +1,4 @@
-"""The closed loop of two connected FMUs as an SSP 1.0 archive."""
+"""The closed loop of two connected FMUs as an SSP archive."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from pathlib import Path
 
 import fmpy
 from attrs import asdict
+from fmpy.model_description import ModelDescription
 
 from fmus import BuildError
 from fmus.build import write_archive
 from fmus.model import render
-
-# Importers of FMI 2.0 set an enumeration through its number.
-_ELEMENTS = {"Real": "Real", "Integer": "Integer", "Boolean": "Boolean", "Enumeration": "Integer"}
 
 
 def write_ssp(
@@ -26,25 +24,25 @@ def write_ssp(
     *,
     stop_time: float,
 ) -> Path:
-    """Write a loop of two FMI 2.0 FMUs (System Structure and Parameterization); the bytes repeat.
+    """Write a loop of two FMUs (System Structure and Parameterization); the bytes repeat.
 
-    The controller is stepped first. `states` go from the plant to it, `actions` back, by their
-    names in both and with their units; `starts` are the plant's start values with their FMI 2.0
-    types, `Real`, `Integer`, `Boolean` or `Enumeration`. Raises BuildError where an FMU is not FMI
-    2.0.
+    It is SSP 1.0 where both are FMI 2.0, else SSP 2.0, which has FMI 3.0's types. The controller is
+    stepped first. `states` go from the plant to it, `actions` back, by their names in both and with
+    their units; `starts` are the plant's start values with their FMI types. Raises BuildError where
+    an FMU has no co-simulation.
     """
-    members = {"resources/plant.ssv": _parameter_set("plant", starts).encode()}
+    members: dict[str, bytes] = {}
     components = []
+    versions = set()
     units: dict[str, dict[str, float]] = {}
     for name, fmu, inputs, outputs in (
         ("controller", controller, states, actions),
         ("plant", plant, actions, states),
     ):
         description = fmpy.read_model_description(str(fmu))
-        if description.fmiVersion != "2.0" or description.coSimulation is None:
-            raise BuildError(
-                f"{fmu} is not an FMI 2.0 FMU for co-simulation, which SSP 1.0 asks for"
-            )
+        if description.coSimulation is None:
+            raise BuildError(f"{fmu} has no co-simulation interface")
+        versions.add(description.fmiVersion[0])
         members[f"resources/{name}.fmu"] = fmu.read_bytes()
         known = {u.name: asdict(u.baseUnit) for u in description.unitDefinitions if u.baseUnit}
         unit_of = {v.name: v.unit for v in description.modelVariables if v.unit in known}
@@ -54,14 +52,22 @@ def write_ssp(
             for kind, names in (("input", inputs), ("output", outputs))
             for each in names
         ]
-        components.append(({"name": name, "starts": name == "plant"}, connectors))
+        real = "Real" if description.fmiVersion[0] == "2" else "Float64"
+        about = {"name": name, "starts": name == "plant", "real": real}
+        components.append((about, connectors))
     connections = [
         {"start": (one, name), "end": (other, name)}
         for one, other, names in (("plant", "controller", states), ("controller", "plant", actions))
         for name in names
     ]
+    ssp = "1.0" if versions == {"2"} else "2.0"
+    parameters = _parameters(description, starts)
+    members["resources/plant.ssv"] = render(
+        "parameters.ssv", version=ssp, name="plant", parameters=parameters
+    ).encode()
     members["SystemStructure.ssd"] = render(
         "SystemStructure.ssd",
+        version=ssp,
         name="loop",
         components=components,
         connections=connections,
@@ -71,11 +77,20 @@ def write_ssp(
     return write_archive(members, Path(target))
 
 
-def _parameter_set(component: str, starts: Mapping[str, tuple[str, float]]) -> str:
+def _parameters(
+    plant: ModelDescription, starts: Mapping[str, tuple[str, float]]
+) -> list[tuple[str, str, str]]:
+    """Name, element and text of each start value."""
+    types = {variable.name: variable.declaredType for variable in plant.modelVariables}
     parameters = []
-    for name, (kind, value) in starts.items():
-        text = repr(float(value)) if kind == "Real" else str(int(value))
+    for name, (stated, value) in starts.items():
+        # Importers of FMI 2.0 set an enumeration through its number.
+        number = stated == "Enumeration" and plant.fmiVersion[0] == "2"
+        kind = "Integer" if number else stated
+        text = repr(float(value)) if kind in ("Real", "Float64", "Float32") else str(int(value))
         if kind == "Boolean":
             text = "true" if value else "false"
-        parameters.append((name, _ELEMENTS[kind], text))
-    return render("parameters.ssv", name=component, parameters=parameters)
+        elif kind == "Enumeration":
+            text = next(item.name for item in types[name].items if item.value == text)
+        parameters.append((name, kind, text))
+    return parameters

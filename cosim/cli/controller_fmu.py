@@ -155,7 +155,7 @@ def write_loop(controller: Path, scenario: Scenario, seed: int, target: Path) ->
     The controller comes first: it acts on the state at the sample, then the plant takes the step.
     Where the plant can, its inputs saturate, as the loop of `simulate` does it, so that a master
     may begin before any action has come.
-    Raises BuildError where the plant is not FMI 2.0, PlantError where it does not fit the scenario.
+    Raises PlantError where the plant does not fit the scenario.
     """
     plant = scenario.plant
     plant_seed, _ = spawn_seeds(seed)

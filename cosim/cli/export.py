@@ -67,8 +67,6 @@ def export(
         system = controller_fmu.sampled_controller(rti, loaded, units)
         every_platform = not local and find_spec("ziglang") is not None
         version: FmiVersion = 3 if fmi == 3 else 2
-        if ssp is not None and version != 2:
-            raise CosimError("--ssp needs --fmi 2: SSP 1.0 connects FMUs of FMI 2.0")
         path = controller_fmu.write_fmu(system, rti, loaded, out, version, every_platform)
         platforms = [p.tuple for p in (PLATFORMS if every_platform else [present()])]
         out_.note(f"wrote {path}: FMI {version}.0 for {', '.join(platforms)}")

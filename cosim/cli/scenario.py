@@ -70,10 +70,11 @@ def show(
 
 
 def _seed_values(scenario: Scenario, seed: int) -> dict[str, float | bool | int]:
-    from cosim.plant.fmu_plant import start_values
+    from cosim.plant.fmu_plant import REALS, start_values
     from cosim.simulation import spawn_seeds
 
-    types: dict[str, Callable[[float], float | bool | int]] = {"Real": float, "Boolean": bool}
+    types: dict[str, Callable[[float], float | bool | int]] = dict.fromkeys(REALS, float)
+    types["Boolean"] = bool
     starts = start_values(scenario, spawn_seeds(seed)[0])
     return {name: types.get(kind, int)(value) for name, (kind, value) in starts.items()}
 

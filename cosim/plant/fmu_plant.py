@@ -28,7 +28,7 @@ from cosim.protocols import Array, CompiledLoop, Step
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
 
-_REAL = ("Real", "Float64", "Float32")
+REALS = ("Real", "Float64", "Float32")
 
 
 def refusals(fmu: UnpackedFmu) -> Iterator[str]:
@@ -57,19 +57,19 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
         yield f"{name} has no output that is a number: there is nothing for a controller to see"
 
 
-def check_step(fmu: UnpackedFmu, sampling_time: float) -> None:
-    """Raise PlantError where the sampling time [s] is no multiple of a fixed internal step.
+def check_step(fmu: UnpackedFmu, step: float) -> None:
+    """Raise PlantError where a communication step [s] is no multiple of a fixed internal step.
 
     canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
     """
     internal = fmu.description.coSimulation.fixedInternalStepSize
     if internal is None or float(internal) <= 0:
         return
-    count = sampling_time / float(internal)
+    count = step / float(internal)
     if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
         raise PlantError(
             f"FMU '{fmu.path}' steps by multiples of {float(internal):g} s "
-            f"(fixedInternalStepSize), and the sampling time of {sampling_time:g} s is none"
+            f"(fixedInternalStepSize), and the communication step of {step:g} s is none"
         )
 
 
@@ -173,7 +173,7 @@ class Wirer:
         variable = self._find(name, table)
         if variable.type not in self._interface.setters:
             raise self._misfit(name, table, f"is {_a(variable.type)}, which cannot be set here")
-        if variable.type not in _REAL and value != int(value):
+        if variable.type not in REALS and value != int(value):
             raise self._misfit(name, table, f"is {_a(variable.type)} and cannot take {value}")
         if not has_start(variable):
             raise self._misfit(name, table, f"is {_a(variable.causality)} without a start to set")
@@ -253,14 +253,14 @@ def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
 
 
 def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, float]]:
-    """FMI 2.0 type and value of each parameter that differs by scenario, the seed's words too.
+    """FMI type and value of each parameter that differs by scenario, the seed's words too.
 
     `plant_seed`, 64 bits, is the first of `cosim.simulation.spawn_seeds`; an Integer, which has
     32 bits and a sign, takes its low word, the next one the high word. Raises PlantError where the
     scenario's FMU does not fit it.
     """
     fmu = unpack(scenario.plant.fmu)
-    wirer = Wirer(scenario, fmu, Fmi2Instance)
+    wirer = Wirer(scenario, fmu, _interface(fmu))
     names = {
         (int(variable.valueReference), variable.type): variable.name
         for variable in fmu.description.modelVariables
@@ -270,6 +270,10 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
         signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
         found[names[place[:2]]] = (place.type, signed)
     return found
+
+
+def _interface(fmu: UnpackedFmu) -> type[Instance]:
+    return Fmi2Instance if str(fmu.description.fmiVersion)[0] == "2" else Fmi3Instance
 
 
 _NOT_STARTED = -1
@@ -299,7 +303,8 @@ class FmuPlant:
     """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
 
     At sample k, time k·h: the action is written, ℓ(x_k, u_k, d_k) and d_k are read, the FMU steps
-    by the sampling time h, and x_{k+1} is read. Use it as a context manager, or call `close`.
+    by the sampling time h, in one step or in those of `plant.communication_step`, and x_{k+1} is
+    read. Use it as a context manager, or call `close`.
     An FMU is native code: name only files that you trust.
 
     Raises PlantError if the FMU is missing, corrupt, has no co-simulation binary for this
@@ -316,14 +321,15 @@ class FmuPlant:
         self._handles: list[ctypes.c_void_p] = []
         self._free_handles: list[ctypes.c_void_p] = []
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
-        version = str(archive.description.fmiVersion)
         for refusal in refusals(archive):
             raise PlantError(refusal)
-        check_step(archive, self.scenario.sampling_time)
-        interface = Fmi2Instance if version[0] == "2" else Fmi3Instance
+        self._h = self.scenario.sampling_time
+        step = self.scenario.plant.communication_step or self._h
+        check_step(archive, step)
+        interface = _interface(archive)
         wirer = Wirer(self.scenario, archive, interface)
         self.unpacked = archive
-        self.fmi_version = version
+        self.fmi_version = str(archive.description.fmiVersion)
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
         wiring = wirer.wiring()
@@ -333,15 +339,15 @@ class FmuPlant:
         self._seeds = wirer.seeds()
         self._initial = wirer.initial_states()
         self._elsewhere = False
-        self._h = self.scenario.sampling_time
         self._m = len(self.scenario.plant.actions)
         self._k = _NOT_STARTED
         self._started = False
         self._penalty_now = 0.0
-        self._fmi = interface(archive, wiring, self._h)
-        self.drivable = self._fmi.drivable  # what `drive` can step
+        self._steps = round(self._h / step)
+        self._fmi = interface(archive, wiring, self._h / self._steps)
+        self.drivable = self._fmi.drivable and self._steps == 1  # what `drive` can step
         self._changes = {k: self._fmi.writer(*change) for k, change in wirer.changes().items()}
-        self._advance = self._fmi.advance
+        self._advance = self._fmi.advance if self._steps == 1 else self._advance_in_steps
         self._inputs = self._fmi.inputs
         self._outputs = self._fmi.outputs
         self._states = self._fmi.states
@@ -405,6 +411,15 @@ class FmuPlant:
         self._k = k + 1
         self._penalty_now = self.penalty(states)
         return Step(self._copy_states(), cost, penalty, self._copy_disturbances())
+
+    def _advance_in_steps(self, time: float) -> None:
+        """Step through a sample; the outputs are those of its begin."""
+        fmi = self._instance
+        fmi.advance(time)
+        begin = self._outputs[:]
+        for i in range(1, self._steps):
+            fmi.advance(time + i * self._h / self._steps)
+        self._outputs[:] = begin
 
     def drive(self, loop: CompiledLoop, table: Array) -> Array:
         """Let a compiled loop make the next samples, a row of `table` each; return the state (n,).

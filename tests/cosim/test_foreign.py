@@ -1,14 +1,17 @@
 """FMUs that this project did not write, or that misbehave."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 import fmus
 from cosim import FmuPlant, Scenario, simulate
-from cosim.errors import CapabilityError, PlantError
+from cosim.errors import CapabilityError, PlantError, ScenarioError
 from cosim.plant.fmi import unpack
 from tests.helpers.command import run_cosim
 from tests.helpers.kinds import REALS, build_kind, scenario_for
@@ -229,8 +232,28 @@ def test_an_output_that_starts_exactly_is_its_own_start_parameter(tmp_path, vers
 def test_a_fixed_internal_step_takes_its_multiples(tmp_path):
     fmu = build_kind(tmp_path, 3, face=f'{CS} fixedInternalStepSize="0.25"')
     assert trajectory(scenario_for(tmp_path, fmu)) == expected()
-    with pytest.raises(PlantError, match=r"multiples of 0\.25 s .*sampling time of 0\.6 s is none"):
+    with pytest.raises(PlantError, match=r"multiples of 0\.25 s .*communication step of 0\.6 s is"):
         FmuPlant(scenario_for(tmp_path, fmu, sampling_time=0.6))
+
+
+def test_a_sample_is_made_of_the_steps_that_the_scenario_names(tmp_path, version):
+    """For FMUs that integrate by their communication step, as OpenModelica's and pythonfmu's do."""
+    scenario = Scenario.load(scenario_for(tmp_path, build_kind(tmp_path, version)))
+    changes = {"plant": {"communication_step": 0.125, "stage_cost": "x"}}
+    with FmuPlant(scenario.replace(changes)) as plant:
+        x = plant.reset(0)[0]
+        for _ in range(3):
+            begin, step = x, plant.step([2.0])
+            for _ in range(4):
+                x += 0.125 * (2.0 - x)
+            assert (step.s[0], step.stage_cost) == (x, begin)
+        assert simulate(plant, Hold([2.0]), 4, 0)["x"][-1] == x
+    with pytest.raises(ScenarioError, match="communication_step: must be a divisor of sampling_"):
+        scenario.replace({"plant": {"communication_step": 0.2}})
+    fixed = build_kind(tmp_path, 3, face=f'{CS} fixedInternalStepSize="0.25"')
+    changes = {"plant": {"fmu": str(fixed), "communication_step": 0.125}}
+    with pytest.raises(PlantError, match=r"communication step of 0\.125 s is none"):
+        FmuPlant(scenario.replace(changes))
 
 
 def test_model_exchange_alone_is_refused(tmp_path, version):
@@ -264,6 +287,41 @@ def test_one_that_needs_its_tool_runs_where_the_tool_is_there(tmp_path, version)
     other = edited(fmus.path(name), tmp_path / "other.fmu", refused)
     with pytest.raises(PlantError, match=r"instantiated.*needs the tool .*: .*the token differs"):
         FmuPlant("paper", other)
+
+
+SLAVE = """
+import {module}
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+class Slave(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.x, self.u, self.cost = 1.0, 0.0, 0.0
+        self.register_variable(Real("x", causality=Fmi2Causality.output))
+        self.register_variable(Real("cost", causality=Fmi2Causality.output))
+        self.register_variable(Real("u", causality=Fmi2Causality.input))
+
+    def do_step(self, time, step):
+        self.x += step * (self.u - self.x)
+        return True
+"""
+
+
+def test_one_of_pythonfmu_runs_or_names_the_module_that_it_lacks(tmp_path):
+    pytest.importorskip("pythonfmu")
+    (tmp_path / "elsewhere.py").write_text("")
+    document = Scenario.load(scenario_for(tmp_path, build_kind(tmp_path, 2))).to_dict()
+    document["plant"] |= {"parameters": {}, "mapping": {}}
+    build = [sys.executable, "-m", "pythonfmu", "build", "-f"]
+    for module in ("math", "elsewhere"):
+        (tmp_path / f"with_{module}.py").write_text(SLAVE.format(module=module))
+        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+        subprocess.run([*build, f"with_{module}.py"], cwd=tmp_path, env=environment, check=True)
+        (tmp_path / "Slave.fmu").rename(tmp_path / f"{module}.fmu")
+    document["plant"]["fmu"] = str(tmp_path / "math.fmu")
+    assert trajectory(Scenario.from_dict(document)) == expected()
+    with pytest.raises(PlantError, match=r"(?s)instantiated.*needs the tool.*'elsewhere'"):
+        FmuPlant(Scenario.from_dict(document), tmp_path / "elsewhere.fmu")
 
 
 @pytest.mark.parametrize(("fault", "status"), [(1, -7), (2, 9)])

@@ -21,14 +21,18 @@ SAMPLES = 30
 
 
 @pytest.mark.parametrize("law", ["uniform", "normal"])
-def test_fmpy_alone_meets_the_benchmarks_noise(cosim, tmp_path, law):
-    scenario = Scenario.load("paper").replace({"disturbance": {"law": law}})
+@pytest.mark.parametrize("fmu", ["evaporator", "evaporator_fmi3"])
+def test_fmpy_alone_meets_the_benchmarks_noise(cosim, tmp_path, fmu, law):
+    changes = {"plant": {"fmu": fmu}, "disturbance": {"law": law}}
+    scenario = Scenario.load("paper").replace(changes)
     (tmp_path / "s.toml").write_text(scenario.to_toml())
     code, out, _ = cosim("scenario", "s.toml", "--seed-values", 3, "--json")
     assert code == 0
-    assert -(2**31) <= json.loads(out)["start_values"]["seedHigh"] < 2**31
+    starts = json.loads(out)["start_values"]
+    assert starts["P2_start"] == scenario.initial_state[1]
+    assert -(2**31) <= starts.get("seedHigh", 0) < 2**31
     (tmp_path / "start.json").write_text(out)
-    command = [ROOT / "examples" / "fmpy_seed.py", ROOT / "fmus" / "evaporator.fmu", "start.json"]
+    command = [ROOT / "examples" / "fmpy_seed.py", ROOT / "fmus" / f"{fmu}.fmu", "start.json"]
     result = subprocess.run(
         [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, check=True
     )

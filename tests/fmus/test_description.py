@@ -1,4 +1,4 @@
-"""Every FMU and SSP that we make, against the standards' own XML schemas, which fmpy carries."""
+"""Every FMU and SSP that we make, against the standards' own XML schemas, in `tests/schemas`."""
 
 import zipfile
 from dataclasses import replace
@@ -180,18 +180,21 @@ def test_the_terminals_of_plant_and_controller_fit_each_other(name):
     assert [name for name in plant if plant[name] == "output"] == list(scenario.plant.states)
 
 
-SCHEMAS = Path(fmpy.__file__).parent
+SCHEMAS = Path(__file__).parents[1] / "schemas"
 FMI = {
-    2: {"modelDescription.xml": "schema/fmi2/fmi2ModelDescription.xsd"},
+    2: {"modelDescription.xml": "fmi2/fmi2ModelDescription.xsd"},
     3: {
-        "modelDescription.xml": "schema/fmi3/fmi3ModelDescription.xsd",
-        "terminalsAndIcons/terminalsAndIcons.xml": "schema/fmi3/fmi3TerminalsAndIcons.xsd",
+        "modelDescription.xml": "fmi3/fmi3ModelDescription.xsd",
+        "terminalsAndIcons/terminalsAndIcons.xml": "fmi3/fmi3TerminalsAndIcons.xsd",
     },
 }
-BUILD = {"sources/buildDescription.xml": "schema/fmi3/fmi3BuildDescription.xsd"}
+BUILD = {"sources/buildDescription.xml": "fmi3/fmi3BuildDescription.xsd"}
 SSP = {
-    "SystemStructure.ssd": "ssp/schema/SystemStructureDescription.xsd",
-    "resources/plant.ssv": "ssp/schema/SystemStructureParameterValues.xsd",
+    version: {
+        "SystemStructure.ssd": f"ssp{version}/SystemStructureDescription.xsd",
+        "resources/plant.ssv": f"ssp{version}/SystemStructureParameterValues.xsd",
+    }
+    for version in (1, 2)
 }
 
 
@@ -235,5 +238,7 @@ def test_an_exported_controller_and_its_loop(tmp_path):
     for version in (2, 3):
         fmu = build_sampled(system, tmp_path / f"c{version}.fmu", version)
         assert len(hold_archive(fmu, FMI[version] | BUILD)) == version
-    loop = write_loop(tmp_path / "c2.fmu", scenario, 3, tmp_path / "loop.ssp")
-    assert len(hold_archive(loop, SSP)) == 2
+    for version, plant in ((2, "evaporator"), (2, "evaporator_fmi3"), (3, "evaporator")):
+        either = scenario.replace({"plant": {"fmu": plant}})
+        loop = write_loop(tmp_path / f"c{version}.fmu", either, 3, tmp_path / "loop.ssp")
+        assert len(hold_archive(loop, SSP[1 if (version, plant) == (2, "evaporator") else 2])) == 2

@@ -32,7 +32,7 @@ ARM_LIBRARIES = Path("/usr/aarch64-linux-gnu")
 WINE = Path("/usr/lib/wine/wine64")
 STEPS = 10_000
 VERSIONS: tuple[FmiVersion, ...] = (2, 3)
-LAWS = ("none", "uniform", "normal", "drifting")
+LAWS = ("none", "uniform", "normal", "uniform, fouling", "normal, fouling")
 MARKS = [
     pytest.mark.slow,
     pytest.mark.skipif(

@@ -73,30 +73,40 @@ def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
         np.testing.assert_allclose(rows[:, column], expected[name], rtol=0, atol=ACTION)
 
 
-def test_the_example_runs_another_plants_loop(cosim, tmp_path):
-    words = f"export naive -s reactor -o {tmp_path / 'c.fmu'} --ssp {tmp_path / 'l.ssp'} --seed 5"
-    assert cosim(*words.split(), "--local")[0] == 0
+FMI3 = {"plant": {"fmu": "evaporator_fmi3"}, "disturbance": {"law": "normal"}}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "fmi"), [("reactor", {}, 2), ("tanks", {}, 3), ("paper", FMI3, 3)]
+)
+def test_the_example_runs_any_plants_loop(cosim, tmp_path, name, changes, fmi):
+    """Of FMI 2.0, of FMI 3.0, which is SSP 2.0, and of both."""
+    scenario = Scenario.load(name).replace(changes)
+    (tmp_path / "s.toml").write_text(scenario.to_toml())
+    files = f"-o {tmp_path / 'c.fmu'} --ssp {tmp_path / 'l.ssp'} -s {tmp_path / 's.toml'}"
+    assert cosim(*f"export naive {files} --fmi {fmi} --seed 5 --local".split())[0] == 0
     head, *printed = master("-W", "error", EXAMPLES / "fmpy_ssp.py", tmp_path / "l.ssp", 10)
-    assert head == "time,cA,T,q,Tc"
-    scenario = Scenario.load("reactor")
+    assert head.split(",") == ["time", *scenario.plant.states, *scenario.plant.actions]
     with FmuPlant(scenario) as plant:
         expected = simulate(plant, naive(scenario), 10, 5)
     rows = np.array([list(map(float, line.split(","))) for line in printed])
-    for column, name in enumerate(head.split(",")[1:], start=1):
-        np.testing.assert_allclose(rows[:, column], expected[name], rtol=1e-8)
+    for column, signal in enumerate(head.split(",")[1:], start=1):
+        np.testing.assert_allclose(rows[:, column], expected[signal], rtol=1e-8)
 
 
 def test_both_ends_of_a_connection_have_the_plants_unit(exported):
     with zipfile.ZipFile(exported[1]) as container:
         root = ElementTree.fromstring(container.read("SystemStructure.ssd"))
     units = [
-        (each.get("name"), each.find("{*}Real").get("unit")) for each in root.iter("{*}Connector")
+        (each.get("name"), each.find("{*}Real").get("unit"))
+        for each in root.findall(".//{*}Connector")
     ]
+    assert len(units) == 8
     plant = fmpy.read_model_description(str(fmus.path("evaporator")))
     expected = {(v.name, v.unit) for v in plant.modelVariables if v.name in dict(units)}
     assert set(units) == expected
-    assert len(units) == 2 * len(expected)
-    defined = {each.get("name"): each.find("{*}BaseUnit").attrib for each in root.iter("{*}Unit")}
+    found = root.findall(".//{*}Unit")
+    defined = {each.get("name"): each.find("{*}BaseUnit").attrib for each in found}
     for unit in (u for u in plant.unitDefinitions if u.name in dict(expected).values()):
         given = {key: float(value) for key, value in defined.pop(unit.name).items()}
         assert given == attr.asdict(unit.baseUnit)
@@ -230,7 +240,6 @@ def test_libcosim_draws_from_the_scenarios_law(cosim, tmp_path):
     ("arguments", "message"),
     [
         (["converged", "--out", "c.fmu"], "is no RTI-NMPC and cannot be exported"),
-        (["naive", "--out", "c.fmu", "--fmi", "3", "--ssp", "l.ssp"], "--ssp needs --fmi 2"),
         (["nothing.toml", "--out", "c.fmu"], "nothing.toml' does not exist"),
         (["naive", "--out", "no/such/folder/c.fmu", "--local"], "no/such/folder"),
     ],

@@ -33,9 +33,9 @@ int main(int argc, char **argv) {
     open_library(argv);
     const char *law = argv[3];
     open_instance();
-    set_law_and_seed(strcmp(law, "uniform") == 0 ? 1 : 2, 7);
+    set_law_and_seed(strstr(law, "uniform") ? 1 : 2, 7);
     set_stochastic(strcmp(law, "none") != 0);
-    if (strcmp(law, "drifting") == 0) {
+    if (strstr(law, "fouling")) {
         set(VR_fouling_rate, 20.0);
         set(VR_cleaning_period, 0.05);
     }

@@ -54,9 +54,8 @@ def test_both_fmi_versions_give_the_same_bits(run, law: str) -> None:
 
 def test_laws_differ(run) -> None:
     """The hashes see what they are to compare."""
-    runs = {law: run(NATIVE, 2, law)[0] for law in LAWS[:3]}
-    assert len(set(runs.values())) == 3
-    assert run(NATIVE, 2, "normal")[1] != run(NATIVE, 2, "drifting")[1]
+    assert len({run(NATIVE, 2, law)[0] for law in LAWS[:3]}) == 3
+    assert len({run(NATIVE, 2, law)[1] for law in LAWS}) == len(LAWS)
 
 
 @pytest.fixture(scope="module", params=VERSIONS, ids=["fmi2", "fmi3"])

@@ -16,7 +16,7 @@ from fmus.sampled import sampled_sources
 SOAK = Path(__file__).parents[1] / "fmus" / "sampled" / "soak.c"
 COMPILER = os.environ.get("CC", "cc")
 FLAGS = (
-    "-std=c99", "-g", "-O1", "-Wall", "-Wextra", "-Wno-unused-function",
+    "-std=c99", "-g", "-O1", "-Wall", "-Wextra", "-Werror",
     "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all",
 )  # fmt: skip
 

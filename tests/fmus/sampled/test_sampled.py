@@ -57,7 +57,7 @@ def test_sources_of_two_models_link_into_one_program(
         for file, data in files.items():
             (folder / file).write_bytes(data)
         objects.append(folder / "model.o")
-        command = ["cc", "-std=c99", "-w", "-isystem", tmp_path / "headers", "-c"]
+        command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-isystem", tmp_path / "headers", "-c"]
         subprocess.run([*command, folder / f"fmi{version}.c", "-o", objects[-1]], check=True)
     calls = [f"{name}_fmi{version}GetVersion" for name in ("evaporator", "adder")]
     (tmp_path / "main.c").write_text(

@@ -57,8 +57,9 @@ def test_sources_of_two_models_link_into_one_program(
         for file, data in files.items():
             (folder / file).write_bytes(data)
         objects.append(folder / "model.o")
-        command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-isystem", tmp_path / "headers", "-c"]
-        subprocess.run([*command, folder / f"fmi{version}.c", "-o", objects[-1]], check=True)
+        command = ["cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-isystem", "headers", "-c"]
+        command += [folder / f"fmi{version}.c", "-o", objects[-1]]
+        subprocess.run(command, cwd=tmp_path, check=True)
     calls = [f"{name}_fmi{version}GetVersion" for name in ("evaporator", "adder")]
     (tmp_path / "main.c").write_text(
         "".join(f"const char *{call}(void);\n" for call in calls)

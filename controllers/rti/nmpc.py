@@ -11,7 +11,7 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ControllerError, ParameterError, QpError
 from controllers.export.core import SOURCES, STATUSES, controller_sources, stack_needed
@@ -288,6 +288,7 @@ class Engine:
         self._loop = np.zeros(library_.engine_loop_size() // 8 + 1)
         self.action: Vector = np.zeros(functions.problem.n_actions)
         kept = (before, self._work, self._other_work, after, self.action, self._loop)
+        self._memory = before, after
         self._before, self._workspace, self._other, self._after, action, self._begun = (
             ctypes.c_void_p(array.ctypes.data) for array in kept
         )
@@ -330,15 +331,15 @@ class Engine:
         """Feedback phase for the memory's state, with `action` enforced or not."""
         return self._feedback(*(self._action_value if enforced else self._value))
 
-    def batch(self, states: Vector) -> tuple[Vector, Vector]:
-        """π (K, m) and V (K,) of the memory's QP for states (K, n), NaN where there is none."""
-        actions, values = np.empty((len(states), self.action.size)), np.empty(len(states))
-        self._library.engine_batch(
-            *self._value[:3],
-            ctypes.c_longlong(len(states)),
-            *(ctypes.c_void_p(array.ctypes.data) for array in (states, actions, values)),
-        )
-        return actions, values
+    def batch(self, *arrays: Vector | None) -> NDArray[np.intc]:
+        """Run `engine_batch` on its arrays; statuses of the QPs (K,), −1: derivatives by Python."""
+        assert arrays[0] is not None
+        failed = np.empty(len(arrays[0]), dtype=np.intc)
+        before, after = (memory.copy() for memory in self._memory)
+        given = [None if a is None else ctypes.c_void_p(a.ctypes.data) for a in (*arrays, failed)]
+        kept = (ctypes.c_void_p(memory.ctypes.data) for memory in (before, after))
+        self._library.engine_batch(*kept, self._other, ctypes.c_longlong(len(failed)), *given)
+        return failed
 
     def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
         """dπ/dθ (m, n_θ) and dπ/ds (m, n) of copies of the memory; None where LICQ fails."""
@@ -700,27 +701,61 @@ class RtiNmpc:
         """V(s) of the prepared QP."""
         return self._solve(s, None).value
 
-    def feedback_batch(self, states: ArrayLike) -> tuple[Vector, Vector]:
-        """π (K, m) and V (K,) of the prepared QP at states (K, n); NaN where it is not solved.
+    def feedback_batch(
+        self,
+        states: ArrayLike,
+        theta: ArrayLike | None = None,
+        enforced: ArrayLike | None = None,
+        points: LinearisationPoint | None = None,
+        *,
+        derivatives: bool = False,
+    ) -> tuple[Vector, ...]:
+        """π (K, m) and V (K,) at states (K, n), or Q where actions (K, m) are enforced.
 
-        Compiled controllers solve them in one call. Raises ControllerError on a wrong shape.
+        With `derivatives` follow dV/ds (K, n), dV/dθ (K, n_θ), dQ/da (K, m), dπ/dθ (K, m, n_θ) and
+        dπ/ds (K, m, n), zero where there is none. Where a QP is not solved π and V are NaN. θ, one
+        or K, and points of linearisation, arrays of K rows, are the controller's own where they are
+        not given; it keeps its own. Raises ControllerError on a wrong shape.
         """
-        rows = np.ascontiguousarray(states, dtype=np.float64)
-        if rows.ndim != 2 or rows.shape[1] != self.problem.n_states:
-            raise ControllerError(
-                f"the states must have shape (K, {self.problem.n_states}), not {rows.shape}"
-            )
+        n, m, size = self.problem.n_states, self.problem.n_actions, self.theta.size
         if self._prepared is None:
             self.prepare()
-        if self._engine is not None and self.iterations == 1 and not self._status:
-            return self._engine.batch(rows)
-        actions = np.full((len(rows), self.problem.n_actions), np.nan)
-        values = np.full(len(rows), np.nan)
-        for k, s in enumerate(rows):
-            with suppress(QpError):
-                solution = self._solve(s, None)
-                actions[k], values[k] = solution.action, solution.value
-        return actions, values
+        guess = self._x.copy(), self._u.copy(), self._costates.copy()
+        if np.ndim(states) != 2:
+            raise ControllerError(f"the states must have shape (K, {n}), not {np.shape(states)}")
+        count = len(np.asarray(states))
+        s = _rows("states", states, count, (n,))
+        a = None if enforced is None else _rows("actions", enforced, count, (m,))
+        thetas = _rows("θ", self.theta if theta is None else theta, count, (size,))
+        pairs = zip(points or guess, guess, strict=True)
+        each = [_rows("points", given, count, own.shape) for given, own in pairs]
+        actions, values = np.full((count, m), np.nan), np.full(count, np.nan)
+        slopes = np.zeros((count, n + size + m + m * (size + n))) if derivatives else None
+        left = np.arange(count)
+        if self._engine is not None and self.iterations == 1:
+            failed = self._engine.batch(s, a, thetas, *each[:2], actions, values, slopes)
+            left = np.flatnonzero(failed < 0)
+        kept, pending = self._parameters, self._pending
+        for k in left:
+            with suppress(QpError, ParameterError):
+                self.theta, self._pending = thetas[k], None
+                self._linearise_at(LinearisationPoint(*(part[k] for part in each)))
+                found = self._solve(s[k], None if a is None else a[k])
+                actions[k], values[k] = found.action, found.value
+                if slopes is not None:
+                    own = found.costates[0], found.value_gradient, found.action_gradient
+                    flat = np.concatenate(
+                        [*own, *map(np.ravel, () if found.enforced else found._policy)]
+                    )
+                    slopes[k, : flat.size] = flat
+        if len(left):
+            self.parameters = kept
+            self._linearise_at(LinearisationPoint(*guess))
+            self._pending = pending
+        if slopes is None:
+            return actions, values
+        *by, policy_theta, policy_s = np.split(slopes, np.cumsum([n, size, m, m * size]), axis=1)
+        return actions, values, *by, policy_theta.reshape(-1, m, size), policy_s.reshape(-1, m, n)
 
     def action_value(self, s: ArrayLike, a: ArrayLike) -> float:
         """Q(s, a) of the prepared QP."""
@@ -735,6 +770,13 @@ def compile_functions(controller: object, samples: int = LONG) -> None:
     """`RtiNmpc.compile` where the controller is one; nothing on other controllers."""
     if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
         controller.compile(samples)
+
+
+def _rows(kind: str, values: ArrayLike, count: int, shape: tuple[int, ...]) -> Vector:
+    rows = np.asarray(values, dtype=np.float64)
+    if rows.shape not in (shape, (count, *shape)):
+        raise ControllerError(f"the {kind} must have shape {(count, *shape)}, not {rows.shape}")
+    return np.ascontiguousarray(np.broadcast_to(rows, (count, *shape)))
 
 
 def _vector(kind: str, values: ArrayLike, size: int) -> Vector:

@@ -21,15 +21,38 @@ int engine_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved
     return status;
 }
 
-/* π and V of a prepared QP for `count` states, a row each; NAN where there is no solution. */
-void engine_batch(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved, long long count,
-                  const double states[], double actions[], double values[]) {
-    for (; count > 0; count--, states += N_X, actions += N_U, values++) {
-        memcpy(solved->s, states, sizeof solved->s);
-        const int failed = rti_feedback(prepared, work, solved, 0) != RTI_SOLVED;
-        for (int i = 0; i < N_U; i++)
-            actions[i] = failed ? NAN : solved->v[i] + REFERENCE_ACTION[i];
-        *values = failed ? NAN : solved->read[READ_value];
+/* π and V, or Q of the actions `enforced` (or null), of `count` QPs, a row each: state, θ, point of
+ * linearisation. `failed`, and nothing written, where there is no solution. `slopes`, unless it is null, gets dV/ds,
+ * dV/dθ, dQ/da, dπ/dθ and dπ/ds as far as a row has them; `failed` is −1 where the active constraints'
+ * gradients are dependent. A QP's preparation serves the rows behind it that have its θ and point. */
+void engine_batch(RtiPrepared *prepared, RtiSolved *solved, QpWork *work, long long count,
+                  const double (*s)[N_X], const double (*enforced)[N_U],
+                  const double (*theta)[N_THETA], const double (*x)[HORIZON][N_X],
+                  const double (*u)[HORIZON][N_U], double (*actions)[N_U], double values[],
+                  double slopes[], int failed[]) {
+    enum { VALUE = N_X + N_THETA + N_U, POLICY = N_U * (N_THETA + N_X) };
+    int ready = RTI_SOLVED;
+    for (long long k = 0; k < count; k++) {
+        if (k == 0 || memcmp(prepared->theta, theta[k], sizeof theta[k]) ||
+            memcmp(prepared->x, x[k], sizeof x[k]) || memcmp(prepared->u, u[k], sizeof u[k])) {
+            memcpy(prepared->theta, theta[k], sizeof theta[k]);
+            memcpy(prepared->x, x[k], sizeof x[k]);
+            memcpy(prepared->u, u[k], sizeof u[k]);
+            ready = well_posed(prepared->theta) ? engine_prepare(prepared, work) : RTI_ILL_POSED;
+        }
+        const double *const a = enforced ? enforced[k] : 0;
+        double *const slope = slopes ? slopes + k * (VALUE + POLICY) : 0;
+        memcpy(solved->s, s[k], sizeof solved->s);
+        failed[k] = ready != RTI_SOLVED ? ready : rti_feedback(prepared, work, solved, a);
+        if (failed[k]) continue;
+        for (int i = 0; i < N_U; i++) actions[k][i] = solved->v[i] + REFERENCE_ACTION[i];
+        values[k] = solved->read[READ_value];
+        if (!slope) continue;
+        rti_gradient(prepared, solved);
+        memcpy(slope, solved->read + READ_chi, N_X * sizeof(double));
+        memcpy(slope + N_X, solved->gradient, sizeof solved->gradient);
+        for (int i = 0; a && i < N_U; i++) slope[N_X + N_THETA + i] = -solved->nu[i];
+        if (!a && rti_policy(prepared, solved, work, slope + VALUE) != QP_SOLVED) failed[k] = -1;
     }
 }
 

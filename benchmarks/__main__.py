@@ -15,6 +15,7 @@ STEPS = {
     "evaluation": 2000,
     "scaling": 20,
     "before": 500,
+    "acados": 200,
 }
 """The benchmarks, and how many samples each takes at a time."""
 
@@ -24,17 +25,20 @@ def main():
     parser.add_argument("name", choices=STEPS)
     parser.add_argument("--scenario", "-s", default="paper")
     parser.add_argument("--steps", "--samples", "-n", type=int, help="samples at a time")
-    parser.add_argument("--against", help="`before`: folder of another version's sources")
+    parser.add_argument(
+        "--against", help="`before`: folder of another version's sources; `acados`: its Python"
+    )
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     steps = STEPS[chosen.name] if chosen.steps is None else chosen.steps
     if steps < 1:
         parser.error(f"--steps must be at least 1, not {steps}")
-    if chosen.name == "before" and not chosen.against:
-        parser.error("before needs --against, a checkout of the other version")
+    compared = chosen.name in ("before", "acados")
+    if compared and not chosen.against:
+        parser.error(f"{chosen.name} needs --against")
     scenario = Scenario.load(chosen.scenario)
     with output(chosen.json) as out_:
-        more = [chosen.against] if chosen.name == "before" else []
+        more = [chosen.against] if compared else []
         rows = import_module(f"benchmarks.{chosen.name}").measure(scenario, steps, *more)
         title = f"{chosen.name} on {scenario.name}, {steps} samples at a time"
         out_.table(title, HEADER, [cells(row) for row in rows])

@@ -100,11 +100,16 @@ _CROSS_FLAGS = {
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler for one platform: the command that calls it and the flags of its linker."""
+    """A C compiler for one platform: the command that calls it and the flags of its linker.
+
+    `runtime` is a command that compiles the platform's C library, where that is to be done first;
+    it ends with the name of a C file without content.
+    """
 
     platform: Platform
     command: tuple[str, ...]
     linker_flags: tuple[str, ...]
+    runtime: tuple[str, ...] = ()
 
     @property
     def version(self) -> str:
@@ -129,6 +134,9 @@ class Compiler:
         with temporary_folder("cosim-") as folder:
             for path, data in sources.items():
                 (folder / path).write_bytes(data)
+            if self.runtime:
+                (folder / self.runtime[-1]).write_bytes(b"")
+                subprocess.run(self.runtime, cwd=folder, capture_output=True, check=False)
             units = sorted(path for path in sources if path.endswith(".c"))
             command = [
                 *self.command, *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
@@ -155,8 +163,12 @@ def cross_compiler(platform: Platform) -> Compiler:
     """Zig's C compiler for any platform, from PyPI; raises BuildError when it is not installed."""
     if importlib.util.find_spec("ziglang") is None:
         raise BuildError("no cross-compiler: pip install 'rti-cosim[cross]'")
-    command = (sys.executable, "-m", "ziglang", "cc", "-target", platform.target)
-    return Compiler(platform, command, _CROSS_FLAGS[platform.suffix])
+    zig, target = (sys.executable, "-m", "ziglang"), ("-target", platform.target)
+    # `zig cc` compiles the C library of Windows file by file, and has no option for more at once.
+    jobs = f"-j{2 * (os.cpu_count() or 1)}"
+    runtime = (*zig, "build-lib", *target, "-dynamic", "-lc", "-OReleaseFast", "-fstrip", jobs)
+    runtime = (*runtime, "empty.c") if platform.suffix == ".dll" else ()
+    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], runtime)
 
 
 def compilers(every_platform: bool) -> list[Compiler]:
@@ -226,7 +238,7 @@ def _binaries(
     FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both are
     built, lies a universal binary.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(len(compilers)) as pool:
         built = pool.map(lambda each: each.library(sources, identifier, warnings), compilers)
         libraries = dict(zip((each.platform for each in compilers), built, strict=True))
     macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Isolated, since pip's own warnings are not to be errors as ours are.
 PIP = [sys.executable, "-I", "-m", "pip"]
-# Not locked: a comparison that one example makes, in an environment of its own, and what `dev` lacks.
+# Not locked: a comparison that one example makes, in an environment of its own; what `dev` lacks.
 UNLOCKED = {"outsiders", "torch"}
 PLATFORMS = {
     "linux": ["manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64"],

@@ -51,24 +51,6 @@ class SoftQp:
         return copy.deepcopy(self)
 
 
-class Residuals(NamedTuple):
-    """Distances from optimality, each zero exactly at the primal-dual solution.
-
-    `stationarity` ‖Hv + f + ν + Γᵀλ‖∞ divided by max(1, ‖f‖∞, ‖Hv‖∞, ‖Γᵀλ‖∞); `bounds`
-    ‖v − clip(v + ν)‖∞ and `rows` ‖y − prox_φ(y + λ)‖∞ in the units of v and y = Γv, where φ is the
-    soft bound: they measure feasibility, sign and complementarity at once.
-    """
-
-    stationarity: float
-    bounds: float
-    rows: float
-
-    @property
-    def largest(self) -> float:
-        """Largest of the three KKT residuals."""
-        return max(self.stationarity, self.bounds, self.rows)
-
-
 class QpSolution(NamedTuple):
     """Primal-dual solution `v`, `nu`, `lam`: Hv + f + ν + Γᵀλ = 0.
 
@@ -81,8 +63,13 @@ class QpSolution(NamedTuple):
     nu: Vector
     lam: Vector
 
-    def residuals(self, qp: SoftQp) -> Residuals:
-        """Measure the solution against the QP that it is meant to solve."""
+    def residual(self, qp: SoftQp) -> float:
+        """Distance from optimality, zero exactly at the primal-dual solution.
+
+        The largest of ‖Hv + f + ν + Γᵀλ‖∞ / max(1, ‖f‖∞, ‖Hv‖∞, ‖Γᵀλ‖∞), ‖v − clip(v + ν)‖∞ and
+        ‖y − prox_φ(y + λ)‖∞, with y = Γv and φ the soft bound: the latter two measure feasibility,
+        sign and complementarity at once.
+        """
         v, nu, lam = self
         curvature, pull, y = qp.H @ v, lam @ qp.rows, qp.rows @ v
         parts = np.array(
@@ -101,7 +88,7 @@ class QpSolution(NamedTuple):
         beyond = y + lam - nearest
         shrunk = np.maximum(np.abs(beyond) - qp.w, 0.0) / (1 + 2 * qp.W)
         rows = float(np.abs(y - (nearest + np.copysign(shrunk, beyond))).max())
-        return Residuals(stationarity, bounds, rows)
+        return float(max(stationarity, bounds, rows))
 
     def weakly_active(self, qp: SoftQp, tolerance: float = 1e-6) -> bool:
         """Whether some bound or row is about to change its activity.
@@ -131,7 +118,7 @@ class QpSolution(NamedTuple):
     def active(self, qp: SoftQp) -> tuple[Mask, Mask, Mask]:
         """Masks: variables held by a bound, rows held at a limit, rows violated.
 
-        They are the branches of the proximal operators in `residuals`: of a distance and a
+        They are the branches of the proximal operators in `residual`: of a distance and a
         multiplier that should exclude each other, the larger decides. `weakly_active` says where
         that is not safe.
         """
@@ -239,12 +226,12 @@ def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-10) -> QpSolut
     solution this primal-dual active-set method (semismooth Newton on the proximal residuals) ends
     after one or two. Returns the best iterate, `solution` itself if none is better.
     """
-    best, least = solution, solution.residuals(qp).largest
+    best, least = solution, solution.residual(qp)
     for _ in range(STEPS):
         if least < accuracy:
             break
         solution = _newton_step(qp, solution)
-        residual = solution.residuals(qp).largest
+        residual = solution.residual(qp)
         if residual < least:
             best, least = solution, residual
     return best

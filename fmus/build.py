@@ -102,8 +102,8 @@ _CROSS_FLAGS = {
 class Compiler:
     """A C compiler for one platform: the command that calls it and the flags of its linker.
 
-    `runtime` is a command that compiles the platform's C library, where that is to be done first;
-    it ends with the name of a C file without content.
+    `runtime` is a command that compiles the platform's C library and `empty.c`, where that is to be
+    done first.
     """
 
     platform: Platform
@@ -135,7 +135,7 @@ class Compiler:
             for path, data in sources.items():
                 (folder / path).write_bytes(data)
             if self.runtime:
-                (folder / self.runtime[-1]).write_bytes(b"")
+                (folder / "empty.c").write_bytes(b"")
                 subprocess.run(self.runtime, cwd=folder, capture_output=True, check=False)
             units = sorted(path for path in sources if path.endswith(".c"))
             command = [
@@ -165,10 +165,10 @@ def cross_compiler(platform: Platform) -> Compiler:
         raise BuildError("no cross-compiler: pip install 'rti-cosim[cross]'")
     zig, target = (sys.executable, "-m", "ziglang"), ("-target", platform.target)
     # `zig cc` compiles the C library of Windows file by file, and has no option for more at once.
+    runtime = ("build-lib", *target, "-dynamic", "-lc", "-OReleaseFast", "-fstrip", "empty.c")
     jobs = f"-j{2 * (os.cpu_count() or 1)}"
-    runtime = (*zig, "build-lib", *target, "-dynamic", "-lc", "-OReleaseFast", "-fstrip", jobs)
-    runtime = (*runtime, "empty.c") if platform.suffix == ".dll" else ()
-    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], runtime)
+    first = (*zig, *runtime, jobs) if platform.suffix == ".dll" else ()
+    return Compiler(platform, (*zig, "cc", *target), _CROSS_FLAGS[platform.suffix], first)
 
 
 def compilers(every_platform: bool) -> list[Compiler]:

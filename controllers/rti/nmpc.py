@@ -20,7 +20,6 @@ from controllers.problem import Problem
 from controllers.qp import (
     QpBackend,
     QpSolution,
-    Residuals,
     SoftQp,
     make_backend,
     multipliers_at_kink,
@@ -169,16 +168,11 @@ class RtiSolution:
         return np.asarray(-self.multipliers.nu[: self.action.size])
 
     @cached_property
-    def residuals(self) -> Residuals:
-        """KKT residuals of the QP's solution."""
-        return self.multipliers.residuals(self.qp)
-
-    @property
     def residual(self) -> float:
         """Largest KKT residual; compiled code has measured it when it solved."""
         if self.prepared.jacobians is not None and not self.enforced:
             return float(self.memory[self.prepared.functions.readout.places["residual"]][0])
-        return self.residuals.largest
+        return self.multipliers.residual(self.qp)
 
     @cached_property
     def weakly_active(self) -> bool:

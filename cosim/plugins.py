@@ -14,9 +14,12 @@ import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache, partial
+from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, entry_points, version
 from importlib.util import resolve_name
+from itertools import accumulate
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from cosim.errors import ControllerLookupError
@@ -188,8 +191,9 @@ def depends_on(scenario: Scenario, *parts: Any) -> dict[str, str]:
     The versions of what computes, our own code, the scenario, its FMU and models, and of each of
     the `parts` (controllers, algorithms: a registered name, a `module:Name`, a file's path, a class
     or factory) its files: a parameters file, or the module and all that it imports from outside
-    installed packages, as they were loaded. Data files that a plug-in reads are not known. Raises
-    the errors of `load_plugin` as ControllerLookupError.
+    installed packages, as they were loaded; what a function will import later, as it is now. Data
+    files that a plug-in reads are not known. Raises the errors of `load_plugin` as
+    ControllerLookupError.
     """
     found = {"versions": versions(), "rti-cosim": code_hash(), "scenario": scenario.hash}
     fmu = Path(scenario.plant.fmu)
@@ -237,11 +241,28 @@ def _closure(module: str) -> dict[str, str]:
     while waiting:
         name = waiting.pop()
         waiting += [name.rpartition(".")[0]] if "." in name else []
+        if name not in sys.modules:
+            _hash_later_module(name)
         if name not in _sources or _file_name(name) in found:
             continue
         found[_file_name(name)] = _sources[name][1]
         waiting += [*_imports(name), *_brought.get(name, ())]
     return found
+
+
+def _hash_later_module(name: str) -> None:
+    """Note the present source of a user's module that a function will import when it is called."""
+    _sources.pop(name, None)
+    path: list[str] | None = None
+    for part in accumulate(name.split("."), "{}.{}".format):
+        spec = PathFinder.find_spec(part, path)
+        if spec is None or (spec.submodule_search_locations is None and part != name):
+            return
+        path = list(spec.submodule_search_locations or ())
+    if spec and spec.origin and _is_foreign(str(Path(spec.origin).parent)):
+        module = ModuleType(name)
+        module.__file__, module.__package__ = spec.origin, spec.parent
+        _sources[name] = (module, _digest(Path(spec.origin).read_bytes()))
 
 
 def _file_name(module: str) -> str:

@@ -277,7 +277,7 @@ def run_watched(main: Callable[[], None], parent: int, mark: str) -> NoReturn:
         code = error.code
     try:
         sys.stdout.flush()
-    except (OSError, ValueError):
+    except (OSError, ValueError, AttributeError):  # closed, or taken away by foreign code
         code = code or 1
     Path(mark).touch()
     os._exit(code or 0)

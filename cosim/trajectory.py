@@ -385,6 +385,8 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
         if len(row) != len(header):
             raise TrajectoryError(f"'{path}', line {number}: {len(row)} fields, not {len(header)}")
         try:
+            if not (text := "".join(row[:-1])).isascii() or "_" in text:
+                raise ValueError("a number has other signs than those of ASCII, or '_'")
             values[number - 2] = [float(cell) for cell in row[:-1]]
         except ValueError as error:
             raise TrajectoryError(f"'{path}', line {number}: {error}") from None

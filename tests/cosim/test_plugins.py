@@ -75,6 +75,25 @@ def test_an_edit_of_the_module_or_of_what_it_imports_is_said_by_name(plugin, tmp
     assert changed(before, depends_on(PAPER, f"{name}:make")) == [path.name]
 
 
+@pytest.mark.parametrize("form", ["{0}_kit.later", "{0}_kit"])
+def test_an_edit_of_what_a_function_imports_only_when_it_is_called_is_seen(
+    plugin, tmp_path, monkeypatch, form
+):
+    name, _ = plugin
+    monkeypatch.syspath_prepend(str(tmp_path))
+    path = tmp_path / f"{name}.py"
+    path.write_text(f"{path.read_text()}def use():\n    import {form.format(name)}\n")
+    (tmp_path / f"{name}_kit").mkdir()
+    for file in ("__init__.py", "later.py"):
+        (tmp_path / f"{name}_kit" / file).write_text("")
+    before = depends_on(PAPER, f"{name}:make")
+    edited = tmp_path / f"{form.format(name).replace('.', '/')}"
+    edited = edited / "__init__.py" if edited.is_dir() else edited.with_suffix(".py")
+    edited.write_text("# edited\n")
+    found = changed(before, depends_on(PAPER, f"{name}:make"))
+    assert found == [edited.relative_to(tmp_path).as_posix()]
+
+
 def test_what_a_result_depends_on_has_names(plugin, tmp_path):
     name, _ = plugin
     build_controller(f"{name}:make", PAPER)

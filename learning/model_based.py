@@ -3,7 +3,8 @@
 The cost is tuned on the nominal model; what is searched are the back-offs of the state bounds. A θ
 costs what the empirical model promises: the mean stage cost of one long rollout and the expectation
 of the penalty over all errors of prediction. Of back-offs between which the model cannot tell the
-smallest is taken.
+smallest is taken, but where a bound does not bind, which costs nothing: there it is a spare one,
+against a plant that changes.
 """
 
 from __future__ import annotations
@@ -73,6 +74,12 @@ class ModelBasedConfiguration(Configuration):
     memory: Count = Field(20_000, description="samples that the model remembers")
     exploration_samples: Count = Field(
         480, description="samples that explore after the start and after a change of the plant"
+    )
+    spare: float = Field(
+        18.0,
+        ge=0,
+        description="back-off of a bound that does not bind, in standard deviations of the "
+        "one-step error; half or none of it where that would cost",
     )
 
 
@@ -160,7 +167,8 @@ class ModelBased(Algorithm):
         interval = max(data.count - data.era, self.configuration.first_update)
         self._due = data.count + min(interval, self.configuration.longest_interval)
         latest, _ = data.latest(RECENT)
-        search = BackOffs(self._problem, self._rollout, self._base, model, latest, self.rng)
+        spare, rng = self.configuration.spare, self.rng
+        search = BackOffs(self._problem, self._rollout, self._base, model, latest, spare, rng)
         found = search.best(self.back_off, self._least(inputs))
         present = self.controller.parameters
         new = search.theta(found)
@@ -217,7 +225,8 @@ class BackOffs:
     state, and are lost where they cost more on average than the dearest of these samples, or their
     mean state is far from that of `RECENT` of them: the model has gone where the plant has not
     been. All θ meet the same noise until the next `draw`. δ are multiples of a twentieth of the
-    error's order of magnitude, so that no last digit decides.
+    error's order of magnitude, so that no last digit decides. `spare` is the back-off, in standard
+    deviations of the error, of a bound that does not bind.
     """
 
     def __init__(
@@ -227,9 +236,11 @@ class BackOffs:
         base: Parameters,
         model: EmpiricalModel,
         visited: Array,
+        spare: float,
         rng: np.random.Generator,
     ) -> None:
         n = problem.n_states
+        self._spare = spare
         self._problem, self._rollout, self._base, self._model = problem, rollout, base, model
         self._start, self._rng = visited[-1, :n], rng
         self._costs = ExpectedCosts(problem, model)
@@ -292,7 +303,8 @@ class BackOffs:
         """The smallest δ, not below `least`, whose cost the model cannot tell from the least one.
 
         First a grid, at once over the bounds whose penalty shows anywhere, up to two, and one by
-        one over what others there are; then each about the best point, on longer rollouts.
+        one over what others there are; then each about the best point, on longer rollouts. Bounds
+        whose penalty shows nowhere have a spare back-off.
         """
         grids = [
             self._rounded(i, [max(level * unit, least[i]) for level in LEVELS])
@@ -302,8 +314,8 @@ class BackOffs:
         points = [delta, least]
         while True:
             delta = self._least(points)
-            worth = np.where(delta > 0, np.inf, self._worth)
-            new = [int(i) for i in np.argsort(-worth) if worth[i] > WORTH and i not in active]
+            order = np.argsort(-self._worth)
+            new = [int(i) for i in order if self._worth[i] > WORTH and i not in active]
             if not new:
                 break
             active.append(new[0])
@@ -316,7 +328,17 @@ class BackOffs:
                 wanted = [delta[i] * factor for factor in factors] if delta[i] else [self._unit[i]]
                 values = self._rounded(i, [max(value, least[i]) for value in wanted])
                 delta = self._least([delta, *(_with(delta, [i], [value]) for value in values)])
+        for i in set(range(len(delta))) - set(active):
+            delta = self._spared(delta, i)
         return delta
+
+    def _spared(self, delta: Array, i: int) -> Array:
+        """δ with as much of the spare back-off of a bound that does not bind as costs nothing."""
+        values = self._rounded(i, [share * self._spare * self._unit[i] for share in (0.5, 1.0)])
+        points = [delta, *(_with(delta, [i], [value]) for value in values if value > delta[i])]
+        promises = self.promises([self.theta(point) for point in points])
+        free = [self.excess(promise, promises[0]) <= DOUBT for promise in promises]
+        return points[max(np.flatnonzero(free), default=0)]
 
     def _rounded(self, i: int, values: Sequence[float]) -> list[float]:
         """Back-offs of a bound as multiples of its step, within its room, ascending."""

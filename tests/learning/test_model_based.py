@@ -115,7 +115,7 @@ def search(problem, base, rng):
     )
     visited = np.tile([27.0, 60.0, 220.0, 230.0], (model_based.RECENT, 1))
     visited[0, 0] = 20.0
-    return BackOffs(problem, riding(problem, base, 2, 10_000.0), base, model, visited, rng)
+    return BackOffs(problem, riding(problem, base, 2, 10_000.0), base, model, visited, 0.0, rng)
 
 
 def test_the_back_off_of_a_known_loop_is_found(search):

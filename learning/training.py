@@ -36,7 +36,7 @@ from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up
-from learning.commissioning import back_off
+from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError, PrivilegeError
 from learning.loop import TrainingLoop
@@ -109,9 +109,11 @@ class TrainingRun:
     def starting_parameters(self) -> Parameters:
         """θ where the run starts; the errors are those of `starting_parameters` below."""
         problem = Problem.from_scenario(self.scenario)
-        if self.start != "commissioned":
+        if self.start not in ("commissioned", "cautious"):
             return starting_parameters(problem, self.configuration, self.start)
-        return back_off(starting_parameters(problem, self.configuration, "tuned"), self.scenario)
+        tuned = starting_parameters(problem, self.configuration, "tuned")
+        found = back_off(tuned, self.scenario)
+        return found if self.start == "commissioned" else spare(found, self.scenario)
 
 
 OPTIONS = {option.name for option in fields(TrainingRun)[3:]} - {"configuration"}
@@ -518,7 +520,7 @@ def train(
     scenario : a scenario, a preset's name or a TOML file.
     samples : plant samples; None is what the algorithm says, else 50 000.
     seed : seed of noise and exploration.
-    start : where θ starts: naive, tuned, commissioned or a parameters file.
+    start : where θ starts: naive, tuned, commissioned, cautious or a parameters file.
     settings : hyperparameters by name; the algorithm's Configuration documents them.
     controller … rest_after : what the options of `cosim train` of these names say.
     out : folder that the run's checkpoints are kept in; None keeps none. `Training.save` writes

@@ -21,8 +21,8 @@ def evaluate(
         typer.Option(
             "--controllers",
             "-c",
-            help="Comma-separated, or the option again: naive, tuned, commissioned, lqr, pi, "
-            "converged, optimal, a parameters file or module:factory; NAME=… gives one another "
+            help="Comma-separated, or the option again: naive, tuned, commissioned, cautious, lqr, "
+            "pi, converged, optimal, a parameters file or module:factory; NAME=… gives one another "
             "name.",
         ),
     ] = ["naive"],  # noqa: B006

@@ -20,8 +20,8 @@ def simulate(
         typer.Option(
             "--controller",
             "-c",
-            help="naive, tuned, commissioned, lqr, pi, converged, optimal, a parameters file, or "
-            "module:factory.",
+            help="naive, tuned, commissioned, cautious, lqr, pi, converged, optimal, a parameters "
+            "file, or module:factory.",
         ),
     ] = "naive",
     steps: cli.StepsOption = 1000,

@@ -35,7 +35,8 @@ def train(
     start: Annotated[
         str,
         typer.Option(
-            "--start", help="Where θ starts: naive, tuned, commissioned or a parameters file."
+            "--start",
+            help="Where θ starts: naive, tuned, commissioned, cautious or a parameters file.",
         ),
     ] = "naive",
     out: cli.OutOption = Path("cosim-train"),

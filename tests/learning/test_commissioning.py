@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from controllers.economic import tune
+from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
+from cosim.simulation import simulate
 from learning import commissioning
 from learning.training import prepare
 
@@ -40,3 +42,13 @@ def test_without_noise_nothing_is_backed_off(scenario, short, monkeypatch):
     monkeypatch.setattr(commissioning, "GUESS", 0.0)
     found = build_controller("commissioned", scenario).parameters
     assert found["x_l"].tolist() == pytest.approx([25.0, 40.0])
+
+
+def test_a_bound_that_does_not_bind_has_a_spare_back_off_that_costs_nothing(scenario, short):
+    found, start = (build_controller(name, scenario) for name in ("cautious", "commissioned"))
+    one, other = found.parameters, start.parameters
+    assert one["x_l"][0] == other["x_l"][0]  # it binds
+    assert (one["x_u"] < other["x_u"]).all() and one["x_l"][1] > other["x_l"][1]
+    with FmuPlant(scenario) as plant:
+        costs = [simulate(plant, c, 200, 0).signals["stage_cost"].values for c in (found, start)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-9)

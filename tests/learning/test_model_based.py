@@ -125,6 +125,13 @@ def test_the_back_off_of_a_known_loop_is_found(search):
     assert (found[1:] == 0).all()
 
 
+def test_a_bound_that_does_not_bind_has_a_spare_back_off(search):
+    search._spare = 18.0
+    spared = search.best(np.zeros(4), np.zeros(4))
+    assert spared[0] == pytest.approx(0.8, abs=0.06)
+    assert spared[2] == pytest.approx(18.0 * search._unit[2], abs=0.05)
+
+
 def test_a_loop_that_goes_where_the_plant_has_not_been_promises_nothing(search):
     promises = search.promises([search.theta(np.array([delta, 0, 0, 0])) for delta in (14, 20)])
     assert np.isfinite([promise.cost for promise in promises]).tolist() == [True, False]

@@ -109,7 +109,7 @@ class ConvergedNmpc(RtiNmpc):
         super().__init__(problem, parameters, hessian="exact", backend=backend)
 
     def _linearise(self) -> None:
-        """Prepare the QP of the exact Hessian; the lifted one where a backend refuses that."""
+        """Prepare the QP of the exact Hessian, or of the lifted one if the backend refuses it."""
         try:
             self._linearise_as(lifts=False)
         except QpError as error:

@@ -921,7 +921,7 @@ SEARCH = "policy search"
 
 
 def objection(certificate: Sequence[Figure]) -> str | None:
-    """Why a certified solution is not to be called J*; None where there is nothing against it.
+    """Reason why a certified solution may not be called J*, or None.
 
     All figures but that of a policy search must agree within `TOLERANCE`.
     """

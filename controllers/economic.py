@@ -207,7 +207,7 @@ def rotation(A: Array, B: Array, delta_P: Array) -> Array:
 
 
 def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> Convexification:
-    """Least conditioned convex stage cost that leaves the local optimum where it is.
+    """Best-conditioned convex stage cost with the same local optimum.
 
     min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F, with ρ = `weight`
     (Zanon, Gros, Diehl 2016). 𝓗(δP) telescopes along a trajectory; CᵀFC vanishes where the active
@@ -308,7 +308,7 @@ class EconomicTuning:
 def tune(
     problem: Problem, blocks: ThetaBlocks | None = None, *, value_offset: float | None = None
 ) -> EconomicTuning:
-    """Tune the NMPC so that its local feedback is that of the economic optimum.
+    """Tune the NMPC: its local feedback becomes the economic optimum's.
 
     The economic cost is rotated by the costate λ of the optimal steady state, which leaves its
     gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = 1e-3 as

@@ -1,4 +1,4 @@
-"""Errors of the controllers, each with one message that says what is wrong and how to mend it."""
+"""Errors of the controllers; each message names the mistake and the remedy."""
 
 from __future__ import annotations
 

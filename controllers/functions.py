@@ -185,7 +185,7 @@ def switch() -> str:
 
 
 def find_compiler() -> str | None:
-    """The C compiler that CC names, else the first of cc, gcc and clang; None where none is."""
+    """Path of the C compiler: CC, else the first of cc, gcc and clang, else None."""
     names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
     found = next(filter(None, map(shutil.which, names)), None)
     if found and sys.platform == "darwin":  # its `cc` may only ask the user to install a compiler

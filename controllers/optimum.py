@@ -294,7 +294,7 @@ class Fouling:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Fouling | None:
-        """The law by which a scenario's condenser fouls, None where it does not."""
+        """Fouling law of a scenario's condenser, or None."""
         given = scenario.plant.parameters
         rate, floor, period = (
             float(given.get(name, default))
@@ -354,7 +354,7 @@ class Jumps:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Jumps | None:
-        """What jumps in a scenario's plant, None where nothing does."""
+        """Parameter jump of a scenario's plant, or None."""
         changes = scenario.plant.changes
         if not changes:
             return None
@@ -379,7 +379,7 @@ class Jumps:
 
 
 def change_of(scenario: Scenario) -> Fouling | Jumps | None:
-    """How a scenario's plant changes, None where it stays as it is."""
+    """Change of a scenario's plant, or None."""
     fouling, jumps = Fouling.of(scenario), Jumps.of(scenario)
     if fouling and jumps:
         raise OptimumError("a condenser that fouls and plant.changes have no common reference")
@@ -414,7 +414,7 @@ class QuasiStaticPolicy:
     def from_scenario(
         cls, scenario: Scenario, *, progress: Callable[[Progress], None] | None = None
     ) -> QuasiStaticPolicy:
-        """The policy of a scenario that changes; solves what is not stored. Raises OptimumError."""
+        """Policy of a changing scenario; solves missing optima. Raises OptimumError."""
         law = change_of(scenario)
         assert law is not None
         policies = [
@@ -425,7 +425,7 @@ class QuasiStaticPolicy:
 
     @classmethod
     def stored(cls, scenario: Scenario) -> QuasiStaticPolicy | None:
-        """The policy of a scenario that changes where all of its optima are stored, else None."""
+        """Policy of a changing scenario if all of its optima are stored, else None."""
         law = change_of(scenario)
         assert law is not None
         found = [OptimalPolicy.stored(scenario, overrides=plant) for plant in law.plants]
@@ -480,7 +480,7 @@ def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
 
 
 def stored(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy | None:
-    """The same where all of it is stored, else None; solves nothing."""
+    """The stored solution if it is complete, else None; solves nothing."""
     return (OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy).stored(scenario)
 
 

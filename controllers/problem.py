@@ -240,7 +240,7 @@ class Problem:
 
 
 def load_model(name: str | None) -> Model:
-    """Import a model by `module:factory`; raises ModelError where there is none to be had."""
+    """Import a model by `module:factory`; raises ModelError if that fails."""
     if name is None:
         raise ModelError(
             'the scenario names no model for this controller; add model = "module:factory" to its '

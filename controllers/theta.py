@@ -136,7 +136,7 @@ class ThetaBlocks:
         return name in self.slices
 
     def block(self, name: str) -> ThetaBlock:
-        """Block of this name; raises ParameterError where there is none."""
+        """Block of this name; raises ParameterError if it does not exist."""
         for block in self.blocks:
             if block.name == name:
                 return block

@@ -69,7 +69,7 @@ def load_run(path: str | Path) -> RunSignals:
 
 
 def _bounds(path: Path) -> dict[str, tuple[float, float]]:
-    """Bounds of states and actions by name; none where no readable scenario lies beside a run."""
+    """Bounds of states and actions by name; empty without a readable scenario."""
     try:
         return Scenario.load(path).limits if path.is_file() else {}
     except ScenarioError:

@@ -14,7 +14,7 @@ class ScenarioError(CosimError):
 
 
 class PlantError(CosimError):
-    """A plant that cannot be loaded, or that refused a call."""
+    """The plant cannot be loaded, or refused a call."""
 
 
 class CapabilityError(PlantError):
@@ -26,7 +26,7 @@ class ControllerLookupError(CosimError):
 
 
 class TrajectoryError(CosimError):
-    """A trajectory file that cannot be read, or signals that do not fit together."""
+    """A trajectory file is unreadable, or its signals are inconsistent."""
 
 
 class RecordingError(CosimError):
@@ -42,15 +42,15 @@ class ComparisonError(CosimError):
 
 
 class EvaluationError(CosimError):
-    """An evaluation that cannot be set up, or whose workers failed."""
+    """An evaluation cannot be set up, or its workers failed."""
 
 
 class ResultsError(CosimError):
-    """Stored results that are missing, malformed, or differ from what is computed now."""
+    """Stored results are missing, malformed, or differ from recomputed ones."""
 
 
 class StudyError(CosimError):
-    """A study file that cannot be read, or a study that cannot be run or reported."""
+    """A study file is unreadable, or its study cannot be run or reported."""
 
 
 class FailedRunsError(StudyError):

@@ -147,7 +147,7 @@ def _qualified(factory: Factory) -> str:
 def named_controllers(
     controllers: Mapping[str, Factory | str] | Sequence[str],
 ) -> dict[str, Factory | str]:
-    """Controllers by name, of texts SPEC or NAME=SPEC; raises EvaluationError where one is none."""
+    """Controllers by name from SPEC or NAME=SPEC; raises EvaluationError if invalid."""
     if isinstance(controllers, Mapping):
         return dict(controllers)
     if isinstance(controllers, str):
@@ -205,12 +205,12 @@ class Evaluation(Result):
 
     @property
     def optimum(self) -> str | None:
-        """Name of the controller that gives J*, a row of its own or not; None if unknown."""
+        """Name of the controller with J*, whether it has a row or not; None if unknown."""
         return OPTIMAL if OPTIMAL in self.columns else None
 
     @property
     def naive(self) -> str | None:
-        """Name of the controller that the gap is measured from, None if it is not there."""
+        """Name of the reference controller of the closed gap, or None."""
         return NAIVE if NAIVE in self.controllers else None
 
     @property
@@ -356,7 +356,7 @@ class _Recorded:
         self._k += 1
 
     def feedback(self, s: Array, a: object = None) -> Decision:
-        """The sample's action; EvaluationError where its state is not that of the seed's noise."""
+        """The sample's action; raises EvaluationError if the state belongs to other noise."""
         for (name, column), expected in zip(self._states.items(), s.tolist(), strict=True):
             found = float(column.iloc[self._k])
             if not abs(found - expected) <= TOLERANCE * (1 + abs(expected)):

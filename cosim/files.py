@@ -161,7 +161,7 @@ def temporary_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of an .npz file by name; none of Python objects, so that nothing in it is executed.
+    """Arrays of an .npz file by name; refuses pickled objects.
 
     Raises OSError where the file cannot be opened, ValueError where its content is damaged.
     """

@@ -82,7 +82,7 @@ def _importing(module: str) -> Iterator[None]:
 
 
 def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
-    """Object that `module:Name` leads to; `what` is what messages call it.
+    """Import the object `module:Name`; `what` names it in messages.
 
     Modules are searched in the working directory too, and in the folders of `import_from`. Raises
     `error` where the text has another form, where the import fails for whatever reason, or where
@@ -105,7 +105,7 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
 
 
 def blamed(cause: BaseException) -> str:
-    """What was raised, in a line, and by which line of which file."""
+    """The exception, its file and its line, as one line of text."""
     said = str(cause) if isinstance(cause, ImportError) else f"{type(cause).__name__}: {cause}"
     frames = [
         frame

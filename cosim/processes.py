@@ -262,7 +262,7 @@ class Finished(BaseException):
 
 
 def run_watched(main: Callable[[], None], parent: int, mark: str) -> NoReturn:
-    """Run the command line for a process that watches it, and leave a file where it ends.
+    """Run the command line for a watching process; create a file at its end.
 
     Foreign code may call `exit(0)` or be killed: then there is none. Threads that foreign code has
     left do not keep the process.

@@ -14,7 +14,7 @@ def told(
     total: int,
     read: Callable[..., tuple[int, str]] = lambda done, remark="": (done, remark),
 ) -> Iterator[Callable[..., None]]:
-    """Yield the function that an argument `progress` stands for: itself, or one that does nothing.
+    """Yield the callback of an argument `progress`: itself, a bar, or a no-op.
 
     True stands for a bar of `total` samples: `read` turns what the function is called with into
     the number done and a remark.

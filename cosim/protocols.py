@@ -79,7 +79,7 @@ class Solution(Protocol):
 
 
 class Decision(NamedTuple):
-    """The solution of a controller that knows its action (m,), and of the rest what it is given."""
+    """Solution with an action (m,); every other field is optional."""
 
     action: Array
     value: float = nan

@@ -1,4 +1,4 @@
-"""The scenario: one validated document that says what plant is controlled, and to what end."""
+"""The scenario: one validated document of plant, cost, bounds and controller."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Table(BaseModel):
 
 
 class MappingTable(Table):
-    """FMU variables through which a reset writes what the scenario says; each may be left out.
+    """FMU variables that a reset writes; each is optional.
 
     What is left out is not written: without `seed`, for instance, the FMU draws its own noise.
     """

@@ -69,7 +69,7 @@ def regrets(cost: Array, optimum: Array | float) -> Array:
 
 
 def regret_terms(cost: Array, optimum: Array) -> Array:
-    """What each seed, or block of a run, adds to `regret`, which is their mean: (S,)."""
+    """Contribution (S,) of each seed or block to `regret`, their mean."""
     return (cost - optimum) / abs(np.mean(optimum))
 
 

@@ -34,7 +34,7 @@ Derived = Callable[[Scenario, Mapping[str, Array]], Array]
 
 
 class NoSolution:
-    """Stands where the controller failed: whatever a signal asks of it is NaN."""
+    """Placeholder for a failed solution: every number is NaN."""
 
     def __getattr__(self, name: str) -> float:
         return nan
@@ -167,7 +167,7 @@ class SignalColumns:
         self._rows.append(row)
 
     def fill(self, first: int, values: Mapping[str, Array]) -> None:
-        """Store what somebody else has sampled, by name, from sample number `first` on."""
+        """Store given samples by name, from sample number `first` on."""
         where = slice(first, first + len(values["time"]))
         for name, column in self.columns.items():
             if name in values and name not in self._unwanted:
@@ -182,7 +182,7 @@ class SignalColumns:
         return self._derive(where)
 
     def _derive(self, where: slice) -> dict[str, Array]:
-        """Compute what follows from the stored samples `where`; return all of them by name."""
+        """Derive signals from the stored samples `where`; return all by name."""
         stored = {name: column[where] for name, column in self.columns.items()}
         for name, derive in self._derived.items():
             stored[name][:] = derive(self._scenario, stored)

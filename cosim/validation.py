@@ -1,4 +1,4 @@
-"""Turns a failed validation into one line: table, field, what is wrong, what is allowed."""
+"""Turns a failed validation into one line: table, field, error, allowed values."""
 
 from __future__ import annotations
 

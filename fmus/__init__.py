@@ -84,7 +84,7 @@ UNIVERSAL, _MACH_O_64, _MACH_O_32 = 0xCAFEBABE, 0xFEEDFACF, 0xFEEDFACE
 
 
 def platforms_of(library: bytes) -> tuple[str, ...]:
-    """FMI 3.0's tuples of the platforms that can load `library`: none where it is no library.
+    """FMI 3.0's tuples of the platforms that can load `library`; empty if none can.
 
     Several for macOS' universal binaries. An architecture unknown here reads ``?``.
     """

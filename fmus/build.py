@@ -317,7 +317,7 @@ def assemble(
     every_platform: bool = False,
     files: Mapping[str, bytes] | None = None,
 ) -> Path:
-    """Build the FMU `target` of what `sources_of` found, with a page that shows its table.
+    """Build the FMU `target` from `sources_of`, with a page of its variables.
 
     `remarks` are sentences on that page, `files` further members of the archive. As `build_fmu`,
     whose BuildError it raises; with the same compiler the bytes repeat.

@@ -285,7 +285,7 @@ def _attributes(values: Attributes) -> str:
 
 
 def _number(value: float) -> str:
-    """The shortest text that reads back to `value`, without a fraction where there is none."""
+    """Shortest text that reads back to `value`; integers without a fraction."""
     return repr(float(value)).removesuffix(".0")
 
 

@@ -88,7 +88,7 @@ def sampled_sources(system: SampledSystem, version: FmiVersion) -> dict[str, byt
 
 
 def _array_sources(model: Model) -> dict[str, bytes]:
-    """FMI 3.0's face, which knows scalars, and what puts the model's arrays behind it."""
+    """FMI 3.0's functions for scalars, and the adapter for the model's arrays."""
     elements = dict.fromkeys(range(len(model.variables)), (1, 0))
     for array in model.arrays.values():
         own = [model.value_reference(variable.name) for variable in array]

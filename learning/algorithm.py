@@ -49,7 +49,7 @@ class Transition(NamedTuple):
 
 
 class Update(NamedTuple):
-    """What an algorithm says of an update of θ, for the log, and what it asks of the plant.
+    """An update of θ: fields for the log, and requests to the plant.
 
     `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
     step, `smallest_eigenvalue` that of B_l and B_Vf at the new θ; `corrected` and `refused` say

@@ -36,7 +36,7 @@ class Segment(NamedTuple):
 
 
 class BackOffSearch:
-    """Finds κ such that the bounds x_l + κσ and x_u − κσ, where they are active, cost least.
+    """Finds the κ of least cost for the active bounds x_l + κσ and x_u − κσ.
 
     σ is the standard deviation of the model's one-step prediction error in each state, so that κ
     has no unit; a bound is active where it binds in the QP (dV/dx_l or dV/dx_u ≠ 0) now and then.
@@ -128,7 +128,7 @@ class BackOffSearch:
         return self.start.replace({"x_l": lower, "x_u": upper})
 
     def observe(self, transition: Transition | None) -> bool:
-        """Take a sample, None where the controller failed; whether a new episode begins now."""
+        """Take a sample, None after a failure; returns whether a new episode begins."""
         if self.done:
             return False
         segment = self._plan[self._segment]
@@ -191,7 +191,7 @@ class BackOffSearch:
         return [Segment(number, steps, kappa) for kappa in kappas]
 
     def _least(self, bound: int) -> float:
-        """κ at which a bound is the true one, at most 0 for a start that loosens none."""
+        """κ of the true bound; at most 0 if the start loosens no bound."""
         state, upper = bound % self._n, bound >= self._n
         room = (
             self.start["x_u"][state] - self._true[1][state]

@@ -38,7 +38,7 @@ SHIFT = 8 * 3600.0
 
 
 class GreedyConfiguration(Configuration):
-    """Hyperparameters of a rule whose samples are greedy and whose θ comes from no fit."""
+    """Hyperparameters of a rule with greedy samples and without a fit of θ."""
 
     exploration: Literal["none"] = Field(
         "none", description="none: it is θ that is tried, not actions"
@@ -126,7 +126,7 @@ class BackOff(Algorithm):
         return self._start.with_theta(self.theta)
 
     def _episode(self, search: BackOffSearch) -> int | None:
-        """Seed of the noise of a stretch's episode; None in operation, which simply goes on."""
+        """Noise seed of the next episode; None in operation, which continues."""
         return search.seed if self.asks_for == "simulator" else None
 
     def failed(self, cost: float) -> Update | None:

@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a run needs to go on: `run` says which run it is, `state` and `arrays` where it was."""
+    """State to resume a run: `run` identifies it, `state` and `arrays` hold its values."""
 
     run: dict[str, Any]
     state: dict[str, Any]
@@ -86,7 +86,7 @@ def _flat(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def prefixed(prefix: str, arrays: Mapping[str, Array]) -> dict[str, Array]:
-    """Arrays that shall stand beside others, a prefix before each name."""
+    """Arrays with a prefix before each name."""
     return {f"{prefix}{name}": values for name, values in arrays.items()}
 
 
@@ -114,7 +114,7 @@ def arrays_of(state: Any) -> dict[str, Array]:
 
 
 def take_up(state: Any, arrays: Mapping[str, Array]) -> None:
-    """Set what an object keeps to what `arrays_of` gave; a number keeps its present type.
+    """Restore an object's arrays from `arrays_of`; numbers keep their type.
 
     In the order of `KEPT`; what is None now stays so; a part that can `restore` does. Raises
     KeyError where one is missing, TypeError or ValueError where it has another form.

@@ -44,7 +44,7 @@ class Strategy:
     deviation: Vector
 
     def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
-        """Action that explores where the policy's is `action`, (m,), or None: stay greedy."""
+        """Exploring action (m,) in place of the policy's `action`; None: greedy."""
         # Drawn in every sample, so that paired runs stay in step whatever the probability.
         draw, e = rng.random(), rng.standard_normal(self.lower.size)
         if draw >= self.probability:
@@ -125,7 +125,7 @@ class Configuration(BaseModel):
         return validated(cls, values, "hyperparameters", ConfigurationError)
 
     def for_scenario(self, scenario: Scenario) -> Self:
-        """Copy with what the scenario states in place of every default that it states."""
+        """Copy with the scenario's values in place of defaults."""
         stated: dict[str, Any] = {}
         if (table := scenario.exploration) is not None:
             stated = {
@@ -162,7 +162,7 @@ class Configuration(BaseModel):
         return self.model_parameters
 
     def without_part(self) -> Mapping[str, str]:
-        """The hyperparameters that act nowhere here, each with the words for where that is."""
+        """Hyperparameters without effect here, each with the part that it belongs to."""
         return {}
 
     @model_validator(mode="after")

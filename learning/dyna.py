@@ -99,7 +99,7 @@ class Dyna(QLearning):
 
 
 class ModelPlant(PlantInOperation):
-    """A plant that an empirical model plays from the state s (n,), its residuals drawn anew."""
+    """A plant simulated by an empirical model from s (n,), with resampled residuals."""
 
     __slots__ = ()
 

@@ -1,4 +1,4 @@
-"""Errors of the learning package, each with one message that says what is wrong and where."""
+"""Errors of the learning package; each message names the mistake and its place."""
 
 
 class LearningError(Exception):
@@ -22,4 +22,4 @@ class DivergenceError(LearningError):
 
 
 class PrivilegeError(LearningError):
-    """An algorithm that asks for a plant in operation uses what only a simulator can."""
+    """An algorithm for a plant in operation used a simulator's abilities."""

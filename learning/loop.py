@@ -109,7 +109,7 @@ class TrainingLoop:
 
     @property
     def parameters(self) -> Parameters:
-        """The θ that the rule would hand over now: what it reports, else what it behaves with."""
+        """The θ to hand over now: the rule's reported θ, else its behaviour's."""
         theta = getattr(self.algorithm, "theta", None)
         present = self.controller.parameters
         return present if theta is None else present.with_theta(theta)
@@ -204,7 +204,7 @@ class TrainingLoop:
         return a, explored is not None
 
     def _asked(self, privilege: str) -> FmuPlant:
-        """The plant with all that a simulator can; PrivilegeError where none was asked for."""
+        """The plant as a simulator; raises PrivilegeError if not asked for."""
         if self._simulator is None:
             raise PrivilegeError(
                 f"{type(self.algorithm).__name__} asks for a plant in operation, and its update "
@@ -215,7 +215,7 @@ class TrainingLoop:
     def _solve(
         self, s: Vector, a: Vector | None = None, *, prepare: bool = False
     ) -> RtiSolution | None:
-        """V(s) and π(s), or Q(s, a); None where the controller fails, which is counted."""
+        """V(s) and π(s), or Q(s, a); None after a failure, which is counted."""
         try:
             if prepare:
                 self.controller.prepare()

@@ -71,7 +71,7 @@ class ValueConfiguration(Configuration):
 
     @property
     def following(self) -> float:
-        """Time constants over which the mean cost follows δ; 0 where the fit of θ has it."""
+        """Time constants over which the mean cost follows δ; 0: fitted with θ."""
         return 0.0
 
     @property
@@ -119,7 +119,7 @@ class QLearningConfiguration(ValueConfiguration):
 
     @property
     def following(self) -> float:
-        """Time constants over which the mean cost follows δ; 0 where the fit of θ has it."""
+        """Time constants over which the mean cost follows δ; 0: fitted with θ."""
         return self.mean_cost_memory if self.rule == "kalman" else 0.0
 
     def without_part(self) -> Mapping[str, str]:
@@ -363,7 +363,7 @@ class AverageCost:
             self.mean_cost += td_error / self._memory
 
     def fitted(self, gradient: Vector) -> Vector:
-        """∇Q (n,) of what is fitted: without c_lambda where g follows δ."""
+        """∇Q (n,) of the fitted entries: without c_lambda if g follows δ."""
         if not self._memory:
             return gradient
         kept = gradient.copy()

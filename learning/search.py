@@ -1,4 +1,4 @@
-"""The search: a plant that can be put back decides which θ is kept, with a learning rule or none.
+"""The search: a simulator decides which θ is kept, with or without a learning rule.
 
 `SearchPlan` says what to try next, and which of two θ is the better one: a generator that yields
 what the plant shall be run for (`Learn`, `Settle`, `Trial`) and is sent what came of it (`Learned`,
@@ -146,7 +146,7 @@ class Candidate:
 
 
 class PairedComparison:
-    """Decides which of two θ is cheaper, and counts the samples that this takes.
+    """Decides which of two θ is cheaper; counts the samples spent.
 
     A round's comparisons begin at one state of the plant, with the same noise to come. The
     `incumbent` is the best θ so far: it has won a comparison, or it is the start. Candidates are
@@ -190,7 +190,7 @@ class PairedComparison:
         self.base = self.incumbent = candidate
 
     def spend(self, samples: int) -> None:
-        """Count samples that are asked for; raises Spent where the limit leaves fewer."""
+        """Count requested samples; raises Spent beyond the limit."""
         if self.spent + samples > self.limit:
             raise Spent
         self.spent += samples
@@ -248,7 +248,7 @@ class PairedComparison:
     def screen(
         self, theta: Vector, costs: Vector, patience: float = 0.0
     ) -> Generator[Request, Result, Candidate | None]:
-        """θ with its first blocks, where it is never dearer than these, else None."""
+        """θ with its first blocks if it is never dearer on them, else None."""
         admissible = self.admissible(theta)
         if admissible is None:
             return None
@@ -292,7 +292,7 @@ class PairedComparison:
         return best
 
     def admissible(self, theta: Vector) -> Vector | None:
-        """θ with definite Hessians; None where bounds cross or a slack weight is not positive."""
+        """θ with definite Hessians; None if bounds cross or a slack weight is ≤ 0."""
         blocks = self._parameters
         if not np.isfinite(theta).all():
             return None
@@ -614,7 +614,7 @@ class EpisodeData:
         self._jacobians = 0
 
     def take(self, transition: Transition, theta: Vector | None = None) -> None:
-        """Take a sample, and θ (n_θ,) after it, where that may be a candidate."""
+        """Take a sample, and θ (n_θ,) after it if it may be a candidate."""
         self._rows.append(np.concatenate([transition.s, transition.a, transition.next_s]))
         self.done += 1
         if self._learns:
@@ -654,7 +654,7 @@ class EpisodeData:
 
 
 class Search(Algorithm):
-    """An algorithm that carries a `SearchPlan` out; a rule learns in its phases, or none does.
+    """An algorithm that runs a `SearchPlan`, with or without a learning rule.
 
     `theta` is the incumbent: what the run hands over, while the controller carries the θ that is
     being tried. The samples of learning and of comparisons are all the run's. A checkpoint keeps

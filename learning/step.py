@@ -245,7 +245,7 @@ class ConstrainedStep:
 
 
 def moved(blocks: ThetaBlocks, old: Vector, new: Vector, **said: Any) -> Update:
-    """What an algorithm says of a move of θ that no fit led to; `said` are further fields."""
+    """Update of θ without a fit; `said` are further log fields."""
     return Update(
         td_error=float("nan"),
         step=float(np.linalg.norm((new - old) / blocks.scale)),

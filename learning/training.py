@@ -268,7 +268,7 @@ class Totals:
         self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
 
     def means(self) -> dict[str, float]:
-        """Means over the samples and their updates, NaN where there was none."""
+        """Means over the samples and their updates; NaN without any."""
         count = self.updates or float("nan")
         return {
             "J": self.cost / (self.samples or float("nan")),
@@ -402,7 +402,7 @@ class Training(Result):
 
     @property
     def regret(self) -> float:
-        """(J − J*)/|J*| on that noise, NaN where J* is not known."""
+        """(J − J*)/|J*| on that noise; NaN if J* is unknown."""
         found = self.evaluation["regret"]
         return float("nan") if found is None else float(found)
 
@@ -697,7 +697,7 @@ class _Session:
         checkpoint.save(self.out / CHECKPOINT, Checkpoint(self.identity, values, arrays))
 
     def load(self) -> None:
-        """Take up the folder's checkpoint; raises CheckpointError where there is none that fits."""
+        """Load the folder's checkpoint; raises CheckpointError if none fits."""
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
         path = self.out / CHECKPOINT

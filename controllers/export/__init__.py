@@ -1,4 +1,4 @@
-"""The RTI-NMPC as C code that needs no Python: what an FMU of the controller is made of."""
+"""The RTI-NMPC as C code without Python: the sources of a controller's FMU."""
 
 from controllers.export.core import STATUSES, Core, core, plain_c
 

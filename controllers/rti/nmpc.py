@@ -298,7 +298,7 @@ class Engine:
 
     @classmethod
     def load(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
-        """The engine of a Gauss–Newton controller; None where it cannot be had.
+        """Compiled engine of a Gauss–Newton controller, or None if unavailable.
 
         That is without a compiler, where COSIM_COMPILE says `never`, and for long horizons.
         """
@@ -336,7 +336,7 @@ class Engine:
         return failed
 
     def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
-        """dπ/dθ (m, n_θ) and dπ/ds (m, n) of copies of the memory; None where LICQ fails."""
+        """Copies of dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
         # In another workspace: the next feedback needs what the preparation factorised.
         given = (ctypes.c_void_p(array.ctypes.data) for array in (before, after))
         status = self._policy(*given, self._other, self._jacobians_at)
@@ -671,7 +671,7 @@ class RtiNmpc:
         )
 
     def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:
-        """The closed loop in compiled code, begun anew; None where only Python can run it.
+        """A new closed loop in compiled code; None if only Python can run it.
 
         That is before `compile`, with several iterations, in a subclass that samples otherwise, and
         where the scenario saturates otherwise than the problem.

@@ -150,7 +150,7 @@ def write_fmu(
 
 
 def write_loop(controller: Path, scenario: Scenario, seed: int, target: Path) -> Path:
-    """Write the SSP whose trajectory is that of `cosim simulate --seed` with this controller.
+    """Write an SSP with the same trajectory as `cosim simulate --seed`.
 
     The controller comes first: it acts on the state at the sample, then the plant takes the step.
     Where the plant can, its inputs saturate, as the loop of `simulate` does it, so that a master

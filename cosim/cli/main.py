@@ -44,7 +44,7 @@ PANELS = {
 
 
 class _Commands(TyperGroup):
-    """The commands, none of which takes an empty word."""
+    """Command group; refuses empty arguments."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse empty words: as a path, one would mean the working directory; protect inputs."""
@@ -228,7 +228,7 @@ def _fail(message: str) -> None:
 
 
 def _report(error: BaseException) -> None:
-    """Leave the traceback in a file, and say in a line where and what to do with it."""
+    """Write the traceback to a file and print one line with its path."""
     import tempfile
     from importlib.metadata import version
 

@@ -1,4 +1,4 @@
-"""`cosim new`: skeletons of what users bring, which run as they are written."""
+"""`cosim new`: runnable skeletons of rules, controllers, plants and studies."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def new(
     out: cli.OutOption = Path(),
     json: cli.JsonOption = False,
 ) -> None:
-    """Write a skeleton that runs as it is, and say by which commands; replaces no file.
+    """Write a skeleton that runs, and print the commands; replaces no file.
 
     A rule and a controller are Python modules, a plant is C, a model and a scenario, a study TOML.
     """

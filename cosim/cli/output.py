@@ -1,4 +1,4 @@
-"""What commands share: options; tables, progress, notes and JSON; the folder that is written."""
+"""Shared by commands: options, tables, progress, notes, JSON, the output folder."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def resumable(
         "what is finished is kept: the same command goes on from there"
     ),
 ) -> Iterator[None]:
-    """Where the block is interrupted or terminated, say `how` to go on, if that is not empty."""
+    """On interruption or termination, print `how` to continue, unless it is empty."""
     try:
         yield
     except (KeyboardInterrupt, Terminated) as error:
@@ -171,7 +171,7 @@ def resumable(
 
 
 def dump(document: Mapping[str, Any]) -> str:
-    """JSON text with sorted keys, in one line where long; what is not finite becomes null."""
+    """JSON text with sorted keys, on one line if long; non-finite numbers become null."""
     from pydantic_core import to_json
 
     text = to_json(dict(document), inf_nan_mode="null")

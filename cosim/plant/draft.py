@@ -223,7 +223,7 @@ def _actions(fmu: UnpackedFmu, known: Mapping[str, Any], noise: Sequence[str]) -
 def _mapping(
     known: Mapping[str, Any], states: Sequence[str], noise: Sequence[str]
 ) -> dict[str, Any]:
-    """What a reset can write, by the names that the benchmark's own plants have."""
+    """Start values that a reset can write, by the names of our own plants."""
 
     def of(name: str, types: Sequence[str]) -> bool:
         return name in known and known[name].type in types and known[name].causality == "parameter"

@@ -102,7 +102,7 @@ def _unpack(path: Path) -> UnpackedFmu:
 
 
 def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
-    """Refuse what no honest FMU contains: paths that lead outside, links, absurd size.
+    """Refuse archives with paths outside, links or absurd size.
 
     Some tools on Windows part folders by backslashes, against the zip format: read as slashes.
     """
@@ -184,7 +184,7 @@ _FALLBACKS = {"aarch64-linux": "linux64", "aarch64-darwin": "darwin64"}
 
 
 def library_path(fmu: UnpackedFmu) -> Path:
-    """The library to load; raises PlantError that says why there is none.
+    """Path of the library to load; raises PlantError if it is missing.
 
     `modelIdentifier` must be a C identifier, the library an entry of the archive, and made for
     this platform by its own first bytes.
@@ -319,7 +319,7 @@ class Instance(ABC):
 
     @abstractmethod
     def _instantiate(self, **where: Any) -> Any:
-        """An instance by fmpy, which logs to `messages`; `where` is what its constructor takes."""
+        """An fmpy instance that logs to `messages`; `where`: constructor arguments."""
 
     @abstractmethod
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:

@@ -131,7 +131,7 @@ class Wirer:
         return words
 
     def initial_states(self) -> list[Place]:
-        """Places of the states' start parameters; none if the scenario names none."""
+        """Places of the states' start parameters; empty if the scenario has none."""
         names = self._scenario.plant.mapping.initial_state
         return [self._number(name, "plant.mapping.initial_state") for name in names]
 
@@ -143,7 +143,7 @@ class Wirer:
         return np.array(lower), np.array(upper)
 
     def units(self) -> dict[str, str]:
-        """Unit of each exchanged variable by name, empty where the FMU states none."""
+        """Unit of each exchanged variable by name; empty if not stated."""
         plant = self._scenario.plant
         names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
         return {name: _unit(self._find(name, "plant")) for name in names}
@@ -489,7 +489,7 @@ class FmuPlant:
         return Snapshot(self, handle, k)
 
     def _handle(self) -> ctypes.c_void_p:
-        """A dropped snapshot's memory, or none yet: the FMU allocates what it needs."""
+        """Memory of a dropped snapshot, or a null handle, which the FMU allocates."""
         if not self._free_handles:
             self._handles.append(handle := ctypes.c_void_p())
             return handle
@@ -514,7 +514,7 @@ class FmuPlant:
         self.close()
 
     def __del__(self) -> None:
-        """Free the instance of a plant that nobody closed."""
+        """Free the instance if the plant was not closed."""
         if getattr(self, "_fmi", None) is not None:
             self.close()
 

@@ -253,7 +253,7 @@ def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> lis
 
 
 def axis(*, seconds: float | None = None, samples: int = 0) -> rrb.TimeAxis:
-    """Horizontal axis that shows the whole run of that length."""
+    """Horizontal axis over a whole run of that length."""
     at = rr.TimeRangeBoundary.absolute
     start, end = (
         (at(seq=0), at(seq=samples)) if seconds is None else (at(seconds=0.0), at(seconds=seconds))

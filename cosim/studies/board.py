@@ -27,7 +27,7 @@ Text = Annotated[str, Field(pattern=r"^[^|<>\[\]\\`\r\n]+$", max_length=100)]
 
 
 class Entry(Table):
-    """entry.toml of a board's entry: who, what, and what finding it asked of the plant."""
+    """entry.toml of a board's entry: author, method, and plant access."""
 
     name: Text
     authors: Text

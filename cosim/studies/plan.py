@@ -1,4 +1,4 @@
-"""`Study`: what is compared with what. `plan`: its runs, and the facts that each depends on."""
+"""`Study`: the cases to compare. `plan`: its runs and their dependencies."""
 
 from __future__ import annotations
 
@@ -321,7 +321,7 @@ class Study:
 
     @cached_property
     def references(self) -> list[Case]:
-        """Controllers that relative figures need and that the study does not name: naive, J*."""
+        """Controllers that regret needs but the study lacks: naive, optimal."""
         given = {case.controller for case in self.cases}
         wanted: dict[str, list[str]] = {}
         for name, scenario in self.scenarios.items():
@@ -363,7 +363,7 @@ class Study:
         return Noise(tuple(range(HELD_OUT, HELD_OUT + count)), steps)
 
     def marks(self, scenario: str) -> tuple[int, ...]:
-        """Samples of operation at which a scenario's runs are judged; none of another study."""
+        """Samples of operation at which a scenario's runs are judged; else empty."""
         if self.table.operation is None:
             return ()
         hours = self._of(self.table.operation.hours, scenario, "operation.hours")
@@ -498,7 +498,7 @@ def _on(study: Study, scenario: str) -> list[Case]:
 def _traces(
     study: Study, case: Case, scenario: str, seed: int | None
 ) -> tuple[TrajectoryTable, ...]:
-    """The trajectories that a run takes part in: of a training, that of the first seed."""
+    """Trajectories that include a run; of trainings, only the first seed's."""
     if case.training_seeds and seed != case.training_seeds[0]:
         return ()
     return tuple(
@@ -509,7 +509,7 @@ def _traces(
 
 
 def _check_names(study: Study) -> None:
-    """Raise StudyError where the study names a case that it does not have."""
+    """Raise StudyError if the study names an unknown case."""
     names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]
     asked = [(f"trajectory '{t.name}'", t.cases or [], names) for t in study.table.trajectory]
@@ -525,7 +525,7 @@ def _check_names(study: Study) -> None:
 
 
 def check_folders(runs: list[Run]) -> None:
-    """Raise StudyError where two runs would have one folder, on a system that ignores case too."""
+    """Raise StudyError if two runs share a folder, upper and lower case being equal."""
     folders: dict[str, RunKey] = {}
     for run in runs:
         folder = str(run.key.folder).lower()

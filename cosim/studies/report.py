@@ -98,7 +98,7 @@ def texts(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _percent(row: Mapping[str, Any], name: str, ends: str = "") -> str:
-    """A share in per cent with its interval, where it has one; nothing where it is undefined."""
+    """A share in per cent with its interval, if any; empty if undefined."""
     low, high = (float(row.get(f"{ends or name}_{end}", np.nan)) for end in ("low", "high"))
     if np.isnan(row[name]):
         return ""
@@ -205,7 +205,7 @@ def image(path: Path) -> dict[str, str]:
 
 
 def date(path: Path) -> str:
-    """Day on which a file of the study was written, UTC; empty where there is no such file."""
+    """Day (UTC) on which a file of the study was written; empty without it."""
     if not path.is_file():
         return ""
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).date().isoformat()

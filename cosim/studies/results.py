@@ -182,7 +182,7 @@ class StudyResults(Shown):
         return self.runs[(self.runs.scenario == scenario) & (self.runs.case == case)]
 
     def reference(self, kind: str, scenario: str) -> Array | None:
-        """J (S,) of the case that is a scenario's `optimum` or `naive`; None if there is none."""
+        """J (S,) of a scenario's `optimum` or `naive`, or None."""
         cost = self.indicator(self.about[kind].get(scenario, ""), scenario)
         return cost[0] if len(cost) else None
 
@@ -304,7 +304,7 @@ class StudyResults(Shown):
         return rows
 
     def regrets(self, case: str, scenario: str) -> Array:
-        """Regret of each run, (R,), infinite where J is not finite; NaN where J* is not known."""
+        """Regret (R,) of each run; infinite if J is not finite, NaN if J* is unknown."""
         runs = self.of(case, scenario)
         if self.reference("optimum", scenario) is None:
             return np.full(len(runs), np.nan)
@@ -317,7 +317,7 @@ class StudyResults(Shown):
 
     @cached_property
     def aggregate(self) -> pd.DataFrame:
-        """Cases that ran on every scenario whose J* is known, if several: regret over all runs.
+        """Regret over all runs of cases that ran on all (several) scenarios with known J*.
 
         The bootstrap is stratified: runs are resampled within their scenario.
         """
@@ -446,7 +446,7 @@ class StudyResults(Shown):
         return figures.regret_figure(rows, self._looks) if rows else None
 
     def _curves(self, scenario: str) -> Figure | None:
-        """None where no training was evaluated more than once: a point is no curve."""
+        """None if no training was evaluated more than once."""
         own = self.curves[self.curves.scenario == scenario]
         levels = own[own.training_seed.isna()].set_index("case").greedy_J
         trained = own[own.training_seed.notna()]
@@ -503,7 +503,7 @@ class StudyResults(Shown):
         return figures.operation_figure(judged, about, self._looks, self.baselines)
 
     def _profile(self, scenario: str) -> Figure | None:
-        """Of one scenario, or, for "", of all whose J* is known, where they are several."""
+        """Profile of one scenario or, for "", of all (several) with known J*."""
         scenarios = self.known if not scenario else [s for s in self.known if s == scenario]
         if not scenarios or (not scenario and len(scenarios) < 2):
             return None

@@ -78,7 +78,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Item:
-    """Work that one process does in one go, the same wherever that is.
+    """Unit of work of one process, independent of the machine.
 
     A `training` to its end, its checkpoint in `folder` where the workers share this disk. Else a
     controller on some `noise`, for `file`. `samples` are those of all the controller's items. The
@@ -103,7 +103,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Failure:
-    """An item that raised: its message, the traceback, and the error's class where it is ours."""
+    """A failed item: message, traceback, and the class of our own errors."""
 
     message: str
     trace: str
@@ -307,7 +307,7 @@ class Runner:
         self._tell(self._finish(name, self._runs[name]))
 
     def _finish(self, name: str, run: Run) -> str:
-        """Seal a run that has all that the plan asks for; a line on it."""
+        """Seal a complete run; returns a line about it."""
         store = self.stores[name]
         if not store.finished:
             return ""
@@ -355,7 +355,7 @@ def _begin(parent: int) -> None:
 
 
 def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome]]:
-    """Do items on the workers of a scheduler that somebody else runs, in the order they end.
+    """Run items on an existing scheduler's workers; yield them as they end.
 
     Raises EvaluationError, in one line, where the scheduler is none, dies or is silent, where it
     has no worker, and where a worker cannot do an item.
@@ -403,7 +403,7 @@ def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome
 
 
 async def _identity(dask: Any, address: str) -> dict[str, Any]:
-    """What a scheduler says of itself; raises TimeoutError where it says nothing."""
+    """A scheduler's identity; raises TimeoutError without an answer."""
     connect = import_module("distributed.comm").connect
     async with asyncio.timeout(ANSWER_SECONDS):
         security = dask.Security().get_connection_args("client")

@@ -54,7 +54,7 @@ Measured = dict[int, tuple[Figures, Figures]]
 def read_table(
     path: Path, columns: Sequence[str] = (), types: Mapping[str, Any] | None = None
 ) -> pd.DataFrame:
-    """Columns of a CSV, all if none is named, with those of `types`, which go beside `TYPES`.
+    """Columns of a CSV (default: all), typed by `types` and `TYPES`.
 
     Raises StudyError.
     """
@@ -140,7 +140,7 @@ class RunStore:
             self._begin()
 
     def _found(self) -> dict[str, Any]:
-        """run.json, where it and the files that it vouches for are whole; else {}."""
+        """run.json if it and its hashed files are intact, else {}."""
         path = self.folder / RUN
         if not path.is_file():
             if any(map(_ours, self.folder.glob("*"))):
@@ -200,7 +200,7 @@ class RunStore:
         return (self.folder / PARAMETERS).read_text("utf-8")
 
     def train(self, trained: Trained) -> None:
-        """Store a training at its end; run.json last, so that what it says is there."""
+        """Store a finished training; run.json is written last."""
         write_atomically(self.folder / LOG, trained.log)
         write_atomically(self.folder / PARAMETERS, trained.parameters)
         self.note(
@@ -237,7 +237,7 @@ class RunStore:
         return tuple(seed for seed in noise.seeds if seed not in self.indicators(file))
 
     def evaluate(self, file: str, found: Measured) -> None:
-        """Add what was measured to a file, and what the clock said to timing.csv."""
+        """Append indicators to a file, and times to timing.csv."""
         parts = [(file, 0), *([(TIMING, 1)] if file == EVALUATION else [])]
         for name, part in parts:
             self.indicators(name).update({seed: pair[part] for seed, pair in found.items()})

@@ -51,7 +51,7 @@ def stored_studies(folder: Path) -> dict[str, StudyTable]:
 
 
 def chosen(known: Mapping[str, StudyTable], names: list[str]) -> list[str]:
-    """The named studies; raises ResultsError for a name that is none of them."""
+    """The named studies; raises ResultsError for unknown names."""
     for name in names:
         if name not in known:
             raise ResultsError(f"there is no study '{name}'{instead(name, known)}")
@@ -59,7 +59,7 @@ def chosen(known: Mapping[str, StudyTable], names: list[str]) -> list[str]:
 
 
 def store(folder: Path, name: str, out: Path) -> list[str]:
-    """Put what a study measured in place of what was stored of it; returns what was too large.
+    """Replace a study's stored files; returns those that were too large.
 
     Left out: the runs' own folders, whatever a clock said, and tables of more than `LARGEST` bytes.
     """
@@ -86,14 +86,14 @@ def store(folder: Path, name: str, out: Path) -> list[str]:
 
 
 def write_readme(folder: Path, studies: dict[str, StudyTable]) -> None:
-    """Write README.md: of every stored study what it is, its tables, and where the rest is."""
+    """Write README.md: title, tables and links of every stored study."""
     there = [name for name in studies if (folder / name / ABOUT).is_file()]
     results = {name: StudyResults.load(folder / name) for name in there}
     write_atomically(folder / "README.md", rendered("readme.md", studies=studies, results=results))
 
 
 class Tolerance(Table):
-    """The largest difference of a signal that counts as none, in the signal's unit."""
+    """Largest accepted difference of a signal, in its unit."""
 
     absolute: Annotated[float, Field(ge=0, strict=False)]
     unit: str
@@ -153,7 +153,7 @@ def _cause(
     now: pd.DataFrame,
     tolerances: Mapping[str, Tolerance],
 ) -> list[str]:
-    """Where to look, by the cases whose evaluation differs; [] where none does.
+    """Likely causes, from the cases whose evaluation differs; [] if none.
 
     The optimum is a stored table, so that it differs with the plant and the cost alone; controllers
     that learn nothing differ with their model and problem too, and the others with their algorithm.
@@ -200,7 +200,7 @@ def _read(path: Path, keys: list[str]) -> pd.DataFrame:
 def _table_differences(
     name: str, stored: pd.DataFrame, now: pd.DataFrame, tolerances: Mapping[str, Tolerance]
 ) -> list[str]:
-    """What differs between two tables, in words: rows of one alone, the first row that differs."""
+    """Differences of two tables in words: unmatched rows, first differing row."""
     lines = []
     for one, other, text in (
         (stored, now, "stored but not computed any more"),
@@ -237,7 +237,7 @@ def _table_differences(
 
 
 def _tolerance(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:
-    """The signal's own tolerance, else that of the first pattern (`theta *`) that fits it."""
+    """The signal's own tolerance, else the first matching pattern's (`theta *`)."""
     fitting = (name for name in tolerances if fnmatchcase(signal, name))
     name = signal if signal in tolerances else next(fitting, None)
     if name is None:

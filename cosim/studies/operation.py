@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from time import process_time
 from typing import Any, NamedTuple
 
@@ -19,8 +18,8 @@ from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
 from cosim.scenario import Scenario
 from cosim.statistics import paired_difference, shown
-from cosim.studies.plan import ONLINE, Run, greedy_file
-from cosim.studies.store import KEYS, LOG, measured, read_table
+from cosim.studies.plan import ONLINE, greedy_file
+from cosim.studies.store import KEYS, LOG, RunStore, read_table
 from cosim.text_tables import Table
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
@@ -122,25 +121,25 @@ def theta_at(log: str, mark: int) -> tuple[float, ...]:
     return tuple(float(value) for name, value in row.items() if name.startswith("theta "))
 
 
-def collected(runs: Sequence[Run], out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+def collected(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Rows of the lives, by run and mark, and of the greedy evaluations, by noise seed, too.
 
     The optimum has a life on the noise of every training seed, of which J is known.
     """
     lives, greedy = [], []
-    for run in (run for run in runs if run.marks):
-        folder, key = out / run.key.folder, run.key
+    for store in (store for store in stores if store.run.marks):
+        run, key = store.run, store.run.key
         names = {"scenario": key.scenario, "case": key.case}
         for mark in run.marks:
-            rows = read_table(folder / greedy_file(mark), types={"seed": int})
+            rows = store.measured(greedy_file(mark)).rename_axis("seed").reset_index()
             greedy.append(rows.assign(**names, training_seed=key.seed, samples=mark))
         if run.training is not None:
-            rows = read_table(folder / LOG, types={"samples": int})
+            rows = read_table(store.folder / LOG, types={"samples": int})
             lives.append(rows.assign(**names, training_seed=key.seed))
         elif ONLINE in run.noise:
-            for seed, own in measured(folder, run, ONLINE).groupby("seed"):
-                ends = run.noise[ONLINE].block * np.arange(1, len(own) + 1)
-                so_far = own.J.expanding().mean().to_numpy()
+            for seed, blocks in sorted(store.indicators(ONLINE).items()):
+                ends = run.noise[ONLINE].block * np.arange(1, len(blocks["J"]) + 1)
+                so_far = pd.Series(blocks["J"]).expanding().mean()
                 rows = pd.DataFrame({"samples": ends, "J": so_far})
                 rows = rows[rows.samples.isin(run.marks)]
                 lives.append(rows.assign(**names, training_seed=seed))

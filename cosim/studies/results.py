@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -99,38 +99,34 @@ class StudyResults(Shown):
         )
 
     @classmethod
-    def collect(cls, plan: Plan, folder: Path) -> StudyResults:
-        """Read the finished runs of a plan from their folders, by scenario, case and seed.
+    def written(
+        cls, plan: Plan, out: Path, stores: Collection[store.RunStore], *, figures: bool = True
+    ) -> StudyResults:
+        """Write the tables and kept files of a plan's finished runs, and return them.
 
-        Raises StudyError where a file of a run is damaged.
+        `figures` draws the kept trajectories and logs, too; study.json, which names them, is
+        written last, so that its word is true.
         """
-        return cls(folder, document(plan), *store.frames(plan, folder))
-
-    def write(self, plan: Plan, *, figures: bool = True) -> StudyResults:
-        """Write the study's tables and kept files; study.json last, so that its word is true.
-
-        `figures` draws the kept trajectories and logs, too; returns the results that name them.
-        """
-        out = self.folder
+        runs = store.finished(plan, stores)
+        found = cls(out, document(plan), *store.frames(runs))
         pictures.keep(plan, out)
         drawn = pictures.draw(plan, out) if figures else []
-        runs = store.finished(plan, self.state)
         tables = {
-            EVALUATION: self.evaluation,
-            CURVES: self.curves,
-            RUNS: self.runs,
-            SUMMARY: self.summary,
-            TIMING: store.timing(plan, out),
+            EVALUATION: found.evaluation,
+            CURVES: found.curves,
+            RUNS: found.runs,
+            SUMMARY: found.summary,
+            TIMING: store.timing(stores),
         }
-        if self.about.get("operation"):
-            tables[OPERATION], tables[GREEDY] = operation.collected(runs, out)
-        if len(self.aggregate):
-            tables[AGGREGATE] = self.aggregate
+        if found.about.get("operation"):
+            tables[OPERATION], tables[GREEDY] = operation.collected(runs)
+        if len(found.aggregate):
+            tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
             write_atomically(out / name, to_csv(table))
-        about = dict(self.about) | {"pictures": drawn}
+        about = dict(found.about) | {"pictures": drawn}
         write_atomically(out / ABOUT, json.dumps(about, indent=1, sort_keys=True) + "\n")
-        return replace(self, about=about)
+        return replace(found, about=about)
 
     @property
     def name(self) -> str:

@@ -452,7 +452,8 @@ def study(
         for line in runner.remarks:
             report(State(0, 0, len(planned.runs), 0), line)
         runner.go(jobs, scheduler)
-    results = StudyResults.collect(planned, folder).write(planned, figures=figures)
+    stores = runner.stores.values()
+    results = StudyResults.written(planned, folder, stores, figures=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
         others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""

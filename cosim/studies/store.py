@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -100,21 +100,6 @@ class Trained:
     clock: Mapping[int, float] = field(default_factory=dict)
 
 
-def measured(folder: Path, run: Run, file: str) -> pd.DataFrame:
-    """What a file of a run holds, by noise seed, of runs as long as the plan's.
-
-    A row for each seed, or for each of its blocks. Raises StudyError where it is damaged.
-    """
-    noise = run.noise[EVALUATION if file == TIMING else file]
-    key, columns = (BLOCKS, ["J"]) if noise.block else (KEY, INDICATORS)
-    if not (folder / file).is_file():
-        return pd.DataFrame(columns=[*key, *columns]).set_index("seed")
-    wanted = () if file == TIMING else (*key, *columns)
-    rows = read_table(folder / file, wanted, dict.fromkeys(key, int)).set_index("seed")
-    rows = rows[(rows.steps == noise.steps) & (rows[key[2]] == (noise.block or noise.burn_in))]
-    return rows if noise.block else rows[~rows.index.duplicated()]
-
-
 class RunStore:
     """The files of one run; `run.facts` say all that its results depend on.
 
@@ -127,7 +112,7 @@ class RunStore:
         self.folder = out / run.key.folder
         self.remarks: list[str] = []
         """What was found changed or damaged, and is done anew."""
-        self._run = run
+        self.run = run
         self._facts = json.loads(json.dumps(run.facts))
         self._known: dict[str, dict[int, Figures]] = {}
         self._unwritten: set[str] = set()
@@ -135,8 +120,8 @@ class RunStore:
         if not self.folder.resolve().is_relative_to(out.resolve()):
             raise StudyError(f"'{self.folder}' leads out of '{out}'; choose another --out")
         (self.folder / FAILURE).unlink(missing_ok=True)
-        self._about = self._found()
-        if self._about.get("facts") != self._facts:
+        self.about = self._found()
+        if self.about.get("facts") != self._facts:
             self._begin()
 
     def _found(self) -> dict[str, Any]:
@@ -175,19 +160,19 @@ class RunStore:
             if _ours(path):
                 path.unlink()
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._about = {"facts": self._facts}
+        self.about = {"facts": self._facts}
         self.note(status="")
 
     def note(self, **values: Any) -> None:
         """Write values to run.json."""
-        self._about = self._about | values
-        text = json.dumps(self._about, indent=1, sort_keys=True) + "\n"
+        self.about = self.about | values
+        text = json.dumps(self.about, indent=1, sort_keys=True) + "\n"
         write_atomically(self.folder / RUN, text)
 
     @property
     def status(self) -> str:
         """How the training ended; empty while it has not."""
-        return str(self._about.get("status", ""))
+        return str(self.about.get("status", ""))
 
     @property
     def log(self) -> str:
@@ -219,19 +204,33 @@ class RunStore:
         """
         if file not in self._known:
             try:
-                rows = measured(self.folder, self._run, file)
+                self._known[file] = self._read(file)
             except StudyError:
                 self.remarks.append(f"'{self.folder / file}' is damaged; made anew")
-                rows = pd.DataFrame()
-            rows = rows.drop(columns=[*KEY, *BLOCKS], errors="ignore")
-            if file == ONLINE and len(rows):
-                rows = rows.groupby("seed").agg(list)
-            self._known[file] = rows.to_dict("index")
+                self._known[file] = {}
         return self._known[file]
+
+    def _read(self, file: str) -> dict[int, Figures]:
+        noise = self.run.noise[EVALUATION if file == TIMING else file]
+        key, columns = (BLOCKS, ["J"]) if noise.block else (KEY, INDICATORS)
+        if not (self.folder / file).is_file():
+            return {}
+        wanted = () if file == TIMING else (*key, *columns)
+        rows = read_table(self.folder / file, wanted, dict.fromkeys(key, int)).set_index("seed")
+        rows = rows[(rows.steps == noise.steps) & (rows[key[2]] == (noise.block or noise.burn_in))]
+        rows = rows.drop(columns=key[1:])
+        rows = rows.groupby("seed").agg(list) if noise.block else rows[~rows.index.duplicated()]
+        found: dict[int, Figures] = rows.to_dict("index")
+        return found
+
+    def measured(self, file: str) -> pd.DataFrame:
+        """What a file of a finished run holds, a row for each noise seed, in the plan's order."""
+        rows = pd.DataFrame.from_dict(self.indicators(file), "index")
+        return rows.loc[list(self.run.noise[file].seeds)]
 
     def missing(self, file: str) -> tuple[int, ...]:
         """Noise seeds of which a file says nothing."""
-        noise = self._run.noise[file]
+        noise = self.run.noise[file]
         if noise.whole:
             return () if (self.folder / file).is_file() else noise.seeds
         return tuple(seed for seed in noise.seeds if seed not in self.indicators(file))
@@ -254,7 +253,7 @@ class RunStore:
         # The rows of many seeds are written again and again: the pause keeps that a small share.
         begin = time.monotonic()
         rows = pd.DataFrame.from_dict(self._known[file], "index").sort_index()
-        noise = self._run.noise[EVALUATION if file == TIMING else file]
+        noise = self.run.noise[EVALUATION if file == TIMING else file]
         if noise.block:
             rows = rows.explode("J").astype(float)
         elif file != TIMING:
@@ -269,20 +268,20 @@ class RunStore:
     @property
     def finished(self) -> bool:
         """Whether all that the plan asks of the run is there."""
-        trained = self._run.training is None or bool(self.status)
-        return trained and not any(self.missing(file) for file in self._run.noise)
+        trained = self.run.training is None or bool(self.status)
+        return trained and not any(self.missing(file) for file in self.run.noise)
 
     def seal(self) -> None:
         """Note the hashes of a finished run's files, so that a torn or edited one is noticed."""
         self.flush()
         paths = filter(_ours, self.folder.glob("*"))
         files = {path.name: _digest(path) for path in sorted(paths) if path.name != TIMING}
-        if self._about.get("files") != files:
+        if self.about.get("files") != files:
             self.note(files=files)
 
     def unseal(self) -> None:
         """Forget the hashes before more is written, those of the training's own files excepted."""
-        files = self._about.get("files", {})
+        files = self.about.get("files", {})
         if files.keys() - TRAINED:
             self.note(files={name: files[name] for name in files.keys() & TRAINED})
 
@@ -297,88 +296,57 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
-# What the runs of a plan have finished, together
+def finished(plan: Plan, stores: Iterable[RunStore]) -> list[RunStore]:
+    """The runs that are finished, by scenario, case and training seed, in the study's order."""
+    cases = [case.name for case in plan.definition.all_cases]
+    scenarios = list(plan.definition.scenarios)
+
+    def place(store: RunStore) -> tuple[int, int, int]:
+        key = store.run.key
+        seed = -1 if key.seed is None else key.seed
+        return scenarios.index(key.scenario), cases.index(key.case), seed
+
+    return sorted((store for store in stores if store.finished), key=place)
 
 
-def ordered(plan: Plan) -> list[Run]:
-    """The runs by scenario, case and training seed, in the study's order."""
-    definition = plan.definition
-    names = [case.name for case in definition.all_cases]
-    scenarios = list(definition.scenarios)
-    return sorted(
-        plan.runs,
-        key=lambda run: (
-            scenarios.index(run.key.scenario),
-            names.index(run.key.case),
-            -1 if run.key.seed is None else run.key.seed,
-        ),
-    )
+def frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:
+    """State, evaluation and curves of finished runs."""
+    found = [_tables(store) for store in stores]
+    result = []
+    for i, header in enumerate((STATE, [*KEYS, "seed", "steps", *INDICATORS], [*KEYS, *CURVE])):
+        parts = [tables[i][header] for tables in found if len(tables[i])]
+        result.append(
+            pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=header)
+        )
+    return result
 
 
-def finished(plan: Plan, state: pd.DataFrame) -> list[Run]:
-    """The runs of a plan that `state` has a row for."""
-    known = state[KEYS].astype(object).where(state[KEYS].notna(), None)
-    done = set(known.itertuples(index=False, name=None))
-    return [r for r in ordered(plan) if (r.key.scenario, r.key.case, r.key.seed) in done]
-
-
-def frames(plan: Plan, out: Path) -> list[pd.DataFrame]:
-    """State, evaluation and curves of the finished runs, by scenario, case and training seed.
-
-    Raises StudyError where a file of a run is damaged.
-    """
-    found = [one for run in ordered(plan) if (one := _collected(run, out)) is not None]
-    headers = (STATE, [*KEYS, "seed", "steps", *INDICATORS], [*KEYS, *CURVE])
-    parts = [[one[i] for one in found if len(one[i])] for i in range(len(headers))]
-    return [
-        pd.concat(own, ignore_index=True) if own else pd.DataFrame(columns=header)
-        for own, header in zip(parts, headers, strict=True)
-    ]
-
-
-def _collected(run: Run, out: Path) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | None:
-    """State, evaluation and curves of a run; None while it is not finished."""
-    folder = out / run.key.folder
-    if not (folder / RUN).is_file():
-        return None
-    document = read_json(folder / RUN, f"'{folder / RUN}'", StudyError)
-    kept = {file: noise for file, noise in run.noise.items() if not noise.whole}
-    found = {file: measured(folder, run, file) for file in kept}
-    if run.training is not None and not document.get("status"):
-        return None
-    if any(set(noise.seeds) - set(found[file].index) for file, noise in kept.items()):
-        return None
-    own = found[EVALUATION].loc[list(run.noise[EVALUATION].seeds)].reset_index()
+def _tables(store: RunStore) -> list[pd.DataFrame]:
+    """State, evaluation and curves of a finished run."""
+    run, about = store.run, store.about
     key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}
-    state = key | {
-        "status": document.get("status") or EVALUATED,
-        "samples": int(document.get("samples", 0)),
-        "plant_samples": int(document.get("plant_samples", 0)),
-    }
+    state: dict[str, Any] = {"status": store.status or EVALUATED}
+    state |= {name: int(about.get(name, 0)) for name in ("samples", "plant_samples")}
+    evaluation = store.measured(EVALUATION).rename_axis("seed").reset_index()
+    evaluation["steps"] = run.noise[EVALUATION].steps
     curve = pd.DataFrame(columns=CURVE)
     if run.training is not None:
-        curve = read_table(folder / LOG).reindex(columns=CURVE)
+        curve = read_table(store.folder / LOG).reindex(columns=CURVE)
     elif GREEDY in run.noise:
-        greedy = found[GREEDY].loc[list(run.noise[GREEDY].seeds)]
-        curve = pd.DataFrame([{"greedy_J": float(greedy.J.mean())}], columns=CURVE)
-    one, other, third = (frame.assign(**key) for frame in (pd.DataFrame([state]), own, curve))
-    curves = {"samples": "Int64"} | dict.fromkeys(CURVE[1:], float)
-    return (
-        one[STATE].astype({"training_seed": "Int64"}),
-        other[[*KEYS, "seed", "steps", *INDICATORS]].astype({"training_seed": "Int64"}),
-        third[[*KEYS, *CURVE]].astype({"training_seed": "Int64"} | curves),
-    )
+        greedy_J = float(store.measured(GREEDY).J.mean())
+        curve = pd.DataFrame([{"greedy_J": greedy_J}], columns=CURVE)
+    curve = curve.astype({"samples": "Int64"} | dict.fromkeys(CURVE[1:], float))
+    tables = (pd.DataFrame([state]), evaluation, curve)
+    return [table.assign(**key).astype({"training_seed": "Int64"}) for table in tables]
 
 
-def timing(plan: Plan, out: Path) -> pd.DataFrame:
+def timing(stores: Iterable[RunStore]) -> pd.DataFrame:
     """Seconds that each run's training took; in operation the processor's up to each mark, too."""
     rows = []
-    for run in plan.runs:
-        path = out / run.key.folder / RUN
-        document = read_json(path, f"'{path}'", StudyError) if path.is_file() else {}
-        clock = document.get("timing", {})
-        seconds = {str(run.key): clock.get("wall_seconds", 0.0)}
+    for store in stores:
+        clock = store.about.get("timing", {})
+        seconds = {str(store.run.key): clock.get("wall_seconds", 0.0)}
         marks = clock.get("processor_seconds", {})
-        seconds |= {f"{run.key}, sample {mark}": value for mark, value in marks.items()}
+        seconds |= {f"{store.run.key}, sample {mark}": value for mark, value in marks.items()}
         rows += [{"run": name, "training_seconds": float(value)} for name, value in seconds.items()]
     return pd.DataFrame(rows, columns=["run", "training_seconds"])

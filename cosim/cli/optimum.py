@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,12 +13,9 @@ import typer
 from cosim.cli import output as cli
 
 if TYPE_CHECKING:
-    from controllers.dynamic_programming import Figure, Optimum, Progress
+    from controllers.dynamic_programming import Progress
     from controllers.optimum import QuasiStaticPolicy
     from cosim.scenario import Scenario
-
-SEEDS, STEPS = range(900_000, 900_010), 10_000
-"""Runs on which a searched θ is compared with the policy."""
 
 
 def optimum(
@@ -30,15 +27,6 @@ def optimum(
             help="Solve, refine grid and quadrature, simulate the policy; keep the certificate.",
         ),
     ] = False,
-    against: Annotated[
-        Path | None,
-        typer.Option(
-            "--against",
-            help="With --refine: a policy search's θ, compared with the policy on the same noise.",
-            exists=True,
-            dir_okay=False,
-        ),
-    ] = None,
     recompute: Annotated[
         bool, typer.Option("--recompute", help="Solve even if the policy is stored.")
     ] = False,
@@ -59,7 +47,7 @@ def optimum(
             with _progress(out_) as show:
                 _show_quasi_static(QuasiStaticPolicy.from_scenario(task, progress=show), task, out_)
             return
-        document = _solve(task, refine, against, recompute, out_)
+        document = _solve(task, refine, recompute, out_)
         out_.json(document)
     if refine and document["objection"]:
         raise typer.Exit(1)
@@ -77,9 +65,7 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Outp
     out_.json(document | {"table": table})
 
 
-def _solve(
-    task: Scenario, refine: bool, against: Path | None, recompute: bool, out_: cli.Output
-) -> dict[str, Any]:
+def _solve(task: Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
     from controllers.dynamic_programming import (
@@ -101,9 +87,6 @@ def _solve(
             found = solve(plant, settings, progress=show)
         if refine:
             found = certify(plant, settings, found, progress=show)
-            if against is not None:
-                searched = _search_figure(against, found, plant, task)
-                found = replace(found, certificate=(*found.certificate, searched))
         path = path or store.keep(key, found)
     certificate = found.certificate
     why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
@@ -128,31 +111,6 @@ def _solve(
         "states": found.grid.shape,
         "accuracy": asdict(found.accuracy),
     }
-
-
-def _search_figure(theta: Path, found: Optimum, plant: Any, scenario: Scenario) -> Figure:
-    """J of a parameters file: the policy's simulated J and the difference, paired on `SEEDS`."""
-    import numpy as np
-
-    from controllers import OptimalPolicy, factories
-    from controllers.dynamic_programming import SEARCH, Figure
-    from cosim.plant import FmuPlant
-    from cosim.simulation import simulate
-    from cosim.statistics import mean
-
-    with FmuPlant(scenario) as fmu:
-        J = [
-            [simulate(fmu, each, STEPS, seed, residuals=False).summary()["J"] for seed in SEEDS]
-            for each in (factories.from_file(scenario, theta), OptimalPolicy(plant, found))
-        ]
-    difference = mean(np.array(J[0]) - np.array(J[1]))
-    assert difference.interval is not None
-    base = next(figure for figure in found.certificate if figure.name == "simulation")
-    value = base.value + difference.value
-    half_width = 0.5 * np.hypot(
-        difference.interval[1] - difference.interval[0], base.upper - base.lower
-    )
-    return Figure(SEARCH, value, value - float(half_width), value + float(half_width))
 
 
 @contextmanager

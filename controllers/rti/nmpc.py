@@ -544,13 +544,13 @@ class RtiNmpc:
 
     def _weigh(self, w: Vector, W: Vector) -> None:
         """Give the slack of the predicted stages its weights (n,), discounted."""
-        problem, horizon = self.problem, self.problem.horizon
-        discounts = np.repeat(problem.discount ** np.arange(1, horizon + 1), problem.n_states)
+        problem, stages = self.problem, np.arange(1, self.problem.horizon + 1)
+        discounts = np.repeat(problem.discount**stages, problem.reference_state.size)
         memory, places = self._prepare.memory, self._prepare.places
         # New views: a backend sees by them that the weights are others.
         self._qp.w, self._qp.W = memory[places["w"]], memory[places["W"]]
-        self._qp.w[:] = discounts * np.tile(w, horizon)
-        self._qp.W[:] = discounts * np.tile(W, horizon)
+        self._qp.w[:] = discounts * np.tile(w, stages.size)
+        self._qp.W[:] = discounts * np.tile(W, stages.size)
 
     def _linearise(self) -> None:
         prepare = self._prepare
@@ -609,14 +609,14 @@ class RtiNmpc:
 
     def _solve_qp(self, s: ArrayLike, a: ArrayLike | None) -> RtiSolution:
         problem = self.problem
-        s = _vector("state", s, problem.n_states)
+        s = _vector("state", s, problem.reference_state.size)
         if self._prepared is None:
             self.prepare()
         prepared = self._prepared
         assert prepared is not None
         self._readout.inputs["s"][:] = s
         if a is not None:
-            a = _vector("action", a, problem.n_actions)
+            a = _vector("action", a, problem.reference_action.size)
         if self._engine is None:
             self._solve_interpreted(s, a)
         else:

@@ -16,7 +16,10 @@ from typer.testing import CliRunner
 
 import fmus
 from benchmarks import importers
-from controllers.factories import naive, tuned
+from controllers import Parameters
+from controllers.factories import naive, nmpc, tuned
+from controllers.problem import Problem
+from controllers.theta import ThetaBlocks
 from cosim import FmuPlant, Scenario, simulate
 from cosim.cli.controller_fmu import rti_controller, sampled_controller
 from cosim.cli.main import app
@@ -146,30 +149,40 @@ def test_another_instance_goes_on_from_its_bytes_with_the_same_bits(exported, tm
     other.close()
 
 
-def test_theta_set_in_the_fmu_is_the_controller_with_that_theta(exported):
-    """The tuned FMU with naive θ acts as the naive controller."""
-    scenario = Scenario.load("paper")
-    controller = naive(scenario)
-    names = [f"theta.{label}" for label in controller.parameters.blocks.labels]
-    states = np.array([[25.0, 49.7], [26.0, 50.0], [24.0, 49.0], [25.5, 51.0]])
-    inputs = np.array(
-        [(60.0 * k, *s) for k, s in enumerate(states)],
-        dtype=[("time", float), ("X2", float), ("P2", float)],
+@pytest.mark.parametrize("version", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_theta_may_change_between_samples(tmp_path, version):
+    """All of it, a bound alone, a parameter of the model: as the Python controller's θ."""
+    scenario = Scenario.load("paper").replace({"controller": {"horizon": 3}})
+    problem = Problem.from_scenario(scenario)
+    blocks = ThetaBlocks.of(problem, model_parameters=("UA2",))
+    naive_theta = Parameters.naive(problem, blocks)
+    controller = nmpc(scenario, naive_theta.replace({"b_l": [0.1, 0.0, 0.2, 0.1]}))
+    system = sampled_controller(controller, scenario, {})
+    fmpy.extract(
+        str(build_sampled(system, tmp_path / "c.fmu", version)), str(tmp_path / "unzipped")
     )
-    result = fmpy.simulate_fmu(
-        str(exported[0]),
-        stop_time=60.0 * len(states),
-        step_size=60.0,
-        output_interval=60.0,
-        start_values=dict(zip(names, controller.theta.tolist(), strict=True)),
-        input=inputs,
-        output=["P100", "F200"],
-    )
-    for k, s in enumerate(states):
+    fmu = Instance(tmp_path / "unzipped", version).initialise()
+    everything = {block.name: naive_theta[block.name] for block in blocks}
+    names = [v.name for v in system.signals if v.name.startswith("theta.")]
+    arrays = system.model.arrays if version == 3 else {}
+    changes = [{}, {"x_l": [25.4, 40.0]}, {"p": [5.0]}, {}, everything]
+    states = np.random.default_rng(2).normal((25.5, 50.0), (0.3, 0.5), (len(changes), 2))
+    actions = []
+    for k, (s, change) in enumerate(zip(states, changes, strict=True)):
+        controller.parameters = controller.parameters.replace(change)
+        values = dict(zip(names, controller.theta.tolist(), strict=True))
+        for name, elements in arrays.items():
+            if name.startswith("theta."):
+                values[name] = [values.pop(each.name) for each in elements]
+        references = [fmu.reference(name) for name in values]
+        numbers = np.hstack(list(values.values())).tolist()
+        (fmu.fmu.setReal if version == 2 else fmu.fmu.setFloat64)(references, numbers)
+        fmu.set(X2=s[0], P2=s[1])
+        fmu.step(60.0 * k)
         controller.prepare()
-        action = controller.feedback(s).action
-        found = [result[name][k + 1] for name in ("P100", "F200")]
-        np.testing.assert_allclose(found, action, rtol=0, atol=ACTION)
+        actions.append(controller.feedback(s).action)
+        np.testing.assert_allclose(fmu.get("P100", "F200"), actions[-1], rtol=0, atol=ACTION)
+    assert len({tuple(action) for action in actions}) == len(actions)
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -21,7 +21,17 @@ from cosim.protocols import Array, Controller, Decision
 from cosim.result import Result
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, simulate
-from cosim.statistics import gain, gains, gap_closed, gaps_closed, mean, regret, regrets
+from cosim.statistics import (
+    bootstrapped,
+    gain,
+    gains,
+    gap_closed,
+    gaps_closed,
+    magnitude,
+    mean,
+    regret,
+    regrets,
+)
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, check_folders
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING, to_csv
@@ -290,7 +300,8 @@ class Evaluation(Result):
         (J − J*)/|J*|, and where the naive controller is there too `gap_closed` =
         (J_naive − J)/(J_naive − J*). `comparisons`: for each pair, the paired difference
         controller − reference of each mean, and `gain_in_J`, (J_ref − J)/|J_ref|. Every interval
-        is of 95 %, Student's, paired over seeds. `optimal_J` is J* on the same seeds.
+        is of 95 %, paired over seeds, `interval` Student's and `bootstrap` BCa. `optimal_J` is J*
+        on the same seeds.
         """
         return {
             **self.facts,
@@ -317,12 +328,15 @@ class Evaluation(Result):
         }
         cost, naive = self._cost(name), self._cost(self.naive)
         if self.optimum is not None:
-            document["regret"] = regret(cost, self.optimal)._asdict()
+            resampled = bootstrapped(cost - self.optimal, magnitude(self.optimal))
+            document["regret"] = regret(cost, self.optimal)._asdict() | {"bootstrap": resampled}
         if self.optimum is not None and self.naive is not None:
             document["gap_closed"] = gap_closed(cost, naive, self.optimal)._asdict()
         return document
 
     def _comparison(self, name: str, reference: str) -> dict[str, Any]:
+        cost, other = self._cost(name), self._cost(reference)
+        resampled = bootstrapped(other - cost, magnitude(other))
         return {
             "controller": name,
             "reference": reference,
@@ -330,7 +344,7 @@ class Evaluation(Result):
                 key: mean(self.column(name, key) - self.column(reference, key))._asdict()
                 for key in COMPARED
             },
-            "gain_in_J": gain(self._cost(name), self._cost(reference))._asdict(),
+            "gain_in_J": gain(cost, other)._asdict() | {"bootstrap": resampled},
         }
 
 

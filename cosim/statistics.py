@@ -19,6 +19,8 @@ Interval = tuple[float, float] | None
 
 LEVEL = 0.95
 RESAMPLES = 9999
+RESAMPLED = 10_000
+"""Most seeds that are resampled; with more of them Student's interval is as good."""
 AT_ONCE = RESAMPLES * 1000
 """Most values that are drawn at once."""
 TD_WINDOW = 10_000
@@ -48,14 +50,39 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
     return Estimate(value, _t_interval((numerator - value * denominator) / (below or 1.0), value))
 
 
+def bootstrapped(numerator: Array, denominator: Array) -> Interval:
+    """BCa bootstrap interval of `ratio`, resampling seeds: for costs of which few seeds have most.
+
+    None for one seed, for more than `RESAMPLED`, and where a value is not finite.
+    """
+    seeds, total = len(numerator), np.sum(denominator)
+    if not 2 <= seeds <= RESAMPLED or not np.isfinite(numerator).all() or not total:
+        return None
+    value = float(np.sum(numerator) / total)
+    without = (np.sum(numerator) - numerator) / (total - denominator)
+    if np.ptp(without) <= 1e-12 * max(1.0, abs(value)):  # BCa is undefined where no seed counts
+        return value, value
+    found = stats.bootstrap(
+        (numerator, denominator),
+        lambda a, b, axis: np.mean(a, axis=axis) / np.mean(b, axis=axis),
+        paired=True,
+        n_resamples=RESAMPLES,
+        batch=max(1, AT_ONCE // seeds),
+        confidence_level=LEVEL,
+        method="BCa",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
 def regret(cost: Array, optimum: Array) -> Estimate:
     """(J − J*)/|J*|, as a ratio of means; `cost` and `optimum` (S,) are J of each seed."""
-    return ratio(cost - optimum, _magnitude(optimum))
+    return ratio(cost - optimum, magnitude(optimum))
 
 
 def gain(cost: Array, reference: Array) -> Estimate:
     """Gain in J over a reference, (J_ref − J)/|J_ref|, as a ratio of means; both (S,)."""
-    return ratio(reference - cost, _magnitude(reference))
+    return ratio(reference - cost, magnitude(reference))
 
 
 def gap_closed(cost: Array, naive: Array, optimum: Array) -> Estimate:
@@ -176,7 +203,7 @@ def decimals(value: float, digits: int) -> int:
     return min(max(digits - 1 - floor(log10(abs(value))), 0), 9)
 
 
-def _magnitude(reference: Array) -> Array:
+def magnitude(reference: Array) -> Array:
     """The reference with the sign that makes its mean positive: a cost may be a profit."""
     return -reference if float(np.mean(reference)) < 0 else reference
 
@@ -195,7 +222,7 @@ def two_way(cost: Array, optimum: Array) -> Interval:
     `cost` (R, S) is J of each run and noise seed, `optimum` (S,) J* on the same noise. Runs and
     noise seeds are resampled independently (percentiles). None for one seed.
     """
-    return _two_way(cost - optimum, _magnitude(optimum))
+    return _two_way(cost - optimum, magnitude(optimum))
 
 
 def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float, Interval, float]:
@@ -205,7 +232,7 @@ def paired_difference(cost: Array, other: Array, optimum: Array) -> tuple[float,
     differences when their signs are flipped: all 2^R ways, or 9999 for more than 12 pairs. It is
     NaN for fewer than two pairs.
     """
-    below = _magnitude(optimum)
+    below = magnitude(optimum)
     each = (cost - other).mean(axis=1) / below.mean()
     each = np.where(np.isnan(each), np.inf, each)  # a cost that is no number is the worst
     ranks, count = stats.rankdata(np.abs(each)), len(each)

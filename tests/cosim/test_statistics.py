@@ -4,6 +4,7 @@ from scipy.stats import trim_mean, wilcoxon
 
 from cosim import statistics
 from cosim.statistics import (
+    bootstrapped,
     gain,
     gap_closed,
     interquartile_mean,
@@ -33,16 +34,24 @@ def test_intervals_of_a_mean_cover_the_truth_at_their_level():
     assert 88 <= covered <= 100
 
 
-def test_intervals_of_a_ratio_cover_the_truth_at_their_level():
+@pytest.mark.parametrize("method", [lambda a, b: ratio(a, b).interval, bootstrapped])
+def test_intervals_of_a_ratio_cover_the_truth_at_their_level(method):
     rng = np.random.default_rng(2)
     covered = 0
     for _ in range(100):
         common = rng.normal(0.0, 1.0, 25)
         numerator = 3.0 + common + rng.normal(0.0, 0.3, 25)
         denominator = 6.0 + common + rng.normal(0.0, 0.3, 25)
-        low, high = ratio(numerator, denominator).interval
+        low, high = method(numerator, denominator)
         covered += low <= 0.5 <= high
     assert 88 <= covered <= 100
+
+
+def test_the_bootstrap_of_rare_spikes_does_not_fall_below_what_was_seen():
+    cost, optimum = np.array([101.0] * 9 + [400.0]), np.full(10, 100.0)
+    low = bootstrapped(cost - optimum, optimum)[0]
+    assert low >= 0.01 and ratio(cost - optimum, optimum).interval[0] < 0.0
+    assert bootstrapped(optimum, optimum) == (1.0, 1.0)
 
 
 def test_one_seed_has_no_interval():

@@ -25,7 +25,7 @@ BLOCKS = {
 }
 HESSIANS = ("gauss-newton", "exact")
 WHOLE = {"all": slice(None)}
-FEW, MANY = 4, 20
+FEW, MANY = 2, 20
 KINDS = [(blocks, hessian) for blocks in BLOCKS for hessian in HESSIANS]
 
 

@@ -120,10 +120,3 @@ def test_no_run_ends_as_diverged_by_a_candidate_that_is_tried(scenario, tmp_path
         assert np.array_equal(row.parameters.theta, result.start.theta)
     stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
     assert np.array_equal(stored.theta, result.start.theta)
-
-
-def test_the_algorithms_generator_goes_through_a_checkpoint(scenario, tmp_path):
-    run = make_run(scenario, "q-learning", samples=300)
-    whole = run_training(run, rule=Reporting)
-    resumed = killed_and_resumed(run, tmp_path, 250, Reporting)
-    assert np.array_equal(resumed.parameters.theta, whole.parameters.theta)

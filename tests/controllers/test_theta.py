@@ -75,14 +75,6 @@ def test_naive_is_the_papers_guess(problem):
         assert not theta[name].any()
 
 
-def test_replace_changes_the_named_blocks_only(problem):
-    before = Parameters.naive(problem)
-    after = before.replace({"c_f": [0.5, -0.5]})
-    np.testing.assert_array_equal(after["c_f"], [0.5, -0.5])
-    changed = np.flatnonzero(after.theta != before.theta)
-    assert changed.tolist() == list(range(*before.blocks.slices["c_f"].indices(after.blocks.size)))
-
-
 # hash and file --------------------------------------------------------------------------------
 
 

@@ -18,15 +18,6 @@ def run(status=(), **signals):
     return RunSignals("run", table, status)
 
 
-def test_equal_runs_are_equal():
-    a = run(("solved",) * 3, P2=[1.0, np.nan, np.inf])
-    result = compare(a, run(("solved",) * 3, P2=[1.0, np.nan, np.inf]))
-    assert result.equal
-    assert result.first is None
-    assert result.lines() == []
-    assert result.differences[0].maximum == 0.0
-
-
 @given(st.lists(st.tuples(values, values), min_size=1, max_size=30), st.floats(0.0, 10.0))
 def test_first_and_largest_difference_against_a_plain_loop(pairs, tolerance):
     a, b = zip(*pairs, strict=True)

@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 
 import cosim
-from cosim.errors import CosimError
-from cosim.files import write_atomically
-from cosim.text_tables import csv_text, read_csv
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +83,3 @@ def test_frames_hold_the_values(run, training):
     np.testing.assert_array_equal(
         training.parameters.to_pandas()["theta"], training.parameters.theta
     )
-
-
-def test_a_table_reads_back(tmp_path):
-    text = csv_text(["name", "value"], [["a,b", "1"], ['say "c"', ""]])
-    assert text == 'name,value\n"a,b",1\n"say ""c""",\n'
-    path = write_atomically(tmp_path / "table.csv", text)
-    assert read_csv(path, CosimError) == [["name", "value"], ["a,b", "1"], ['say "c"', ""]]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from controllers.theta import Parameters
+from cosim.protocols import Matrix, Vector
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import (
     Configuration,
@@ -24,8 +25,6 @@ from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel, PredictionErrors
 from learning.step import ConstrainedStep, Fit, prior_deviation, td_fit, td_step
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
 Values = TypeVar("Values", float, NDArray[np.float64])
 OUTLIER = 25.0
 """Squares of innovations beyond this many variances count as this many."""

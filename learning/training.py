@@ -35,7 +35,7 @@ from cosim.text_tables import csv_text
 from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
-from learning.checkpoint import Checkpoint, arrays_of, group, prefixed, take_up
+from learning.checkpoint import Checkpoint
 from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError, PrivilegeError
@@ -688,7 +688,6 @@ class _Session:
             self.without_checkpoint = str(error)
             return
         values["columns"] = list(self.rows[0]) if self.rows else []
-        arrays |= prefixed("totals ", arrays_of(self.totals))
         arrays |= {
             "plant": np.frombuffer(plant, dtype=np.uint8),
             "rows": np.array([list(row.values()) for row in self.rows]),
@@ -709,7 +708,6 @@ class _Session:
                 LogRow(dict(zip(columns, figures, strict=True)), self.start.with_theta(theta))
                 for figures, theta in rows
             ]
-            take_up(self.totals, group(arrays, "totals "))
             self.plant.restore(self.plant.deserialise(arrays["plant"].tobytes()))
             self.loop.restore(found.state, arrays)
         except DAMAGED as e:

@@ -174,6 +174,13 @@ class RtiSolution:
             return float(self.memory[self.prepared.functions.readout.places["residual"]][0])
         return self.multipliers.residual(self.qp)
 
+    @property
+    def iterations(self) -> int | None:
+        """Steps of the compiled QP solver; None where another one solved."""
+        if self.prepared.jacobians is None:
+            return None
+        return int(self.memory[self.prepared.functions.readout.places["iterations"]][0])
+
     @cached_property
     def weakly_active(self) -> bool:
         """Whether a limit is about to change its activity, so that derivatives are one-sided.

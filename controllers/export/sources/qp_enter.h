@@ -66,7 +66,8 @@ static QpStatus qp_enter(const Qp *qp, QpWork *work, int p, double violation) {
     char held[QP_LIMITS] = {0}; /* members that could not change since the set last did */
     if (!equation) work->mode[p] = QP_AT;
     work->mu[p] = 0.0;
-    for (; work->iterations < QP_ITERATIONS; work->iterations++) {
+    while (work->iterations < QP_ITERATIONS) {
+        work->iterations += !equation; /* an equation is met by its first step */
         const double pivot = qp_project(qp, work, p);
         const int met = pivot > 1e-12 * work->gram[p];
         double *const step = work->step;

@@ -32,7 +32,7 @@ def simulate(
 ) -> None:
     """Run a controller on a scenario's plant.
 
-    Writes trajectory.csv, trajectory.png (of a run of at most 20 000 samples), timing.csv,
+    Writes trajectory.csv, trajectory.png (of 2 to 20 000 samples), timing.csv,
     summary.json, scenario.toml and, with --record, run.rrd.
     Everything that a clock measured is in timing.csv and the summary's `timing`; all other bytes
     are the same for the same command and seed.
@@ -76,7 +76,7 @@ def simulate(
             (folder / "run.rrd").unlink(missing_ok=True)
         trajectory.write_csv(folder / "trajectory.csv")
         trajectory.write_timing_csv(folder / "timing.csv")
-        if steps <= DRAWN:
+        if 1 < steps <= DRAWN:
             trajectory.plot(folder / "trajectory.png")
         else:  # nor may a shorter run's stay
             (folder / "trajectory.png").unlink(missing_ok=True)

@@ -16,6 +16,8 @@ STEPS = {
     "scaling": 20,
     "before": 500,
     "acados": 200,
+    "rollouts": 100_000,
+    "batches": 1000,
 }
 """The benchmarks, and how many samples each takes at a time."""
 

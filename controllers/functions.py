@@ -128,7 +128,7 @@ def c_source(functions: Sequence[ca.Function]) -> str:
 SWITCH = "COSIM_COMPILE"
 CHOICES = ("auto", "never", "now")
 INTERPRETED, COMPILED = "interpreted", "compiled"
-FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
 LONG = 1000
 """Samples from which a run is worth a compiled controller; what is compiled is kept."""
 PATIENCE = 120.0

@@ -160,10 +160,23 @@ _INCLUDE = re.compile(r'^[ \t]*#include "(?P<name>[\w.]+)"[ \t]*\n', re.MULTILIN
 _C_NAME = re.compile(r"[A-Za-z]\w*")
 
 
-def plain_c(core: Core, name: str, scenario: Scenario) -> dict[str, str]:
+# Rounding alone leaves a KKT residual of up to 1e-2 in single precision.
+_SINGLE = (
+    (re.compile(r"\b1e-100\b"), "1e-37"),  # the least float is 1.2e-38
+    (re.compile(r"(?<![\w.])(\d+\.\d*(?:e[-+]?\d+)?|\d+e[-+]?\d+)(?![\w.])"), r"\1f"),
+    (re.compile(r"\bdouble\b"), "float"),
+    (re.compile(r"\b(sqrt|fabs|fmin|fmax|floor|copysign|exp|log|pow|tanh?|sin|cos)\("), r"\1f("),
+    (re.compile(r"%lf"), "%f"),
+    (re.compile(r"(_MEMORY = \d+)"), r"\1 * 2"),  # the counters in it are not smaller
+    (re.compile(r"(#define RTI_RESIDUAL) \S+"), r"\1 1e-2f"),
+)
+
+
+def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) -> dict[str, str]:
     """Text of ``NAME.c``, ``NAME.h``, ``main.c`` and ``CMakeLists.txt`` by file name.
 
-    Raises ControllerError where `name`, with which the functions begin, is no C name.
+    `single` has `float` in the place of `double`. Raises ControllerError where `name`, with which
+    the functions begin, is no C name.
     """
     if not _C_NAME.fullmatch(name):
         raise ControllerError(f"'{name}' is no name for C: letters, digits and _ only")
@@ -191,12 +204,13 @@ def plain_c(core: Core, name: str, scenario: Scenario) -> dict[str, str]:
         "core": _joined(core),
     }
     names = {"controller.c": f"{name}.c", "controller.h": f"{name}.h"}
-    return {
-        names.get(path.name, path.name): Template(path.read_text(encoding="utf-8")).substitute(
-            values
-        )
-        for path in sorted(TEMPLATES.iterdir())
-    }
+    files = {}
+    for path in sorted(TEMPLATES.iterdir()):
+        text = Template(path.read_text(encoding="utf-8")).substitute(values)
+        for pattern, by in _SINGLE if single and path.suffix in (".c", ".h") else ():
+            text = pattern.sub(by, text)
+        files[names.get(path.name, path.name)] = text
+    return files
 
 
 def _joined(core: Core) -> str:

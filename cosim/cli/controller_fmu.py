@@ -108,11 +108,13 @@ def sampled_controller(
     )
 
 
-def write_c(controller: RtiNmpc, scenario: Scenario, folder: Path) -> dict[str, Any]:
+def write_c(
+    controller: RtiNmpc, scenario: Scenario, folder: Path, single: bool = False
+) -> dict[str, Any]:
     """Write the controller as C into `folder`, whose name its functions begin with."""
     exported = core(controller.problem, controller.parameters, scenario.controller.hessian)
     name = re.sub(r"\W", "_", folder.absolute().name)
-    files = plain_c(exported, name, scenario)
+    files = plain_c(exported, name, scenario, single=single)
     folder.mkdir(exist_ok=True)
     for file, text in files.items():
         write_atomically(folder / file, text)

@@ -21,6 +21,9 @@ def export(
     format_: Annotated[
         Literal["fmu", "c"], typer.Option("--format", help="fmu, or c: one .c and .h, no FMI.")
     ] = "fmu",
+    single: Annotated[
+        bool, typer.Option("--single", help="With --format c: float in place of double.")
+    ] = False,
     fmi: Annotated[int, typer.Option("--fmi", help="FMI version: 2 or 3.", min=2, max=3)] = 2,
     local: Annotated[
         bool, typer.Option("--local", help="Build for this machine alone, by $CC or cc.")
@@ -57,10 +60,12 @@ def export(
         if format_ == "c":
             if ssp is not None:
                 raise CosimError("--ssp connects FMUs: leave --format c out")
-            summary = controller_fmu.write_c(rti, loaded, out)
+            summary = controller_fmu.write_c(rti, loaded, out, single)
             out_.note(f"wrote {', '.join(summary['files'])} to {out}")
             out_.json(summary)
             return
+        if single:
+            raise CosimError("--single goes with --format c: an FMU's numbers are doubles")
         out_.announce(loaded.plant.fmu)
         with FmuPlant(loaded) as plant:
             units = plant.units

@@ -112,6 +112,24 @@ def test_it_calls_no_more_than_it_says(exported):
     assert "EVAPORATOR_NMPC_STATES = 2,  /* X2, P2 */" in header
 
 
+def test_in_single_precision_a_loop_has_its_actions_and_a_wild_state_is_held(tmp_path, example):
+    folder = tmp_path / "single_nmpc"
+    run_cosim("export", "tuned", "--format", "c", "--single", "--out", folder, check=True)
+    command = [CC, *FLAGS, "-O0", "-Wdouble-promotion", "-c", "single_nmpc.c", "-o", "object.o"]
+    subprocess.run(command, cwd=folder, check=True)
+    program = built(folder)
+    states = np.random.default_rng(0).normal((25.4, 49.8), (0.3, 0.3), (200, 2))
+    found, expected = rows(program, states), rows(example, states)
+    assert set(found[:, 2]) == {0}
+    np.testing.assert_allclose(found[:, :2], expected[:, :2], rtol=0, atol=1e-3)
+    assert not np.array_equal(found[:, :2], expected[:, :2])
+    held = rows(program, [(25.0, 50.0), (1e9, 1e9)])
+    assert held[1, 2] != 0
+    np.testing.assert_array_equal(held[1, :2], held[0, :2])
+    failed = run_cosim("export", "tuned", "--single", "--out", tmp_path / "c.fmu")
+    assert (failed.returncode, "--single goes with --format c" in failed.stderr) == (2, True)
+
+
 def test_two_controllers_link_into_one_program(exported, tmp_path):
     for name in ("one", "other"):
         scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})

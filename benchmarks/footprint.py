@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+from math import prod
 from pathlib import Path
 
 from cosim import Scenario
@@ -20,6 +21,9 @@ PROCESSORS = {
     "Cortex-M7, double-precision FPU": ("thumb-linux-musleabihf", "-mcpu=cortex_m7+fp_armv8d16"),
     "Cortex-M4, arithmetic in software": ("thumb-linux-musleabihf", "-mcpu=cortex_m4"),
     "RISC-V, RV32GC": ("riscv32-linux-musl",),
+}
+SINGLE = {
+    "Cortex-M4F, `--single`": ("thumb-linux-musleabihf", "-mcpu=cortex_m4+vfp4d16sp"),
 }
 ALLOCATED, NO_BITS, WRITABLE = 2, 8, 1
 
@@ -44,17 +48,21 @@ def footprint(folder: Path, target: tuple[str, ...]) -> dict[str, int]:
             sizes["static" if kind == NO_BITS or flags & WRITABLE else "flash"] += length
     frames = re.findall(r"stack frame size \((\d+)\)", result.stderr)
     header = (folder / "nmpc.h").read_text()
-    memory = sum(map(int, re.findall(r"_(?:MEMORY|THETA) = (\d+)", header)))
-    return sizes | {"stack": sum(map(int, frames)), "a controller": 8 * memory}
+    lengths = re.findall(r"_(?:MEMORY|THETA) = ([\d *]+)", header)
+    memory = sum(prod(map(int, length.split("*"))) for length in lengths)
+    bytes_each = 4 if "float theta" in header else 8
+    return sizes | {"stack": sum(map(int, frames)), "a controller": bytes_each * memory}
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as name:
-        code = Path(name, "nmpc")
-        paper = Scenario.load("paper")
-        write_c(rti_controller("tuned", paper), paper, code)
-        rows = [
-            (name, *(f"{size / 1000:.2g} kB" for size in footprint(code, target).values()))
-            for name, target in PROCESSORS.items()
-        ]
+        paper, rows = Scenario.load("paper"), []
+        for processors in (PROCESSORS, SINGLE):
+            code = Path(name, str(len(rows)), "nmpc")
+            code.parent.mkdir()
+            write_c(rti_controller("tuned", paper), paper, code, processors is SINGLE)
+            rows += [
+                (name, *(f"{size / 1000:.2g} kB" for size in footprint(code, target).values()))
+                for name, target in processors.items()
+            ]
     print(markdown_table(("processor", "flash", "static memory", "stack", "a controller"), rows))

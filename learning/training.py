@@ -29,7 +29,7 @@ from cosim.progress import told
 from cosim.protocols import Array, Controller, Plant, Vector, functions_of
 from cosim.result import Result
 from cosim.scenario import Scenario
-from cosim.simulation import indicators_of, spawn_seeds
+from cosim.simulation import indicators_of, simulate, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
 from cosim.text_tables import csv_text
 from cosim.validation import known_keywords, suggestion
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
+FRAMES = 40
+"""Of an animation, at most."""
 SHOWN = {"J": "J", "greedy_J": "greedy J", "regret": "regret", "td_error": "TD"}
 """Columns of the log behind the progress bar, with their text there."""
 EVERY = ("log_every", "evaluate_every", "checkpoint_every")
@@ -434,6 +436,24 @@ class Training(Result):
             title=f"{run.algorithm} ({self.asks_for}) on {run.scenario.name} from "
             f"{Path(run.start).stem}, seed {run.seed}: {end}, J = {greedy}",
         )
+
+    def animate(self, path: str | Path, steps: int = 200) -> Path:
+        """Write a GIF of the closed loop with θ as it was learnt, over that of the start.
+
+        At most `FRAMES` rows of the log, on noise that no training met. Raises FigureError, or
+        OSError where the file cannot be written.
+        """
+        from cosim.figures.trajectory import animation  # noqa: PLC0415 - matplotlib
+
+        policy, runs = nmpc(self.run.scenario, self.start, self.run.controller), {}
+        seed = 2 * HELD_OUT + self.run.seed
+        with FmuPlant(self.run.scenario) as plant:
+            first = simulate(plant, policy, steps, seed)
+            for row in self.rows[:: -(-len(self.rows) // FRAMES)]:
+                policy.theta = row.parameters.theta
+                title = f"after {row['samples']:.0f} samples"
+                runs[title] = simulate(plant, policy, steps, seed)
+        return animation(first, runs, self.run.algorithm, path)
 
     def save(self, folder: str | Path) -> Path:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""

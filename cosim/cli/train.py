@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from learning.training import Training
 
 FILES = (
-    "checkpoint.npz", "learning.csv", "learning.png", "parameters.toml", "summary.json",
-    "training.rrd",
+    "checkpoint.npz", "learning.csv", "learning.gif", "learning.png", "parameters.toml",
+    "summary.json", "training.rrd",
 )  # fmt: skip
 """What a training leaves in its folder; each belongs to the same run."""
 
@@ -82,6 +82,9 @@ def train(
             "--rest-after", text="Samples after which θ stays and nothing explores; default: never."
         ),
     ] = None,
+    gif: Annotated[
+        bool, typer.Option("--gif", help="Draw learning.gif too: the loop while θ is learnt.")
+    ] = False,
     record: cli.RecordOption = False,
     json: cli.JsonOption = False,
 ) -> None:
@@ -127,11 +130,14 @@ def train(
         timing = {"wall_seconds": training.wall_seconds, "functions": training.functions}
         summary = training.summary() | {"timing": timing}
         training.save(folder)
+        for name, wanted in (("learning.gif", gif), ("training.rrd", record)):
+            if overwrite and not wanted:
+                # Only now: had this run failed, the one before it would have been lost.
+                (folder / name).unlink(missing_ok=True)
+        if gif:
+            training.animate(folder / "learning.gif")
         if record:
             record_training(folder / "training.rrd", training)
-        elif overwrite:
-            # Only now: had this run failed, the one before it would have been lost.
-            (folder / "training.rrd").unlink(missing_ok=True)
         _show(summary, out_)
         out_.note(f"the learning curve is {folder / 'learning.png'}")
         out_.json(summary, folder)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 
+from cosim.errors import FigureError
 from cosim.figures.style import BOUND, DASHED, REFERENCE, SERIES, figure, label, palette, plain
+from cosim.files import write_atomically
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 
+FRAME = 350
+"""Milliseconds of an animation's frame."""
 Run = Any
 """A `cosim.trajectory.Trajectory`, which draws itself with what is here."""
 
@@ -115,6 +122,31 @@ def overlay_figure(runs: Mapping[str, Run]) -> Figure:
     return drawn
 
 
+def animation(first: Run, runs: Mapping[str, Run], name: str, path: str | Path) -> Path:
+    """Write a GIF: a frame for each of `runs`, by title, drawn over the `first` on the same axes.
+
+    `name` is what the legend calls them. Raises FigureError on another suffix, OSError where the
+    file cannot be written.
+    """
+    if Path(path).suffix != ".gif":
+        raise FigureError(f"cannot draw '{path}': the file must end in .gif")
+    images = []
+    for title, run in runs.items():
+        drawn = overlay_figure({"start": first, name: run})
+        for axes, signal in zip(drawn.axes, first.scenario.limits, strict=True):
+            values = np.concatenate([one[signal] for one in (first, *runs.values())])
+            margin = 0.05 * float(np.ptp(values)) or 1.0
+            axes.set_ylim(values.min() - margin, values.max() + margin)
+        drawn.axes[0].set_title(title, loc="left", fontsize=8.5, pad=24.0)
+        images.append(Image.fromarray(_pixels(drawn)))
+    content = BytesIO()
+    images[0].save(
+        content, "GIF", save_all=True, append_images=images[1:], loop=0,
+        duration=[*[FRAME] * (len(images) - 1), 6 * FRAME],
+    )  # fmt: skip
+    return write_atomically(path, content.getvalue())
+
+
 def episode_image(
     scenario: Scenario, units: dict[str, str], first: int, states: Array, actions: Array
 ) -> NDArray[np.uint8]:
@@ -140,9 +172,13 @@ def episode_image(
         panels[-1].set_xlabel(f"time [{unit}]")
         panels[-1].set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1.0)
         drawn.align_ylabels()
-        canvas: Any = FigureCanvasAgg(drawn)
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        return _pixels(drawn)
+
+
+def _pixels(drawn: Figure) -> NDArray[np.uint8]:
+    canvas: Any = FigureCanvasAgg(drawn)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def time_unit(time: Array) -> tuple[float, str]:

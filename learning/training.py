@@ -453,7 +453,7 @@ class Training(Result):
                 policy.theta = row.parameters.theta
                 title = f"after {row['samples']:.0f} samples"
                 runs[title] = simulate(plant, policy, steps, seed)
-        return animation(first, runs, self.run.algorithm, path)
+        return animation(Path(self.run.start).stem, first, self.run.algorithm, runs, path)
 
     def save(self, folder: str | Path) -> Path:
         """Write parameters.toml, learning.csv, learning.png and scenario.toml; the folder."""

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -122,22 +123,25 @@ def overlay_figure(runs: Mapping[str, Run]) -> Figure:
     return drawn
 
 
-def animation(first: Run, runs: Mapping[str, Run], name: str, path: str | Path) -> Path:
+def animation(start: str, first: Run, name: str, runs: Mapping[str, Run], path: str | Path) -> Path:
     """Write a GIF: a frame for each of `runs`, by title, drawn over the `first` on the same axes.
 
-    `name` is what the legend calls them. Raises FigureError on another suffix, OSError where the
-    file cannot be written.
+    `start` and `name` are what the legend calls the first and the others. Raises FigureError on
+    another suffix, OSError where the file cannot be written.
     """
     if Path(path).suffix != ".gif":
         raise FigureError(f"cannot draw '{path}': the file must end in .gif")
     images = []
     for title, run in runs.items():
-        drawn = overlay_figure({"start": first, name: run})
+        drawn = overlay_figure({start: first, name: run})
         for axes, signal in zip(drawn.axes, first.scenario.limits, strict=True):
             values = np.concatenate([one[signal] for one in (first, *runs.values())])
             margin = 0.05 * float(np.ptp(values)) or 1.0
-            axes.set_ylim(values.min() - margin, values.max() + margin)
-        drawn.axes[0].set_title(title, loc="left", fontsize=8.5, pad=24.0)
+            low, high = axes.set_ylim(values.min() - margin, values.max() + margin)
+            for text in axes.texts:
+                if isinstance(text, Annotation) and isinstance(text.xycoords, tuple):
+                    text.set_visible(low <= text.xy[1] <= high)  # a bound in sight
+        drawn.axes[0].set_title(title, loc="right", fontsize=8.5, pad=16.0)
         images.append(Image.fromarray(_pixels(drawn)))
     content = BytesIO()
     images[0].save(

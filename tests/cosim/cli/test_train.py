@@ -2,6 +2,7 @@ import json
 import sys
 
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from cosim.cli.main import app
@@ -49,7 +50,9 @@ def test_what_was_learned_is_a_controller(cosim, trained):
 
 
 def test_the_same_command_and_seed_give_the_same_bytes(cosim, trained, tmp_path):
-    assert cosim(*SHORT, "--out", "again", "--seed", 5)[0] == 0
+    assert cosim(*SHORT, "--out", "again", "--seed", 5, "--gif")[0] == 0
+    with Image.open(tmp_path / "again/learning.gif") as animation:
+        assert (animation.format, animation.n_frames) == ("GIF", 4)
     for file in ("learning.csv", "learning.png", "parameters.toml"):
         assert (tmp_path / "again" / file).read_bytes() == (trained[0] / file).read_bytes()
 

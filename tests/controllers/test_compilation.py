@@ -59,6 +59,27 @@ def test_a_compiler_that_fails_or_hangs_leaves_nothing(folder, monkeypatch, tmp_
     assert list(folder.glob("*.lib")) == []
 
 
+@needs_compiler
+@pytest.mark.parametrize(
+    "deed",
+    [
+        "head -c 100 /dev/zero > library; exit 1",
+        "rm -rf ../.partial-*",
+        "rm -rf $COSIM_CACHE",
+        "true",
+    ],
+    ids=["full disk", "own folder", "whole cache", "nothing written"],
+)
+def test_a_compiler_that_breaks_its_surroundings_is_survived(folder, monkeypatch, tmp_path, deed):
+    script = tmp_path / "cc"
+    script.write_text(f"#!/bin/sh\n{deed}\n")
+    script.chmod(0o700)
+    with monkeypatch.context() as patched:
+        patched.setenv("CC", str(script))
+        assert answer(42) is None
+    assert ctypes.CDLL(str(answer(42))).answer() == 42
+
+
 def test_never_means_never(folder, monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "never")
     assert answer(42) is None

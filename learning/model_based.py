@@ -269,7 +269,7 @@ class BackOffs:
         return base.replace(moved).theta
 
     def promises(self, thetas: Sequence[Array]) -> list[Promise]:
-        """Predicted cost of each θ; infinite if its rollout diverges."""
+        """What the model promises of each θ; infinite cost where the rollout is lost."""
         rollouts = self._rollout(thetas, self._start, self._model, self._picks)
         return [self._promise(*parts) for parts in rollouts]
 

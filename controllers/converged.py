@@ -18,6 +18,7 @@ from controllers.rti.nmpc import LinearisationPoint, RtiSolution
 from controllers.rti.preparation import sampled_jacobian
 from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
 from cosim.protocols import Vector
+from cosim.validation import known_keywords
 
 
 def merit(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
@@ -95,6 +96,7 @@ class ConvergedNmpc(RtiNmpc):
     memoryless = False
     """A second feedback starts its SQP where the first one ended."""
 
+    @known_keywords
     def __init__(
         self,
         problem: Problem,

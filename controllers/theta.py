@@ -22,7 +22,7 @@ from cosim.files import read_toml, write_atomically
 from cosim.protocols import Vector
 from cosim.scenario import Names, Table
 from cosim.text_tables import Shown
-from cosim.validation import validated
+from cosim.validation import instead, validated
 
 
 @cache
@@ -140,7 +140,7 @@ class ThetaBlocks:
         for block in self.blocks:
             if block.name == name:
                 return block
-        raise ParameterError(f"θ has no block '{name}'; it has {', '.join(self.slices)}")
+        raise ParameterError(f"θ has no block '{name}'{instead(name, self.slices)}")
 
     @classmethod
     def of(

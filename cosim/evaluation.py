@@ -36,7 +36,7 @@ from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, chec
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING, to_csv
 from cosim.text_tables import markdown_table
-from cosim.validation import known_keywords
+from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -234,7 +234,10 @@ class Evaluation(Result):
         return self._cost(self.optimum)
 
     def column(self, controller: str, name: str) -> Array:
-        """An indicator of a controller over the seeds, (S,)."""
+        """An indicator of a controller over the seeds, (S,); raises EvaluationError on others."""
+        for word, known in ((controller, self.columns), (name, next(iter(self.columns.values())))):
+            if word not in known:
+                raise EvaluationError(f"there is no '{word}'{instead(word, map(str, known))}")
         found: Array = self.columns[controller][name].to_numpy()
         return found
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
 from itertools import islice
-from math import inf, isfinite, isnan
+from math import gcd, inf, isfinite, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 SAMPLES = 50_000
 """Of a run where neither user nor algorithm says how many."""
+STARTS = ("naive", "tuned", "commissioned", "cautious")
 FRAMES = 40
 """Of an animation, at most."""
 SHOWN = {"J": "J", "greedy_J": "greedy J", "regret": "regret", "td_error": "TD"}
@@ -139,12 +140,18 @@ def prepare(
             raise ConfigurationError(f"training has no option '{name}'{suggestion(name, OPTIONS)}")
     if not isinstance(settings, Configuration):
         settings = found.Configuration.from_dict(dict(settings or {}))
+    # What is not given of log, evaluation and checkpoint is near its default and fits the others.
+    given = {name: value for name in EVERY if (value := options.get(name)) is not None}
+    together = gcd(*(given[name] for name in EVERY[1:] if name in given))
+    most = TrainingRun.log_every
+    log = given.get("log_every", next(k for k in range(most, 0, -1) if together % k == 0))
+    rows = max(1, round(TrainingRun.evaluate_every / max(1, log)))
     return TrainingRun(
         algorithm=algorithm,
         scenario=scenario,
         samples=getattr(found, "budget", SAMPLES) if samples is None else samples,
         configuration=settings,
-        **options,
+        **{**options, **dict.fromkeys(EVERY[1:], rows * log), "log_every": log, **given},
     )
 
 
@@ -181,6 +188,8 @@ def starting_parameters(
     has slack weights and the parametrisation none, ParameterError on a bad file, TuningError where
     the tuning fails.
     """
+    if not Path(start).exists() and (meant := suggestion(start, STARTS)) and start not in STARTS:
+        raise ConfigurationError(f"there is no start '{start}'{meant}, nor such a parameters file")
     file = None if start in ("naive", "tuned") else Parameters.load(start, problem)
     if file is not None and "w_sigma" in file.blocks and configuration.parametrisation == "paper":
         raise ConfigurationError(
@@ -517,9 +526,9 @@ def train(
     start: str | Path = TrainingRun.start,
     settings: Mapping[str, Any] | Configuration | None = None,
     controller: str = TrainingRun.controller,
-    log_every: int = TrainingRun.log_every,
-    evaluate_every: int = TrainingRun.evaluate_every,
-    checkpoint_every: int = TrainingRun.checkpoint_every,
+    log_every: int | None = None,
+    evaluate_every: int | None = None,
+    checkpoint_every: int | None = None,
     evaluation_seeds: int = TrainingRun.evaluation_seeds,
     evaluation_steps: int = TrainingRun.evaluation_steps,
     divergence: float = TrainingRun.divergence,

@@ -34,6 +34,7 @@ from controllers.sensitivities import (
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.protocols import CompiledLoop, Matrix, Vector
 from cosim.scenario import Scenario
+from cosim.validation import known_keywords
 
 
 class LinearisationPoint(NamedTuple):
@@ -402,6 +403,7 @@ class RtiNmpc:
     memoryless = True
     """A feedback depends on nothing but θ, the point at which it was prepared, s and a."""
 
+    @known_keywords
     def __init__(
         self,
         problem: Problem,

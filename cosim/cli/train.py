@@ -57,13 +57,20 @@ def train(
     controller: Annotated[
         str, typer.Option("--controller", help="What carries θ: rti or converged.")
     ] = "rti",
-    log_every: Annotated[int, cli.count("--log-every", text="Samples per row of the log.")] = 1000,
+    log_every: Annotated[
+        int | None,
+        cli.count(
+            "--log-every", text="Samples per row of the log; default: 1000, or what fits the next."
+        ),
+    ] = None,
     evaluate_every: Annotated[
-        int, cli.count("--evaluate-every", text="Samples per greedy evaluation.")
-    ] = 5000,
+        int | None,
+        cli.count("--evaluate-every", text="Samples per greedy evaluation; default: about 5000."),
+    ] = None,
     checkpoint_every: Annotated[
-        int, cli.count("--checkpoint-every", text="Samples per checkpoint.")
-    ] = 5000,
+        int | None,
+        cli.count("--checkpoint-every", text="Samples per checkpoint; default: about 5000."),
+    ] = None,
     evaluation_seeds: Annotated[
         int, cli.count("--evaluation-seeds", most=1_000_000, text="Held-out runs per evaluation.")
     ] = 4,

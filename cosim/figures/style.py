@@ -13,6 +13,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
@@ -26,7 +27,8 @@ WIDTH = 7.16
 FLOOR = 0.01
 """Regret in % below which an axis is linear."""
 
-SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+ENTRIES = tuple(map(to_hex, mpl.colormaps["viridis"](np.linspace(0.0, 0.88, 6))))
+"""Colours of θ's blocks and entries, none of which is a controller's."""
 BOUND = "#B2182B"
 REFERENCE = "#5A6570"
 INK = "#222222"
@@ -37,9 +39,9 @@ _KNOWN = {
     "q-learning": "#0072B2", "batch-q-learning": "#009E73", "actor-critic": "#D55E00",
     "search": "#882255", "held": "#999933", "model-based": "#44AA99", "dyna": "#332288",
     "offset-free": "#AA4499", "identified": "#117733", "policy-search": "#661100",
-    "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9",
+    "backoff": "#6699CC", "pi": "#B08D57", "lqr": "#8C8CD9", "learnt": "#56B4E9",
 }  # fmt: skip
-_OTHERS = ("#56B4E9", "#CC6677", "#A6761D", "#E377C2", "#6D9E1F", "#B04FD0", "#4477AA", "#DDCC77")
+_OTHERS = ("#CC6677", "#A6761D", "#E377C2", "#6D9E1F", "#B04FD0", "#4477AA", "#DDCC77")
 _DASHES: Any = ((4, 1.5), (1, 1.2), (5, 1.5, 1, 1.5), (9, 2), (1, 3), (4, 1, 1, 1, 1, 1))
 _LINES: Any = ("-", *((0, dashes) for dashes in _DASHES))
 _STYLE = Path(__file__).with_name("house.mplstyle")
@@ -136,6 +138,15 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def shown_case(name: str) -> str:
+    """A case's name as figures set it: `q-learning, naive` for `q-learning(start=naive)`."""
+    head, _, settings = name.removesuffix(")").partition("(")
+    if settings and "=" not in settings:  # a file, whose name the case's often repeats
+        return plain(head if settings.endswith(head) else name)
+    values = (word.removeprefix("start=").replace("=", " ") for word in settings.split())
+    return plain(", ".join((head, *values)).replace("_", " "))
+
+
 def symbol(name: str) -> str:
     """`B_Vf` as mathematics, B with the block's subscript."""
     head, _, subscript = name.partition("_")
@@ -196,7 +207,7 @@ def dot_rows(axes: Axes, rows: Sequence[Dots], looks: Mapping[str, Look]) -> Arr
         if np.isfinite([dots.low, dots.high]).all():
             axes.hlines(row, dots.low, dots.high, color=INK, linewidth=1.1, zorder=4)
         axes.vlines(dots.middle, row - 0.3, row + 0.3, color=INK, linewidth=1.4, zorder=5)
-    axes.set_yticks(range(len(rows)), [plain(dots.case) for dots in rows])
+    axes.set_yticks(range(len(rows)), [shown_case(dots.case) for dots in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
     return np.concatenate([dots.values for dots in rows])
@@ -221,10 +232,10 @@ def cost_lines(
 
     A line is (name, samples (K,), costs (K,), style); `relative` costs are regrets in %.
     """
-    labels = [EndLabel(plain(name), level, REFERENCE) for name, level in levels.items()]
+    labels = [EndLabel(shown_case(name), level, REFERENCE) for name, level in levels.items()]
     for name, samples, costs, style in lines:
         axes.plot(samples, costs, **style)
-        labels.append(EndLabel(plain(name), float(costs[-1]), style["color"]))
+        labels.append(EndLabel(shown_case(name), float(costs[-1]), style["color"]))
     for level in levels.values():
         axes.axhline(level, color=REFERENCE, linewidth=0.8, linestyle=DASHED)
     if relative:

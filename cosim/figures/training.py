@@ -14,11 +14,13 @@ from matplotlib.ticker import EngFormatter, FuncFormatter
 
 from cosim.figures.style import (
     DASHED,
-    SERIES,
+    ENTRIES,
+    INK,
     EndLabel,
     cost_lines,
     figure,
     label_ends,
+    palette,
     percent,
     plain,
     samples_axis,
@@ -27,7 +29,7 @@ from cosim.figures.style import (
 from cosim.protocols import Array
 from cosim.statistics import regrets
 
-GREEDY, TRAINING = SERIES[0], SERIES[1]
+GREEDY = palette(["learnt"])["learnt"].color
 DECADES = 30.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""
 POINTS = 30
@@ -72,7 +74,7 @@ def training_figure(
                 samples, share = _known(log, "greedy_violating_share")
                 _course(axes, samples, 100 * share, GREEDY, 1.0)
             elif name.startswith("TD"):
-                _course(axes, *_known(log, "td_error"), TRAINING, 1e-12)
+                _course(axes, *_known(log, "td_error"), INK, 1e-12)
             elif name.startswith("change"):
                 named.append((axes, _change(axes, log, {n: norms[n] for n in order[:BLOCKS]})))
             else:
@@ -107,7 +109,7 @@ def _cost(
         return values if best is None else 100 * regrets(values, best)
 
     lines = []
-    for name, color, text in (("J", TRAINING, "training"), ("greedy_J", GREEDY, "greedy")):
+    for name, color, text in (("J", INK, "training"), ("greedy_J", GREEDY, "greedy")):
         samples, cost = _known(log, name)
         if name == "greedy_J" and np.isfinite(start):
             samples, cost = np.append(0.0, samples), np.append(start, cost)
@@ -132,7 +134,7 @@ def _course(axes: Axes, samples: Array, values: Array, color: str, least: float)
 def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) -> list[EndLabel]:
     samples = np.append(0.0, log["samples"])
     labels = []
-    for color, (name, norm) in zip(SERIES, moved.items(), strict=False):
+    for color, (name, norm) in zip(ENTRIES, moved.items(), strict=False):
         axes.plot(samples, np.append(0.0, norm), color=color, linewidth=1.2)
         labels.append(EndLabel(symbol(name), float(norm[-1]), color))
     top = max(float(norm.max()) for norm in moved.values())
@@ -152,7 +154,7 @@ def parameters_figure(
     the root mean square over the preceding `window` samples. Source: paper.tex, fig. nmpc_learn.
     """
     moving = {name: values for name, values in increments.items() if np.any(values)}
-    looks = [{"linestyle": line, "color": color} for line, color in product(("-", DASHED), SERIES)]
+    looks = [{"linestyle": line, "color": color} for line, color in product(("-", DASHED), ENTRIES)]
     columns = 4
     rows = -(-len(moving) // columns)
     with figure(1.3 * rows + 2.2) as drawn:
@@ -168,7 +170,7 @@ def parameters_figure(
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
         axes = drawn.add_subplot(grid[rows, :], sharex=first)
-        axes.plot(samples, td_error, color=SERIES[1], linewidth=1.0)
+        axes.plot(samples, td_error, color=INK, linewidth=1.0)
         samples_axis(axes, float(samples[-1]), "samples")
         title = f"TD error in the stage cost's unit, r.m.s. of the preceding {window} samples"
         axes.set_title(title, loc="left", fontsize=8.0)

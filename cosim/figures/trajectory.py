@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cosim.errors import FigureError
-from cosim.figures.style import BOUND, DASHED, REFERENCE, SERIES, figure, label, palette, plain
+from cosim.figures.style import (
+    BOUND,
+    DASHED,
+    INK,
+    REFERENCE,
+    figure,
+    label,
+    palette,
+    plain,
+    shown_case,
+)
 from cosim.files import write_atomically
 from cosim.protocols import Array
 from cosim.scenario import Scenario
@@ -30,13 +40,16 @@ Run = Any
 def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[Run] = ()) -> Figure:
     """States and inputs with bounds (red) and operating point (grey), disturbances and costs.
 
-    Inputs, disturbances and costs hold from one sample to the next. Violated bounds are shaded,
-    fallback actions marked; a bound far from the data is named, not drawn. The axes span the runs
-    `beside` this one too, so that figures of a set can be compared.
+    States and inputs have the controller's colour; inputs, disturbances and costs hold from one
+    sample to the next. Violated bounds are shaded, fallback actions marked; a bound far from the
+    data is named, not drawn. The axes span the runs `beside` this one too, so that figures of a
+    set can be compared.
     """
     plant, units = scenario.plant, {k: s.unit for k, s in trajectory.signals.items()}
     scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
+    who = trajectory.controller or "run"
+    color = palette([who])[who].color
     left = [*plant.states, *plant.actions]
     right = [*plant.disturbances, "stage_cost", "penalty"]
     rows = int(np.lcm(len(left), len(right)))
@@ -58,14 +71,14 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
             axes[names[-1]].set_xlabel(f"time [{unit}]")
         for i, name in enumerate(plant.states):
             lower, upper = float(scenario.state_lower[i]), float(scenario.state_upper[i])
-            axes[name].plot(time, trajectory[name], color=SERIES[0], linewidth=0.9)
+            axes[name].plot(time, trajectory[name], color=color, linewidth=0.9)
             _shade(axes[name], time, trajectory[name], lower, upper, BOUND)
             _limits(axes[name], lower, upper)
             axes[name].axhline(scenario.reference_state[i], color=REFERENCE, linewidth=0.7)
         failed = trajectory["failed"] > 0
         for i, name in enumerate(plant.actions):
             own = axes[name]
-            own.step(time, trajectory[name], where="post", color=SERIES[2], linewidth=0.9)
+            own.step(time, trajectory[name], where="post", color=color, linewidth=0.9)
             own.axhline(scenario.reference_action[i], color=REFERENCE, linewidth=0.7)
             _limits(own, scenario.action_lower[i], scenario.action_upper[i])
             if failed.any():
@@ -73,16 +86,16 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
                 own.plot(time[failed], values, "x", color=BOUND, ms=4, label="fallback")
                 own.legend(loc="upper right")
         for name in plant.disturbances:
-            axes[name].step(time, trajectory[name], where="post", color=SERIES[3], linewidth=0.6)
-        for name, color in (("stage_cost", SERIES[4]), ("penalty", SERIES[1])):
-            _cost(axes[name], time, trajectory[name], color)
+            axes[name].step(time, trajectory[name], where="post", color=REFERENCE, linewidth=0.6)
+        for name, shade in (("stage_cost", REFERENCE), ("penalty", BOUND)):
+            _cost(axes[name], time, trajectory[name], shade)
         axes["penalty"].set_ylim(bottom=0.0)
         axes[left[0]].set_xlim(time[0], time[-1] + (time[1] - time[0] if len(time) > 1 else 1.0))
         drawn.align_ylabels()
         summary = trajectory.summary()
         seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
         drawn.suptitle(
-            f"{plain(trajectory.controller or 'run')} on {plain(scenario.name)}{seed}:   "
+            f"{shown_case(who)} on {plain(scenario.name)}{seed}:   "
             f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
             f"violating {100 * summary['violating_share']:.1f} % of samples",
             fontsize=8.5,
@@ -116,7 +129,7 @@ def overlay_figure(runs: Mapping[str, Run]) -> Figure:
         for controller, run in runs.items():
             summary = run.summary()
             violating = f"{100 * summary['violating_share']:.0f} % of samples violate"
-            text = f"{plain(controller)}: J = {summary['J']:.0f}, {violating}"
+            text = f"{shown_case(controller)}: J = {summary['J']:.0f}, {violating}"
             rows[0].plot([], [], color=looks[controller].color, label=text)
         rows[0].plot([], [], color=BOUND, linestyle=DASHED, label="bound")
         rows[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.02), ncols=2, borderaxespad=0.2)
@@ -166,10 +179,10 @@ def episode_image(
     with figure(1.3 * len(names), 6.0) as drawn:
         panels = drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
         for i in range(len(plant.states)):
-            panels[i].plot(time, states[:, i], color=SERIES[0])
+            panels[i].plot(time, states[:, i], color=INK)
             _limits(panels[i], scenario.state_lower[i], scenario.state_upper[i])
         for j, panel in enumerate(panels[len(plant.states) :]):
-            panel.stairs(actions[:, j], time, color=SERIES[2], baseline=None)
+            panel.stairs(actions[:, j], time, color=INK, baseline=None)
             _limits(panel, scenario.action_lower[j], scenario.action_upper[j])
         for panel, name in zip(panels, names, strict=True):
             panel.set_ylabel(label(name, units[name]))
@@ -227,7 +240,7 @@ def _limits(axes: Axes, lower: float, upper: float) -> None:
 def _cost(axes: Axes, time: Array, values: Array, color: str) -> None:
     axes.step(time, values, where="post", color=color, linewidth=0.6)
     mean = float(np.mean(values))
-    axes.axhline(mean, color="#222222", linewidth=0.8, linestyle=(0, (1, 1)))
+    axes.axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
     axes.annotate(
         f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
         (0.99, 0.95), xycoords="axes fraction", ha="right", va="top", fontsize=6.5,

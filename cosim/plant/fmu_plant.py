@@ -26,7 +26,7 @@ from cosim.plant.fmi import (
 )
 from cosim.protocols import Array, CompiledLoop, Step
 from cosim.scenario import Scenario
-from cosim.validation import suggestion
+from cosim.validation import known_keywords, suggestion
 
 REALS = ("Real", "Float64", "Float32")
 
@@ -315,6 +315,7 @@ class FmuPlant:
     takes the place of the scenario's.
     """
 
+    @known_keywords
     def __init__(self, scenario: Scenario | str | Path, fmu: str | Path | None = None) -> None:
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self._fmi: Instance | None = None

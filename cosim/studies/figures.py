@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullFormatter
 
 from cosim.figures.style import (
@@ -25,9 +26,9 @@ from cosim.figures.style import (
     label_ends,
     palette,
     percent,
-    plain,
     regret_axis,
     samples_axis,
+    shown_case,
 )  # fmt: skip
 from cosim.protocols import Array
 from cosim.statistics import LEVEL, regrets
@@ -94,36 +95,61 @@ def curves_figure(
     *,
     relative: bool,
 ) -> Figure:
-    """All cases in two panels: above the cost of the training samples, below the greedy policy's.
+    """Above the cost of the training samples, below the greedy policy's.
 
-    Lines are medians over runs, bands their quartiles, drawn where at most six cases are shown.
-    `levels` are drawn across both panels, by name. `relative` values are regrets in %.
+    More than six cases have a column for each θ that they start from. Lines are medians over runs,
+    bands their quartiles, drawn where at most six cases are in a panel. `levels` are drawn across
+    all panels, by name. `relative` values are regrets in %.
     """
     unit = "regret %" if relative else "J"
+    words = {"training": "training samples", "greedy": "greedy policy"}
     height = max(2.6, 0.135 * (len(curves) + len(levels)))
+    starts = _by_start(curves) if len(curves) > BANDED else {"": list(curves)}
+    handles: dict[str, Line2D] = {}
     with figure(2 * height + 0.4) as drawn:
-        grid = drawn.subplots(2, 1, sharex=True)
-        ends: list[list[EndLabel]] = []
-        for axes, kind in zip(grid, ("training", "greedy"), strict=True):
-            lines = []
-            for name, curve in curves.items():
-                values: Array = getattr(curve, kind)
-                color, line = looks[name]
-                finite = np.isfinite(values).all(axis=0)
-                samples, values = curve.samples[finite], values[:, finite]
-                if not values.size:
-                    continue
-                low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
-                style = {"color": color, "linestyle": line, "linewidth": 1.3}
-                lines.append((name, samples, middle, style))
-                if len(values) > 1 and len(curves) <= BANDED:
-                    axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
-            ends.append(cost_lines(axes, lines, levels, relative=relative))
-            axes.set_ylabel(f"{unit} of the {'greedy policy' if ends[1:] else 'training samples'}")
+        grid = drawn.subplots(2, len(starts), sharex=True, sharey="row", squeeze=False)
+        named: list[tuple[Axes, list[EndLabel]]] = []
+        for row, kind in zip(grid, words, strict=True):
+            for axes, (start, names) in zip(row, starts.items(), strict=True):
+                lines, own = [], palette(names)
+                for name in names:
+                    curve, values = curves[name], getattr(curves[name], kind)
+                    finite = np.isfinite(values).all(axis=0)
+                    samples, values = curve.samples[finite], values[:, finite]
+                    if not values.size:
+                        continue
+                    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), axis=0)
+                    color, line = looks[name].color, (own if start else looks)[name].line
+                    style: Any = {"color": color, "linestyle": line, "linewidth": 1.3}
+                    lines.append((name, samples, middle, style))
+                    rule = shown_case(name).replace(start.replace("from", ","), "")
+                    handles.setdefault(rule, Line2D([], [], label=rule, **style))
+                    if len(values) > 1 and len(names) <= BANDED:
+                        axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
+                ends = cost_lines(axes, lines, levels, relative=relative)
+                if axes is row[-1] or len(starts) == 1:
+                    named.append((axes, ends[: len(levels)] if start else ends))
+                if start and kind == "training":
+                    axes.set_title(start)
+            if relative:
+                regret_axis(row[0], "y", np.concatenate([axes.dataLim.intervaly for axes in row]))
+            row[0].set_ylabel(f"{unit} of the {words[kind]}")
         end = max(float(curve.samples[-1]) for curve in curves.values())
-        samples_axis(grid[1], end, "training samples")
-        label_ends(drawn, zip(grid, ends, strict=True))
+        for axes in grid[1]:
+            samples_axis(axes, end, "training samples")
+        if len(starts) > 1:
+            drawn.legend(handles=[*handles.values()], loc="outside lower center", ncols=4)
+        label_ends(drawn, named)
     return drawn
+
+
+def _by_start(names: Iterable[str]) -> dict[str, list[str]]:
+    """Cases by where θ starts, titled so; those without a start are in the last panel."""
+    panels: dict[str, list[str]] = {}
+    for name in sorted(names, key=lambda name: "start=" not in name):
+        start = name.partition("start=")[2].rstrip(")").split(" ")[0]
+        panels.setdefault(f"from {start}" if start else "others", []).append(name)
+    return panels
 
 
 def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Look]) -> Figure:
@@ -140,7 +166,7 @@ def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Lo
             color, line = looks[name]
             below = [(stratum[:, None] <= axis).astype(float) for stratum in runs]
             share = np.concatenate(below).mean(axis=0)
-            axes.step(axis, share, where="post", c=color, ls=line, lw=1.3, label=plain(name))
+            axes.step(axis, share, where="post", c=color, ls=line, lw=1.3, label=shown_case(name))
             if len(strata) <= BANDED:
                 low, high = _band(below)
                 axes.fill_between(axis, low, high, step="post", color=color, alpha=0.15, lw=0)
@@ -180,7 +206,7 @@ def operation_figure(
     lines = palette(list(map(str, lives.case.unique())))
     with figure(3.4) as drawn:
         panels = drawn.subplots(1, 2, sharey=True)
-        titles = ("of θ, run greedily", "of the run so far, exploration included")
+        titles = ("regret % of θ at that time", "regret % of all samples so far")
         reached = 100 * lives[["regret", "life_regret"]].to_numpy(dtype=np.float64)
         for axes, name, title in zip(panels, ("regret", "life_regret"), titles, strict=True):
             ends = []
@@ -193,7 +219,7 @@ def operation_figure(
                 if not known:
                     band = runs["min"], runs["max"]
                     axes.fill_between(runs.index, *band, color=color, alpha=0.12, lw=0)
-                ends.append(EndLabel(plain(str(case)), float(runs["median"].iloc[-1]), color))
+                ends.append(EndLabel(shown_case(str(case)), float(runs["median"].iloc[-1]), color))
             axes.set_xscale("log")
             first, end = float(lives.samples.min()), float(lives.samples.max())
             axes.set_xlim(first, end)
@@ -212,6 +238,5 @@ def operation_figure(
                     )  # fmt: skip
             axes.set_title(title, pad=12)
             axes.set_xlabel("samples of the plant")
-        panels[0].set_ylabel("regret %")
         label_ends(drawn, [(panels[1], ends)])
     return drawn

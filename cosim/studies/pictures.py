@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, plain, save_set
+from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, save_set, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.files import write_atomically
@@ -143,7 +143,7 @@ def density_figure(runs: Mapping[str, Trajectory], scenario: Scenario) -> Figure
             heights = np.histogram(values, edges)[0] / (len(values) * width)
             color = looks[case].color
             axes.stairs(heights, edges, fill=True, alpha=0.12, color=color)
-            text = f"{plain(case)}: {share:.1f} % below"
+            text = f"{shown_case(case)}: {share:.1f} % below"
             axes.stairs(heights, edges, color=color, linewidth=1.2, label=text)
         axes.axvline(bound, color=BOUND, linewidth=1.1, linestyle=DASHED, label="bound")
         axes.set_xlim(edges[0], edges[-1])
@@ -190,7 +190,7 @@ def phase_figure(
             for line, i in ((axes.axvline, 0), (axes.axhline, 1)):
                 for bound in (scenario.state_lower[i], scenario.state_upper[i]):
                     line(bound, color=BOUND, linewidth=1.0, linestyle=DASHED, zorder=3)
-            axes.set_title(plain(case))
+            axes.set_title(shown_case(case))
             axes.set_xlim(extent[:2])
             axes.set_ylim(extent[2:])
         states = [label(name, signals[name].unit) for name in scenario.plant.states[:2]]

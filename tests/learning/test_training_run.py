@@ -14,6 +14,7 @@ from learning.training import (
     FIGURES,
     HELD_OUT,
     Judge,
+    prepare,
     starting_parameters,
 )
 from tests.helpers.training import make_run
@@ -24,6 +25,22 @@ def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(proble
     assert theta["w_sigma"].tolist() == [100.0, 100.0]
     assert theta["W_sigma"].tolist() == [1000.0, 1000.0]
     assert theta["c_lambda"] == pytest.approx(problem.reference_cost / (1 - problem.discount))
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, (1000, 5000, 5000)),
+        ({"log_every": 70}, (70, 4970, 4970)),
+        ({"evaluate_every": 400}, (400, 400, 4800)),
+        ({"evaluate_every": 2000, "checkpoint_every": 3000}, (1000, 2000, 3000)),
+    ],
+)
+def test_what_is_not_given_of_log_evaluation_and_checkpoint_fits_the_rest(
+    scenario, given, expected
+):
+    run = prepare("q-learning", scenario, 100, None, given)
+    assert (run.log_every, run.evaluate_every, run.checkpoint_every) == expected
 
 
 STATED = {

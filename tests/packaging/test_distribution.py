@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -118,6 +119,14 @@ def test_the_wheel_holds_the_committed_data_to_the_byte(wheel, checkout):
         for path in (checkout / package).rglob("*.py")
     }
     assert sources == {name for name in stored if name.endswith(".py")}
+
+
+def test_an_index_can_follow_every_link_of_the_description(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+        description = archive.read(name).decode()
+    assert "## Install and run" in description
+    assert re.findall(r"\]\((?!https://).*?\)", description) == []
 
 
 def test_the_command_works_outside_the_checkout(installed, tmp_path):

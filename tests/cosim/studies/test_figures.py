@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.figures.style import palette
-from cosim.studies.figures import learning_curve, profile_figure
+from cosim.figures.style import palette, shown_case
+from cosim.studies.figures import LearningCurve, curves_figure, learning_curve, profile_figure
 from cosim.studies.pictures import density_figure, increments
 from tests.helpers.loop import Proportional
 
@@ -57,3 +57,21 @@ def test_a_profile_is_the_share_of_runs_at_most_so_bad():
 def test_increments_are_of_each_block_since_its_first_row():
     log = pd.DataFrame({"samples": [0, 1], "theta b[0]": [1.0, 3.0], "theta b[1]": [2.0, 2.0]})
     assert increments(log)["b"].tolist() == [[0.0, 0.0], [2.0, 0.0]]
+
+
+def test_a_cases_settings_are_set_after_its_name():
+    assert (
+        shown_case("q-learning(start=naive prior_width=0.3)")
+        == "q-learning, naive, prior width 0.3"
+    )
+    assert shown_case("two-fouled(tuned-two-fouled)") == "two-fouled"
+    assert shown_case("mine(2)") == "mine(2)"
+
+
+def test_many_curves_have_a_panel_for_each_start():
+    values = np.array([[3.0, 2.0]])
+    one = LearningCurve(np.array([100.0, 200.0]), values, values)
+    cases = [f"{rule}(start={start})" for start in ("naive", "tuned") for rule in "abcd"]
+    axes = curves_figure(dict.fromkeys(cases, one), {}, palette(cases), relative=True).axes
+    assert [panel.get_title() for panel in axes] == ["from naive", "from tuned", "", ""]
+    assert all(len(panel.lines) == 4 for panel in axes)

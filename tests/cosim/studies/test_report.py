@@ -91,7 +91,7 @@ def test_an_own_reader_finds_the_stored_summary():
 def test_all_rules_are_in_one_panel_under_the_names_of_the_table(results):
     _, greedy = results.figure("curves-paper").axes
     named = {text.get_text() for text in greedy.texts}
-    assert {"grow(rate=5.0)", "grow(rate=45.0)", "lost", "naive"} <= named
+    assert {"grow, rate 5.0", "grow, rate 45.0", "lost", "naive"} <= named
     curve = greedy.lines[0]
     own = results.curves[(results.curves.case == "grow(rate=5.0)")]
     own = own[own.scenario == "paper"].dropna(subset="greedy_J")

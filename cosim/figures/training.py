@@ -123,8 +123,9 @@ def _cost(
 def _course(axes: Axes, samples: Array, values: Array, color: str, least: float) -> None:
     """A line from 0 to `least` or more, logarithmic where it spans decades."""
     axes.plot(samples, values, marker="." if len(values) < POINTS else "", color=color, **_LINE)
-    axes.yaxis.set_major_formatter(EngFormatter(sep=""))
     low, top = float(values.min()), max(float(values.max()), least)
+    short = EngFormatter(sep="") if top >= 1e3 else FuncFormatter(percent)
+    axes.yaxis.set_major_formatter(short)
     if 0 < DECADES * low < top:
         axes.set_yscale("log")
     else:

@@ -20,7 +20,7 @@ from cosim.validation import validated
 from learning.algorithm import Privilege
 
 SEEDS, STEPS = range(3_000_000, 3_000_005), 2000
-"""Noise of the entries, which no study and no training may meet, and samples on each."""
+"""Noise of the entries, which no study and no training may meet; samples, unless it says."""
 MOST_FILES, MOST_BYTES = 20, 2_000_000
 """Of an entry: runs of all seeds take half of it."""
 Text = Annotated[str, Field(pattern=r"^[^|<>\[\]\\`\r\n]+$", max_length=100)]
@@ -35,6 +35,12 @@ class Entry(Table):
     scenario: Annotated[str, Field(pattern=r"^[\w-]+$")]
     asks_for: Literal["nothing"] | Privilege
     samples: Annotated[int, Field(ge=0)]
+    steps: Annotated[int, Field(ge=100, le=20_000)] = STEPS
+
+    @property
+    def task(self) -> str:
+        """The table that the entry is in: one a scenario and length."""
+        return f"`{self.scenario}`" + f", {self.steps} samples" * (self.steps != STEPS)
 
 
 def read_entry(folder: Path) -> tuple[Entry, pd.DataFrame]:
@@ -45,7 +51,7 @@ def read_entry(folder: Path) -> tuple[Entry, pd.DataFrame]:
     path, origin = folder / "entry.toml", f"'{folder / 'entry.toml'}'"
     entry = validated(Entry, read_toml(path, origin, ResultsError), origin, ResultsError)
     scenario = Scenario.load(entry.scenario)
-    asked = [(seed, STEPS, scenario.hash) for seed in SEEDS]
+    asked = [(seed, entry.steps, scenario.hash) for seed in SEEDS]
     try:
         rows = pd.read_csv(folder / "judged.csv", dtype={"scenario_hash": str})
         found = list(rows[["seed", "steps", "scenario_hash"]].itertuples(False, None))

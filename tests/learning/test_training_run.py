@@ -39,7 +39,7 @@ def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(proble
 def test_what_is_not_given_of_log_evaluation_and_checkpoint_fits_the_rest(
     scenario, given, expected
 ):
-    run = prepare("q-learning", scenario, 100, None, given)
+    run = prepare("q-learning", scenario, 100, None, {"seed": 0, **given})
     assert (run.log_every, run.evaluate_every, run.checkpoint_every) == expected
 
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from cosim.result import markdown_table
 from cosim.statistics import mean, shown
 from cosim.studies.plan import Plan, Study, plan
 from cosim.studies.results import StudyResults
-from cosim.text_tables import markdown_table
 
 LEFT_OUT = ("B_lambda", "b_lambda", "c_lambda")
 

@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ModelError
 from controllers.model import Model
 from controllers.qp import FIXED, MEANING, SETTINGS
-from cosim.penalty import Penalty
 from cosim.plugins import blamed, load_plugin
 from cosim.protocols import Vector
-from cosim.scenario import Scenario
+from cosim.scenario import Penalty, Scenario
 
 Mask = NDArray[np.bool_]
 

@@ -20,8 +20,8 @@ from controllers.errors import ModelError, ParameterError
 from controllers.problem import Problem
 from cosim.files import read_toml, write_atomically
 from cosim.protocols import Vector
+from cosim.result import Shown
 from cosim.scenario import Names, Table
-from cosim.text_tables import Shown
 from cosim.validation import instead, validated
 
 

@@ -18,7 +18,7 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
 from cosim.progress import told
 from cosim.protocols import Array, Controller, Decision
-from cosim.result import Result
+from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import indicators, measure, simulate
 from cosim.statistics import (
@@ -35,8 +35,7 @@ from cosim.statistics import (
 from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, check_folders
 from cosim.studies.run import Runner
 from cosim.studies.store import TIMING, to_csv
-from cosim.text_tables import markdown_table
-from cosim.validation import instead, known_keywords
+from cosim.validation import instead
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +53,6 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-@known_keywords
 def evaluate(
     scenario: Scenario | str | Path,
     controllers: Mapping[str, Factory | str] | Sequence[str],

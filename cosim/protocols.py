@@ -159,21 +159,3 @@ class Recorder(Protocol):
 
     def close(self) -> None:
         """Finish the record; also called when the run fails."""
-
-
-def recover(controller: Controller, error: Exception) -> None:
-    """Reset a controller that declared this failure; raise every other error."""
-    if not getattr(type(error), "is_solver_failure", False):
-        raise error
-    controller.reset()
-
-
-def functions_of(controller: Any) -> str | None:
-    """How a controller's functions are computed, `interpreted` or `compiled`; None without any."""
-    mode = getattr(controller, "functions", None)
-    return mode if isinstance(mode, str) else None
-
-
-def controller_name(controller: Any) -> str:
-    """Name of a controller for tables: its `name`, else its class's."""
-    return str(getattr(controller, "name", type(controller).__name__))

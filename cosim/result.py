@@ -1,17 +1,63 @@
-"""What a measurement's result can do: a table, a page and a picture."""
+"""What results can do: a line at a prompt, a table, a page and a picture; tables as text."""
 
 from __future__ import annotations
 
 import base64
+import csv
 import io
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cosim.files import write_atomically
-from cosim.text_tables import Shown, markdown_table, short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+TextTable = tuple[str, Sequence[str], list[list[str]]]
+"""Title, header and rows of texts."""
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table of texts as CSV, lines ended by one newline."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table; the first column is text, the others are numbers."""
+    rule = ["---", *["---:"] * (len(header) - 1)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (header, rule, *rows)) + "\n"
+
+
+def short(value: object) -> str:
+    """A value as text; of a float six digits."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+class Shown:
+    """What shows its facts: a line at a prompt, a table in a notebook."""
+
+    def _facts(self) -> Mapping[str, object]:
+        """What is shown of it, by label."""
+        return {}
+
+    def __repr__(self) -> str:
+        facts = ", ".join(f"{key}={short(value)}" for key, value in self._facts().items())
+        return f"{type(self).__name__}({facts})"
+
+    def _repr_html_(self) -> str:
+        """The facts as a table."""
+        rows = "".join(
+            f'<tr><th style="text-align:left">{escape(key)}</th>'
+            f'<td style="text-align:left">{escape(short(value))}</td></tr>'
+            for key, value in self._facts().items()
+        )
+        return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
 
 class Result(Shown):

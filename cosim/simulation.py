@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,6 @@ from cosim.protocols import (
     Recorder,
     SampleBlock,
     Solution,
-    controller_name,
-    recover,
 )
 from cosim.scenario import Scenario
 from cosim.trajectory import (
@@ -31,7 +30,6 @@ from cosim.trajectory import (
     SignalColumns,
     Trajectory,
 )
-from cosim.validation import known_keywords
 
 BLOCK = 500
 
@@ -49,7 +47,6 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     return int(plant.generate_state(1, np.uint64)[0]), np.random.default_rng(exploration)
 
 
-@known_keywords
 def simulate(
     plant: Plant,
     controller: Controller,
@@ -255,6 +252,24 @@ class _Run:
             seed=self._seed,
             controller=controller_name(self._controller),
         )
+
+
+def recover(controller: Controller, error: Exception) -> None:
+    """Reset a controller that declared this failure; raise every other error."""
+    if not getattr(type(error), "is_solver_failure", False):
+        raise error
+    controller.reset()
+
+
+def functions_of(controller: Any) -> str | None:
+    """How a controller's functions are computed, `interpreted` or `compiled`; None without any."""
+    mode = getattr(controller, "functions", None)
+    return mode if isinstance(mode, str) else None
+
+
+def controller_name(controller: Any) -> str:
+    """Name of a controller for tables: its `name`, else its class's."""
+    return str(getattr(controller, "name", type(controller).__name__))
 
 
 # key performance indicators of a run

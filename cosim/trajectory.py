@@ -14,14 +14,11 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import numpy as np
 
-from cosim import text_tables
 from cosim.errors import TrajectoryError
 from cosim.files import replacing, write_atomically
-from cosim.penalty import VIOLATING
 from cosim.protocols import Array, Solution, Step
-from cosim.result import Result
-from cosim.scenario import Scenario
-from cosim.text_tables import csv_text
+from cosim.result import Result, csv_text
+from cosim.scenario import VIOLATING, Scenario
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -297,7 +294,7 @@ class Trajectory(Result):
         """Means a sample after the first `burn_in`.
 
         `economic_cost` ℓ; `mean_violation` Σᵢ vᵢ; `violating_share` share of samples with Σᵢ vᵢ >
-        `cosim.penalty.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does not
+        `cosim.scenario.VIOLATING`, 1e-6 in the states' units, so that rounding at a bound does not
         count; `J` mean of ℓ + penalty, to which every violation counts.
         """
         names = ("stage_cost", "penalty", "violation")
@@ -376,7 +373,11 @@ def read_signals(path: str | Path) -> tuple[dict[str, Signal], list[str]]:
 
     Raises TrajectoryError with file and line.
     """
-    rows = text_tables.read_csv(path, TrajectoryError)
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.reader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as cause:
+        raise TrajectoryError(f"'{path}' cannot be read: {cause}") from None
     if len(rows) < 2 or not rows[0] or rows[0][-1] != STATUS:
         raise TrajectoryError(f"'{path}' is not a trajectory: its last column is not '{STATUS}'")
     header, body = rows[0], rows[1:]

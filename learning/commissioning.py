@@ -16,8 +16,9 @@ from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.protocols import Array, recover
+from cosim.protocols import Array
 from cosim.scenario import Scenario
+from cosim.simulation import recover
 from learning.algorithm import Transition
 from learning.back_off_search import BackOffSearch
 from learning.prediction_errors import OneStepModel

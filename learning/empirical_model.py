@@ -29,7 +29,8 @@ from controllers.model import discretise, economic_cost
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim.protocols import Array, recover
+from cosim.protocols import Array
+from cosim.simulation import recover
 from learning.algorithm import Transition
 from learning.checkpoint import group, take_up
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
-from cosim.protocols import Step, Vector, recover
+from cosim.protocols import Step, Vector
+from cosim.simulation import recover
 from learning.algorithm import Algorithm, Transition, Update
 from learning.checkpoint import arrays_of, group, prefixed, take_up
 from learning.configuration import Strategy

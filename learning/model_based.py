@@ -21,7 +21,7 @@ from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.penalty import Penalty
+from cosim.scenario import Penalty
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import Configuration, Count
 from learning.empirical_model import ALARM, WINDOWS, EmpiricalModel, Features, PlantData, Rollout

@@ -9,9 +9,8 @@ from controllers.functions import StackedFunction
 from controllers.model import discretise
 from controllers.problem import Problem
 from controllers.theta import Parameters
-from cosim.penalty import Penalty
 from cosim.protocols import Matrix, Vector
-from cosim.scenario import Scenario
+from cosim.scenario import Penalty, Scenario
 
 SLOWEST = 1000.0
 """Samples of the slowest time constant that is believed: of a state that integrates, say."""

@@ -26,13 +26,12 @@ from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, depends_on
 from cosim.progress import told
-from cosim.protocols import Array, Controller, Plant, Vector, functions_of
-from cosim.result import Result
+from cosim.protocols import Array, Controller, Plant, Vector
+from cosim.result import Result, csv_text
 from cosim.scenario import Scenario
-from cosim.simulation import indicators_of, simulate, spawn_seeds
+from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
-from cosim.text_tables import csv_text
-from cosim.validation import known_keywords, suggestion
+from cosim.validation import suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import Checkpoint
@@ -516,7 +515,6 @@ class Tracker(Protocol):
         """Take the result, finished or diverged."""
 
 
-@known_keywords
 def train(
     algorithm: str,
     scenario: Scenario | str | Path = "paper",

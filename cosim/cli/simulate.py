@@ -44,7 +44,7 @@ def simulate(
         from cosim.files import write_atomically
         from cosim.plant import FmuPlant
         from cosim.plugins import build_controller, parameters_hash
-        from cosim.protocols import functions_of
+        from cosim.simulation import functions_of
         from cosim.simulation import simulate as run
 
         loaded = cli.load_scenario(scenario)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from cosim.errors import FigureError
 from cosim.files import write_atomically
-from cosim.protocols import Array
 
 WIDTH = 7.16
 """Width of a two-column figure in inches, as journals print it."""
@@ -173,7 +172,9 @@ def percent(value: float, _: object = None) -> str:
     return f"{value:g}"
 
 
-def regret_axis(axes: Axes, which: Literal["x", "y"], values: Array, floor: float = FLOOR) -> None:
+def regret_axis(
+    axes: Axes, which: Literal["x", "y"], values: NDArray[np.float64], floor: float = FLOOR
+) -> None:
     """Scale an axis for regrets in %: logarithmic above `floor`, linear below, J* at zero."""
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, floor)
@@ -187,14 +188,14 @@ class Dots(NamedTuple):
     """Values of a case (K,), whether each finished, and a middle with its interval."""
 
     case: str
-    values: Array
+    values: NDArray[np.float64]
     finished: NDArray[np.bool_]
     middle: float
     low: float = np.nan
     high: float = np.nan
 
 
-def dot_rows(axes: Axes, rows: Sequence[Dots], looks: Mapping[str, Look]) -> Array:
+def dot_rows(axes: Axes, rows: Sequence[Dots], looks: Mapping[str, Look]) -> NDArray[np.float64]:
     """A row for each case: its values, crosses where one diverged, and their middle; all values."""
     for row, dots in enumerate(rows):
         count = len(dots.values)
@@ -223,7 +224,7 @@ class EndLabel(NamedTuple):
 
 def cost_lines(
     axes: Axes,
-    lines: Iterable[tuple[str, Array, Array, Mapping[str, Any]]],
+    lines: Iterable[tuple[str, NDArray[np.float64], NDArray[np.float64], Mapping[str, Any]]],
     levels: Mapping[str, float],
     *,
     relative: bool,
@@ -276,7 +277,7 @@ def label_ends(drawn: Figure, labels: Iterable[tuple[Axes, Sequence[EndLabel]]])
             )  # fmt: skip
 
 
-def spread(positions: Array, gap: float) -> Array:
+def spread(positions: NDArray[np.float64], gap: float) -> NDArray[np.float64]:
     """Descending positions (K,) in [0, 1], moved as little as need be to be `gap` apart.
 
     They minimise the sum of the squared moves, within [0, 1]: an isotonic regression of
@@ -285,5 +286,5 @@ def spread(positions: Array, gap: float) -> Array:
     from scipy.optimize import isotonic_regression  # noqa: PLC0415 - a third of a second
 
     steps = gap * np.arange(len(positions))
-    placed: Array = isotonic_regression(positions + steps, increasing=False).x
+    placed: NDArray[np.float64] = isotonic_regression(positions + steps, increasing=False).x
     return np.clip(placed, steps[-1], max(1.0, steps[-1])) - steps

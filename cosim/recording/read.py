@@ -16,8 +16,8 @@ from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
 from cosim.errors import RecordingError
-from cosim.penalty import VIOLATING
 from cosim.recording.stream import SAMPLE, SIGNAL, TIME
+from cosim.scenario import VIOLATING
 
 _SCALARS = rr.Scalars.descriptor_scalars().component
 _STATUS = rr.StateChange.descriptor_state().component

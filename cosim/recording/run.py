@@ -16,7 +16,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.comparison import RunSignals
-from cosim.protocols import Array, Controller, SampleBlock, controller_name
+from cosim.protocols import Array, Controller, SampleBlock
 from cosim.recording.stream import (
     SAMPLE,
     SERIES,
@@ -34,6 +34,7 @@ from cosim.recording.stream import (
     view,
 )
 from cosim.scenario import Scenario
+from cosim.simulation import controller_name
 from cosim.trajectory import SIGNALS, SignalKind
 
 ALONE = ("states", "actions", "costs")

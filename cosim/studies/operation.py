@@ -12,15 +12,14 @@ import pandas as pd
 
 from controllers import compile_functions
 from controllers.optimum import Fouling, QuasiStaticPolicy, change_of
-from cosim.penalty import VIOLATING
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
-from cosim.scenario import Scenario
+from cosim.result import TextTable
+from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import paired_difference, shown
 from cosim.studies.plan import ONLINE, greedy_file
 from cosim.studies.store import KEYS, LOG, RunStore, read_table
-from cosim.text_tables import Table
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
 from learning.training import LogRow, TrainingRun, begin
@@ -200,7 +199,7 @@ def tables(
     about: Mapping[str, Any],
     against: Mapping[str, str | None],
     seconds: Mapping[str, float],
-) -> list[Table]:
+) -> list[TextTable]:
     """Title, header and rows of a scenario's tables.
 
     `about` holds its `sampling_time` and the samples of the `columns`; `against` the counterpart
@@ -208,7 +207,7 @@ def tables(
     """
     marks, lives = about["columns"], found.lives
     times = [duration(mark * about["sampling_time"]) for mark in marks]
-    result: list[Table] = []
+    result: list[TextTable] = []
     for name, title in (
         ("regret", "Greedy regret in % of the θ that a run would hand over, median (worst)"),
         ("life_regret", "Regret in % of the run so far, exploration included, median (worst)"),

@@ -16,10 +16,9 @@ from cosim.figures.style import BOUND, DASHED, WIDTH, figure, label, palette, sa
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.files import write_atomically
-from cosim.penalty import VIOLATING
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
-from cosim.scenario import Scenario
+from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import TD_WINDOW, td_error_mean
 from cosim.studies.document import TrajectoryTable
 from cosim.studies.plan import Plan, Run, safe

@@ -18,8 +18,8 @@ from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from cosim.files import write_atomically
 from cosim.protocols import Array
+from cosim.result import TextTable, markdown_table
 from cosim.statistics import Estimate, gain, shown
-from cosim.text_tables import Table, markdown_table
 
 PAGE, TABLES, FOLDER = "report.html", "report.md", "figures"
 Rows = tuple[Sequence[str], list[list[str]]]
@@ -143,7 +143,7 @@ def run_table(runs: pd.DataFrame) -> Rows:
 
 def paper_table(
     scenarios: Sequence[str], trained: Sequence[str], indicator: Callable[[str, str, str], Array]
-) -> Table:
+) -> TextTable:
     """Title, header and rows: gains of each trained case's median run on every scenario.
 
     `indicator` maps case, scenario and name to values (R, S) of runs on noise seeds. The paper's

@@ -18,6 +18,7 @@ from cosim.errors import StudyError
 from cosim.figures.style import Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
+from cosim.result import Shown, TextTable, markdown_table
 from cosim.statistics import (
     Estimate,
     Interval,
@@ -32,7 +33,6 @@ from cosim.studies import figures, operation, pictures, report, store
 from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, NAIVE, Plan, safe
 from cosim.studies.report import COLUMNS, SHORT
 from cosim.studies.store import CURVE, INDICATORS, KEYS, STATE, TIMING, WHERE, read_table, to_csv
-from cosim.text_tables import Shown, Table, markdown_table
 from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
@@ -371,7 +371,7 @@ class StudyResults(Shown):
             for name, (head, rows) in tables.items()
         )
 
-    def further(self) -> list[Table]:
+    def further(self) -> list[TextTable]:
         """Title, header and rows of the tables that the study asks for beside its summary."""
         found = []
         against = {name: case.get("against") for name, case in self.cases.items()}
@@ -382,7 +382,7 @@ class StudyResults(Shown):
             found.append(self.paper())
         return found
 
-    def paper(self) -> Table:
+    def paper(self) -> TextTable:
         """Title, header and rows: the gains that the paper's text states, beside the study's."""
         return report.paper_table(self.scenarios, self.trained, self.indicator)
 

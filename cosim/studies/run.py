@@ -36,7 +36,6 @@ from cosim.studies import operation
 from cosim.studies.plan import EVALUATION, Noise, Plan, Run, Study, Training, plan
 from cosim.studies.results import StudyResults
 from cosim.studies.store import CHECKPOINT, FAILURE, Measured, RunStore, Trained
-from cosim.validation import known_keywords
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 ANSWER_SECONDS = 10.0
@@ -415,7 +414,6 @@ async def _identity(dask: Any, address: str) -> dict[str, Any]:
             comm.abort()
 
 
-@known_keywords
 def study(
     source: Study | str | Path | Mapping[str, Any],
     out: str | Path,

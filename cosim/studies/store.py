@@ -18,14 +18,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.files import read_json, write_atomically
 from cosim.plugins import changed
 from cosim.studies.plan import EVALUATION, GREEDY, ONLINE, Plan, Run
-from cosim.text_tables import read_csv
 
 RUN, CHECKPOINT = "run.json", "checkpoint.npz"
 TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
@@ -58,26 +56,22 @@ def read_table(
 
     Raises StudyError.
     """
-    header, *rows = read_csv(path, StudyError)
     kinds = TYPES | dict(types or {})
-    frame = pd.DataFrame()
     try:
-        for name in dict.fromkeys([*(columns or header), *(types or ())]):
-            texts = [row[header.index(name)] for row in rows]
-            frame[name] = _converted(texts, kinds.get(name, float))
-        if any(len(row) != len(header) for row in rows):
-            raise ValueError("a row is torn")
-    except (IndexError, ValueError) as error:
-        raise StudyError(f"'{path}' is damaged: {error}") from None
-    return frame
+        texts = pd.read_csv(path, dtype=str, na_filter=False)
+        names = dict.fromkeys([*(columns or texts), *(types or ())])
+        found = {name: _converted(texts[name], kinds.get(name, float)) for name in names}
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise StudyError(f"'{path}' is missing or damaged: {error}") from None
+    return pd.DataFrame(found)
 
 
-def _converted(texts: Sequence[str], kind: Any) -> Any:
-    if kind == "Int64":
-        return pd.array([int(text) if text else pd.NA for text in texts], dtype="Int64")
+def _converted(texts: pd.Series[str], kind: Any) -> Any:
     if kind is float:
-        return np.array([float(text or "nan") for text in texts], dtype=np.float64)
-    return pd.Series(texts, dtype=str) if kind is str else np.array([int(text) for text in texts])
+        return texts.replace("", "nan").astype(float)
+    if kind == "Int64":
+        return pd.array([int(text) if text else pd.NA for text in texts], dtype=kind)
+    return texts.map(kind)  # whole numbers of 64 bits, too
 
 
 def to_csv(frame: pd.DataFrame) -> str:

@@ -4,8 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosim.errors import ScenarioError
-from cosim.penalty import Penalty
-from cosim.scenario import Scenario, presets
+from cosim.scenario import Penalty, Scenario, presets
 
 
 def test_paper_holds_the_numbers_of_the_paper(paper):

@@ -43,7 +43,7 @@ def test_clock_readings_are_only_in_the_timing(trajectory, tmp_path):
 
 BAD = {
     "missing": (None, "cannot be read"),
-    "empty": ("", "is empty"),
+    "empty": ("", "not a trajectory"),
     "other table": ("a,b\n1,2\n", "not a trajectory"),
     "short row": ("time [s],status\n0.0\n", "line 2: 1 fields, not 2"),
     "text in a number": ("time [s],status\n0.0,ok\nx,ok\n", "line 3"),

@@ -3,7 +3,7 @@ import pytest
 
 from controllers.model import discretise
 from controllers.theta import Parameters, ThetaBlocks
-from cosim.penalty import Penalty
+from cosim.scenario import Penalty
 from learning.checkpoint import arrays_of, take_up
 from learning.prediction_errors import (
     OneStepModel,

@@ -32,9 +32,18 @@ from cosim.statistics import (
     regret,
     regrets,
 )
-from cosim.studies.plan import EVALUATION, NAIVE, Case, Noise, Run, RunKey, check_folders
-from cosim.studies.run import Runner
-from cosim.studies.store import TIMING, to_csv
+from cosim.studies.plan import NAIVE
+from cosim.studies.run import Report, Runner
+from cosim.studies.store import (
+    EVALUATION,
+    TIMING,
+    Case,
+    Noise,
+    Run,
+    RunKey,
+    check_folders,
+    to_csv,
+)
 from cosim.validation import instead
 
 if TYPE_CHECKING:
@@ -62,7 +71,7 @@ def evaluate(
     folder: str | Path | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
-    progress: Callable[[int, str], None] | bool = False,
+    progress: Report | bool = False,
     command: str = "cosim.evaluate",
 ) -> Evaluation:
     """Run every controller on every seed and return the table; the bytes depend on no worker.
@@ -84,8 +93,7 @@ def evaluate(
     folder : where finished runs are kept and found again; None keeps none.
     jobs : worker processes; 1 works in this process.
     scheduler : address of a Dask scheduler, used in place of `jobs`.
-    progress : called with the samples done, and with a line on what is done anew; True draws a
-        bar.
+    progress : called as `cosim.study` does, with a line on what is done anew; True draws a bar.
     command : the text of the column `command`.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
@@ -128,9 +136,9 @@ def evaluate(
     total = sum(run.samples for run in runs)
     bar = told(progress, scenario.name, total)
     with temporary_folder("cosim-evaluation-") as own, bar as tell:
-        runner = Runner(runs, Path(folder or own), (Path.cwd(),), lambda s, _: tell(s.samples, ""))
+        runner = Runner(runs, Path(folder or own), (Path.cwd(),), lambda *at: tell(*at[:2], ""))
         for line in runner.remarks:
-            tell(0, line)
+            tell(0, "", line)
         runner.go(jobs, scheduler)
         for failure in runner.failures.values():
             raise failure.error()

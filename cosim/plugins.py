@@ -175,7 +175,7 @@ def _named(controller: Controller, name: str) -> Controller:
 DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
 SUFFIXES = (".py", ".toml", ".fmu", ".npz")
 # Nothing that these files hold bears on a number.
-ASIDE = {"cli", "figures", "recording", "__pycache__", "report.py", "pictures.py"}
+ASIDE = {"cli", "figures", "recording", "__pycache__", "report.py", "figures.py"}
 
 _brought: dict[str, set[str]] = {}
 """Modules that loading a plug-in, and calling its factory, imported, by the plug-in's module."""

@@ -12,7 +12,7 @@ def told(
     progress: Callable[..., None] | bool,
     label: str,
     total: int,
-    read: Callable[..., tuple[int, str]] = lambda done, remark="": (done, remark),
+    read: Callable[..., tuple[int, str]] = lambda done, remark="", *_: (done, remark),
 ) -> Iterator[Callable[..., None]]:
     """Yield the callback of an argument `progress`: itself, a bar, or a no-op.
 

@@ -55,7 +55,6 @@ def evaluate(
         from cosim.evaluation import evaluate as run
         from cosim.evaluation import named_controllers
         from cosim.files import write_atomically
-        from cosim.progress import told
 
         task = cli.load_scenario(scenario)
         if trajectories is not None:
@@ -68,13 +67,7 @@ def evaluate(
         folder = cli.open_folder(out)
         out_.announce(task.plant.fmu)
         total = (len(named) + ("optimal" not in named)) * seeds * steps
-        with cli.resumable(), told(out_.live, f"samples on {task.name}", total) as progress:
-
-            def report(samples: int, line: str) -> None:
-                progress(samples)
-                if line:
-                    out_.note(line)
-
+        with cli.followed(out_, f"samples on {task.name}", total) as report:
             evaluation = run(
                 task,
                 named,

@@ -170,6 +170,21 @@ def resumable(
         raise
 
 
+@contextmanager
+def followed(out: Output, label: str, samples: int) -> Iterator[Callable[[int, str, str], None]]:
+    """The `progress` of resumable work on so many samples: a bar, and a line for what happened."""
+    from cosim.progress import told
+
+    with resumable(), told(out.live, label, samples) as bar:
+
+        def report(samples: int, runs: str, line: str) -> None:
+            bar(samples, runs)
+            if line:
+                out.note(f"{runs}  {line}".strip())
+
+        yield report
+
+
 def dump(document: Mapping[str, Any]) -> str:
     """JSON text with sorted keys, on one line if long; non-finite numbers become null."""
     from pydantic_core import to_json

@@ -12,7 +12,6 @@ from cosim.cli import output as cli
 
 if TYPE_CHECKING:
     from cosim.studies.results import StudyResults
-    from cosim.studies.run import State
 
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 results = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
@@ -67,7 +66,6 @@ def _execute(
     from loky import cpu_count
 
     from cosim.errors import FailedRunsError
-    from cosim.progress import told
     from cosim.studies.plan import Study, plan
     from cosim.studies.run import study
 
@@ -76,13 +74,7 @@ def _execute(
     for scenario in definition.scenarios.values():
         out_.announce(scenario.plant.fmu)
     planned = plan(definition)
-    with cli.resumable(), told(out_.live, definition.name, planned.samples) as bar:
-
-        def report(state: State, line: str) -> None:
-            bar(*state.short)
-            if line:
-                out_.note(f"{state.short[1]}  {line}")
-
+    with cli.followed(out_, definition.name, planned.samples) as report:
         try:
             return study(
                 definition,

@@ -18,8 +18,7 @@ from cosim.protocols import Array, Controller
 from cosim.result import TextTable
 from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import paired_difference, shown
-from cosim.studies.plan import ONLINE, greedy_file
-from cosim.studies.store import KEYS, LOG, RunStore, read_table
+from cosim.studies.store import KEYS, LOG, ONLINE, RunStore, greedy_file, read_table
 from learning.algorithm import load_algorithm
 from learning.errors import DivergenceError
 from learning.training import LogRow, TrainingRun, begin

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -29,10 +29,22 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import figures, operation, pictures, report, store
-from cosim.studies.plan import BASELINES, EVALUATION, GREEDY, NAIVE, Plan, safe
+from cosim.studies import figures, operation, report, store
+from cosim.studies.plan import BASELINES, NAIVE, Plan
 from cosim.studies.report import COLUMNS, SHORT
-from cosim.studies.store import CURVE, INDICATORS, KEYS, STATE, TIMING, WHERE, read_table, to_csv
+from cosim.studies.store import (
+    CURVE,
+    EVALUATION,
+    GREEDY,
+    INDICATORS,
+    KEYS,
+    STATE,
+    TIMING,
+    WHERE,
+    read_table,
+    safe,
+    to_csv,
+)
 from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
@@ -100,17 +112,17 @@ class StudyResults(Shown):
 
     @classmethod
     def written(
-        cls, plan: Plan, out: Path, stores: Collection[store.RunStore], *, figures: bool = True
+        cls, plan: Plan, out: Path, stores: Collection[store.RunStore], *, draw: bool = True
     ) -> StudyResults:
         """Write the tables and kept files of a plan's finished runs, and return them.
 
-        `figures` draws the kept trajectories and logs, too; study.json, which names them, is
+        `draw` draws the kept trajectories and logs, too; study.json, which names them, is
         written last, so that its word is true.
         """
-        runs = store.finished(plan, stores)
+        runs = _finished(plan, stores)
         found = cls(out, document(plan), *store.frames(runs))
-        pictures.keep(plan, out)
-        drawn = pictures.draw(plan, out) if figures else []
+        figures.keep(plan, out)
+        drawn = figures.draw(plan, out) if draw else []
         tables = {
             EVALUATION: found.evaluation,
             CURVES: found.curves,
@@ -560,6 +572,19 @@ class StudyResults(Shown):
 def _columns(name: str, value: float, interval: Interval) -> dict[str, float]:
     low, high = interval or (np.nan, np.nan)
     return {name: value, f"{name}_low": low, f"{name}_high": high}
+
+
+def _finished(plan: Plan, stores: Iterable[store.RunStore]) -> list[store.RunStore]:
+    """The runs that are finished, by scenario, case and training seed, in the study's order."""
+    cases = [case.name for case in plan.definition.all_cases]
+    scenarios = list(plan.definition.scenarios)
+
+    def place(one: store.RunStore) -> tuple[int, int, int]:
+        key = one.run.key
+        seed = -1 if key.seed is None else key.seed
+        return scenarios.index(key.scenario), cases.index(key.case), seed
+
+    return sorted((one for one in stores if one.finished), key=place)
 
 
 def document(plan: Plan) -> dict[str, Any]:

@@ -33,9 +33,19 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import measure, simulate
 from cosim.studies import operation
-from cosim.studies.plan import EVALUATION, Noise, Plan, Run, Study, Training, plan
+from cosim.studies.plan import Plan, Study, plan
 from cosim.studies.results import StudyResults
-from cosim.studies.store import CHECKPOINT, FAILURE, Measured, RunStore, Trained
+from cosim.studies.store import (
+    CHECKPOINT,
+    EVALUATION,
+    FAILURE,
+    Measured,
+    Noise,
+    Run,
+    RunStore,
+    Trained,
+    Training,
+)
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 ANSWER_SECONDS = 10.0
@@ -186,24 +196,9 @@ def _controller(item: Item) -> Controller:
     return controller
 
 
-@dataclass(frozen=True)
-class State:
-    """How far a study is: plant samples done, runs done and in all, and how many failed."""
-
-    samples: int
-    runs: int
-    all_runs: int
-    failed: int
-
-    @property
-    def short(self) -> tuple[int, str]:
-        """The samples, and the rest in words."""
-        failed = f", {self.failed} failed" if self.failed else ""
-        return self.samples, f"{self.runs}/{self.all_runs} runs{failed}"
-
-
-Report = Callable[[State, str], None]
-"""Gets the state and a line for what just happened; the line is empty for mere progress."""
+Report = Callable[[int, str, str], None]
+"""Gets the plant samples done, the runs done in words, and a line for what just happened; the line
+is empty for mere progress."""
 
 
 class Runner:
@@ -319,8 +314,9 @@ class Runner:
         return f"{name}: J {cost:.6g}{f', {status}' if status else ''}"
 
     def _tell(self, line: str) -> None:
-        done, failed = len(self._finished), len(self.failures)
-        self._report(State(sum(self._done.values()), done, len(self._runs), failed), line)
+        failed = f", {len(self.failures)} failed" if self.failures else ""
+        runs = f"{len(self._finished)}/{len(self._runs)} runs{failed}"
+        self._report(sum(self._done.values()), runs, line)
 
 
 def _outcomes(
@@ -434,8 +430,8 @@ def study(
     source : a study, its file, or the same document as a mapping.
     jobs : worker processes; 1 works in this process. No byte of a table depends on it.
     scheduler : address of a Dask scheduler, used in place of `jobs`.
-    progress : called with the state after every work item, and with a line for each run that ends
-        or fails; True draws a bar.
+    progress : a `Report`, called after every work item, and with a line for each run that ends or
+        fails; True draws a bar.
     planned : what `plan` returned, if it is known.
     figures : whether the study's trajectories and logs are drawn.
     """
@@ -444,14 +440,13 @@ def study(
     definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     planned = planned or plan(definition)
-    bar = told(progress, definition.name, planned.samples, lambda state, _: state.short)
-    with bar as report:
+    with told(progress, definition.name, planned.samples) as report:
         runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
         for line in runner.remarks:
-            report(State(0, 0, len(planned.runs), 0), line)
+            report(0, "", line)
         runner.go(jobs, scheduler)
     stores = runner.stores.values()
-    results = StudyResults.written(planned, folder, stores, figures=figures)
+    results = StudyResults.written(planned, folder, stores, draw=figures)
     if runner.failures:
         name, failure = next(iter(runner.failures.items()))
         others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""

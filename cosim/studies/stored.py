@@ -16,11 +16,10 @@ from cosim.errors import ResultsError
 from cosim.files import read_json, read_toml, write_atomically
 from cosim.studies.document import StudyTable, Table
 from cosim.studies.document import read as read_study
-from cosim.studies.pictures import LOGS, TRAJECTORIES
-from cosim.studies.plan import EVALUATION, RUNS
+from cosim.studies.figures import LOGS, TRAJECTORIES
 from cosim.studies.report import rendered
 from cosim.studies.results import ABOUT, CURVES, StudyResults
-from cosim.studies.store import KEYS, TIMING, to_csv
+from cosim.studies.store import EVALUATION, KEYS, RUNS, TIMING, to_csv
 from cosim.trajectory import Signal
 from cosim.validation import instead, validated
 

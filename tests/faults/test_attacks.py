@@ -15,7 +15,7 @@ from cosim.comparison import compare, load_run
 from cosim.errors import CosimError, StudyError
 from cosim.files import check_target, protect, write_atomically
 from cosim.recording import RerunRecorder
-from cosim.studies.plan import RunKey
+from cosim.studies.store import RunKey
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Proportional
 

@@ -74,6 +74,6 @@ def document(**changes):
     } | changes
 
 
-def run_toy(out, *, jobs=1, report=lambda state, line: None, **changes):
+def run_toy(out, *, jobs=1, report=lambda *state: None, **changes):
     """Run the document with some changes."""
     return study(document(**changes), out, jobs=jobs, progress=report)

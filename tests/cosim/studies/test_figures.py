@@ -6,8 +6,14 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.figures.style import palette, shown_case
-from cosim.studies.figures import LearningCurve, curves_figure, learning_curve, profile_figure
-from cosim.studies.pictures import density_figure, increments
+from cosim.studies.figures import (
+    LearningCurve,
+    curves_figure,
+    density_figure,
+    increments,
+    learning_curve,
+    profile_figure,
+)
 from tests.helpers.loop import Proportional
 
 

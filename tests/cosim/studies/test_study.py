@@ -88,7 +88,7 @@ def test_a_changed_setting_is_named_and_trained_anew(tmp_path):
             tmp_path,
             case=[case("g", samples=200, settings={"rate": rate})],
             training_seeds={"count": 1},
-            report=lambda _, line: lines.append(line),
+            report=lambda *state: lines.append(state[-1]),
         )
         return (tmp_path / "runs/paper/g/0/parameters.toml").read_text()
 
@@ -116,7 +116,7 @@ def test_a_failing_case_is_told_at_once_and_the_others_are_done(tmp_path):
         run_toy(
             tmp_path,
             case=[case("broken", "Break"), case("grow")],
-            report=lambda _, line: lines.append(line),
+            report=lambda *state: lines.append(state[-1]),
         )
     assert any(line.startswith("failed: broken on paper, seed 0") for line in lines)
     assert len(list(tmp_path.glob("runs/paper/grow/*/evaluation.csv"))) == 2
@@ -199,7 +199,7 @@ def test_a_finished_run_s_damaged_file_is_named_and_made_again(whole, tmp_path, 
     else:
         path.write_bytes(content[: len(content) // 2] + b"1\n" * damage.startswith("edited"))
     lines = []
-    run_toy(tmp_path, report=lambda _, line: lines.append(line))
+    run_toy(tmp_path, report=lambda *state: lines.append(state[-1]))
     assert any(str(path) in line for line in lines)
     # run.json holds how long the run took.
     assert name == "run.json" or path.read_bytes() == content

@@ -34,7 +34,6 @@ def demo(
     """
     with cli.output(json) as out_:
         from cosim.cli.evaluate import show
-        from cosim.cli.train import record_training
         from cosim.comparison import RunSignals
         from cosim.evaluation import evaluate
         from cosim.figures.style import save
@@ -42,7 +41,7 @@ def demo(
         from cosim.files import temporary_folder
         from cosim.plant import FmuPlant
         from cosim.plugins import build_controller
-        from cosim.recording import record_overlay
+        from cosim.recording import record_overlay, record_training
         from cosim.scenario import Scenario
         from cosim.simulation import simulate
         from learning.training import HELD_OUT

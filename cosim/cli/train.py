@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from cosim.cli import output as cli
 from cosim.errors import CosimError
-
-if TYPE_CHECKING:
-    from learning.training import Training
 
 FILES = (
     "checkpoint.npz", "learning.csv", "learning.gif", "learning.png", "parameters.toml",
@@ -144,34 +141,14 @@ def train(
         if gif:
             training.animate(folder / "learning.gif")
         if record:
+            from cosim.recording import record_training
+
             record_training(folder / "training.rrd", training)
         _show(summary, out_)
         out_.note(f"the learning curve is {folder / 'learning.png'}")
         out_.json(summary, folder)
     if training.status != "finished":
         raise typer.Exit(1)
-
-
-def record_training(path: Path, training: Training) -> None:
-    """Write a Rerun recording of a training."""
-    from cosim import recording
-
-    run, blocks = training.run, training.parameters.blocks
-    recording.record_training(
-        path,
-        f"{run.algorithm} on {run.scenario.name}",
-        training.log(),
-        training.theta(),
-        {name: blocks.labels[where] for name, where in blocks.slices.items()},
-        {
-            "algorithm": run.algorithm,
-            "scenario": run.scenario.name,
-            "scenario_hash": run.scenario.hash,
-            "samples": run.samples,
-            "seed": run.seed,
-            **run.configuration.model_dump(mode="json"),
-        },
-    )
 
 
 def _show(summary: dict[str, Any], output: cli.Output) -> None:

@@ -1,8 +1,8 @@
 """Rerun recordings of runs, trainings and overlays; the only importer of rerun."""
 
 from cosim.recording.read import Recording, read_recording, summarise
-from cosim.recording.run import RerunRecorder, record_overlay, record_training
 from cosim.recording.viewer import open_viewer, render
+from cosim.recording.write import RerunRecorder, record_overlay, record_training
 
 __all__ = [
     "Recording",

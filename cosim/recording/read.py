@@ -16,7 +16,7 @@ from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
 from cosim.errors import RecordingError
-from cosim.recording.stream import SAMPLE, SIGNAL, TIME
+from cosim.recording.write import SAMPLE, SIGNAL, TIME
 from cosim.scenario import VIOLATING
 
 _SCALARS = rr.Scalars.descriptor_scalars().component

@@ -19,7 +19,7 @@ from cosim.errors import RecordingError
 from cosim.files import replacing
 from cosim.processes import child_process
 from cosim.recording.read import telling_moment
-from cosim.recording.stream import SAMPLE, TIME
+from cosim.recording.write import SAMPLE, TIME
 
 LOOPBACK = "127.0.0.1"
 _NOWHERE = f"http://{LOOPBACK}:9"

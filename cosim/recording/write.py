@@ -1,0 +1,599 @@
+"""Writes recordings: a run by blocks of samples, ended runs over each other, a training."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import secrets
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from itertools import chain, cycle
+from math import inf, isfinite
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple, NoReturn, Self
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from cosim.comparison import RunSignals
+from cosim.errors import RecordingError
+from cosim.files import check_target, publish
+from cosim.protocols import Array, Controller, SampleBlock
+from cosim.scenario import Scenario
+from cosim.simulation import controller_name
+from cosim.trajectory import SIGNALS, SignalKind
+
+if TYPE_CHECKING:
+    from learning.training import Training
+
+TIME, SAMPLE = "time", "sample"
+SIGNAL = "cosim.Signal"
+"""Archetype of the static mark (name, unit) on every entity that holds a signal."""
+
+SERIES = ("#3B94DE", "#E8731F", "#22AC7E", "#CC79A7", "#E5A11A", "#6CC3F0")
+BOUND = "#D8392B"
+_DRAWABLE = ((0x20, 0x24F), (0x370, 0x4FF), (0x2010, 0x2026))
+_FOOTER = b"RRF2FOOT"
+_WRITE_SECONDS = 30.0
+_ABANDONED: list[rr.RecordingStream] = []
+
+Range = tuple[float, float]
+
+ALONE = ("states", "actions", "costs")
+"""Groups with an entity for each signal; those of the others share one, which takes less space."""
+HELD = ("actions", "disturbances")
+FREE = (-inf, inf)
+_STATUS, _RESIDUAL = "solver/status", "solver/log_residual"
+_GOOD = "#3A9A5B"
+
+
+class RerunRecorder:
+    """Recorder of `simulate`: a `.rrd` file with layout, signals, predictions and run properties.
+
+    Every signal keeps its name and float64 bits; `read_recording` gives them back. Predictions are
+    the signals `prediction/<name>`, N+1 or N numbers a sample.
+
+    Raises RecordingError where the file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._stream: Stream | None = None
+
+    def start(
+        self,
+        scenario: Scenario,
+        controller: Controller,
+        seed: int,
+        steps: int,
+        units: dict[str, str],
+    ) -> None:
+        """Open the file and write what is known before the first sample."""
+        name = controller_name(controller)
+        self._seconds = steps * scenario.sampling_time
+        recorded = [kind for kind in SIGNALS if kind.group is not None]
+        self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
+        self._predicted: dict[str, Channel] = {}
+        self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
+        self._status: str | None = None
+        self._samples = 0
+        properties = {
+            "scenario": scenario.name,
+            "scenario_hash": scenario.hash,
+            "controller": name,
+            "theta_hash": getattr(getattr(controller, "parameters", None), "hash", "none"),
+            "seed": seed,
+            "steps": steps,
+            "sampling_time": f"{scenario.sampling_time:g} s",
+            "fmu": Path(scenario.plant.fmu).name,
+            "package": f"rti-cosim {version('rti-cosim')}",
+        }
+        title = f"{name} on {scenario.name}, seed {seed}"
+        stream = self._stream = Stream(self.path, title, self._layout())
+        stream.properties(properties)
+        stream.about(_about(scenario, properties))
+        good = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
+        stream.static(_STATUS, good)
+
+    def record(self, block: SampleBlock) -> None:
+        """Append K samples: one column of K rows for each signal."""
+        stream = self._stream
+        if stream is None or not len(block):
+            return
+        samples, time = np.arange(block.first, block.first + len(block)), block["time"]
+        rows, ends = times(samples, time), times(samples[[0, -1]], time[[0, -1]])
+        bundles: dict[str, tuple[list[Channel], list[np.ndarray]]] = {}
+        for kind, channels in self._kinds.items():
+            for channel, values in zip(
+                channels, block[kind.name].reshape(len(block), -1).T, strict=True
+            ):
+                channel.see(values, tail=0.05 if kind.clock else 0.0)
+                members, columns = bundles.setdefault(channel.entity, ([], []))
+                members.append(channel)
+                columns.append(values)
+            stream.bounds(channels, ends)
+        for members, columns in bundles.values():
+            stream.send(members, rows, np.column_stack(columns))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            residual = np.log10(block["residual"])
+        stream.columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
+        self._residual.see(residual)
+        self._changes_of_status(stream, samples, block)
+        self._predictions(stream, rows, block)
+        self._samples += len(block)
+
+    def close(self) -> None:
+        """Finish the file with the ranges that the run has filled; no sample, no file."""
+        if self._stream is not None:
+            if self._samples:
+                self._stream.close(self._layout())
+            else:
+                self._stream.discard()
+            self._stream = None
+
+    def _changes_of_status(self, stream: Stream, samples: np.ndarray, block: SampleBlock) -> None:
+        before = [self._status, *block.status[:-1]]
+        rows = [i for i, status in enumerate(block.status) if status != before[i]]
+        self._status = block.status[-1]
+        if rows:
+            states = rr.StateChange.columns(state=[drawable(block.status[i]) for i in rows])
+            stream.columns(_STATUS, times(samples[rows], block["time"][rows]), states)
+
+    def _predictions(self, stream: Stream, rows: list[rr.TimeColumn], block: SampleBlock) -> None:
+        for group, values in (
+            ("states", block.predicted_states),
+            ("actions", block.predicted_actions),
+        ):
+            if values is None:
+                continue
+            for i, channel in enumerate(self._group(group)):
+                predicted = self._predicted.setdefault(
+                    channel.name,
+                    Channel(
+                        f"prediction/{escaped(channel.name)}",
+                        f"prediction/{channel.name}",
+                        channel.unit,
+                        labels=[f"+{stage}" for stage in range(values.shape[1])],
+                    ),
+                )
+                predicted.see(values[:, :, i])
+                stream.send([predicted], rows, values[:, :, i])
+
+    def _group(self, *groups: str) -> list[Channel]:
+        return [
+            c for kind, channels in self._kinds.items() if kind.group in groups for c in channels
+        ]
+
+    def _layout(self) -> rrb.Blueprint:
+        """Left: states and actions with bounds; middle: costs, causes, solver; right: the rest."""
+        along = axis(seconds=self._seconds)
+        loop = [view(c.title, [c], along) for c in self._group("states", "actions")]
+        causes = [
+            *(view(c.title, [c], along) for c in self._group("costs")),
+            view("disturbances", self._group("disturbances"), along),
+            view("prepare and feedback time [s]", self._group("step_time"), along),
+            view(self._residual.name, [self._residual], along),
+            rrb.StateTimelineView(name="QP status", contents=[f"/{_STATUS}"], time_view=along),
+        ]
+        about = about_view("about this run")
+        predicted = [view(c.title, [c], along, legend=False) for c in self._predicted.values()]
+        right = rrb.Tabs(rrb.Vertical(*predicted, name="predictions"), about)
+        return layout(
+            rrb.Horizontal(
+                rrb.Vertical(*loop),
+                rrb.Vertical(*causes),
+                right if predicted else about,
+                column_shares=[4, 3, 3],
+            )
+        )
+
+
+def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) -> list[Channel]:
+    """The signals of a kind as they are drawn; a unit not known is left empty."""
+    colors = cycle(SERIES[2:] if kind.name == "actions" else SERIES)
+    return [
+        Channel(
+            f"{kind.group}/{escaped(name)}" if kind.group in ALONE else str(kind.group),
+            name,
+            unit,
+            SERIES[1] if name in ("penalty", "feedback_time") else next(colors),
+            scenario.limits.get(name, FREE) if kind.vector else FREE,
+            step=kind.name in HELD,
+        )
+        for name, unit in zip(kind.names(scenario), kind.units(scenario, units), strict=True)
+    ]
+
+
+def _about(scenario: Scenario, properties: Mapping[str, object]) -> str:
+    return f"""# {scenario.name}
+
+{scenario.description}
+
+{table("run", properties)}
+
+**Time** is the plant's. Sample k of a state is what the controller measured; the input,
+disturbance and cost of sample k hold until sample k+1. The cost per sample is economic cost +
+penalty of violating the state bounds (red lines).
+
+**Predictions**: line +i is the QP's prediction, made at the cursor, of the sample i later.
+"""
+
+
+class Plot(NamedTuple):
+    """A view of what has ended: its title, and of each signal its channel, rows and values."""
+
+    title: str
+    signals: Sequence[tuple[Channel, list[rr.TimeColumn], Array]]
+
+
+def _record(
+    path: str | Path,
+    title: str,
+    tabs: Mapping[str, Sequence[Plot]],
+    along: rrb.TimeAxis,
+    about: str,
+    *,
+    timeline: str = TIME,
+    ends: list[rr.TimeColumn] | None = None,
+    properties: Mapping[str, object] = MappingProxyType({}),
+) -> None:
+    """Write a recording of plots in tabs; bounds are drawn between the two times `ends`."""
+    grids = []
+    for name, plots in tabs.items():
+        views = (view(p.title, [channel for channel, _, _ in p.signals], along) for p in plots)
+        grids += [rrb.Grid(*views, grid_columns=3, name=name)] * bool(plots)
+    shown = layout(rrb.Tabs(*grids, about_view("about")), timeline)
+    with Stream(path, title, shown) as stream:
+        if properties:
+            stream.properties(properties)
+        stream.about(about)
+        for plot in chain(*tabs.values()):
+            for channel, rows, values in plot.signals:
+                stream.bounds([channel], ends or [])
+                stream.send([channel], rows, values)
+
+
+def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str) -> None:
+    """Write a recording of runs of one scenario by name, over each other; raises RecordingError.
+
+    The signals are `<run>/<signal>` for every signal that all runs have, and, of two runs,
+    `difference/<signal>`; bounds are those that the first run knows. `about` is Markdown.
+    """
+    first, *others = runs.values()
+    times_of = {
+        name: run.signals["time"].values if "time" in run.signals else np.arange(float(len(run)))
+        for name, run in runs.items()
+    }
+    rows = {name: times(np.arange(len(time)), time) for name, time in times_of.items()}
+    overlaid, differences = [], []
+    for signal, own in first.signals.items():
+        if signal == "time" or not all(signal in run.signals for run in others):
+            continue
+        lines = []
+        for (name, run), color in zip(runs.items(), cycle(SERIES), strict=False):
+            entity, values = f"{escaped(name)}/{escaped(signal)}", run.signals[signal].values
+            bounds = first.bounds.get(signal, FREE) if run is first else FREE
+            line = Channel(entity, f"{name}/{signal}", own.unit, color, bounds, labels=[name])
+            lines.append((line.see(values), rows[name], values))
+        overlaid.append(Plot(replace(lines[0][0], name=signal).title, lines))
+        if len(runs) == 2:
+            common = min(len(values) for _, _, values in lines)
+            with np.errstate(invalid="ignore"):
+                values = lines[0][2][:common] - lines[1][2][:common]
+            entity, name = f"difference/{escaped(signal)}", f"difference/{signal}"
+            line = Channel(entity, name, own.unit, SERIES[3]).see(values)
+            time = next(iter(times_of.values()))[:common]
+            differences.append(Plot(line.title, [(line, times(np.arange(common), time), values)]))
+    seconds = max((float(time[-1]) for time in times_of.values() if len(time)), default=0.0)
+    title, last = " / ".join(runs), max(map(len, runs.values())) - 1
+    tabs = {title: overlaid, "difference": differences}
+    ends = times([0, last], np.array([0.0, seconds]))
+    _record(path, title, tabs, axis(seconds=seconds), about, ends=ends)
+
+
+def record_training(path: str | Path, training: Training) -> None:
+    """Write a recording of a training: the signals are the log's columns and `increment/<block>`.
+
+    `increment/<block>` is the change of a block of θ since the start, (K, size).
+
+    Raises RecordingError where the file cannot be written.
+    """
+    run, blocks, log = training.run, training.parameters.blocks, training.log()
+    properties = {
+        "algorithm": run.algorithm,
+        "scenario": run.scenario.name,
+        "scenario_hash": run.scenario.hash,
+        "samples": run.samples,
+        "seed": run.seed,
+        **run.configuration.model_dump(mode="json"),
+    }
+    samples = log["samples"].astype(np.int64)
+    rows, theta, course = times(samples), [], []
+    for name, values in training.theta().items():
+        labels = list(blocks.labels[blocks.slices[name]])
+        entity = f"increment/{escaped(name)}"
+        block = Channel(entity, f"increment/{name}", labels=labels).see(values)
+        theta.append(Plot(f"change of {name}", [(block, rows, values)]))
+    for (name, values), color in zip(log.items(), cycle(SERIES), strict=False):
+        rare = bool(np.isnan(values).any())
+        column = Channel(f"log/{escaped(name)}", name, color=color, points=rare).see(values)
+        course.append(Plot(name, [(column, rows, values)]))
+    along = axis(samples=int(samples[-1]) if len(samples) else 0)
+    title = f"{run.algorithm} on {run.scenario.name}"
+    about = f"# {title}\n\n{table('training', properties)}\n"
+    tabs = {"θ": theta, "log": course}
+    _record(path, title, tabs, along, about, timeline=SAMPLE, properties=properties)
+
+
+# The file, its signals and its layout
+
+
+@dataclass
+class Channel:
+    """A signal in a recording: its entity, how it is drawn, and the range `seen` of its values.
+
+    `labels` name the lines of a signal with several numbers a row. `step` holds a value until the
+    next one, `points` draws dots, for values between NaN; `bounds` may be infinite.
+    """
+
+    entity: str
+    name: str
+    unit: str = ""
+    color: str = SERIES[0]
+    bounds: Range = (-inf, inf)
+    labels: Sequence[str] = ()
+    step: bool = False
+    points: bool = False
+    seen: Range = (inf, -inf)
+
+    @property
+    def title(self) -> str:
+        """Name, unit and bounds in words: the viewer's lines have no labels, its font no ≥."""
+        label = self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"
+        sides = zip(("at least", "at most"), self.bounds, strict=True)
+        return ", ".join([label, *(f"{side} {b:g}" for side, b in sides if isfinite(b))])
+
+    def see(self, values: Array, *, tail: float = 0.0) -> Self:
+        """Widen the range seen by values of any shape, without the share `tail` of the largest."""
+        values = values[np.isfinite(values)]
+        if values.size:
+            low, high = self.seen
+            top = np.quantile(values, 1.0 - tail) if tail else values.max()
+            self.seen = (min(low, float(values.min())), max(high, float(top)))
+        return self
+
+    def window(self) -> Range | None:
+        """Range of view: the values seen and each bound within their span; None before any."""
+        low, high = self.seen
+        if low > high:
+            return None
+        lower, upper = self.bounds
+        span = max(high - low, 1e-3 * max(abs(low), abs(high))) or 1.0
+        low = min(low, lower) if low - span <= lower else low
+        high = max(high, upper) if upper <= high + span else high
+        margin = 0.06 * max(high - low, span)
+        return low - margin, high + margin
+
+
+class Stream:
+    """An open recording: `static` and `send`, then `close`; an exception in its block discards it.
+
+    The layout stands first in the file, as Rerun wants it, and `close` can send a better one. The
+    file is written beside `path` under a hidden name and renamed by `close`, so that `path` never
+    holds half a recording; `rerun rrd optimize` repairs what a killed process leaves.
+
+    Raises RecordingError where the folder does not exist or cannot be written.
+    """
+
+    def __init__(self, path: str | Path, name: str, layout: rrb.Blueprint) -> None:
+        self.path = check_target(path)
+        name_of_partial = f".{self.path.stem}.{secrets.token_hex(4)}.partial.rrd"
+        self._partial = self.path.with_name(name_of_partial)
+        try:
+            self._partial.touch()
+        except OSError as error:
+            raise RecordingError(
+                f"cannot write the recording {self.path}: {error.strerror}"
+            ) from None
+        # Without it a column of the wrong shape is dropped with no more than a warning.
+        rr.set_strict_mode(True)
+        self._stream = rr.RecordingStream("rti-cosim")
+        self._stream.send_recording_name(drawable(name))
+        self._declared: set[str] = set()
+        self._bounded(partial(self._stream.save, self._partial, default_blueprint=layout))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.discard()
+
+    def properties(self, values: Mapping[str, object]) -> None:
+        """Describe the run as a whole; shown in the viewer when the recording is selected."""
+        described = rr.AnyValues()
+        for key, value in values.items():
+            described.with_component_from_data(key, drawable(str(value)))
+        self._stream.send_property("run", described)
+
+    def about(self, markdown: str) -> None:
+        """Give the text of the view `about`."""
+        page = rr.TextDocument(drawable(markdown), media_type=rr.MediaType.MARKDOWN)
+        self.static("about", page)
+
+    def static(self, entity: str, *archetypes: rr.AsComponents) -> None:
+        """Log what does not change over time."""
+        self._stream.log(entity, *archetypes, static=True)
+
+    def columns(
+        self, entity: str, times: list[rr.TimeColumn], columns: rr.ComponentColumnList
+    ) -> None:
+        """Send a block of rows."""
+        self._stream.send_columns(entity, times, columns)
+
+    def send(self, channels: Sequence[Channel], times: list[rr.TimeColumn], values: Array) -> None:
+        """Send K rows of the signals of one entity: (K,), (K, m), or (K, labels)."""
+        entity = channels[0].entity
+        if entity not in self._declared:
+            self._declared.add(entity)
+            names, units = [c.name for c in channels], [c.unit for c in channels]
+            mark = rr.DynamicArchetype(SIGNAL, components={"name": names, "unit": units})
+            self.static(entity, mark, _style(channels))
+        self.columns(entity, times, rr.Scalars.columns(scalars=np.array(values)))
+
+    def bounds(self, channels: Sequence[Channel], ends: list[rr.TimeColumn]) -> None:
+        """Draw the finite bounds of signals between two times."""
+        for channel in channels:
+            for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
+                if isfinite(bound):
+                    entity = f"bounds/{channel.entity}/{side}"
+                    line = Channel(entity, f"{side} bound", color=BOUND)
+                    self.static(entity, _style([line]))
+                    self.columns(entity, ends, rr.Scalars.columns(scalars=[bound, bound]))
+
+    def close(self, layout: rrb.Blueprint | None = None) -> None:
+        """Finish the file, with a layout in place of the first, and give it its name.
+
+        Raises RecordingError where not all of it could be written.
+        """
+        if self._stream in _ABANDONED:
+            return
+        if layout is not None:
+            self._stream.send_blueprint(layout)
+        self._bounded(self._stream.disconnect)
+        with self._partial.open("rb") as written:
+            written.seek(-min(len(_FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
+            if _FOOTER not in written.read():
+                self._give_up("its end is missing")
+        publish(self._partial, self.path)
+
+    def discard(self) -> None:
+        """End the recording without a file."""
+        if self._stream not in _ABANDONED:
+            self._bounded(self._stream.disconnect)
+            self._partial.unlink(missing_ok=True)
+
+    def _bounded(self, call: Callable[[], None]) -> None:
+        """Let Rerun write for a limited time: once its writer has ended, it waits for ever."""
+        writing = threading.Thread(target=call, daemon=True)
+        writing.start()
+        writing.join(_WRITE_SECONDS)
+        if writing.is_alive():
+            # To drop the stream, or to let Rerun shut down, would wait for ever too.
+            _ABANDONED.append(self._stream)
+            atexit.unregister(rr.rerun_shutdown)
+            self._give_up("its writer does not answer")
+
+    def _give_up(self, reason: str) -> NoReturn:
+        raise RecordingError(
+            f"the recording {self.path} could not be written ({reason}): is the disk full? Repair "
+            f"what was written by: rerun rrd optimize {self._partial} -o REPAIRED.rrd"
+        ) from None
+
+
+def _style(channels: Sequence[Channel]) -> rr.SeriesLines | rr.SeriesPoints:
+    first = channels[0]
+    labels = first.labels or [channel.title.partition(",")[0] for channel in channels]
+    colors = [c.color for c in channels]
+    if len(labels) > len(colors):
+        colors = [SERIES[i % len(SERIES)] for i in range(len(labels))]
+    names = [drawable(label) for label in labels]
+    # An array, since Rerun misreads a list of three numbers as one colour.
+    packed = np.array([packed_color(color) for color in colors], dtype=np.uint32)
+    if first.points:
+        return rr.SeriesPoints(names=names, colors=packed, marker_sizes=np.full(len(names), 4.0))
+    mode, policy = rr.components.InterpolationMode, rr.components.AggregationPolicy
+    return rr.SeriesLines(
+        names=names,
+        colors=packed,
+        widths=np.full(len(names), 1.5),
+        # The default average would hide the violations of a run that is wider than the screen.
+        aggregation_policy=policy.MinMax,
+        interpolation_mode=mode.StepAfter if first.step else mode.Linear,
+    )
+
+
+def packed_color(color: str) -> int:
+    """`#RRGGBB` as the opaque 32-bit number that Rerun takes."""
+    return int(color.removeprefix("#") + "FF", 16)
+
+
+def drawable(text: str) -> str:
+    """Replace by `?` each character that the viewer's font lacks; the headless viewer aborts on it.
+
+    Names and units are the user's to choose.
+    """
+    return "".join(
+        c if c == "\n" or any(low <= ord(c) <= high for low, high in _DRAWABLE) else "?"
+        for c in text
+    )
+
+
+def escaped(name: str) -> str:
+    """A variable's name, e.g. `tank[1].level`, as one part of an entity path."""
+    return rr.escape_entity_path_part(name)
+
+
+def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> list[rr.TimeColumn]:
+    """Index columns of K rows: sample numbers and, where there is one, the time in s to 1 ns."""
+    columns = [rr.TimeColumn(SAMPLE, sequence=np.asarray(samples, dtype=np.int64))]
+    if time is not None:
+        nanoseconds = np.rint(time * 1e9).astype("timedelta64[ns]")
+        columns.append(rr.TimeColumn(TIME, duration=nanoseconds))
+    return columns
+
+
+def axis(*, seconds: float | None = None, samples: int = 0) -> rrb.TimeAxis:
+    """Horizontal axis over a whole run of that length."""
+    at = rr.TimeRangeBoundary.absolute
+    start, end = (
+        (at(seq=0), at(seq=samples)) if seconds is None else (at(seconds=0.0), at(seconds=seconds))
+    )
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
+
+
+def view(
+    title: str, channels: Sequence[Channel], along: rrb.TimeAxis, *, legend: bool | None = None
+) -> rrb.TimeSeriesView:
+    """A plot of signals and their bounds, in the range of view of all of them."""
+    windows = [window for channel in channels if (window := channel.window())]
+    shown = (min(low for low, _ in windows), max(high for _, high in windows)) if windows else None
+    entities = dict.fromkeys(channel.entity for channel in channels)
+    return rrb.TimeSeriesView(
+        name=drawable(title),
+        origin="/",
+        contents=[path for e in entities for path in (f"/{e}", f"/bounds/{e}/**")],
+        axis_x=along,
+        axis_y=rrb.ScalarAxis(range=shown) if shown else None,
+        plot_legend=rrb.PlotLegend(
+            corner=rrb.Corner2D.RightTop, visible=len(channels) > 1 if legend is None else legend
+        ),
+    )
+
+
+def about_view(name: str) -> rrb.TextDocumentView:
+    """The view of the text that `Stream.about` gives."""
+    return rrb.TextDocumentView(name=name, origin="/about")
+
+
+def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
+    """The views with a paused time panel on a timeline, and no other panels in the way."""
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="paused"),
+    )
+
+
+def table(title: str, values: Mapping[str, object]) -> str:
+    """Markdown table of names and values."""
+    rows = [f"| {key.replace('_', ' ')} | {value} |" for key, value in values.items()]
+    return "\n".join([f"| {title} | |", "|---|---|", *rows])

@@ -12,9 +12,8 @@ from pydantic import Field
 from cosim.errors import ResultsError
 from cosim.evaluation import judge
 from cosim.files import read_toml, write_atomically
-from cosim.scenario import Scenario
+from cosim.scenario import Scenario, Table
 from cosim.statistics import regret, shown
-from cosim.studies.document import Table
 from cosim.studies.report import rendered
 from cosim.validation import validated
 from learning.algorithm import Privilege

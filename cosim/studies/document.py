@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from cosim.errors import StudyError
 from cosim.files import read_toml
+from cosim.scenario import Table
 from cosim.validation import validated
 
 Count = Annotated[int, Field(ge=1, le=100_000_000)]
@@ -20,12 +21,6 @@ PerScenario = Count | dict[str, Count]
 DEFAULT = "default"
 Hour = Annotated[float, Field(gt=0.0)]
 Hours = Annotated[list[Hour], Field(min_length=1)]
-
-
-class Table(BaseModel):
-    """A table whose fields are all known, checked strictly and never changed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, populate_by_name=True)
 
 
 class SeedsTable(Table):

@@ -30,7 +30,6 @@ from cosim.plugins import OURS, build_controller, code_hash, import_from
 from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
 from cosim.progress import told
 from cosim.protocols import Controller
-from cosim.scenario import Scenario
 from cosim.simulation import measure, simulate
 from cosim.studies import operation
 from cosim.studies.plan import Plan, Study, plan
@@ -44,7 +43,6 @@ from cosim.studies.store import (
     Run,
     RunStore,
     Trained,
-    Training,
 )
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
@@ -60,54 +58,38 @@ ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Place:
-    """What every item needs: folders of foreign modules, and the hashes of our code and the FMU
-    that the work was given out with."""
-
-    folders: tuple[str, ...]
-    code: str
-    fmu: str
-
-    def enter(self, scenario: Scenario) -> None:
-        """Let foreign modules be imported; raises EvaluationError on other code or another FMU."""
-        for folder in self.folders:
-            import_from(Path(folder))
-        if (here := code_hash()) != self.code:
-            raise EvaluationError(
-                f"a worker runs other code ({here}) than the work was given out with "
-                f"({self.code}); install the same version of rti-cosim everywhere"
-            )
-        if (found := unpack(scenario.plant.fmu)).sha256 != self.fmu:
-            raise EvaluationError(
-                f"FMU '{found.path}' was replaced, or is another one on this worker (SHA-256 "
-                f"{found.sha256[:16]}…, not {self.fmu[:16]}…); what is finished is stored: put "
-                "the FMU back, or begin anew with it"
-            )
-
-
-@dataclass(frozen=True)
 class Item:
     """Unit of work of one process, independent of the machine.
 
-    A `training` to its end, its checkpoint in `folder` where the workers share this disk. Else a
-    controller on some `noise`, for `file`. `samples` are those of all the controller's items. The
-    controller is a text for `build_controller`, a factory(scenario), or the `training`'s with θ =
-    `parameters`. A training in operation is judged at its `marks`; a policy at the noise's, with
-    the `theta` that it had then.
+    The run's training to its end, its checkpoint in `folder` where the workers share this disk;
+    or, with a `file`, its controller on some `noise`: that of the run, or, of a training, that of
+    the θ in `parameters` (TOML) or of another `theta`. Plug-ins are looked up in `folders`.
     """
 
-    run: str
-    place: Place
-    scenario: Scenario
-    training: Training | None = None
+    run: Run
+    folders: tuple[str, ...]
     folder: Path | None = None
-    parameters: str = ""
-    controller: Any = None
     file: str = ""
     noise: Noise = NONE
-    marks: tuple[int, ...] = ()
+    parameters: str = ""
     theta: tuple[float, ...] = ()
-    samples: int = 0
+
+    def enter(self) -> None:
+        """Let plug-ins be imported; raises EvaluationError on other code or another FMU here."""
+        for folder in self.folders:
+            import_from(Path(folder))
+        facts = self.run.facts
+        if (here := code_hash()) != facts["rti-cosim"]:
+            raise EvaluationError(
+                f"a worker runs other code ({here}) than the work was given out with "
+                f"({facts['rti-cosim']}); install the same version of rti-cosim everywhere"
+            )
+        if (found := unpack(self.run.scenario.plant.fmu)).sha256 != facts["fmu"]:
+            raise EvaluationError(
+                f"FMU '{found.path}' was replaced, or is another one on this worker (SHA-256 "
+                f"{found.sha256[:16]}…, not {facts['fmu'][:16]}…); what is finished is stored: put "
+                "the FMU back, or begin anew with it"
+            )
 
 
 @dataclass(frozen=True)
@@ -131,10 +113,8 @@ Outcome = Trained | Measured | str | Failure
 def perform(item: Item) -> tuple[Item, Outcome]:
     """Do an item; whatever it raises becomes a Failure, `sys.exit` in a plug-in too."""
     try:
-        item.place.enter(item.scenario)
-        if item.training is not None and not item.parameters:
-            return item, _train(item.training, item.folder, item.marks)
-        return item, _simulate(item)
+        item.enter()
+        return item, _simulate(item) if item.file else _train(item.run, item.folder)
     except (KeyboardInterrupt, Terminated):
         raise
     except BaseException as error:
@@ -146,8 +126,9 @@ def perform(item: Item) -> tuple[Item, Outcome]:
         return item, Failure(message, traceback.format_exc(), kind)
 
 
-def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> Trained:
-    run, begin = training.prepare(), perf_counter()
+def _train(run_: Run, folder: Path | None) -> Trained:
+    assert run_.training is not None
+    run, marks, begin = run_.training.prepare(), run_.marks, perf_counter()
     if marks:
         lived, status, clock, taken = operation.live(run, marks)
         log, theta = to_csv(lived), lived[-1].parameters.to_toml()
@@ -169,30 +150,31 @@ def _train(training: Training, folder: Path | None, marks: tuple[int, ...]) -> T
 
 
 def _simulate(item: Item) -> Measured | str:
-    controller = _controller(item)
-    compile_functions(controller, item.samples)
-    scenario, (seeds, steps, burn_in, block, whole, mark) = item.scenario, item.noise
+    controller, run = _controller(item), item.run
+    compile_functions(controller, sum(noise.samples for noise in run.noise.values()))
+    scenario, (seeds, steps, burn_in, block, whole, mark) = run.scenario, item.noise
     if mark:
         scenario = operation.plant_at(scenario, mark * scenario.sampling_time)
     with FmuPlant(scenario) as plant:
         if whole:
             return simulate(plant, controller, steps, seeds[0]).to_csv()
         if block:
-            run = simulate(plant, controller, steps, seeds[0], residuals=False)
-            cost = run["stage_cost"] + run["penalty"]
+            found = simulate(plant, controller, steps, seeds[0], residuals=False)
+            cost = found["stage_cost"] + found["penalty"]
             firsts = range(0, steps, block)
             return {seeds[0]: ({"J": [float(cost[k : k + block].mean()) for k in firsts]}, {})}
         return {seed: measure(plant, controller, seed, steps, burn_in) for seed in seeds}
 
 
 def _controller(item: Item) -> Controller:
-    if item.training is not None:
-        return item.training.controller(item.parameters, item.theta)
+    run = item.run
+    if run.training is not None:
+        return run.training.controller(item.parameters, item.theta)
     if item.noise.mark:
-        return operation.optimum_at(item.scenario, item.noise.mark)
-    if isinstance(item.controller, str):
-        return build_controller(item.controller, item.scenario)
-    controller: Controller = item.controller(item.scenario)
+        return operation.optimum_at(run.scenario, item.noise.mark)
+    if isinstance(run.controller, str):
+        return build_controller(run.controller, run.scenario)
+    controller: Controller = run.controller(run.scenario)
     return controller
 
 
@@ -252,21 +234,15 @@ class Runner:
         return items
 
     def _items(self, name: str, run: Run, shared_disk: bool) -> Iterator[Item]:
-        store = self.stores[name]
-        place = Place(self._folders, run.facts["rti-cosim"], run.facts["fmu"])
-        trained = 0 if run.training is None else run.training.samples
-        samples = run.samples - trained
-        base = Item(name, place, run.scenario, controller=run.controller, samples=samples)
+        store, base = self.stores[name], Item(run, self._folders)
         self._done[name] = 0
         if run.training is not None:
-            base = replace(base, training=run.training)
             if not store.status:
                 store.unseal()
-                shared = store.folder.absolute() if shared_disk else None
-                yield replace(base, folder=shared, marks=run.marks)
+                yield replace(base, folder=store.folder.absolute() if shared_disk else None)
                 return
             base = replace(base, parameters=store.parameters)
-            self._done[name] = trained
+            self._done[name] = run.training.samples
         for file, noise in run.noise.items():
             missing = noise._replace(seeds=store.missing(file))
             self._done[name] += noise.samples - missing.samples
@@ -280,7 +256,8 @@ class Runner:
 
     def _take(self, item: Item, outcome: Outcome) -> None:
         """Store what an item gave and say so."""
-        name, store = item.run, self.stores[item.run]
+        name = str(item.run.key)
+        store = self.stores[name]
         if isinstance(outcome, Failure):
             if name not in self.failures:
                 self.failures[name] = outcome
@@ -298,7 +275,7 @@ class Runner:
             write_atomically(store.folder / item.file, outcome)
         else:
             store.evaluate(item.file, outcome)
-        self._tell(self._finish(name, self._runs[name]))
+        self._tell(self._finish(name, item.run))
 
     def _finish(self, name: str, run: Run) -> str:
         """Seal a complete run; returns a line about it."""

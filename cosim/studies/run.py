@@ -376,15 +376,9 @@ def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome
 
 async def _identity(dask: Any, address: str) -> dict[str, Any]:
     """A scheduler's identity; raises TimeoutError without an answer."""
-    connect = import_module("distributed.comm").connect
-    async with asyncio.timeout(ANSWER_SECONDS):
-        security = dask.Security().get_connection_args("client")
-        comm = await connect(address, timeout=ANSWER_SECONDS, **security)
-        try:
-            await comm.write({"op": "identity", "reply": True})
-            return dict(await comm.read())
-        finally:
-            comm.abort()
+    security = dask.Security().get_connection_args("client")
+    async with asyncio.timeout(ANSWER_SECONDS), dask.rpc(address, connection_args=security) as scheduler:
+        return dict(await scheduler.identity())
 
 
 def study(

@@ -238,7 +238,6 @@ class Runner:
         self._done[name] = 0
         if run.training is not None:
             if not store.status:
-                store.unseal()
                 yield replace(base, folder=store.folder.absolute() if shared_disk else None)
                 return
             base = replace(base, parameters=store.parameters)
@@ -264,7 +263,6 @@ class Runner:
                 write_atomically(store.folder / FAILURE, outcome.trace)
                 self._tell(f"failed: {name}: {outcome.message}")
             return
-        store.unseal()
         self._done[name] += item.noise.samples
         if isinstance(outcome, Trained):
             store.train(outcome)
@@ -278,11 +276,11 @@ class Runner:
         self._tell(self._finish(name, item.run))
 
     def _finish(self, name: str, run: Run) -> str:
-        """Seal a complete run; returns a line about it."""
+        """Write what a complete run has; returns a line about it."""
         store = self.stores[name]
         if not store.finished:
             return ""
-        store.seal()
+        store.flush()
         self._finished.add(name)
         found = store.indicators(EVALUATION)
         seeds = run.noise[EVALUATION].seeds
@@ -377,7 +375,10 @@ def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome
 async def _identity(dask: Any, address: str) -> dict[str, Any]:
     """A scheduler's identity; raises TimeoutError without an answer."""
     security = dask.Security().get_connection_args("client")
-    async with asyncio.timeout(ANSWER_SECONDS), dask.rpc(address, connection_args=security) as scheduler:
+    async with (
+        asyncio.timeout(ANSWER_SECONDS),
+        dask.rpc(address, connection_args=security) as scheduler,
+    ):
         return dict(await scheduler.identity())
 
 

@@ -177,28 +177,14 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
-LARGEST = 1 << 24
-"""Bytes of the largest document that is read."""
-DEEPEST = 100
-"""Tables within tables of the deepest one."""
-
-
 def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
     """Document of a TOML file; `origin` is what messages call it.
 
-    Raises `error` where there is no such regular file, or where it is not UTF-8, not TOML or larger
-    than `LARGEST`.
+    Raises `error` where there is no such regular file, or where it is not UTF-8 or not TOML.
     """
     text = _text(path, origin, error)
     try:
-        document = tomllib.loads(text)
-        deepest: list[Any] = [document]
-        for _ in range(DEEPEST):
-            tables = [t.values() if isinstance(t, dict) else t for t in deepest]
-            deepest = [value for t in tables for value in t if isinstance(value, dict | list)]
-        if deepest:
-            raise ValueError(f"it is nested more than {DEEPEST} deep")
-        return document
+        return tomllib.loads(text)
     # Nesting without end exhausts the parser's stack, a number without end Python's patience.
     except (ValueError, RecursionError) as cause:
         raise error(f"{origin} is not valid TOML: {cause}") from None
@@ -226,8 +212,6 @@ def _text(path: str | Path, origin: str, error: type[Exception]) -> str:
     except (OSError, ValueError) as cause:
         reason = getattr(cause, "strerror", None) or cause
         raise error(f"{origin} cannot be read: {reason}") from None
-    if len(content) > LARGEST:
-        raise error(f"{origin} has {len(content)} bytes, more than any document of ours")
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError:

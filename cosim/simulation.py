@@ -118,13 +118,9 @@ class _Run:
             s.flags.writeable = False  # a controller reads the state, and changes nothing
             solution, prepare_time, feedback_time = solve(s)
             action = applied if solution is None else solution.action
-            if (
-                not isinstance(action, np.ndarray)
-                or action.shape != shape
-                or action.dtype.kind not in "fiu"
-            ):
-                array = isinstance(action, np.ndarray) and action.dtype.kind in "fiu"
-                given = f"shape {action.shape}" if array else f"{type(action).__name__} {action}"
+            numbers = isinstance(action, np.ndarray) and action.dtype.kind in "fiu"
+            if not numbers or action.shape != shape:
+                given = f"shape {action.shape}" if numbers else f"{type(action).__name__} {action}"
                 raise self._wrong(f"an action of {given}, not {shape}", k)
             applied = saturate(action)
             begin = perf_counter()

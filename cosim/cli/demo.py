@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 from cosim.cli import output as cli
-
-if TYPE_CHECKING:
-    from learning.training import Training
 
 SCENARIO = "fouled"
 NAIVE, LEARNT, BACKED_OFF, OPTIMAL = "naive", "learnt", "tuned + back-off", "optimal"
 BACKOFF_SAMPLES = 8000
+EVERY = ("log_every", "evaluate_every", "checkpoint_every")
 RUNS = 10
 """Runs of the comparison; the first is drawn and recorded."""
 
@@ -44,15 +42,19 @@ def demo(
         from cosim.recording import record_overlay, record_training
         from cosim.scenario import Scenario
         from cosim.simulation import simulate
-        from learning.training import HELD_OUT
+        from learning.training import HELD_OUT, train
 
         scenario = Scenario.load(SCENARIO)
         folder = cli.open_folder(out)
         out_.note(scenario.description)
-        trained = {
-            BACKED_OFF: _train("backoff", "tuned", BACKOFF_SAMPLES, seed, {}, out_),
-            LEARNT: _train("search", "naive", samples, seed, {"rule": "q-learning"}, out_),
-        }
+        trained = {}
+        for name, rule, start, number, settings in (
+            (BACKED_OFF, "backoff", "tuned", BACKOFF_SAMPLES, {}),
+            (LEARNT, "search", "naive", samples, {"rule": "q-learning"}),
+        ):
+            own: dict[str, Any] = {"settings": settings, "seed": seed, "start": start}
+            own |= dict.fromkeys(EVERY, max(1, number // 10))
+            trained[name] = train(rule, SCENARIO, number, progress=out_.live, **own)
         first = 2 * HELD_OUT + seed  # noise that no training met
         with temporary_folder("cosim-demo-") as work, FmuPlant(scenario) as plant:
             named = {NAIVE: NAIVE, BACKED_OFF: "", LEARNT: "", OPTIMAL: OPTIMAL}
@@ -82,23 +84,3 @@ def demo(
             f"learnt θ   {folder / 'parameters.toml'}   (a controller's name in every command)"
         )
         out_.json(summary | {"training": trained[LEARNT].summary()}, folder)
-
-
-def _train(
-    algorithm: str, start: str, samples: int, seed: int, settings: dict[str, Any], out_: cli.Output
-) -> Training:
-    from learning.training import train
-
-    every = max(1, samples // 10)
-    return train(
-        algorithm,
-        SCENARIO,
-        samples,
-        settings=settings,
-        seed=seed,
-        start=start,
-        progress=out_.live,
-        log_every=every,
-        evaluate_every=every,
-        checkpoint_every=every,
-    )

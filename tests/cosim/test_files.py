@@ -8,7 +8,6 @@ import pytest
 
 from cosim import files
 from cosim.files import (
-    LARGEST,
     cache_folder,
     lock,
     read_json,
@@ -74,8 +73,8 @@ def test_what_is_not_a_file_is_never_replaced(tmp_path, kind):
 @pytest.mark.parametrize("read", [read_toml, read_json])
 @pytest.mark.parametrize(
     "content",
-    [None, b"\xff", b"{ [ no", b"1", b"x" * (LARGEST + 1), b"[" * 10**5, b"a = " + b"9" * 10**5],
-    ids=["missing", "not UTF-8", "no document", "a number", "large", "endless", "long number"],
+    [None, b"\xff", b"{ [ no", b"1", b"[" * 10**5, b"a = " + b"9" * 10**5],
+    ids=["missing", "not UTF-8", "no document", "a number", "endless", "long number"],
 )
 def test_a_document_that_is_none_is_one_line_that_names_it(tmp_path, read, content):
     path = tmp_path / "document"

@@ -16,9 +16,11 @@ from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
 from cosim.errors import RecordingError
-from cosim.recording.write import SAMPLE, SIGNAL, TIME
 from cosim.scenario import VIOLATING
 
+TIME, SAMPLE = "time", "sample"
+SIGNAL = "cosim.Signal"
+"""Archetype of the static mark (name, unit) on every entity that holds a signal."""
 _SCALARS = rr.Scalars.descriptor_scalars().component
 _STATUS = rr.StateChange.descriptor_state().component
 

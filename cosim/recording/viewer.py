@@ -18,8 +18,7 @@ from rerun.experimental import ViewerClient
 from cosim.errors import RecordingError
 from cosim.files import replacing
 from cosim.processes import child_process
-from cosim.recording.read import telling_moment
-from cosim.recording.write import SAMPLE, TIME
+from cosim.recording.read import SAMPLE, TIME, telling_moment
 
 LOOPBACK = "127.0.0.1"
 _NOWHERE = f"http://{LOOPBACK}:9"

@@ -24,16 +24,13 @@ from cosim.comparison import RunSignals
 from cosim.errors import RecordingError
 from cosim.files import check_target, publish
 from cosim.protocols import Array, Controller, SampleBlock
+from cosim.recording.read import SAMPLE, SIGNAL, TIME
 from cosim.scenario import Scenario
 from cosim.simulation import controller_name
 from cosim.trajectory import SIGNALS, SignalKind
 
 if TYPE_CHECKING:
     from learning.training import Training
-
-TIME, SAMPLE = "time", "sample"
-SIGNAL = "cosim.Signal"
-"""Archetype of the static mark (name, unit) on every entity that holds a signal."""
 
 SERIES = ("#3B94DE", "#E8731F", "#22AC7E", "#CC79A7", "#E5A11A", "#6CC3F0")
 BOUND = "#D8392B"

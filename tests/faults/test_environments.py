@@ -27,11 +27,8 @@ ENVIRONMENTS = {
     "no PATH": {"PATH": "/nonexistent"},
     "development mode": {"PYTHONDEVMODE": "1", "PYTHONWARNINGS": "default"},
 }
-ARGUMENTS = {"-OO": ["-OO"]}
-UMASKS = {"umask 077": 0o077}
 CASES = {name: (values, [], None) for name, values in ENVIRONMENTS.items()}
-CASES |= {name: ({}, options, None) for name, options in ARGUMENTS.items()}
-CASES |= {name: ({}, [], mask) for name, mask in UMASKS.items()}
+CASES |= {"-OO": ({}, ["-OO"], None), "umask 077": ({}, [], 0o077)}
 
 
 def results(folder, command, values=None, options=(), umask=None):

@@ -277,8 +277,7 @@ def _interface(fmu: UnpackedFmu) -> type[Instance]:
 
 
 _NOT_STARTED = -1
-_HEADER = struct.Struct("<8sq32s")
-_MAGIC = b"cosimfs1"
+_HEADER = struct.Struct("<q32s")
 
 
 class Snapshot:
@@ -470,17 +469,14 @@ class FmuPlant:
         fmi = self._instance
         if snapshot.plant is not self:
             raise PlantError("this snapshot was taken from another plant")
-        header = _HEADER.pack(_MAGIC, snapshot.k, bytes.fromhex(self.fmu_sha256))
-        return header + fmi.serialise(snapshot.handle)
+        return _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256)) + fmi.serialise(
+            snapshot.handle
+        )
 
     def deserialise(self, data: bytes) -> Snapshot:
         """Return the snapshot that `serialise` wrote, of any plant with the very same FMU file."""
         fmi = self._instance
-        if len(data) < _HEADER.size:
-            raise PlantError("these bytes are not a serialised plant state")
-        magic, k, digest = _HEADER.unpack_from(data)
-        if magic != _MAGIC or k < 0:
-            raise PlantError("these bytes are not a serialised plant state")
+        k, digest = _HEADER.unpack_from(data)
         if digest.hex() != self.fmu_sha256:
             raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")
         if not self._started:

@@ -139,7 +139,7 @@ def evaluate(
         runner = Runner(runs, Path(folder or own), (Path.cwd(),), lambda *at: tell(*at[:2], ""))
         for line in runner.remarks:
             tell(0, "", line)
-        runner.go(jobs, scheduler)
+        runner.run(jobs, scheduler)
         for failure in runner.failures.values():
             raise failure.error()
         stores = dict(zip(named, runner.stores.values(), strict=True))

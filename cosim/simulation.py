@@ -81,12 +81,12 @@ def simulate(
         loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
     with told(progress, plant.scenario.name, steps) as tell:
         if loop is not None:
-            run.go_compiled(loop, tell)
+            run.compiled(loop, tell)
         elif recorder is None:
-            run.go(None, tell)
+            run.interpreted(None, tell)
         else:
             with closing(recorder):
-                run.go(recorder.record, tell)
+                run.interpreted(recorder.record, tell)
     return run.trajectory()
 
 
@@ -105,7 +105,7 @@ class _Run:
         self._predicted_actions: Array | None = None
         self._final_state: Array | None = None
 
-    def go(
+    def interpreted(
         self, record: Callable[[SampleBlock], None] | None, progress: Callable[[int], None]
     ) -> None:
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
@@ -149,7 +149,7 @@ class _Run:
                 progress(k + 1)
         self._final_state = s
 
-    def go_compiled(self, loop: CompiledLoop, progress: Callable[[int], None]) -> None:
+    def compiled(self, loop: CompiledLoop, progress: Callable[[int], None]) -> None:
         """Run with the controller's loop, to the same columns."""
         scenario, plant, columns = self._scenario, self._plant, self._columns
         s = plant.reset(spawn_seeds(self._seed)[0])

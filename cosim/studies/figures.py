@@ -250,7 +250,7 @@ def operation_figure(
 def keep(plan: Plan, out: Path) -> None:
     """Copy the trajectories, logs and θ that the study keeps into folders of their own."""
     for run in plan.runs:
-        files = {table.file: _trajectory(out, table, run) for table in run.traces}
+        files = {table.file: _trajectory(out, table, run) for table in run.trajectories}
         if _is_logged(plan, run):
             files[LOG] = out / LOGS / f"{_stem(run)}.csv"
             files[PARAMETERS] = out / KEPT / f"{_stem(run)}.toml"
@@ -283,7 +283,9 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
     """Names and figures of the tables `[[trajectory]]`, then of the logs."""
     for name, scenario in plan.definition.scenarios.items():
         for table in plan.definition.table.trajectory:
-            runs = [run for run in plan.runs if run.key.scenario == name and table in run.traces]
+            runs = [
+                run for run in plan.runs if run.key.scenario == name and table in run.trajectories
+            ]
             runs = [run for run in runs if _trajectory(out, table, run).is_file()]
             found = {
                 case: replace(read_csv(_trajectory(out, table, run), scenario), controller=case)

@@ -25,7 +25,7 @@ from cosim.studies.store import (
     Noise,
     Run,
     RunKey,
-    Training,
+    TrainingTask,
     check_folders,
     greedy_file,
 )
@@ -248,7 +248,7 @@ class Study:
             raise StudyError(f"{field}: has no number for '{scenario}', and no '{DEFAULT}'")
         return number
 
-    def training(self, case: Case, scenario: str, seed: int) -> Training:
+    def training(self, case: Case, scenario: str, seed: int) -> TrainingTask:
         """The training of a case on a scenario with one seed; raises ConfigurationError."""
         assert case.algorithm is not None
         curves, samples = self.held_out(scenario), case.samples
@@ -275,7 +275,7 @@ class Study:
             **case.training,
         }
         described, settings = self.scenarios[scenario], dict(case.settings)
-        return Training(case.algorithm, described, samples, settings, options)
+        return TrainingTask(case.algorithm, described, samples, settings, options)
 
 
 @dataclass(frozen=True)
@@ -328,13 +328,13 @@ def plan(study: Study) -> Plan:
             noise[GREEDY] = study.held_out(name)
         at_mark = study.held_out(name)._replace(burn_in=own.burn_in)
         noise |= {greedy_file(mark): at_mark._replace(mark=mark) for mark in marks}
-        traces = _traces(study, case, name, seed)
-        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in traces}
+        kept = _trajectories(study, case, name, seed)
+        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in kept}
         if training is None and case.name == study.optima.get(name) and (ends := study.marks(name)):
             seeds = {seed for case in _on(study, name) for seed in case.training_seeds}
             noise[ONLINE] = Noise(tuple(sorted(seeds)), ends[-1], block=gcd(*ends))
         key = RunKey(name, case.name, seed)
-        found = Run(key, case, scenario, case.controller, training, facts, noise, traces, marks)
+        found = Run(key, case, scenario, case.controller, training, facts, noise, kept, marks)
         runs.append(found)
     _check_names(study)
     check_folders(runs)
@@ -356,7 +356,7 @@ def _on(study: Study, scenario: str) -> list[Case]:
     return [case for case in study.cases if scenario in case.scenarios]
 
 
-def _traces(
+def _trajectories(
     study: Study, case: Case, scenario: str, seed: int | None
 ) -> tuple[TrajectoryTable, ...]:
     """Trajectories that include a run; of trainings, only the first seed's."""

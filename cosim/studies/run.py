@@ -97,7 +97,7 @@ class Failure:
     """A failed item: message, traceback, and the class of our own errors."""
 
     message: str
-    trace: str
+    traceback: str
     kind: type[Exception] | None = None
 
     def error(self) -> Exception:
@@ -197,7 +197,7 @@ class Runner:
         self.remarks = list(dict.fromkeys(x for s in self.stores.values() for x in s.remarks))
         """What was found changed or damaged, and is done anew."""
 
-    def go(self, jobs: int, scheduler: str | None) -> None:
+    def run(self, jobs: int, scheduler: str | None) -> None:
         """Do all that is not done: trainings and controllers first, then the learnt policies.
 
         Raises EvaluationError where no worker can work. Every run that can be done is done.
@@ -260,7 +260,7 @@ class Runner:
         if isinstance(outcome, Failure):
             if name not in self.failures:
                 self.failures[name] = outcome
-                write_atomically(store.folder / FAILURE, outcome.trace)
+                write_atomically(store.folder / FAILURE, outcome.traceback)
                 self._tell(f"failed: {name}: {outcome.message}")
             return
         self._done[name] += item.noise.samples
@@ -416,7 +416,7 @@ def study(
         runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
         for line in runner.remarks:
             report(0, "", line)
-        runner.go(jobs, scheduler)
+        runner.run(jobs, scheduler)
     stores = runner.stores.values()
     results = StudyResults.written(planned, folder, stores, draw=figures)
     if runner.failures:

@@ -86,7 +86,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingTask:
     """Arguments of `learning`'s `prepare`: equal ones give equal θ on any worker."""
 
     algorithm: str
@@ -177,19 +177,19 @@ class Run:
     """One run: a controller, or a training and the θ that comes of it.
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `noise` is what it is measured on, by the file that keeps what is found; `traces` are
-    the trajectories that it takes part in. `marks` are the samples of operation at which θ, or the
-    optimum, is judged.
+    training. `noise` is what it is measured on, by the file that keeps what is found;
+    `trajectories` are those that it takes part in. `marks` are the samples of operation at which
+    θ, or the optimum, is judged.
     """
 
     key: RunKey
     case: Case
     scenario: Scenario
     controller: Any
-    training: Training | None
+    training: TrainingTask | None
     facts: Mapping[str, Any]
     noise: Mapping[str, Noise]
-    traces: tuple[TrajectoryTable, ...] = ()
+    trajectories: tuple[TrajectoryTable, ...] = ()
     marks: tuple[int, ...] = ()
 
     @property
@@ -279,6 +279,8 @@ class RunStore:
         self.about = self._found()
         if self.about.get("facts") != self._facts:
             self._begin()
+        for file in run.noise:  # a damaged one is named before the work
+            self.missing(file)
 
     def _found(self) -> dict[str, Any]:
         """run.json if it is intact and a finished training's files are there, else {}."""

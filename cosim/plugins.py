@@ -144,10 +144,6 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
     try:
         with _importing(target.partition(":")[0]):
             controller = factory(scenario)
-    except TypeError as error:
-        raise ControllerLookupError(
-            f"controller '{name}' is not a factory of one scenario: {blamed(error)}"
-        ) from error
     except (Exception, SystemExit) as error:
         packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
         if target == name and not packages & set(OURS):  # the words of ours say enough

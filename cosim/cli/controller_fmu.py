@@ -49,30 +49,24 @@ def sampled_controller(
     origin = f"{scenario.hash} {hessian} {controller.parameters.hash}"
     problem, parameters = controller.problem, controller.parameters
     exported, blocks = core(problem, parameters, hessian), parameters.blocks
-    states = [(name, units.get(name, "")) for name in scenario.plant.states]
-    actions = [(name, units.get(name, "")) for name in scenario.plant.actions]
-    predicted = [(states, k) for k in range(problem.horizon + 1)]
-    predicted += [(actions, k) for k in range(problem.horizon)]
-    bounds = zip(problem.action_lower.tolist(), problem.action_upper.tolist(), strict=True)
-    codes = ", ".join(f"{code} {text}" for code, text in enumerate(STATUSES))
-    signals = [
-        Variable(name, Kind.INPUT, unit=unit, start=start, description="measured state")
-        for (name, unit), start in zip(states, problem.reference_state.tolist(), strict=True)
-    ]
+    states, actions = scenario.plant.states, scenario.plant.actions
+    points = (*problem.reference_state.tolist(), *problem.reference_action.tolist())
+    start = dict(zip((*states, *actions), points, strict=True))
+
+    def signal(kind: Kind, name: str, about: str, of: str, **more: Any) -> Variable:
+        return Variable(name, kind, unit=units.get(of, ""), description=about, **more)
+
+    signals = [signal(Kind.INPUT, x, "measured state", x, start=start[x]) for x in states]
     about = "whether the actions are those of manual_…, as of the next sample"
     signals.append(
         Variable("manual", Kind.INPUT, Type.BOOLEAN, start=0.0, min=0.0, max=1.0, description=about)
     )
     about = "action in manual; acts within the bounds of the action"
-    signals += [
-        Variable(f"manual_{name}", Kind.INPUT, unit=unit, start=start, description=about)
-        for (name, unit), start in zip(actions, problem.reference_action.tolist(), strict=True)
-    ]
-    about = "action, within its bounds"
-    signals += [
-        Variable(name, Kind.OUTPUT, unit=unit, min=low, max=high, description=about)
-        for (name, unit), (low, high) in zip(actions, bounds, strict=True)
-    ]
+    signals += [signal(Kind.INPUT, f"manual_{u}", about, u, start=start[u]) for u in actions]
+    for u in actions:
+        low, high = scenario.limits[u]
+        signals.append(signal(Kind.OUTPUT, u, "action, within its bounds", u, min=low, max=high))
+    codes = ", ".join(f"{code} {text}" for code, text in enumerate(STATUSES))
     reports = {
         "value": "value V(s) of the state, in manual Q(s, a)",
         "qp_status": f"of the present sample: {codes}",
@@ -81,12 +75,12 @@ def sampled_controller(
         "failures": "samples without a solution so far; they hold the last or manual action",
     }
     signals += [Variable(name, Kind.OUTPUT, description=text) for name, text in reports.items()]
-    for quantities, k in predicted:
-        for name, unit in quantities:
-            about = f"predicted {name}, {k} samples ahead"
-            signals.append(
-                Variable(f"predicted.{name}[{k}]", Kind.OUTPUT, unit=unit, description=about)
-            )
+    for names, stages in ((states, problem.horizon + 1), (actions, problem.horizon)):
+        signals += [
+            signal(Kind.OUTPUT, f"predicted.{x}[{k}]", f"predicted {x}, {k} samples ahead", x)
+            for k in range(stages)
+            for x in names
+        ]
     meanings = [block.meaning for block in blocks for _ in range(block.size)]
     signals += [
         Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
@@ -104,7 +98,7 @@ def sampled_controller(
         sampling_time=scenario.sampling_time,
         signals=tuple(signals),
         sources=exported.sources,
-        terminal=tuple(name for name, _ in (*states, *actions)),
+        terminal=(*states, *actions),
     )
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -44,8 +43,8 @@ def optimum(
 
         task = cli.load_scenario(scenario)
         if change_of(task) is not None:
-            with _progress(out_) as show:
-                _show_quasi_static(QuasiStaticPolicy.from_scenario(task, progress=show), task, out_)
+            policy = QuasiStaticPolicy.from_scenario(task, progress=_told(out_))
+            _show_quasi_static(policy, task, out_)
             return
         document = _solve(task, refine, recompute, out_)
         out_.json(document)
@@ -80,14 +79,11 @@ def _solve(task: Scenario, refine: bool, recompute: bool, out_: cli.Output) -> d
     plant, settings = PlantProblem.from_scenario(task), Settings()
     key = store.optimum_key(plant, settings)
     path = None if refine or recompute else store.stored_file(key)
-    with _progress(out_) as show:
-        if path is not None:
-            found = store.read_optimum(path, key)
-        else:
-            found = solve(plant, settings, progress=show)
-        if refine:
-            found = certify(plant, settings, found, progress=show)
-        path = path or store.keep(key, found)
+    show = _told(out_)
+    found = store.read_optimum(path, key) if path else solve(plant, settings, progress=show)
+    if refine:
+        found = certify(plant, settings, found, progress=show)
+    path = path or store.keep(key, found)
     certificate = found.certificate
     why_not = objection(certificate) if certificate else "no certificate; make one with --refine"
     kind = "reference" if why_not else "optimum"
@@ -113,19 +109,15 @@ def _solve(task: Scenario, refine: bool, recompute: bool, out_: cli.Output) -> d
     }
 
 
-@contextmanager
-def _progress(out_: cli.Output) -> Iterator[Callable[[Progress], None]]:
-    """Show the round and the closing bounds on standard error."""
-    if not out_.live:
-        yield lambda _: None
-        return
-    from rich.console import Console
+def _told(out_: cli.Output) -> Callable[[Progress], None]:
+    """Tell of each round on a terminal: the grid and the closing bounds."""
 
-    with Console(stderr=True).status("dynamic programming") as status:
-        yield lambda p: status.update(
-            f"grid {p.level} ({p.states} states), round {p.round}: "
-            f"{p.lower:.1f} ≤ J* ≤ {p.upper:.1f}"
-        )
+    def tell(p: Progress) -> None:
+        if out_.live:
+            where = f"grid {p.level} ({p.states} states), round {p.round}"
+            out_.note(f"{where}: {p.lower:.1f} ≤ J* ≤ {p.upper:.1f}")
+
+    return tell
 
 
 def tuning(

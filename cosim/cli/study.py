@@ -37,7 +37,6 @@ def run(
     out: cli.OutOption = Path("cosim-study"),
     jobs: cli.JobsOption = None,
     scheduler: cli.SchedulerOption = None,
-    columns: ColumnsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Train and evaluate every case on every scenario with every training seed.
@@ -48,7 +47,7 @@ def run(
     """
     with cli.output(json) as out_:
         found = _execute(file, out, out_, jobs=jobs, scheduler=scheduler)
-        _show(found, out_, columns)
+        _show(found, out_)
         out_.note(f"tables are in {out.resolve()}; cosim study report {out} draws them")
         out_.json(_summary(found), found.folder)
 

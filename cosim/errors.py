@@ -5,6 +5,10 @@ class CosimError(Exception):
     """Base of every error that `cosim` raises on bad input or a failed co-simulation."""
 
 
+class ArgumentError(CosimError, TypeError):
+    """A function was called with a keyword that it does not have."""
+
+
 class ScenarioError(CosimError):
     """A scenario document that cannot be found, read or validated."""
 

@@ -44,7 +44,7 @@ from cosim.studies.store import (
     check_folders,
     to_csv,
 )
-from cosim.validation import instead
+from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -62,6 +62,7 @@ COLUMNS = [
 ]  # fmt: skip
 
 
+@known_keywords
 def evaluate(
     scenario: Scenario | str | Path,
     controllers: Mapping[str, Factory | str] | Sequence[str],

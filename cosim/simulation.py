@@ -30,6 +30,7 @@ from cosim.trajectory import (
     SignalColumns,
     Trajectory,
 )
+from cosim.validation import known_keywords
 
 BLOCK = 500
 
@@ -47,6 +48,7 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     return int(plant.generate_state(1, np.uint64)[0]), np.random.default_rng(exploration)
 
 
+@known_keywords
 def simulate(
     plant: Plant,
     controller: Controller,

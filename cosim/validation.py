@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
-from typing import Any, TypeVar, get_args
+from functools import wraps
+from inspect import signature
+from typing import Any, ParamSpec, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from cosim.errors import ArgumentError
+
 Model = TypeVar("Model", bound=BaseModel)
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # What pydantic calls otherwise than TOML does.
 _EXPECTED = {"tuple_type": "must be a list"} | dict.fromkeys(
@@ -34,6 +40,19 @@ def instead(word: str, known: Iterable[str]) -> str:
     """What there is in place of an unknown word, the closest first."""
     known = list(known)
     return f"{suggestion(word, known)}; there are {', '.join(known)}"
+
+
+def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a function refuse an unknown keyword by ArgumentError, with the closest known one."""
+    known = signature(function).parameters
+
+    @wraps(function)
+    def checked(*args: P.args, **keywords: P.kwargs) -> R:
+        for name in keywords.keys() - known.keys():
+            raise ArgumentError(f"no such argument: '{name}'{suggestion(name, known)}")
+        return function(*args, **keywords)
+
+    return checked
 
 
 def describe(error: ValidationError, model: type[BaseModel]) -> str:

@@ -31,7 +31,7 @@ from cosim.result import Result, csv_text
 from cosim.scenario import Scenario
 from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
-from cosim.validation import suggestion
+from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
 from learning.checkpoint import Checkpoint
@@ -515,6 +515,7 @@ class Tracker(Protocol):
         """Take the result, finished or diverged."""
 
 
+@known_keywords
 def train(
     algorithm: str,
     scenario: Scenario | str | Path = "paper",

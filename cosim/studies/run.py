@@ -44,6 +44,7 @@ from cosim.studies.store import (
     RunStore,
     Trained,
 )
+from cosim.validation import known_keywords
 from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 ANSWER_SECONDS = 10.0
@@ -382,6 +383,7 @@ async def _identity(dask: Any, address: str) -> dict[str, Any]:
         return dict(await scheduler.identity())
 
 
+@known_keywords
 def study(
     source: Study | str | Path | Mapping[str, Any],
     out: str | Path,

@@ -95,7 +95,7 @@ class RerunRecorder:
         stream.properties(properties)
         stream.about(_about(scenario, properties))
         good = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
-        stream.static(_STATUS, good)
+        stream.rerun.log(_STATUS, good, static=True)
 
     def record(self, block: SampleBlock) -> None:
         """Append K samples: one column of K rows for each signal."""
@@ -118,7 +118,7 @@ class RerunRecorder:
             stream.send(members, rows, np.column_stack(columns))
         with np.errstate(divide="ignore", invalid="ignore"):
             residual = np.log10(block["residual"])
-        stream.columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
+        stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
         self._residual.see(residual)
         self._changes_of_status(stream, samples, block)
         self._predictions(stream, rows, block)
@@ -139,7 +139,7 @@ class RerunRecorder:
         self._status = block.status[-1]
         if rows:
             states = rr.StateChange.columns(state=[drawable(block.status[i]) for i in rows])
-            stream.columns(_STATUS, times(samples[rows], block["time"][rows]), states)
+            stream.rerun.send_columns(_STATUS, times(samples[rows], block["time"][rows]), states)
 
     def _predictions(self, stream: Stream, rows: list[rr.TimeColumn], block: SampleBlock) -> None:
         for group, values in (
@@ -378,7 +378,7 @@ class Channel:
 
 
 class Stream:
-    """An open recording: `static` and `send`, then `close`; an exception in its block discards it.
+    """An open recording: `send`, then `close`; an exception in its block discards it.
 
     The layout stands first in the file, as Rerun wants it, and `close` can send a better one. The
     file is written beside `path` under a hidden name and renamed by `close`, so that `path` never
@@ -399,10 +399,10 @@ class Stream:
             ) from None
         # Without it a column of the wrong shape is dropped with no more than a warning.
         rr.set_strict_mode(True)
-        self._stream = rr.RecordingStream("rti-cosim")
-        self._stream.send_recording_name(drawable(name))
+        self.rerun = rr.RecordingStream("rti-cosim")
+        self.rerun.send_recording_name(drawable(name))
         self._declared: set[str] = set()
-        self._bounded(partial(self._stream.save, self._partial, default_blueprint=layout))
+        self._bounded(partial(self.rerun.save, self._partial, default_blueprint=layout))
 
     def __enter__(self) -> Self:
         return self
@@ -418,22 +418,12 @@ class Stream:
         described = rr.AnyValues()
         for key, value in values.items():
             described.with_component_from_data(key, drawable(str(value)))
-        self._stream.send_property("run", described)
+        self.rerun.send_property("run", described)
 
     def about(self, markdown: str) -> None:
         """Give the text of the view `about`."""
         page = rr.TextDocument(drawable(markdown), media_type=rr.MediaType.MARKDOWN)
-        self.static("about", page)
-
-    def static(self, entity: str, *archetypes: rr.AsComponents) -> None:
-        """Log what does not change over time."""
-        self._stream.log(entity, *archetypes, static=True)
-
-    def columns(
-        self, entity: str, times: list[rr.TimeColumn], columns: rr.ComponentColumnList
-    ) -> None:
-        """Send a block of rows."""
-        self._stream.send_columns(entity, times, columns)
+        self.rerun.log("about", page, static=True)
 
     def send(self, channels: Sequence[Channel], times: list[rr.TimeColumn], values: Array) -> None:
         """Send K rows of the signals of one entity: (K,), (K, m), or (K, labels)."""
@@ -442,8 +432,8 @@ class Stream:
             self._declared.add(entity)
             names, units = [c.name for c in channels], [c.unit for c in channels]
             mark = rr.DynamicArchetype(SIGNAL, components={"name": names, "unit": units})
-            self.static(entity, mark, _style(channels))
-        self.columns(entity, times, rr.Scalars.columns(scalars=np.array(values)))
+            self.rerun.log(entity, mark, _style(channels), static=True)
+        self.rerun.send_columns(entity, times, rr.Scalars.columns(scalars=np.array(values)))
 
     def bounds(self, channels: Sequence[Channel], ends: list[rr.TimeColumn]) -> None:
         """Draw the finite bounds of signals between two times."""
@@ -452,19 +442,21 @@ class Stream:
                 if isfinite(bound):
                     entity = f"bounds/{channel.entity}/{side}"
                     line = Channel(entity, f"{side} bound", color=BOUND)
-                    self.static(entity, _style([line]))
-                    self.columns(entity, ends, rr.Scalars.columns(scalars=[bound, bound]))
+                    self.rerun.log(entity, _style([line]), static=True)
+                    self.rerun.send_columns(
+                        entity, ends, rr.Scalars.columns(scalars=[bound, bound])
+                    )
 
     def close(self, layout: rrb.Blueprint | None = None) -> None:
         """Finish the file, with a layout in place of the first, and give it its name.
 
         Raises RecordingError where not all of it could be written.
         """
-        if self._stream in _ABANDONED:
+        if self.rerun in _ABANDONED:
             return
         if layout is not None:
-            self._stream.send_blueprint(layout)
-        self._bounded(self._stream.disconnect)
+            self.rerun.send_blueprint(layout)
+        self._bounded(self.rerun.disconnect)
         with self._partial.open("rb") as written:
             written.seek(-min(len(_FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
             if _FOOTER not in written.read():
@@ -473,8 +465,8 @@ class Stream:
 
     def discard(self) -> None:
         """End the recording without a file."""
-        if self._stream not in _ABANDONED:
-            self._bounded(self._stream.disconnect)
+        if self.rerun not in _ABANDONED:
+            self._bounded(self.rerun.disconnect)
             self._partial.unlink(missing_ok=True)
 
     def _bounded(self, call: Callable[[], None]) -> None:
@@ -484,7 +476,7 @@ class Stream:
         writing.join(_WRITE_SECONDS)
         if writing.is_alive():
             # To drop the stream, or to let Rerun shut down, would wait for ever too.
-            _ABANDONED.append(self._stream)
+            _ABANDONED.append(self.rerun)
             atexit.unregister(rr.rerun_shutdown)
             self._give_up("its writer does not answer")
 

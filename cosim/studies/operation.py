@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.stats import ttest_1samp
 
 from controllers import compile_functions
 from controllers.optimum import Fouling, QuasiStaticPolicy, change_of
@@ -20,12 +21,17 @@ from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import paired_difference, shown
 from cosim.studies.store import KEYS, LOG, ONLINE, RunStore, greedy_file, read_table
 from learning.algorithm import load_algorithm
+from learning.baselines import Held
 from learning.errors import DivergenceError
 from learning.training import LogRow, TrainingRun, begin
 
 WINDOW = 100
 """Samples in a row of which the dearest are reported."""
-LIFE = ["J", "violating", "dearest", "first_change", "updates", "model_samples"]
+SHIFT, PARTS, LEVEL = 480, 8, 0.05
+"""Samples in a row that are compared with those of the start, in how many parts, at which level."""
+LIFE = [
+    "J", "violating", "dearest", "first_change", "updates", "model_samples", "dearer", "excess",
+]  # fmt: skip
 COLUMNS = [*KEYS, "samples", *LIFE]
 GREEDY_COLUMNS = [*KEYS, "samples", "seed", "J"]
 
@@ -66,14 +72,18 @@ def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dic
     Also the status, the processor time in s by mark, and the plant samples taken. `J` is the mean
     cost of all samples so far; since the first change of θ (since the start, where θ rests)
     `violating` is the share of violating samples and `dearest` the largest mean cost of `WINDOW`
-    samples in a row. A run that diverges keeps its θ, and costs without bound from there on.
+    samples in a row; `dearer` and `excess` compare with θ as it starts (`dearer_than`). A run that
+    diverges keeps its θ, and costs without bound from there on.
     """
     cost, violating = np.full(run.samples, np.inf), np.ones(run.samples, dtype=bool)
     rows: list[LogRow] = []
     clock: dict[int, float] = {}
-    status, first, updates, start = "finished", 0, 0, process_time()
+    status, first, updates = "finished", 0, 0
     with FmuPlant(run.scenario) as plant:
-        loop = begin(run, load_algorithm(run.algorithm), plant)
+        held = begin(run, Held, plant)
+        compile_functions(held.controller, run.samples)
+        before = np.array([held.advance()[0] for _ in range(run.samples)])
+        loop, start = begin(run, load_algorithm(run.algorithm), plant), process_time()
         compile_functions(loop.controller, run.samples)
         theta, penalty = loop.controller.theta.copy(), run.scenario.state_penalty
         for k in range(run.samples):
@@ -90,6 +100,7 @@ def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dic
                 continue
             clock[k + 1] = process_time() - start
             since = violating[first : k + 1]
+            dearer, excess = dearer_than(before[first : k + 1], cost[first : k + 1])
             figures = {
                 "samples": k + 1,
                 "J": float(cost[: k + 1].mean()),
@@ -98,6 +109,8 @@ def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dic
                 "first_change": first or np.nan,
                 "updates": updates,
                 "model_samples": int(getattr(loop.algorithm, "model_samples", 0)),
+                "dearer": dearer if first else np.nan,
+                "excess": excess if first else np.nan,
             }
             rows.append(LogRow(figures, loop.parameters))
         return rows, status, clock, loop.counts.number
@@ -110,6 +123,23 @@ def dearest(cost: Array) -> float:
     width = min(WINDOW, len(cost))
     total = np.concatenate([[0.0], np.cumsum(cost)])
     return float((total[width:] - total[:-width]).max() / width)
+
+
+def dearer_than(before: Array, cost: Array) -> tuple[float, float]:
+    """Number of shifts that are dearer than `before`, and the largest excess of a shift's mean.
+
+    Costs (K,) of the same noise, in shifts of `SHIFT` samples; NaN where there is none. A shift is
+    dearer where the excess of its `PARTS` is above zero by Student's t; the chance that any is
+    called so by noise alone is `LEVEL` (Bonferroni).
+    """
+    shifts = len(cost) // SHIFT
+    if not shifts:
+        return np.nan, np.nan
+    with np.errstate(invalid="ignore", divide="ignore"):
+        parts = (cost - before)[: shifts * SHIFT].reshape(shifts, PARTS, -1).mean(axis=2)
+        p = ttest_1samp(parts, 0.0, axis=1, alternative="greater").pvalue
+    mean = parts.mean(axis=1)
+    return float(((p < LEVEL / shifts) | (mean == np.inf)).sum()), float(mean.max())
 
 
 def theta_at(log: str, mark: int) -> tuple[float, ...]:
@@ -152,7 +182,8 @@ class Judged(NamedTuple):
     """Operation on one scenario: by case and samples the greedy costs, and each run's life.
 
     `greedy[case][samples]` (R, S), `optimum[samples]` (S,); `lives` has a row for each run and
-    mark with `regret` (greedy), `life_regret`, and `dearest` as a regret.
+    mark with `regret` (greedy), `life_regret`, `dearest` as a regret, and `excess` as a share of
+    the optimum's cost.
     """
 
     greedy: dict[str, dict[int, Array]]
@@ -183,6 +214,7 @@ def judged(lives: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> Judged:
     found["regret"] = (found.greedy_J - level) / level.abs()
     found["life_regret"] = (found.J - found.optimal_J) / found.optimal_J.abs()
     found["dearest"] = (found.dearest - found.optimal_J) / found.optimal_J.abs()
+    found["excess"] = found.excess / found.optimal_J.abs()
     return Judged(costs, best, found)
 
 
@@ -222,13 +254,15 @@ def tables(
     last = lives[lives.samples == marks[-1]].groupby("case", sort=False)
     header = (
         "case", "runs", "first change, samples", "violating % since", "dearest 100 samples %",
-        "updates", "model samples", "processor s",
+        "480 samples dearer than at first (most %)", "updates", "model samples", "processor s",
     )  # fmt: skip
     middle = last.median(numeric_only=True)
     rows = [
         [
             case, str(last.size()[case]), _whole(row.first_change),
-            f"{100 * row.violating:.2f}", f"{100 * row.dearest:.1f}", _whole(row.updates),
+            f"{100 * row.violating:.2f}", f"{100 * row.dearest:.1f}",
+            f"{_whole(row.dearer)} ({100 * row.excess:.2f})" if row.dearer >= 0 else "",
+            _whole(row.updates),
             _whole(row.model_samples), _whole(seconds.get(str(case), np.nan)),
         ]
         for case, row in middle.iterrows()

@@ -1,0 +1,20 @@
+import numpy as np
+
+from cosim.studies.operation import SHIFT, dearer_than
+
+
+def test_noise_alone_makes_no_shift_dearer_and_a_dearer_one_is_found(rng):
+    before = rng.gamma(2.0, 100.0, (200, 21 * SHIFT))
+    cost = before + rng.normal(0.0, 50.0, before.shape)
+    called = [dearer_than(*pair)[0] > 0 for pair in zip(before, cost, strict=True)]
+    assert np.mean(called) < 0.1  # 5 % of lives
+    cost[0, 480:960] += 25.0
+    number, excess = dearer_than(before[0], cost[0])
+    assert number == 1 and abs(excess - 25.0) < 10.0
+
+
+def test_a_run_that_diverged_is_dearer_in_each_shift_since():
+    cost = np.ones(4 * SHIFT)
+    cost[SHIFT:] = np.inf
+    assert dearer_than(np.ones(4 * SHIFT), cost) == (3.0, np.inf)
+    assert np.isnan(dearer_than(cost[:10], cost[:10])).all()

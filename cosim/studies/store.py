@@ -52,7 +52,7 @@ CURVE = ["samples", "J", "greedy_J", "td_error"]
 TYPES: dict[str, Any] = {"scenario": str, "case": str, "training_seed": "Int64", "status": str}
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 PAUSE = 20
-"""Of the time that a table took to write, what passes at least until it is written again."""
+"""Of the time that tables took to write, what passes at least until they are written again."""
 Figures = dict[str, Any]
 Measured = dict[int, tuple[Figures, Figures]]
 """Indicators, or the mean cost of each block as `J`, and what the clock said, by noise seed."""
@@ -272,7 +272,7 @@ class RunStore:
         self._facts = json.loads(json.dumps(run.facts))
         self._known: dict[str, dict[int, Figures]] = {}
         self._unwritten: set[str] = set()
-        self._next: dict[str, float] = {}
+        self._quiet_until = 0.0
         if not self.folder.resolve().is_relative_to(out.resolve()):
             raise StudyError(f"'{self.folder}' leads out of '{out}'; choose another --out")
         (self.folder / FAILURE).unlink(missing_ok=True)
@@ -395,17 +395,18 @@ class RunStore:
         for name, part in parts:
             self.indicators(name).update({seed: pair[part] for seed, pair in found.items()})
             self._unwritten.add(name)
-            if time.monotonic() >= self._next.get(name, 0.0):
-                self._write(name)
+        if time.monotonic() >= self._quiet_until:
+            self.flush()
 
     def flush(self) -> None:
         """Write the tables that wait for it."""
-        for name in list(self._unwritten):
-            self._write(name)
-
-    def _write(self, file: str) -> None:
         # The rows of many seeds are written again and again: the pause keeps that a small share.
         begin = time.monotonic()
+        while self._unwritten:
+            self._write(self._unwritten.pop())
+        self._quiet_until = time.monotonic() + PAUSE * (time.monotonic() - begin)
+
+    def _write(self, file: str) -> None:
         rows = pd.DataFrame.from_dict(self._known[file], "index").sort_index()
         noise = self.run.noise[EVALUATION if file == TIMING else file]
         if noise.block:
@@ -416,8 +417,6 @@ class RunStore:
         for place, value in enumerate((rows.index, noise.steps, noise.block or noise.burn_in)):
             rows.insert(place, key[place], value)
         write_atomically(self.folder / file, to_csv(rows))
-        self._next[file] = time.monotonic() + PAUSE * (time.monotonic() - begin)
-        self._unwritten.discard(file)
 
     @property
     def finished(self) -> bool:

@@ -324,14 +324,15 @@ def plan(study: Study) -> Plan:
         judged = training is not None or case.name == study.optima.get(name)
         marks = study.marks(name) if judged else ()
         noise = {EVALUATION: (own := study.noise(name))}
-        if training is None and any(case.algorithm for case in _on(study, name)):
+        cases = [case for case in study.cases if name in case.scenarios]
+        if training is None and any(case.algorithm for case in cases):
             noise[GREEDY] = study.held_out(name)
         at_mark = study.held_out(name)._replace(burn_in=own.burn_in)
         noise |= {greedy_file(mark): at_mark._replace(mark=mark) for mark in marks}
         kept = _trajectories(study, case, name, seed)
         noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in kept}
         if training is None and case.name == study.optima.get(name) and (ends := study.marks(name)):
-            seeds = {seed for case in _on(study, name) for seed in case.training_seeds}
+            seeds = {seed for case in cases for seed in case.training_seeds}
             noise[ONLINE] = Noise(tuple(sorted(seeds)), ends[-1], block=gcd(*ends))
         key = RunKey(name, case.name, seed)
         found = Run(key, case, scenario, case.controller, training, facts, noise, kept, marks)
@@ -350,10 +351,6 @@ def _order(study: Study) -> Iterator[tuple[Case, str, int | None]]:
             for case in study.all_cases:
                 if seed in (case.training_seeds or (None,)) and scenario in case.scenarios:
                     yield case, scenario, seed
-
-
-def _on(study: Study, scenario: str) -> list[Case]:
-    return [case for case in study.cases if scenario in case.scenarios]
 
 
 def _trajectories(

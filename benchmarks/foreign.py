@@ -13,6 +13,7 @@ from pathlib import Path
 from cosim import FmuPlant, Scenario
 from cosim.errors import CosimError
 from cosim.plant.fmi import unpack
+from cosim.plant.fmu_plant import refusals
 from cosim.result import markdown_table
 
 SAMPLES, STEP = 20, 0.1
@@ -30,8 +31,11 @@ def names(description, causality):
 
 
 def scenario(fmu, description):
-    outputs, inputs = names(description, "output"), names(description, "input")
+    outputs = names(description, "output") or names(description, "local")
+    inputs = names(description, "input")
     tunable = [v.name for v in description.modelVariables if v.variability == "tunable"]
+    internal = description.coSimulation.fixedInternalStepSize
+    preferred = getattr(description.defaultExperiment, "stepSize", None)
     action = (inputs + tunable)[0]
     known = {variable.name: variable for variable in description.modelVariables}
     start = float(str(known[action.partition("[")[0]].start or 0).split()[0])
@@ -39,7 +43,7 @@ def scenario(fmu, description):
     document = {
         "schema": 1,
         "name": fmu.stem,
-        "sampling_time": float(getattr(description.defaultExperiment, "stepSize", None) or STEP),
+        "sampling_time": float(preferred or internal or STEP),
         "discount": 0.9,
         "plant": {
             "fmu": str(fmu), "states": outputs, "actions": [action], "stage_cost": outputs[0],
@@ -60,7 +64,10 @@ def scenario(fmu, description):
 def verdict(fmu):
     """What came of a plant made of the FMU."""
     try:
-        description = unpack(fmu).description
+        archive = unpack(fmu)
+        for refusal in refusals(archive):
+            return "", f"refused: {refusal}"
+        description = archive.description
         made, action = scenario(fmu, description)
         with FmuPlant(made) as plant:
             plant.reset(0)
@@ -68,8 +75,6 @@ def verdict(fmu):
                 state = plant.step([action]).s
         about = f"FMI {description.fmiVersion}, {description.generationTool or 'no tool named'}"
         return about, f"{SAMPLES} samples; then {', '.join(f'{x:.4g}' for x in state[:4])}"
-    except IndexError:
-        return "", "refused: no input and no tunable parameter, or no output, that is a number"
     except CosimError as error:
         return "", f"refused: {' '.join(str(error).split())}"
 

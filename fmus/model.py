@@ -370,6 +370,8 @@ def _type(version: FmiVersion, variable: Variable, model: Model) -> tuple[str, A
     if variable.kind is Kind.DERIVATIVE:
         state = variable.name.removeprefix("der(").removesuffix(")")
         attributes["derivative"] = _numbering(version, model)(state)
+    if version == 3 and variable.kind in (Kind.STATE, Kind.OUTPUT) and not model.sampled:
+        attributes["intermediateUpdate"] = "true"
     return "Real" if version == 2 else "Float64", attributes
 
 

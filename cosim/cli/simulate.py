@@ -50,14 +50,14 @@ def simulate(
         loaded = cli.load_scenario(scenario)
         folder = cli.open_folder(out)
         out_.announce(loaded.plant.fmu)
-        with FmuPlant(loaded) as plant:
+        recorder = None
+        if record:
+            from cosim.recording import RerunRecorder
+
+            recorder = RerunRecorder(folder / "run.rrd")
+        with FmuPlant(loaded, intermediate=recorder.intermediate if recorder else None) as plant:
             law = build_controller(controller, loaded)
             compile_functions(law, steps)
-            recorder = None
-            if record:
-                from cosim.recording import RerunRecorder
-
-                recorder = RerunRecorder(folder / "run.rrd")
             trajectory = run(plant, law, steps, seed, recorder=recorder, progress=out_.live)
             summary: dict[str, Any] = {
                 "version": version("rti-cosim"),

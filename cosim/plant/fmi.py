@@ -19,6 +19,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
+from xml.etree import ElementTree
 
 import fmpy
 import numpy as np
@@ -211,7 +212,7 @@ def library_path(fmu: UnpackedFmu) -> Path:
             return path
         what = f"made for {' and '.join(made_for)}" if made_for else "not a shared library"
         others.append(f"its '{entry}' is {what}")
-    found = {name.split("/")[1] for name in fmu.entries if name.startswith("binaries/")}
+    found = {name.split("/")[1] for name in fmu.entries if name.startswith("binaries/")} - {""}
     why = "; ".join(others) or f"it has: {', '.join(sorted(found)) or 'none'}"
     raise PlantError(
         f"FMU '{fmu.path}' has no binary for {platform.tuple} ({why}); build one from its sources, "
@@ -239,6 +240,10 @@ class Place(NamedTuple):
     starts: tuple[float, ...] = (0.0,)
 
 
+Intermediate = Callable[[float, NDArray[np.float64]], None]
+"""Is told of the time [s] and the states (n,) at each internal step of an FMU."""
+
+
 class Wiring(NamedTuple):
     """Places of what a plant exchanges with its FMU; `starts` with the value at every reset."""
 
@@ -246,6 +251,7 @@ class Wiring(NamedTuple):
     outputs: Sequence[Place]
     states: Sequence[Place]
     starts: Sequence[tuple[Place, float]]
+    intermediate: Intermediate | None = None
 
 
 def _as(buffer: Any, value: float) -> float:
@@ -294,6 +300,7 @@ class Instance(ABC):
         self.messages: deque[str] = deque(maxlen=8)
         self.fatal = False
         self._interface = fmu.description.coSimulation
+        self._wiring = wiring
         if self._interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
             raise CapabilityError(
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
@@ -605,6 +612,7 @@ class Fmi3Instance(Instance):
         ("EnterInitializationMode", (_NO, _ZERO, _ZERO, _NO, _ZERO)),
         ("ExitInitializationMode", ()),
     )
+    _raised: BaseException | None
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         super().__init__(fmu, wiring, step_size)
@@ -628,8 +636,29 @@ class Fmi3Instance(Instance):
             messages.append(message.decode("utf-8", "replace"))
 
         slave = fmi3.FMU3Slave(**where)
-        slave.instantiate(loggingOn=True, logMessage=log)
+        slave.instantiate(loggingOn=True, logMessage=log, **self._intermediate_update())
         return slave
+
+    def _intermediate_update(self) -> dict[str, Any]:
+        """The arguments that ask for the states at each internal step; none if they are not had."""
+        if self._wiring.intermediate is None or not self._interface.providesIntermediateUpdate:
+            return {}
+        # fmpy does not read the attribute.
+        elements = ElementTree.parse(self.fmu.folder / DESCRIPTION).iter()
+        offered = {e.get("valueReference") for e in elements if e.get("intermediateUpdate")}
+        states = {place.reference for place in self._wiring.states}
+        told = {str(state) for state in states} <= offered
+        update = {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}
+        return update if told else {}
+
+    def _update(self, _: Any, time: float, __: bool, readable: bool, *___: Any) -> None:
+        """Tell of the states; the FMU calls it in a step."""
+        if readable and self._raised is None and self._wiring.intermediate is not None:
+            try:
+                self._get_states()
+                self._wiring.intermediate(time, self.states_view.copy())
+            except BaseException as error:
+                self._raised = error  # ctypes would print and drop it
 
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
         pointers = (ctypes.c_uint * len(references))(*references)
@@ -638,7 +667,10 @@ class Fmi3Instance(Instance):
 
     def advance(self, time: float) -> None:
         """Step as in FMI 2.0; an FMU that ends the step early is an error."""
+        self._raised = None
         super().advance(time)
+        if self._raised is not None:
+            raise self._raised
         if self._terminate.value or self._early.value:
             self.messages.append(f"the FMU ended the step early, at {self._last_time.value} s")
             self.fail("DoStep", DISCARD)

@@ -18,6 +18,7 @@ from cosim.plant.fmi import (
     Fmi2Instance,
     Fmi3Instance,
     Instance,
+    Intermediate,
     Place,
     UnpackedFmu,
     Wiring,
@@ -311,11 +312,17 @@ class FmuPlant:
     the FMU lacks is asked for, not before.
 
     `scenario` is a `Scenario` or what `Scenario.load` takes; `fmu`, a shipped one's name or a path,
-    takes the place of the scenario's.
+    takes the place of the scenario's. `intermediate` is called with time [s] and states (n,) after
+    each internal step of an FMI 3.0 FMU that provides these values, and by no other.
     """
 
     @known_keywords
-    def __init__(self, scenario: Scenario | str | Path, fmu: str | Path | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario | str | Path,
+        fmu: str | Path | None = None,
+        intermediate: Intermediate | None = None,
+    ) -> None:
         self.scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self._fmi: Instance | None = None
         self._handles: list[ctypes.c_void_p] = []
@@ -332,7 +339,7 @@ class FmuPlant:
         self.fmi_version = str(archive.description.fmiVersion)
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
-        wiring = wirer.wiring()
+        wiring = wirer.wiring()._replace(intermediate=intermediate)
         self.units = wirer.units()
         self.state_range = wirer.state_range()
         self.penalty = self.scenario.state_penalty
@@ -345,7 +352,7 @@ class FmuPlant:
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
         self._fmi = interface(archive, wiring, self._h / self._steps)
-        self.drivable = self._fmi.drivable and self._steps == 1  # what `drive` can step
+        self.drivable = self._fmi.drivable and self._steps == 1 and intermediate is None
         self._changes = {k: self._fmi.writer(*change) for k, change in wirer.changes().items()}
         self._advance = self._fmi.advance if self._steps == 1 else self._advance_in_steps
         self._inputs = self._fmi.inputs

@@ -33,6 +33,7 @@ class Recording:
     (`prediction/<name>`) and a block of θ (`increment/<block>`); `samples` (K,) are the numbers of
     their rows and `time` (K,) the plant's time in s (NaN where there is none); `units` and
     `properties` are text; `status` (K,) is the solver's status, empty if it was not recorded.
+    `intermediate` maps a state's name to times [s] and values within the samples, (M, 2).
     """
 
     signals: dict[str, NDArray[np.float64]]
@@ -41,6 +42,7 @@ class Recording:
     units: dict[str, str]
     properties: dict[str, str]
     status: list[str]
+    intermediate: dict[str, NDArray[np.float64]]
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -62,6 +64,7 @@ def read_recording(path: str | Path) -> Recording:
         raise RecordingError(f"{path} holds no signals of rti-cosim")
     signals: dict[str, NDArray[np.float64]] = {}
     units: dict[str, str] = {}
+    intermediate: dict[str, NDArray[np.float64]] = {}
     samples, time = np.empty(0, np.int64), np.empty(0)
     for entity, texts in marks.items():
         names, spelled = texts[f"{SIGNAL}:name"], texts.get(f"{SIGNAL}:unit", [])
@@ -69,6 +72,10 @@ def read_recording(path: str | Path) -> Recording:
             raise RecordingError(f"{path} was recorded by another version of rti-cosim")
         units |= dict(zip(names, spelled, strict=True))
         found, values = _columns(rows[entity], len(names))
+        if entity.startswith("/intermediate/"):
+            moments = np.column_stack([_time(rows[entity]), *values])
+            intermediate[names[0]] = moments[moments[:, 0].argsort(kind="stable")]
+            continue
         signals |= dict(zip(names, values, strict=True))
         if len(found) > len(samples):
             samples, time = found, _time(rows[entity])
@@ -76,7 +83,8 @@ def read_recording(path: str | Path) -> Recording:
     properties = {key: text[0] for key, text in described.items() if ":" not in key and text}
     properties.pop("rerun.controls.RowId", None)
     status = _status(rows.get("/solver/status", []), samples)
-    return Recording(dict(sorted(signals.items())), samples, time, units, properties, status)
+    signals = dict(sorted(signals.items()))
+    return Recording(signals, samples, time, units, properties, status, intermediate)
 
 
 def telling_moment(path: str | Path) -> float | None:

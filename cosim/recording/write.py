@@ -53,7 +53,8 @@ class RerunRecorder:
     """Recorder of `simulate`: a `.rrd` file with layout, signals, predictions and run properties.
 
     Every signal keeps its name and float64 bits; `read_recording` gives them back. Predictions are
-    the signals `prediction/<name>`, N+1 or N numbers a sample.
+    the signals `prediction/<name>`, N+1 or N numbers a sample. A plant that is made with
+    `intermediate=recorder.intermediate` has its states within the samples recorded, too.
 
     Raises RecordingError where the file cannot be written.
     """
@@ -61,6 +62,7 @@ class RerunRecorder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._stream: Stream | None = None
+        self._within: list[tuple[float, Array]] = []
 
     def start(
         self,
@@ -76,6 +78,10 @@ class RerunRecorder:
         recorded = [kind for kind in SIGNALS if kind.group is not None]
         self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
         self._predicted: dict[str, Channel] = {}
+        self._fine = [
+            Channel(f"intermediate/{escaped(c.name)}", c.name, c.unit, color, labels=["within"])
+            for c, color in zip(self._group("states"), cycle(SERIES[2:]), strict=False)
+        ]
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
         self._status: str | None = None
         self._samples = 0
@@ -122,7 +128,12 @@ class RerunRecorder:
         self._residual.see(residual)
         self._changes_of_status(stream, samples, block)
         self._predictions(stream, rows, block)
+        self._intermediate(stream, samples, time)
         self._samples += len(block)
+
+    def intermediate(self, time: float, states: Array) -> None:
+        """Take the states (n,) at a time [s] within a sample."""
+        self._within.append((time, states))
 
     def close(self) -> None:
         """Finish the file with the ranges that the run has filled; no sample, no file."""
@@ -161,6 +172,17 @@ class RerunRecorder:
                 predicted.see(values[:, :, i])
                 stream.send([predicted], rows, values[:, :, i])
 
+    def _intermediate(self, stream: Stream, samples: np.ndarray, time: Array) -> None:
+        if not self._within:
+            return
+        moments = np.array([moment for moment, _ in self._within])
+        values = np.array([states for _, states in self._within]).T
+        self._within.clear()
+        # The end of a sample is its own.
+        rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
+        for channel, column in zip(self._fine, values, strict=True):
+            stream.send([channel.see(column)], rows, column)
+
     def _group(self, *groups: str) -> list[Channel]:
         return [
             c for kind, channels in self._kinds.items() if kind.group in groups for c in channels
@@ -169,7 +191,11 @@ class RerunRecorder:
     def _layout(self) -> rrb.Blueprint:
         """Left: states and actions with bounds; middle: costs, causes, solver; right: the rest."""
         along = axis(seconds=self._seconds)
-        loop = [view(c.title, [c], along) for c in self._group("states", "actions")]
+        fine = {c.name: [c] for c in self._fine if c.window()}
+        loop = [
+            view(c.title, [c, *fine.get(c.name, [])], along)
+            for c in self._group("states", "actions")
+        ]
         causes = [
             *(view(c.title, [c], along) for c in self._group("costs")),
             view("disturbances", self._group("disturbances"), along),

@@ -10,9 +10,25 @@
 #include "simulation.h"
 #include "snapshot.h"
 
+/* An instance with what FMI 3.0 alone gives it: whom to tell of intermediate values. */
+typedef struct {
+    Instance shared; /* first: the rest of the sources knows this part alone */
+    fmi3IntermediateUpdateCallback intermediate_update;
+} Fmi3Instance;
+
+/* Inside a step, while the importer is told of an intermediate value: it may read, no more. */
+enum { INTERMEDIATE_UPDATE = 64 };
+
+static int allowed_here(const Instance *instance, unsigned modes, const char *function) {
+    if (!instance || instance->state.mode != INTERMEDIATE_UPDATE || (modes & INTERMEDIATE_UPDATE))
+        return allowed(instance, modes | INTERMEDIATE_UPDATE, function);
+    report(instance, ERROR, "%s: not allowed in state 'intermediate update mode'.", function);
+    return 0;
+}
+
 #define ENTER(modes)                                                        \
     Instance *const self = (Instance *)instance;                            \
-    if (!allowed(self, (modes), __func__)) return fmi3Error
+    if (!allowed_here(self, (modes), __func__)) return fmi3Error
 
 #define ENTER_AS(required, modes)                                           \
     ENTER(modes);                                                           \
@@ -36,7 +52,7 @@ const char *fmi3GetVersion(void) { return fmi3Version; }
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories,
                                const fmi3String categories[]) {
-    ENTER(ANY_MODE);
+    ENTER(ANY_MODE | INTERMEDIATE_UPDATE);
     return (fmi3Status)set_logging(self, __func__, loggingOn, nCategories, categories);
 }
 
@@ -50,6 +66,20 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String in
                          (void (*)(void))logMessage, log_fmi3, loggingOn);
 }
 
+/* Whether the variables have values inside a step: a model's states and outputs. */
+static int are_intermediate(const Instance *instance, const char *function,
+                            const fmi3ValueReference references[], size_t n) {
+    for (size_t i = 0; i < n; i++) {
+        const VariableKind kind = references && references[i] < N_VARIABLES && N_STATES > 0
+                                      ? VARIABLES[references[i]].kind
+                                      : FIXED;
+        if (kind == STATE || kind == OUTPUT) continue;
+        report(instance, ERROR, "%s: a required variable has no intermediate values.", function);
+        return 0;
+    }
+    return 1;
+}
+
 fmi3Instance fmi3InstantiateCoSimulation(
     fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
     fmi3Boolean visible, fmi3Boolean loggingOn, fmi3Boolean eventModeUsed,
@@ -57,13 +87,21 @@ fmi3Instance fmi3InstantiateCoSimulation(
     size_t nRequiredIntermediateVariables, fmi3InstanceEnvironment instanceEnvironment,
     fmi3LogMessageCallback logMessage, fmi3IntermediateUpdateCallback intermediateUpdate) {
     (void)resourcePath, (void)visible, (void)earlyReturnAllowed;
-    (void)requiredIntermediateVariables, (void)intermediateUpdate;
-    Instance *self =
+    Instance *const opened =
         open_instance(instanceName, CO_SIMULATION, instantiationToken, instanceEnvironment,
                       (void (*)(void))logMessage, log_fmi3, loggingOn);
-    if (!self || (!eventModeUsed && nRequiredIntermediateVariables == 0)) return self;
-    report(self, ERROR, "%s: event mode and intermediate update are not offered.", __func__);
-    free_instance(self);
+    Fmi3Instance *const self = opened ? realloc(opened, sizeof *self) : NULL;
+    if (!self) {
+        free_instance(opened);
+        return NULL;
+    }
+    self->intermediate_update = N_STATES > 0 ? intermediateUpdate : NULL;
+    if (eventModeUsed)
+        report(&self->shared, ERROR, "%s: event mode is not offered.", __func__);
+    else if (are_intermediate(&self->shared, __func__, requiredIntermediateVariables,
+                              nRequiredIntermediateVariables))
+        return self;
+    free_instance(&self->shared);
     return NULL;
 }
 
@@ -130,7 +168,7 @@ fmi3Status fmi3Reset(fmi3Instance instance) {
     TRY(check_arrays(self, __func__, valueReferences, nValueReferences, values, nValues))
 
 fmi3Status fmi3GetFloat64(GETTER_ARGUMENTS(Float64)) {
-    ENTER(READABLE);
+    ENTER(READABLE | INTERMEDIATE_UPDATE);
     CHECK_ARRAYS;
     return (fmi3Status)get_values(self, __func__, REAL, valueReferences, nValues, values);
 }
@@ -142,7 +180,7 @@ fmi3Status fmi3SetFloat64(SETTER_ARGUMENTS(Float64)) {
 }
 
 fmi3Status fmi3GetUInt64(GETTER_ARGUMENTS(UInt64)) {
-    ENTER(READABLE);
+    ENTER(READABLE | INTERMEDIATE_UPDATE);
     CHECK_ARRAYS;
     for (size_t i = 0; i < nValues; i++)
         TRY(check_reference(self, __func__, valueReferences[i], SEED));
@@ -162,7 +200,7 @@ fmi3Status fmi3SetUInt64(SETTER_ARGUMENTS(UInt64)) {
 }
 
 fmi3Status fmi3GetInt64(GETTER_ARGUMENTS(Int64)) {
-    ENTER(READABLE);
+    ENTER(READABLE | INTERMEDIATE_UPDATE);
     CHECK_ARRAYS;
     for (size_t i = 0; i < nValues; i++)
         TRY(check_reference(self, __func__, valueReferences[i], LAW));
@@ -183,7 +221,7 @@ fmi3Status fmi3SetInt64(SETTER_ARGUMENTS(Int64)) {
 }
 
 fmi3Status fmi3GetBoolean(GETTER_ARGUMENTS(Boolean)) {
-    ENTER(READABLE);
+    ENTER(READABLE | INTERMEDIATE_UPDATE);
     CHECK_ARRAYS;
     for (size_t i = 0; i < nValues; i++)
         TRY(check_reference(self, __func__, valueReferences[i], BOOLEAN));
@@ -413,6 +451,42 @@ fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *nConti
 
 /* Co-simulation */
 
+#ifndef MAX_STEPS_PER_CALL
+#define MAX_STEPS_PER_CALL 0 /* a model without states has no step in parts */
+#endif
+
+/* A step by the points of the integration's grid, at each of which the importer is told: the very same
+ * arithmetic, and none of it where a part fails. */
+static Status do_step_in_parts(Fmi3Instance *instance, const char *function, double time, double h) {
+    Instance *const self = &instance->shared;
+    State *const state = &self->state;
+    const State before = *state;
+    const Grid grid = model_grid(state);
+    const double end = time + h;
+    Status status = check_step(self, function, time, h);
+    if (status != OK) return status;
+    const GridPosition last = locate(grid, end);
+    int64_t point = locate(grid, time).point;
+    if (last.point - point > MAX_STEPS_PER_CALL) return do_step(self, function, time, h);
+    for (int ends = 0; !ends; time = state->v[VR_time]) {
+        fmi3Boolean returns_early = false;
+        fmi3Float64 early_time = end;
+        ends = ++point > last.point || (point == last.point && last.fraction == 0.0);
+        const double next = ends ? end : (double)point * grid.step;
+        status = do_step(self, function, time, next - time);
+        if (status != OK) {
+            *state = before;
+            return status;
+        }
+        state->v[VR_time] = next;
+        state->mode = INTERMEDIATE_UPDATE;
+        instance->intermediate_update(self->environment, next, false, true, true, false,
+                                      &returns_early, &early_time);
+        state->mode = STEP;
+    }
+    return OK;
+}
+
 fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoint,
                       fmi3Float64 communicationStepSize,
                       fmi3Boolean noSetFMUStatePriorToCurrentPoint,
@@ -426,8 +500,11 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
     *terminateSimulation = false;
     *earlyReturn = false;
     *lastSuccessfulTime = self->state.v[VR_time];
+    Fmi3Instance *const whole = (Fmi3Instance *)instance;
     const Status status =
-        do_step(self, __func__, currentCommunicationPoint, communicationStepSize);
+        whole->intermediate_update
+            ? do_step_in_parts(whole, __func__, currentCommunicationPoint, communicationStepSize)
+            : do_step(self, __func__, currentCommunicationPoint, communicationStepSize);
     *lastSuccessfulTime = self->state.v[VR_time];
     return (fmi3Status)status;
 }

@@ -33,8 +33,8 @@ def open_fmu(folders: dict[int, Path]) -> Iterator[Callable[..., Instance]]:
     """Open any number of instances; all are freed after the test."""
     opened: list[Instance] = []
 
-    def opener(version: int, exchange: bool = False, logging: bool = False) -> Instance:
-        opened.append(Instance(folders[version], version, exchange, logging))
+    def opener(version: int, exchange: bool = False, logging: bool = False, **asked) -> Instance:
+        opened.append(Instance(folders[version], version, exchange, logging, **asked))
         return opened[-1]
 
     yield opener

@@ -20,7 +20,12 @@ class Instance:
     """An instance of an FMU of ours; `messages` holds its log as (status, category, text)."""
 
     def __init__(
-        self, folder: Path, version: int, exchange: bool = False, logging: bool = False
+        self,
+        folder: Path,
+        version: int,
+        exchange: bool = False,
+        logging: bool = False,
+        **asked: Any,
     ) -> None:
         description = _description(folder)
         self.variables = {v.name: v for v in description.modelVariables}
@@ -45,7 +50,7 @@ class Instance:
             callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(self._log2)
             self.fmu.instantiate(callbacks=callbacks, loggingOn=logging)
         else:
-            self.fmu.instantiate(logMessage=self._log3, loggingOn=logging)
+            self.fmu.instantiate(logMessage=self._log3, loggingOn=logging, **asked)
 
     def _log2(self, _: object, name: bytes, status: int, category: bytes, text: bytes) -> None:
         assert name == b"test"

@@ -169,3 +169,12 @@ def test_what_is_no_recording_of_ours_is_refused(tmp_path, make):
     with pytest.raises(RecordingError, match=r"x\.rrd"):
         read_recording(tmp_path / "x.rrd")
     assert telling_moment(tmp_path / "x.rrd") is None
+
+
+def test_states_within_the_samples_of_an_fmi3_plant_are_recorded(paper, tmp_path):
+    recorder = RerunRecorder(tmp_path / "run.rrd")
+    with FmuPlant(paper, "evaporator_fmi3", recorder.intermediate) as plant:
+        run = simulate(plant, naive(paper), 30, 1, recorder=recorder)
+    time, X2 = read_recording(tmp_path / "run.rrd").intermediate["X2"].T
+    assert time.tolist() == list(range(1, 1801))
+    assert X2[59::60].tolist() == [*run["X2"][1:], run.final_state[0]]

@@ -1,8 +1,10 @@
 """The co-simulation step: its arguments, the stop time, and instances beside each other."""
 
 import math
+from itertools import accumulate
 
 import pytest
+from fmpy.fmi1 import FMICallException
 
 DISCARD, ERROR = 2, 3
 
@@ -50,3 +52,41 @@ def test_parameters_that_make_the_integration_diverge_are_an_error(refused, plan
     assert status == ERROR
     assert "left the finite numbers" in text
     assert plant.run(0) == before
+
+
+@pytest.fixture
+def telling(open_fmu):
+    """An FMI 3.0 instance, and what it tells of its steps: time, states, and what was refused."""
+    told = []
+
+    def update(_, time: float, *__) -> None:
+        status = instance.fmu.dll.fmi3Terminate(instance.handle)
+        told.append((time, *instance.get("X2", "P2"), status))
+
+    instance = open_fmu(3, intermediateUpdate=update, requiredIntermediateVariables=[1, 2])
+    return instance, told
+
+
+@pytest.mark.parametrize("sizes", [[60.0] * 3, [90.3, 0.2, 0.5, 600.0]])
+def test_a_step_that_tells_of_the_values_inside_computes_the_same(open_fmu, telling, sizes) -> None:
+    quiet, (instance, told) = open_fmu(3), telling
+    ends = [0.0, *accumulate(sizes)]
+    for each in (quiet, instance):
+        each.initialise(seed=3)
+    for time, size in zip(ends, sizes, strict=False):
+        quiet.step(time, size)
+        instance.step(time, size)
+        assert instance.run(0) == quiet.run(0)
+        assert told[-1] == (time + size, *quiet.get("X2", "P2"), ERROR)
+    inside = map(float, range(1, int(ends[-1]) + 1))
+    assert [time for time, *_ in told] == sorted({*inside, *ends[1:]})
+
+
+def test_a_step_that_fails_inside_changes_nothing(telling) -> None:
+    instance, told = telling
+    instance.initialise(h=10.0, F3=1000.0, lambda_=1.0, C=0.1, M=1.0)
+    before = instance.run(0)
+    with pytest.raises(FMICallException):
+        instance.step(0.0, 600.0)
+    assert told
+    assert instance.run(0) == before

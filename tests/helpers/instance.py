@@ -19,14 +19,7 @@ def _description(folder: Path) -> Any:
 class Instance:
     """An instance of an FMU of ours; `messages` holds its log as (status, category, text)."""
 
-    def __init__(
-        self,
-        folder: Path,
-        version: int,
-        exchange: bool = False,
-        logging: bool = False,
-        **asked: Any,
-    ) -> None:
+    def __init__(self, folder: Path, version: int, exchange=False, logging=False, **asked) -> None:
         description = _description(folder)
         self.variables = {v.name: v for v in description.modelVariables}
         self.step_size = float(description.defaultExperiment.stepSize)

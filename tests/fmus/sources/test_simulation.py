@@ -4,7 +4,6 @@ import math
 from itertools import accumulate
 
 import pytest
-from fmpy.fmi1 import FMICallException
 
 DISCARD, ERROR = 2, 3
 
@@ -44,16 +43,6 @@ def test_step_of_too_many_integration_steps_is_discarded_at_once(refused, plant)
     plant.step(0.0, 86400.0)
 
 
-def test_parameters_that_make_the_integration_diverge_are_an_error(refused, plant) -> None:
-    """All in range, but so stiff that steps of 1 s are unstable."""
-    plant.initialise(h=10.0, F3=1000.0, lambda_=1.0, C=0.1, M=1.0)
-    before = plant.run(0)
-    status, text = refused(plant, lambda: plant.step(0.0, 600.0))
-    assert status == ERROR
-    assert "left the finite numbers" in text
-    assert plant.run(0) == before
-
-
 @pytest.fixture
 def telling(open_fmu):
     """An FMI 3.0 instance, and what it tells of its steps: time, states, and what was refused."""
@@ -62,6 +51,7 @@ def telling(open_fmu):
     def update(_, time: float, *__) -> None:
         status = instance.fmu.dll.fmi3Terminate(instance.handle)
         told.append((time, *instance.get("X2", "P2"), status))
+        instance.messages.clear()
 
     instance = open_fmu(3, intermediateUpdate=update, requiredIntermediateVariables=[1, 2])
     return instance, told
@@ -82,11 +72,13 @@ def test_a_step_that_tells_of_the_values_inside_computes_the_same(open_fmu, tell
     assert [time for time, *_ in told] == sorted({*inside, *ends[1:]})
 
 
-def test_a_step_that_fails_inside_changes_nothing(telling) -> None:
-    instance, told = telling
-    instance.initialise(h=10.0, F3=1000.0, lambda_=1.0, C=0.1, M=1.0)
-    before = instance.run(0)
-    with pytest.raises(FMICallException):
-        instance.step(0.0, 600.0)
-    assert told
-    assert instance.run(0) == before
+def test_parameters_that_make_the_integration_diverge_are_an_error(refused, plant, telling) -> None:
+    """All in range, but so stiff that steps of 1 s are unstable."""
+    for instance in (plant, telling[0]):
+        instance.initialise(h=10.0, F3=1000.0, lambda_=1.0, C=0.1, M=1.0)
+        before = instance.run(0)
+        status, text = refused(instance, lambda each=instance: each.step(0.0, 600.0))
+        assert status == ERROR
+        assert "left the finite numbers" in text
+        assert instance.run(0) == before
+    assert telling[1]

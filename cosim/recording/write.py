@@ -62,7 +62,7 @@ class RerunRecorder:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._stream: Stream | None = None
-        self._within: list[tuple[float, Array]] = []
+        self._within: list[tuple[float, ...]] = []
 
     def start(
         self,
@@ -79,7 +79,7 @@ class RerunRecorder:
         self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
         self._predicted: dict[str, Channel] = {}
         self._fine = [
-            Channel(f"intermediate/{escaped(c.name)}", c.name, c.unit, color, labels=["within"])
+            replace(c, entity=f"intermediate/{escaped(c.name)}", color=color, labels=["within"])
             for c, color in zip(self._group("states"), cycle(SERIES[2:]), strict=False)
         ]
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
@@ -133,7 +133,7 @@ class RerunRecorder:
 
     def intermediate(self, time: float, states: Array) -> None:
         """Take the states (n,) at a time [s] within a sample."""
-        self._within.append((time, states))
+        self._within.append((time, *states.tolist()))
 
     def close(self) -> None:
         """Finish the file with the ranges that the run has filled; no sample, no file."""
@@ -175,13 +175,12 @@ class RerunRecorder:
     def _intermediate(self, stream: Stream, samples: np.ndarray, time: Array) -> None:
         if not self._within:
             return
-        moments = np.array([moment for moment, _ in self._within])
-        values = np.array([states for _, states in self._within]).T
+        moments, *states = np.array(self._within).T
         self._within.clear()
         # The end of a sample is its own.
         rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
-        for channel, column in zip(self._fine, values, strict=True):
-            stream.send([channel.see(column)], rows, column)
+        for channel, values in zip(self._fine, states, strict=True):
+            stream.send([channel.see(values)], rows, values)
 
     def _group(self, *groups: str) -> list[Channel]:
         return [
@@ -191,9 +190,8 @@ class RerunRecorder:
     def _layout(self) -> rrb.Blueprint:
         """Left: states and actions with bounds; middle: costs, causes, solver; right: the rest."""
         along = axis(seconds=self._seconds)
-        fine = {c.name: [c] for c in self._fine if c.window()}
         loop = [
-            view(c.title, [c, *fine.get(c.name, [])], along)
+            view(c.title, [c, *(f for f in self._fine if f.name == c.name and f.window())], along)
             for c in self._group("states", "actions")
         ]
         causes = [

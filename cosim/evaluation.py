@@ -183,6 +183,8 @@ def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps
         raise EvaluationError("no seed to evaluate on; give at least one")
     if len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise EvaluationError("seeds must be distinct and not negative")
+    if max(seeds) >= 1 << 64:
+        raise EvaluationError(f"seeds must be below 2⁶⁴; the last one is {max(seeds)}")
     if steps < 1:
         raise EvaluationError(f"steps must be at least 1, not {steps}")
 

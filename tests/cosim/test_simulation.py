@@ -4,7 +4,7 @@ import pytest
 from cosim import FmuPlant, Scenario, simulate
 from cosim.plugins import build_controller
 from cosim.simulation import BLOCK, indicators, input_effort, spawn_seeds
-from cosim.trajectory import FALLBACK, Signal, Trajectory, signal_names
+from cosim.trajectory import FALLBACK
 from tests.helpers.loop import Failing, Hold, Proportional
 
 
@@ -134,14 +134,6 @@ def test_the_recorder_is_closed_when_the_run_fails(evaporator, paper):
     assert len(recorder.blocks) == 1
 
 
-def run_with_states(scenario, time, states):
-    columns = {name: np.zeros(len(time)) for name in signal_names(scenario)}
-    columns["time"] = time
-    columns |= dict(zip(scenario.plant.states, states.T, strict=True))
-    signals = {name: Signal(name, "", values) for name, values in columns.items()}
-    return Trajectory(scenario, signals, ["solved"] * len(time))
-
-
 def test_input_effort_is_the_share_of_the_range_moved_per_sample():
     actions = np.array([[100.0, 200.0], [130.0, 200.0], [130.0, 170.0]])
     effort = input_effort(actions, np.array([100.0, 100.0]), np.array([400.0, 400.0]))
@@ -163,9 +155,9 @@ def test_indicators_are_the_definitions_applied_to_the_signals(paper):
     assert found["failures"] == 0
 
 
-def test_rounding_at_a_bound_is_no_violation_but_a_millionth_is(paper):
+def test_rounding_at_a_bound_is_no_violation_but_a_millionth_is(evaporator, paper):
     below = np.array([0.0, 1e-14, 1e-9, 9e-7, 1.1e-6, 1e-3])
-    run = run_with_states(paper, np.arange(6.0), np.stack([25.0 - below, np.full(6, 50.0)], axis=1))
+    run = simulate(evaporator, Proportional(paper), 6, seed=0)
     run.signals["violation"].values[:] = below
     found = indicators(run)
     assert found["violating_share"] == 2 / 6

@@ -196,6 +196,7 @@ WRONG = [
     "simulate --out blocked/inside --steps 3",
     "evaluate --controllers ,",
     "evaluate --scheduler nonsense --steps 3 --seeds 1",
+    "evaluate --first-seed 18446744073709551610 --seeds 10 --steps 3",
     "train --algorithm nothing",
     "train --algorithm a:b",
     "train --algorithm q-learning --set nothing",

@@ -84,12 +84,12 @@ class _Measured(NamedTuple):
 class ConvergedNmpc(RtiNmpc):
     """The NMPC of `RtiNmpc` with every programme solved to convergence; same θ, same read-outs.
 
-    Q, V and π are those of the nonlinear programme, and so are their sensitivities (paper.tex,
-    Sensitivities of Fully Converged NMPC): at the solution the QP with the exact Hessian has the
-    KKT matrix of the programme, so its read-outs are the programme's. SQP solves that QP, which
-    converges quadratically, and where it is not convex one whose Hessian is lifted; an ℓ1 merit
-    function chooses the step length. `tolerance` is on the largest change of states, actions and,
-    relative to 1 + ‖χ‖∞, costates; QpError is raised where `iterations` do not reach it.
+    Q, V, π and their sensitivities are those of the nonlinear programme (paper.tex, Sensitivities
+    of Fully Converged NMPC): at the solution the QP with the exact Hessian has the programme's KKT
+    matrix. SQP solves that QP, which converges quadratically. Where it is not convex, the Hessian
+    is lifted; an ℓ1 merit function chooses the step length. `tolerance` is on the largest change of
+    states, actions and, relative to 1 + ‖χ‖∞, costates; QpError is raised where `iterations` do not
+    reach it.
     """
 
     name = "converged"

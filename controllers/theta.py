@@ -154,9 +154,9 @@ class ThetaBlocks:
 
         `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
         predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
-        Scales are shares of the problem's `Units`, ρ those of states and actions, κ that of cost:
-        κ/ρ_iρ_j for a Hessian, 0.1 κ/ρ for a gradient, ρ/100 for a bound, κ/ρ and 1000 κ/ρ² for the
-        slack weights. Raises ModelError on a parameter that the model lacks.
+        Scales are shares of the problem's `Units`, ρ of states and actions, κ of cost. A Hessian's
+        is κ/ρ_iρ_j, a gradient's 0.1 κ/ρ, a bound's ρ/100, those of the slack weights κ/ρ and
+        1000 κ/ρ². Raises ModelError on a parameter that the model lacks.
         """
         units = problem.units
         kappa, states = units.cost, units.state

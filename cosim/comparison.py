@@ -142,7 +142,7 @@ class Comparison:
             at = f" (time {self.times[step]:g} s)" if len(self.times) > step else ""
             found = [d.text() for d in self.differences if d.first == step]
             found += ["status"] if self.status == step else []
-            text.append(f"first difference at sample {step}{at}: {'; '.join(found)}")
+            text += [f"first difference at sample {step}{at}:", *(f"  {one}" for one in found)]
         if len(set(self.samples)) > 1:
             text.append(f"{self.samples[0]} samples against {self.samples[1]}")
         for missing, side in ((self.only_a, "first"), (self.only_b, "second")):

@@ -66,7 +66,7 @@ def evaluate(
     progress: Report | bool = False,
     command: str = "cosim.evaluate",
 ) -> Evaluation:
-    """Run every controller on every seed and return the table; the bytes depend on no worker.
+    """Run every controller on every seed; the table is the same for any number of workers.
 
     A seed means the same disturbances to all controllers (common random numbers), so differences
     are to be taken seed by seed. Where the scenario's optimum is stored it runs too, for J*,
@@ -213,7 +213,7 @@ class Evaluation(Result):
 
     @property
     def optimum(self) -> str | None:
-        """Name of the controller with J*, whether it has a row or not; None if unknown."""
+        """Name of the controller that gives J*, None if there is none; it need not have a row."""
         return OPTIMAL if OPTIMAL in self.columns else None
 
     @property
@@ -296,13 +296,12 @@ class Evaluation(Result):
     def summary(self) -> dict[str, Any]:
         """The evaluation as a JSON document: controllers, comparisons, provenance, timing.
 
-        `controllers`: per controller the means over all seeds and samples, `failures` in total,
-        `intervals` of each mean, where J* is known the `regret`
-        (J − J*)/|J*|, and where the naive controller is there too `gap_closed` =
-        (J_naive − J)/(J_naive − J*). `comparisons`: for each pair, the paired difference
-        controller − reference of each mean, and `gain_in_J`, (J_ref − J)/|J_ref|. Every interval
-        is of 95 %, paired over seeds, `interval` Student's and `bootstrap` BCa. `optimal_J` is J*
-        on the same seeds.
+        `controllers`: per controller the means over all seeds and samples, the `intervals` of each
+        mean, and `failures` in total. Where J* is known there is the `regret` (J − J*)/|J*|, and
+        with the naive controller `gap_closed` = (J_naive − J)/(J_naive − J*). `comparisons`: for
+        each pair, the paired difference controller − reference of each mean, and `gain_in_J`,
+        (J_ref − J)/|J_ref|. Every interval is of 95 %, paired over seeds, `interval` Student's and
+        `bootstrap` BCa. `optimal_J` is J* on the same seeds.
         """
         return {
             **self.facts,

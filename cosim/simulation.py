@@ -66,9 +66,9 @@ def simulate(
     `progress` the number of samples done; True draws a bar. `residuals` says whether the
     controller's KKT residuals are wanted, which some compute only when asked: NaN without.
 
-    If the controller fails to solve (an exception whose class has `is_solver_failure`), the last
-    applied action is applied again (at the first sample the scenario's reference action), the
-    failure is counted, and the controller is reset. Every other error ends the run and is raised.
+    A failed solve is an exception whose class has `is_solver_failure`. The last applied action is
+    then applied again, at the first sample the scenario's reference action. The failure is
+    counted, and the controller is reset. Every other error ends the run and is raised.
     """
     if steps < 1:
         raise CosimError(f"steps must be at least 1, not {steps}")

@@ -43,13 +43,13 @@ class ActorCriticConfiguration(Configuration):
 
 
 class ActorCritic(Algorithm):
-    """Descends J along ∇J = E[∇π ∇πᵀ] w (paper.tex, eq. pg_update and pg_solution).
+    """Actor-critic: descends J along ∇J = E[∇π ∇πᵀ] w (paper.tex, eq. pg_update and pg_solution).
 
-    Each batch at one θ: LSTDV fits the smooth part W of V = penalty + W, LSTDQ the weights w of
-    the advantage A(s, a) = (a − π(s) − bias)ᵀ ∇π(s)ᵀ w, where `bias` is the mean that saturation
-    gives to the exploration. The known penalty is moved to the next state, r = ℓ + γ·penalty(s₊),
-    so that the critic meets no kink. Its discount γ is 1, that of
-    the mean cost, the benchmark's yardstick.
+    θ stays as it is for a batch. Then LSTDV fits the smooth part W of V = penalty + W, and LSTDQ
+    the weights w of the advantage A(s, a) = (a − π(s) − bias)ᵀ ∇π(s)ᵀ w. `bias` is the mean that
+    saturation gives to the exploration. The known penalty is moved to the next state, r = ℓ +
+    γ·penalty(s₊), so that the critic meets no kink. Its discount γ is 1, that of the mean cost, the
+    benchmark's yardstick.
     """
 
     Configuration = ActorCriticConfiguration

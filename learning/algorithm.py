@@ -120,11 +120,11 @@ class Algorithm:
         return None
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that must survive a checkpoint but θ."""
+        """What a checkpoint must keep besides θ."""
         return arrays_of(self)
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
+        """Restore what `state` returned."""
         take_up(self, state)
 
 

@@ -38,18 +38,18 @@ class BatchQLearningConfiguration(ValueConfiguration):
 
 
 class BatchQLearning(ValueRule):
-    """The measurements and the prior of online Q-learning, replayed at the present θ.
+    """Q-learning in batches: online Q-learning's fit and prior, replayed at the present θ.
 
     Each batch of `batch_size` transitions is a measurement of d = (θ−θ₀)/σ with the information
     GᵀG/r, G the rows ∇Qᵀσ. The prior of a batch is the posterior of the one before:
 
         min_d Σ (δ − ∇Qᵀ(d − d_now))²/r + (d − m)ᵀΛ(d − m),  then Λ ← Λ + GᵀG/r, m ← d
 
-    `relinearisations` times a batch, linearised anew where the last step led to: the iterated
-    filter (Gauss–Newton on the posterior). TD errors hold the next penalty's expectation and are
-    cut at ±`innovation_clip`·√r. Where a step moves an entry by more than `largest_step`, it and
-    what the batch tells are both cut by the same share, as online. The first batch gives noise,
-    widths and c_f as well.
+    This is done `relinearisations` times a batch, linearised anew where the last step led: the
+    iterated filter (Gauss–Newton on the posterior). TD errors hold the next penalty's expectation
+    and are cut at ±`innovation_clip`·√r. Where a step moves an entry by more than `largest_step`,
+    it and what the batch tells are both cut by the same share, as online. The first batch gives
+    noise, widths and c_f as well.
     """
 
     Configuration = BatchQLearningConfiguration

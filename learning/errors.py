@@ -18,7 +18,7 @@ class AlgorithmLookupError(LearningError):
 
 
 class DivergenceError(LearningError):
-    """Learning left the region where θ means anything; the last good θ is kept."""
+    """Learning diverged: θ has left the region where the QP is of use; the last good θ is kept."""
 
 
 class PrivilegeError(LearningError):

@@ -218,7 +218,7 @@ class QLearning(ValueRule):
         self._squares = 0.0
 
     def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; one in `step_every` moves θ, with `td` and `fit` each."""
+        """Take one sample; every `step_every`-th moves θ, with `td` and `fit` each one does."""
         if self.configuration.rule != "kalman":
             return self._sample_step(transition)
         prediction = self._model(transition.s, transition.a)

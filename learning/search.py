@@ -658,8 +658,8 @@ class Search(Algorithm):
 
     `theta` is the incumbent: what the run hands over, while the controller carries the θ that is
     being tried. The samples of learning and of comparisons are all the run's. A checkpoint keeps
-    the results that the plan was given, but for prediction errors that no longer count, and
-    `restore` gives them once more: the plan is deterministic, so it comes back to where it was.
+    the results that the plan was given, but for prediction errors that no longer count. `restore`
+    gives them to the plan once more, which is deterministic and so ends where it was.
     """
 
     Configuration = SearchConfiguration

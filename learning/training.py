@@ -59,12 +59,12 @@ LEAST = {"seed": 0} | dict.fromkeys(
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """What identifies a training run; a checkpoint goes on only in the very same one.
+    """What identifies a training run; a checkpoint can be resumed only by an identical one.
 
     The `algorithm` by name, its `configuration`, completed by what the `scenario` states; the other
-    fields' meaning is their help in `cosim train`. A greedy J that is worse than that of the naive
-    θ and that of the start by more than (`divergence` − 1) of its magnitude, twice in a row or at
-    the end, is divergence and ends the run.
+    fields' meaning is their help in `cosim train`. A run has diverged, and ends, where its greedy J
+    exceeds that of the naive θ and that of the start by more than (`divergence` − 1) of their
+    magnitude, twice in a row or at the end.
 
     Raises ConfigurationError on counts that make no run.
     """

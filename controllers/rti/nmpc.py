@@ -770,7 +770,7 @@ class RtiNmpc:
 
 
 def compile_functions(controller: object, samples: int = LONG) -> None:
-    """`RtiNmpc.compile` where the controller is one; nothing on other controllers."""
+    """Compile the controller if it is an `RtiNmpc`; do nothing for others."""
     if isinstance(controller, RtiNmpc) and controller.functions == INTERPRETED:
         controller.compile(samples)
 

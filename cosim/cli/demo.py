@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -77,10 +79,12 @@ def demo(
         }
         record_overlay(folder / "demo.rrd", signals, scenario.description)
         record_training(folder / "training.rrd", trained[LEARNT])
+        # `make demo` activates no environment.
+        command = "cosim" if shutil.which("cosim") else f"{sys.executable} -m cosim"
         out_.note(
             f"pictures   {folder / 'before-after.png'}, {folder / 'learning.png'}\n"
-            f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}   "
-            f"(look at them with: cosim view {folder / 'demo.rrd'})\n"
-            f"learnt θ   {folder / 'parameters.toml'}   (a controller's name in every command)"
+            f"recordings {folder / 'demo.rrd'}, {folder / 'training.rrd'}\n"
+            f"learnt θ   {folder / 'parameters.toml'} (a controller in every command)\n"
+            f"look at the recording with: {command} view {folder / 'demo.rrd'}"
         )
         out_.json(summary | {"training": trained[LEARNT].summary()}, folder)

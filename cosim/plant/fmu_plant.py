@@ -302,8 +302,8 @@ class Snapshot:
 class FmuPlant:
     """A co-simulation FMU, FMI 2.0 or 3.0, sampled and wired as a scenario says.
 
-    At sample k, time k·h: the action is written, ℓ(x_k, u_k, d_k) and d_k are read, the FMU steps
-    by the sampling time h, in one step or in those of `plant.communication_step`, and x_{k+1} is
+    At sample k, time k·h, the action is written, and ℓ(x_k, u_k, d_k) and d_k are read. Then the
+    FMU steps by the sampling time h, at once or by `plant.communication_step`, and x_{k+1} is
     read. Use it as a context manager, or call `close`.
     An FMU is native code: name only files that you trust.
 
@@ -429,7 +429,7 @@ class FmuPlant:
         self._outputs[:] = begin
 
     def drive(self, loop: CompiledLoop, table: Array) -> Array:
-        """Let a compiled loop make the next samples, a row of `table` each; return the state (n,).
+        """Take the next samples in a compiled loop, a row of `table` each; return the state (n,).
 
         It does what as many calls of `step` do; raises PlantError, then needs a reset.
         """

@@ -201,11 +201,11 @@ class Study:
         return [*self.references, *self.cases]
 
     def named(self, controller: str) -> str:
-        """A case's name for a controller: the study's, if it has one for it."""
+        """A controller's name in the tables: the one that the study gives, else its own."""
         return next((c.name for c in self.cases if c.controller == controller), controller)
 
     def relative(self, path: str) -> str:
-        """A parameters file's path as the study names it: results depend on no checkout's place."""
+        """A parameters file by its path from the study, so that results depend on no folder."""
         if not path.endswith(".toml") or self.folder not in Path(path).parents:
             return path
         return Path(path).relative_to(self.folder).as_posix()

@@ -62,9 +62,9 @@ class StudyResults(Shown):
     """Measurements of a study in `folder`, as pandas frames of its finished runs.
 
     `about` is the document study.json: cases, scenarios, and the versions that made them.
-    `state` has a row for each run (scenario, case, training_seed, status, samples,
-    plant_samples), `evaluation` one for each run and noise seed, `curves` one for each row of a
-    training's log and one, without samples, for each controller on the noise of the curves.
+    `state` has a row for each run: scenario, case, training_seed, status, samples, plant_samples.
+    `evaluation` has one for each run and noise seed. `curves` has one for each row of a training's
+    log and one, without samples, for each controller on the noise of the curves.
     """
 
     folder: Path
@@ -352,7 +352,7 @@ class StudyResults(Shown):
         return header, [[row[name] for name in columns] for row in texts]
 
     def table(self, scenario: str | None = None) -> str:
-        """A scenario's table as Markdown, least J first; without one those of all scenarios."""
+        """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
         if scenario is not None:
             return markdown_table(*self.lines(scenario))
         return "\n".join(f"{name}\n\n{self.table(name)}" for name in self.scenarios)

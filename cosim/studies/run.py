@@ -394,7 +394,7 @@ def study(
     planned: Plan | None = None,
     figures: bool = True,
 ) -> StudyResults:
-    """Train and evaluate all of a study that `out` does not hold yet, and write its tables there.
+    """Train and evaluate what `out` does not yet hold of a study, and write its tables there.
 
     Raises StudyError and what scenarios and algorithms raise before any work is done;
     FailedRunsError after all other runs are done and written.

@@ -30,7 +30,7 @@ def test_equal_runs_end_with_0_and_others_with_1(cosim, runs):
     code, out, err = cosim("compare", "s0", "s1")
     assert code == 1
     assert "P100" in out
-    assert "first difference at sample 0 (time 0 s): X1 differs by up to" in err
+    assert "first difference at sample 0 (time 0 s):\n  X1 differs by up to" in err
 
 
 def test_tolerances_make_runs_equal(cosim, runs):

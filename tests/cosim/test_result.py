@@ -68,6 +68,7 @@ def test_every_result_is_a_line_a_table_and_a_page(run, training, tmp_path):
         (cosim.train, "evaluate_evry", "evaluate_every"),
         (cosim.evaluate, "step", "steps"),
         (cosim.study, "job", "jobs"),
+        (cosim.FmuPlant, "fmuu", "fmu"),
     ],
 )
 def test_an_unknown_keyword_is_refused_with_the_one_that_is_meant(function, typo, meant):

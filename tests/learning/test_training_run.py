@@ -30,7 +30,6 @@ def test_the_extended_theta_starts_at_slack_weights_of_the_problems_scale(proble
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        ({}, (1000, 5000, 5000)),
         ({"log_every": 70}, (70, 4970, 4970)),
         ({"evaluate_every": 400}, (400, 400, 4800)),
         ({"evaluate_every": 2000, "checkpoint_every": 3000}, (1000, 2000, 3000)),

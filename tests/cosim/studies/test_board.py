@@ -3,12 +3,9 @@
 import shutil
 from pathlib import Path
 
-import pandas as pd
 import pytest
 
-from cosim import Scenario
 from cosim.errors import CosimError
-from cosim.evaluation import judge
 from cosim.studies.board import read_entry, write_board
 
 BOARD = Path(__file__).parents[3] / "results" / "board"
@@ -32,6 +29,7 @@ def test_every_entry_holds_and_the_page_shows_it(tmp_path):
         ("entry.toml", ("PI loops", "a | b"), "name"),
         ("entry.toml", ('"paper"', '"../paper"'), "scenario"),
         ("entry.toml", ("samples = 0", "samples = 7"), "samples must be 0"),
+        ("entry.toml", ("samples = 0", "samples = 0\nsteps = 100"), "3000000, 100, "),
         ("entry.toml", ("PI loops", "PI " * 40), "name"),
         ("entry.toml", ("authors", "#" * 3_000_000 + "\nauthors"), "bytes"),
         ("judged.csv", ("3000001,2000", "3000009,2000"), "must have J"),
@@ -49,16 +47,3 @@ def test_a_wrong_entry_is_refused(tmp_path, file, change, words):
     path.write_text(text)
     with pytest.raises(CosimError, match=words):
         read_entry(tmp_path / "mine")
-
-
-def test_an_entry_of_another_length_has_a_table_of_its_own(tmp_path):
-    mine = Path(shutil.copytree(BOARD / "pi-paper", tmp_path / "mine"))
-    run, table, entry = mine / "runs/run-3000000.csv", mine / "judged.csv", mine / "entry.toml"
-    run.write_text("".join(run.read_text().splitlines(keepends=True)[:101]))
-    entry.write_text("steps = 100\n" + entry.read_text())
-    rows = pd.read_csv(table, dtype={"scenario_hash": str}).assign(steps=100)
-    found = judge(Scenario.load("paper"), mine / "runs")
-    rows.loc[0, ["J", "optimum"]] = found.loc[0, ["J", "optimum"]]
-    rows.to_csv(table, index=False)
-    write_board(tmp_path)
-    assert "Scenario `paper`, 100 samples:" in (tmp_path / "README.md").read_text()

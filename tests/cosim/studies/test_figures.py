@@ -71,7 +71,6 @@ def test_a_cases_settings_are_set_after_its_name():
         == "q-learning, naive, prior width 0.3"
     )
     assert shown_case("two-fouled(tuned-two-fouled)") == "two-fouled"
-    assert shown_case("mine(2)") == "mine(2)"
 
 
 def test_many_curves_have_a_panel_for_each_start():

@@ -103,18 +103,19 @@ def curves_figure(
     all panels, by name. `relative` values are regrets in %.
     """
     unit = "regret %" if relative else "J"
-    words = {"training": "training samples", "greedy": "greedy policy"}
     height = max(2.6, 0.135 * (len(curves) + len(levels)))
-    starts = _by_start(curves) if len(curves) > BANDED else {"": list(curves)}
+    starts = _by_start(curves)
+    if len(curves) <= BANDED or not 1 < len(starts) < BANDED:
+        starts = {"": list(curves)}
     handles: dict[str, Line2D] = {}
     with style.figure(2 * height + 0.4) as drawn:
         grid = drawn.subplots(2, len(starts), sharex=True, sharey="row", squeeze=False)
         named: list[tuple[Axes, list[EndLabel]]] = []
-        for row, kind in zip(grid, words, strict=True):
+        for row, kind in zip(grid, ("training samples", "greedy policy"), strict=True):
             for axes, (start, names) in zip(row, starts.items(), strict=True):
                 lines, own = [], palette(names)
                 for name in names:
-                    curve, values = curves[name], getattr(curves[name], kind)
+                    curve, values = curves[name], getattr(curves[name], kind.split()[0])
                     finite = np.isfinite(values).all(axis=0)
                     samples, values = curve.samples[finite], values[:, finite]
                     if not values.size:
@@ -128,15 +129,14 @@ def curves_figure(
                     if len(values) > 1 and len(names) <= BANDED:
                         axes.fill_between(samples, low, high, color=color, alpha=0.15, linewidth=0)
                 ends = style.cost_lines(axes, lines, levels, relative=relative)
-                if axes is row[-1] or len(starts) == 1:
+                if axes is row[-1]:
                     named.append((axes, ends[: len(levels)] if start else ends))
-                if start and kind == "training":
-                    axes.set_title(start)
+                axes.set_title(start if kind.startswith("training") else "")
             if relative:
                 style.regret_axis(
                     row[0], "y", np.concatenate([axes.dataLim.intervaly for axes in row])
                 )
-            row[0].set_ylabel(f"{unit} of the {words[kind]}")
+            row[0].set_ylabel(f"{unit} of the {kind}")
         end = max(float(curve.samples[-1]) for curve in curves.values())
         for axes in grid[1]:
             style.samples_axis(axes, end, "training samples")

@@ -80,3 +80,6 @@ def test_many_curves_have_a_panel_for_each_start():
     axes = curves_figure(dict.fromkeys(cases, one), {}, palette(cases), relative=True).axes
     assert [panel.get_title() for panel in axes] == ["from naive", "from tuned", "", ""]
     assert all(len(panel.lines) == 4 for panel in axes)
+    plain = {name.replace("start", "mine"): one for name in cases}
+    first, _ = curves_figure(plain, {}, palette([*plain]), relative=True).axes
+    assert len(first.texts) == len(cases)

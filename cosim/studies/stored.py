@@ -6,14 +6,14 @@ import shutil
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import pandas as pd
 from pydantic import Field
 
 from cosim.comparison import RunSignals, compare
 from cosim.errors import ResultsError
-from cosim.files import read_json, read_toml, write_atomically
+from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
@@ -141,41 +141,7 @@ def differences(
             continue
         one, other = (_read(folder / table, keys) for folder in (stored, now))
         lines += _table_differences(f"{name}/{table}", one, other, tolerances)
-        if lines and table == EVALUATION:  # the last of them
-            about = read_json(stored / ABOUT, f"'{stored / ABOUT}'", ResultsError)
-            lines[:0] = [f"{name}: {words}" for words in _cause(about, one, other, tolerances)]
     return lines
-
-
-def _cause(
-    about: Mapping[str, Any],
-    stored: pd.DataFrame,
-    now: pd.DataFrame,
-    tolerances: Mapping[str, Tolerance],
-) -> list[str]:
-    """Likely causes, from the cases whose evaluation differs; [] if none.
-
-    The optimum is a stored table, so that it differs with the plant and the cost alone; controllers
-    that learn nothing differ with their model and problem too, and the others with their algorithm.
-    """
-    cases = {case["name"]: case for case in about["cases"]}
-    differing = []
-    for case in cases:
-        one, other = (t[t.index.get_level_values("case") == case] for t in (stored, now))
-        if _table_differences("", one, other, tolerances):
-            differing.append(case)
-    if not differing:
-        return []
-    same = ", ".join(case for case in cases if case not in differing) or "none"
-    if any(cases[case]["target"] == "optimal" for case in differing):
-        place = "the plant, its noise and its cost"
-    elif all(cases[case]["trained"] for case in differing):
-        place = "the algorithm of " + ", ".join(cases[case]["target"] for case in differing)
-    elif "tuned" in cases and "tuned" not in differing:
-        place = "the problem's discount, for which a tuned cost makes up"
-    else:
-        place = "the controller's model, its problem (horizon, bounds) and its QP"
-    return [f"evaluations that differ: {', '.join(differing)}; the same: {same}; look at {place}"]
 
 
 def _read(path: Path, keys: list[str]) -> pd.DataFrame:

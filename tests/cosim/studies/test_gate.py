@@ -1,4 +1,4 @@
-"""A change of one per cent in what the gate guards trips it, and its message says where to look."""
+"""A change of one per cent in what the gate guards trips it."""
 
 import dataclasses
 import json
@@ -61,15 +61,6 @@ def back_off(patch):
     patch.setattr(BackOffSearch, "at", lambda self, kappa: at(self, 1.01 * kappa))
 
 
-MUTATIONS = {
-    plant: "look at the plant",
-    model: "look at the controller's model",
-    discount: "look at the problem's discount",
-    gradient: "look at the algorithm of q-learning",
-    back_off: "look at the algorithm of backoff",
-}
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
@@ -90,9 +81,7 @@ def test_without_a_change_the_gate_holds(folder):
     assert check(folder) == []
 
 
-@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda change: change.__name__)
-def test_a_change_of_one_per_cent_trips_it_and_is_named(folder, monkeypatch, mutation):
+@pytest.mark.parametrize("mutation", [plant, model, discount, gradient, back_off])
+def test_a_change_of_one_per_cent_trips_it(folder, monkeypatch, mutation):
     mutation(monkeypatch)
-    lines = check(folder)
-    print("\n".join(lines))
-    assert MUTATIONS[mutation] in lines[0]
+    assert check(folder) != []

@@ -182,19 +182,14 @@ def _table_differences(
     )
     allowed = {c: _tolerance(c, units[c], tolerances) for c in stored if c in now}
     result = compare(a, b, {signal: one.absolute for signal, one in allowed.items()})
-    first = result.first
-    for found in sorted(result.differences, key=lambda one: one.first != first):
+    for found in sorted(result.differences, key=lambda one: one.first != result.first):
         if found.first is None:
-            continue
-        where = f"{name}: row {_row(stored, common[found.first])}: signal {found.name}"
-        if found.first != first:
-            lines.append(f"{where} differs from here on")
             continue
         was, value = (float(run.signals[found.name].values[found.first]) for run in (a, b))
         unit = allowed[found.name].unit.removeprefix("1")
         lines.append(
-            f"{where} is {value!r} now, {was!r} stored: {abs(value - was):.3g} apart, tolerance "
-            f"{found.tolerance:g} {unit}".rstrip()
+            f"{name}: row {_row(stored, common[found.first])}: signal {found.name} is {value!r} "
+            f"now, {was!r} stored, tolerance {found.tolerance:g} {unit}".rstrip()
         )
     for lost, text in ((result.only_a, "stored, not computed"), (result.only_b, "not stored")):
         if lost:

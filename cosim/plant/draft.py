@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from cosim.errors import PlantError
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, unpack
-from cosim.plant.fmu_plant import REALS, FmuPlant, has_start
+from cosim.plant.fmu_plant import REALS, FmuPlant, has_start, refusals
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -47,6 +47,8 @@ def draft_scenario(
     begins. Raises PlantError, which says what to give, where nothing can be guessed.
     """
     archive = unpack(fmu)
+    for refusal in refusals(archive):
+        raise PlantError(refusal)
     known = {variable.name: variable for variable in archive.description.modelVariables}
     for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
         if name not in known:
@@ -183,7 +185,7 @@ def _reals(known: Mapping[str, Any], causality: str) -> list[str]:
 def _cost(fmu: UnpackedFmu, known: Mapping[str, Any]) -> str:
     outputs = _reals(known, "output")
     if not outputs:
-        raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output: it cannot be a plant")
+        raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output to draft from")
     found = [name for name in outputs if any(word in name.lower() for word in COSTS)]
     if len(found) == 1:
         return found[0]
@@ -282,7 +284,8 @@ def nearest_steady_state(
 
     precise = {"diff_step": DIFFERENCE, "gtol": 1e-15, "ftol": None, "xtol": None}
     start = np.clip(start, *bounds)
-    found = least_squares(residual, start, "3-point", bounds, x_scale=scale, **precise)
+    with np.errstate(divide="ignore", invalid="ignore"):  # SciPy's own, of a step that is lost
+        found = least_squares(residual, start, "3-point", bounds, x_scale=scale, **precise)
     z, left = found.x, float(np.max(np.abs(found.fun)))
     if left > LOOSE:
         raise PlantError(

@@ -55,12 +55,6 @@ def test_every_installed_importer_passes(example, version):
     assert sum(f.status == importers.PASSED for f in findings) >= 4
 
 
-@pytest.mark.slow
-def test_two_builds_are_byte_identical(example, tmp_path):
-    again = example.build(tmp_path / example.fmu.name, 2)
-    assert again.read_bytes() == example.fmu.read_bytes()
-
-
 def test_both_fmi_versions_give_the_same_bits(example):
     rows = []
     for fmu in (example.fmu, example.fmu3):

@@ -81,7 +81,7 @@ def test_what_cannot_be_guessed_is_asked_for(cosim, tank, tmp_path):
         ('name="cost"', 'name="outflow"', "give --cost NAME, one of x, outflow"),
         ('name="x"', 'name="other_cost"', "other_cost and cost could be"),
         ('name="x_start"', 'name="x0"', "--states A,B"),
-        ('"input"><Real start="0"', '"local"><Real', "no real input to act on\n"),
+        ('"input"><Real start="0"', '"local"><Real', "has no input and no tunable parameter"),
         ('causality="output"', 'causality="local"', "no scalar real output"),
     ):
         code, _, err = cosim("scenario", "init", changed(old, new), "--sampling-time", 0.5)

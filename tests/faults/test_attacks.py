@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -45,17 +46,8 @@ class Plugin:
         return self._answer(self._k, s)
 
 
-class Keep:
-    """A recorder, so that predictions are looked at."""
-
-    def start(self, *_):
-        pass
-
-    def record(self, block):
-        pass
-
-    def close(self):
-        pass
+# A recorder, so that predictions are looked at.
+KEEP = SimpleNamespace(start=lambda *_: None, record=lambda block: None, close=lambda: None)
 
 
 def one_line(error):
@@ -113,7 +105,7 @@ def test_a_prediction_that_changes_its_shape_or_kind_is_one_line(plant, kind):
         return Decision(np.array(GOOD), predicted_states=states, predicted_actions=actions)
 
     with pytest.raises(CosimError, match="prediction") as error:
-        simulate(plant, Plugin(answer), 3, 0, recorder=Keep())
+        simulate(plant, Plugin(answer), 3, 0, recorder=KEEP)
     one_line(error)
 
 

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -57,19 +56,9 @@ def web(connection: socket.socket) -> None:
 ANSWERS = {answer.__name__: answer for answer in (silent, web)}
 
 
-@dataclass
-class Processes:
-    """A scheduler and its workers as processes."""
-
-    address: str = ""
-    scheduler: subprocess.Popen[bytes] | None = None
-    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
-
-
 @contextmanager
-def processes(*, workers: int = 1, code: Path = ROOT) -> Iterator[Processes]:
-    """A cluster whose workers run the code in a folder."""
-    cluster = Processes()
+def processes(*, workers: int = 1, code: Path = ROOT) -> Iterator[tuple[str, subprocess.Popen]]:
+    """Address and scheduler of a cluster whose workers run the code in a folder."""
     with tempfile.TemporaryDirectory(prefix="cosim-dask-") as folder, ExitStack() as running:
 
         def start(which: str, *words: str, path: Path) -> subprocess.Popen[bytes]:
@@ -85,12 +74,11 @@ def processes(*, workers: int = 1, code: Path = ROOT) -> Iterator[Processes]:
 
         note = Path(folder) / "scheduler.json"
         where = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
-        cluster.scheduler = start("scheduler", *where, "--scheduler-file", str(note), path=ROOT)
-        cluster.address = _address(note)
+        scheduler = start("scheduler", *where, "--scheduler-file", str(note), path=ROOT)
+        address = _address(note)
         for _ in range(workers):
-            words = (cluster.address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
-            cluster.workers.append(start("worker", *words, path=code))
-        yield cluster
+            start("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", path=code)
+        yield address, scheduler
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -108,7 +96,6 @@ def _address(note: Path) -> str:
 
 
 FORMS = [
-    "",
     "nonsense",
     "tcp://127.0.0.1:9",
     "tcp://127.0.0.1:99999",
@@ -135,7 +122,7 @@ def soon(monkeypatch):
 
 
 @pytest.mark.usefixtures("soon")
-@pytest.mark.parametrize("address", FORMS)
+@pytest.mark.parametrize("address", ["", *FORMS])
 def test_an_address_that_leads_nowhere_is_named(address):
     refused(address)
 
@@ -160,16 +147,16 @@ SLOW = pytest.mark.slow
 
 @SLOW
 def test_a_sound_cluster_gives_the_bytes_of_one_process():
-    with processes(workers=2) as there:
-        table = run(there.address)
+    with processes(workers=2) as (address, _):
+        table = run(address)
     assert table.to_csv() == evaluate("paper", {"naive": naive}, 2, 20).to_csv()
 
 
 @SLOW
 def test_a_cluster_without_workers_is_named(monkeypatch):
     monkeypatch.setattr(engine, "WORKER_SECONDS", 2.0)
-    with processes(workers=0) as there:
-        refused(there.address)
+    with processes(workers=0) as (address, _):
+        refused(address)
 
 
 @SLOW
@@ -178,8 +165,8 @@ def test_a_worker_of_another_version_is_named(tmp_path):
         shutil.copytree(ROOT / package, tmp_path / package)
     with (tmp_path / "cosim" / "simulation.py").open("a") as file:
         file.write("\n# another version\n")
-    with processes(code=tmp_path) as there:
-        refused(there.address)
+    with processes(code=tmp_path) as (address, _):
+        refused(address)
 
 
 @SLOW
@@ -192,11 +179,11 @@ def test_a_scheduler_that_ends_or_hangs_ends_the_run_and_loses_nothing(number, t
             time.sleep(0.05)
         scheduler.send_signal(signal.Signals[number])
 
-    with processes() as there:
-        stop = threading.Thread(target=stop_later, args=(there.scheduler,))
+    with processes() as (address, scheduler):
+        stop = threading.Thread(target=stop_later, args=(scheduler,))
         stop.start()
         with pytest.raises(EvaluationError) as caught:
-            run(there.address, seeds=400, steps=5000, folder=tmp_path)
+            run(address, seeds=400, steps=5000, folder=tmp_path)
         stop.join()
     assert "\n" not in str(caught.value)
     assert 1 <= len(rows.read_text().splitlines()) - 1 < 400

@@ -113,19 +113,9 @@ SIGNALS: tuple[SignalKind, ...] = (
 )
 
 
-def signal_names(scenario: Scenario) -> list[str]:
-    """Names of a run's signals, in the order of the CSV's columns."""
-    return [name for kind in SIGNALS if not kind.clock for name in kind.names(scenario)]
-
-
 def clocked() -> frozenset[str]:
     """Names of the signals that a clock measured: two equal runs differ in them."""
     return frozenset(kind.name for kind in SIGNALS if kind.clock)
-
-
-def whole() -> frozenset[str]:
-    """Names of the signals that are 0 or 1."""
-    return frozenset(kind.name for kind in SIGNALS if kind.whole)
 
 
 class SignalColumns:
@@ -200,11 +190,6 @@ class Signal:
     unit: str
     values: Array
 
-    @property
-    def header(self) -> str:
-        """Column title in CSV, `name [unit]`."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
-
 
 @dataclass(frozen=True, repr=False)
 class Trajectory(Result):
@@ -228,7 +213,8 @@ class Trajectory(Result):
 
     def __post_init__(self) -> None:
         """Check that every signal is there and has one value per sample."""
-        expected = signal_names(self.scenario)
+        kinds = [kind for kind in SIGNALS if not kind.clock]
+        expected = (name for kind in kinds for name in kind.names(self.scenario))
         if missing := [name for name in expected if name not in self.signals]:
             raise TrajectoryError(f"the trajectory lacks the signal {', '.join(missing)}")
         samples = len(self.status)
@@ -348,10 +334,12 @@ class Trajectory(Result):
         return write_atomically(path, csv_text(header, rows))
 
     def _write(self, stream: TextIO) -> None:
-        signals, counted = list(self.signals.values()), whole()
+        signals = list(self.signals.values())
+        counted = {kind.name for kind in SIGNALS if kind.whole}
         text = [(lambda v: repr(int(v))) if s.name in counted else repr for s in signals]
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*(signal.header for signal in signals), STATUS])
+        titles = (f"{s.name} [{s.unit}]" if s.unit else s.name for s in signals)
+        writer.writerow([*titles, STATUS])
         numbers = _rows([signal.values for signal in signals])
         for row, status in zip(numbers, self.status, strict=True):
             writer.writerow([*(write(v) for write, v in zip(text, row, strict=True)), status])

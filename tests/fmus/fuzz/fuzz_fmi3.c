@@ -12,6 +12,21 @@ static void logger(fmi3InstanceEnvironment environment, fmi3Status status, fmi3S
     check_message(category, message);
 }
 
+static Instance *stepping; /* which of the instances is inside a step */
+
+/* Inside a step a state can be read and nothing else can be done. */
+static void told(fmi3InstanceEnvironment environment, fmi3Float64 time, fmi3Boolean set,
+                 fmi3Boolean get, fmi3Boolean finished, fmi3Boolean may_return,
+                 fmi3Boolean *returns, fmi3Float64 *early) {
+    fmi3Float64 x = NAN;
+    (void)environment, (void)returns, (void)early;
+    assert(isfinite(time) && !set && get && finished && !may_return);
+    if (!rarely()) return;
+    assert(fmi3GetFloat64(stepping, STATE_REFERENCES, 1, &x, 1) == fmi3OK && isfinite(x));
+    assert(fmi3Reset(stepping) == fmi3Error && fmi3Terminate(stepping) == fmi3Error);
+    assert(fmi3SetFloat64(stepping, STATE_REFERENCES, 1, &x, 1) == fmi3Error);
+}
+
 static Instance *instantiate(void) {
     const char *name = rarely() ? (below(2) ? NULL : "") : "fuzz";
     const char *token = rarely() ? (below(2) ? NULL : "x") : MODEL_TOKEN;
@@ -22,7 +37,7 @@ static Instance *instantiate(void) {
         fmi3InstantiateScheduledExecution(name, token, NULL, false, false, NULL, logger, NULL, NULL,
                                           NULL);
     return fmi3InstantiateCoSimulation(name, token, NULL, false, below(2), rarely(), below(2),
-                                       &required, (size_t)rarely(), NULL, logger, NULL);
+                                       &required, (size_t)rarely(), NULL, logger, below(2) ? told : NULL);
 }
 
 static fmi3Status walk(Instance *c) {
@@ -105,6 +120,7 @@ static int any_call(Instance *c, void **state) {
         case 41: return fmi3GetNominalsOfContinuousStates(c, x, rarely() ? n : N_STATES);
         case 42: return fmi3GetNumberOfContinuousStates(c, rarely() ? NULL : &size);
         case 43: case 44:
+            stepping = c;
             return fmi3DoStep(c, any_time(c), any_step(), true, flag, truth, truth, x);
         default: return fmi3GetIntervalDecimal(c, r, n, x, NULL);
     }

@@ -19,8 +19,8 @@ from controllers.factories import tuned
 from cosim import FmuPlant, Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from fmus import PLATFORMS, Platform
-from fmus.build import SOURCES, cross_compiler
-from fmus.evaporator import EVAPORATOR, HEADER
+from fmus.build import cross_compiler
+from fmus.evaporator import EVAPORATOR, HEADER, sources
 from fmus.model import FmiVersion
 from fmus.sampled import SampledSystem, sampled_sources
 
@@ -125,7 +125,8 @@ class Hosted:
 def hosted_plant(version: FmiVersion, folder: Path) -> Hosted:
     """The shipped plant."""
     fmu = fmus.path(fmus.NAMES[version - 2])
-    importer = Importer("host.c", {HEADER: (SOURCES / HEADER).read_bytes()}, folder / "host")
+    header = sources(version)[HEADER]
+    importer = Importer("host.c", {HEADER: header}, folder / f"host{version}")
     return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, EVAPORATOR.identifier)
 
 

@@ -100,17 +100,24 @@ class ActorCritic(Algorithm):
         deviation[explored] = batch["deviation"][explored] - np.nan_to_num(bias)
         return deviation / self._unit
 
-    def _update(self, number: int) -> Update:
-        settings, batch = self.configuration, self._batch
+    def gradient(self) -> tuple[Vector, Matrix, Vector]:
+        """∇J and E[∇π ∇πᵀ] in units of θ's scale, (n_θ,) and (n_θ, n_θ), of a full batch (K,).
+
+        Also the TD errors, (K,). The batch counts in the advantage from there on.
+        """
+        batch = self._batch
         errors = lstdv(batch["states"], batch["next_states"], batch["reward"])
         jacobian = batch["jacobian"] * self._step.scale / self._unit[:, None]
         advantage = np.einsum("kmi,km->ki", jacobian, self._deviation())
         self._advantage.add(advantage, errors)
-        weights = self._advantage.weights()
         fisher = np.einsum("kmi,kmj->ij", jacobian, jacobian) / len(errors)
-        gradient = fisher @ weights
-        floor = settings.ridge * float(np.trace(fisher)) / weights.size
-        metric = fisher + (floor + np.finfo(float).tiny) * np.eye(weights.size)
+        return fisher @ self._advantage.weights(), fisher, errors
+
+    def _update(self, number: int) -> Update:
+        settings = self.configuration
+        gradient, fisher, errors = self.gradient()
+        floor = settings.ridge * float(np.trace(fisher)) / gradient.size
+        metric = fisher + (floor + np.finfo(float).tiny) * np.eye(gradient.size)
         fit = policy_gradient_fit(gradient, settings.step_size, metric)
         # A step that the policy does not feel has no length here, and is none to take.
         if not fit.minimiser @ fisher @ fit.minimiser > 0:

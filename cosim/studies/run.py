@@ -239,6 +239,7 @@ class Runner:
         self._done[name] = 0
         if run.training is not None:
             if not store.status:
+                store.unseal()
                 yield replace(base, folder=store.folder.absolute() if shared_disk else None)
                 return
             base = replace(base, parameters=store.parameters)
@@ -264,6 +265,7 @@ class Runner:
                 write_atomically(store.folder / FAILURE, outcome.traceback)
                 self._tell(f"failed: {name}: {outcome.message}")
             return
+        store.unseal()
         self._done[name] += item.noise.samples
         if isinstance(outcome, Trained):
             store.train(outcome)
@@ -277,11 +279,11 @@ class Runner:
         self._tell(self._finish(name, item.run))
 
     def _finish(self, name: str, run: Run) -> str:
-        """Write what a complete run has; returns a line about it."""
+        """Seal a complete run; returns a line about it."""
         store = self.stores[name]
         if not store.finished:
             return ""
-        store.flush()
+        store.seal()
         self._finished.add(name)
         found = store.indicators(EVALUATION)
         seeds = run.noise[EVALUATION].seeds
@@ -376,10 +378,7 @@ def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome
 async def _identity(dask: Any, address: str) -> dict[str, Any]:
     """A scheduler's identity; raises TimeoutError without an answer."""
     security = dask.Security().get_connection_args("client")
-    async with (
-        asyncio.timeout(ANSWER_SECONDS),
-        dask.rpc(address, connection_args=security) as scheduler,
-    ):
+    async with asyncio.timeout(ANSWER_SECONDS), dask.rpc(address, connection_args=security) as scheduler:
         return dict(await scheduler.identity())
 
 

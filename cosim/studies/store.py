@@ -10,6 +10,7 @@ checkpoint of the training that it runs, and its log and θ so far.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import time
@@ -259,7 +260,7 @@ class Trained:
 class RunStore:
     """The files of one run; `run.facts` say all that its results depend on.
 
-    What is there of other facts, or is damaged, is deleted and named in `remarks`.
+    What is there of other facts, or is not as it was written, is deleted and named in `remarks`.
     Only files that a run of a study writes are deleted, and only beside a run.json. Raises
     StudyError where the folder holds other files than ours, or leads out of `out`.
     """
@@ -283,7 +284,7 @@ class RunStore:
             self.missing(file)
 
     def _found(self) -> dict[str, Any]:
-        """run.json if it is intact and a finished training's files are there, else {}."""
+        """run.json if it and its hashed files are intact, else {}."""
         path = self.folder / RUN
         if not path.is_file():
             if any(map(_ours, self.folder.glob("*"))):
@@ -294,14 +295,19 @@ class RunStore:
             return {}
         try:
             about = read_json(path, f"'{path}'", StudyError)
+            about["files"] = dict(about.get("files", {}))
             dict(about["facts"])
         except (StudyError, KeyError, TypeError, ValueError):
             self.remarks.append(f"'{path}' is damaged; the run is done anew")
             return {}
-        for name in TRAINED if about.get("status") else ():
-            if not (self.folder / name).is_file():
-                self.remarks.append(f"'{self.folder / name}' is gone; the run is done anew")
+        for name, digest in list(about["files"].items()):
+            if _digest(self.folder / name) == digest:
+                continue
+            self.remarks.append(f"'{self.folder / name}' is not as it was written; made anew")
+            if name in TRAINED:
                 return {}
+            (self.folder / name).unlink(missing_ok=True)
+            del about["files"][name]
         if (before := about["facts"]) != self._facts:
             names = ", ".join(changed(before, self._facts))
             self.remarks.append(f"{names} changed since these runs; they are done anew")
@@ -346,6 +352,7 @@ class RunStore:
             samples=trained.samples,
             plant_samples=trained.plant_samples,
             timing={"wall_seconds": trained.wall_seconds, "processor_seconds": trained.clock},
+            files={name: _digest(self.folder / name) for name in TRAINED},
         )
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
@@ -369,8 +376,6 @@ class RunStore:
             return {}
         wanted = () if file == TIMING else (*key, *columns)
         rows = read_table(self.folder / file, wanted, dict.fromkeys(key, int)).set_index("seed")
-        if rows.isna().any(axis=None):
-            raise StudyError(f"'{self.folder / file}': a row is torn")
         rows = rows[(rows.steps == noise.steps) & (rows[key[2]] == (noise.block or noise.burn_in))]
         rows = rows.drop(columns=key[1:])
         rows = rows.groupby("seed").agg(list) if noise.block else rows[~rows.index.duplicated()]
@@ -424,10 +429,29 @@ class RunStore:
         trained = self.run.training is None or bool(self.status)
         return trained and not any(self.missing(file) for file in self.run.noise)
 
+    def seal(self) -> None:
+        """Note the hashes of a finished run's files, so that a torn or edited one is noticed."""
+        self.flush()
+        paths = filter(_ours, self.folder.glob("*"))
+        files = {path.name: _digest(path) for path in sorted(paths) if path.name != TIMING}
+        if self.about.get("files") != files:
+            self.note(files=files)
+
+    def unseal(self) -> None:
+        """Forget the hashes before more is written, those of the training's own files excepted."""
+        files = self.about.get("files", {})
+        if files.keys() - TRAINED:
+            self.note(files={name: files[name] for name in files.keys() & TRAINED})
+
 
 def _ours(path: Path) -> bool:
     """Whether a file is one that a run of a study writes."""
     return path.name in OURS or any(map(path.match, PATTERNS))
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, empty where it is not there."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:

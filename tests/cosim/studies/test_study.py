@@ -178,9 +178,10 @@ def test_a_mistake_is_refused_before_any_work(changes, tmp_path):
 @pytest.mark.parametrize(
     ("name", "damage"),
     [
-        ("learning.csv", "gone"),
-        ("parameters.toml", "gone"),
-        ("evaluation.csv", "torn"),
+        ("learning.csv", "torn"),
+        ("parameters.toml", "edited"),
+        ("parameters.toml", "edited before its evaluation"),
+        ("evaluation.csv", "gone"),
         ("run.json", "torn"),
     ],
 )
@@ -188,7 +189,15 @@ def test_a_finished_run_s_damaged_file_is_named_and_made_again(whole, tmp_path, 
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     path = tmp_path / "runs" / "paper" / "grow(rate=1.0)" / "0" / name
     content = path.read_bytes()
-    path.unlink() if damage == "gone" else path.write_bytes(content[: len(content) // 2])
+    if "before" in damage:  # as an interrupted study leaves it
+        (path.parent / "evaluation.csv").unlink()
+        about = json.loads((path.parent / "run.json").read_text())
+        about["files"] = {name: about["files"][name] for name in ("learning.csv", path.name)}
+        (path.parent / "run.json").write_text(json.dumps(about))
+    if damage == "gone":
+        path.unlink()
+    else:
+        path.write_bytes(content[: len(content) // 2] + b"1\n" * damage.startswith("edited"))
     lines = []
     run_toy(tmp_path, report=lambda *state: lines.append(state[-1]))
     assert any(str(path) in line for line in lines)

@@ -32,9 +32,18 @@ from cosim.statistics import (
     regret,
     regrets,
 )
-from cosim.studies import store
 from cosim.studies.plan import NAIVE
 from cosim.studies.run import Report, Runner
+from cosim.studies.store import (
+    EVALUATION,
+    TIMING,
+    Case,
+    Noise,
+    Run,
+    RunKey,
+    check_folders,
+    to_csv,
+)
 from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:
@@ -107,7 +116,7 @@ def evaluate(
         "fmu_sha256": fmu,
         "command": command,
     }
-    noise = {store.EVALUATION: store.Noise(numbers, steps)}
+    noise = {EVALUATION: Noise(numbers, steps)}
     runs, parameters = [], {}
     for name, item in named.items():
         controller = build_controller(item, scenario) if isinstance(item, str) else item(scenario)
@@ -118,12 +127,12 @@ def evaluate(
             "parameters": parameters[name],
         }
         try:
-            key = store.RunKey(scenario.name, name)
+            key = RunKey(scenario.name, name)
         except StudyError as error:
             raise EvaluationError(str(error)) from None
-        case = store.Case(name, (scenario.name,), "")
-        runs.append(store.Run(key, case, scenario, item, None, depends, noise))
-    store.check_folders(runs)
+        case = Case(name, (scenario.name,), "")
+        runs.append(Run(key, case, scenario, item, None, depends, noise))
+    check_folders(runs)
 
     total = sum(run.samples for run in runs)
     bar = told(progress, scenario.name, total)
@@ -137,10 +146,10 @@ def evaluate(
         stores = dict(zip(named, runner.stores.values(), strict=True))
         columns, timing = (
             {
-                name: pd.DataFrame.from_dict(kept.indicators(file), "index").reindex(numbers)
-                for name, kept in stores.items()
+                name: pd.DataFrame.from_dict(store.indicators(file), "index").reindex(numbers)
+                for name, store in stores.items()
             }
-            for file in (store.EVALUATION, store.TIMING)
+            for file in (EVALUATION, TIMING)
         )
     return Evaluation(wanted, numbers, columns, timing, parameters, facts)
 
@@ -263,7 +272,7 @@ class Evaluation(Result):
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
-        return store.to_csv(self.to_pandas())
+        return to_csv(self.to_pandas())
 
     def figure(self) -> Figure:
         """Regret (J where J* is not known) with its intervals; economic cost against violation."""
@@ -288,7 +297,7 @@ class Evaluation(Result):
         self.plot(folder / "evaluation.png")
         clock = pd.concat({name: self.timing[name] for name in self.controllers})
         clock = clock.rename_axis(["controller", "seed"]).reset_index()
-        for name, frame in ((store.EVALUATION, self.to_pandas()), (store.TIMING, clock.round(3))):
+        for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock.round(3))):
             # Rows as they are written: their text takes ten times the memory of their numbers.
             with replacing(folder / name) as path:
                 frame.to_csv(path, index=False, lineterminator="\n")

@@ -16,6 +16,15 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Run a study from a file, and report it.", no_args_is_help=True)
 results = typer.Typer(help="Check the stored studies, or make them anew.", no_args_is_help=True)
 
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--columns",
+        help="Columns of the printed tables, by comma, or `all`: case, rank, samples, finished, "
+        "regret, worst, iqm, J, J-worst, gap, economic, violation, violating, against, difference, "
+        "p; default: case,rank,regret,worst,finished.",
+    ),
+]
 FileArgument = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 NamesArgument = Annotated[
     list[str] | None, typer.Argument(help="Studies; default: all that apply.")
@@ -106,6 +115,7 @@ def show_plan(file: FileArgument, json: cli.JsonOption = False) -> None:
 @app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of a study.", show_default=False)],
+    columns: ColumnsOption = None,
     json: cli.JsonOption = False,
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
@@ -117,7 +127,7 @@ def report(
 
         found = StudyResults.load(folder)
         page = found.report()
-        _show(found, out_)
+        _show(found, out_, columns)
         out_.note(f"the report is {page.resolve()}")
         out_.json({"report": str(page), "runs": len(found.runs)})
 
@@ -135,12 +145,13 @@ def _summary(found: StudyResults) -> dict[str, Any]:
     }
 
 
-def _show(found: StudyResults, out_: cli.Output) -> None:
-    """Print a table for each scenario; all its columns are in the report."""
-    from cosim.studies.report import SHORT
+def _show(found: StudyResults, out_: cli.Output, columns: str | None = None) -> None:
+    """Print a table for each scenario, with the columns that `--columns` names."""
+    from cosim.studies.report import COLUMNS, SHORT
 
+    chosen = COLUMNS if columns == "all" else columns.split(",") if columns else SHORT
     for scenario in found.scenarios:
-        out_.table(f"{found.name}: {scenario}", *found.lines(scenario, SHORT))
+        out_.table(f"{found.name}: {scenario}", *found.lines(scenario, tuple(chosen)))
 
 
 def reproduce(

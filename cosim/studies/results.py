@@ -32,6 +32,19 @@ from cosim.statistics import (
 from cosim.studies import figures, operation, report, store
 from cosim.studies.plan import BASELINES, NAIVE, Plan
 from cosim.studies.report import COLUMNS, SHORT
+from cosim.studies.store import (
+    CURVE,
+    EVALUATION,
+    GREEDY,
+    INDICATORS,
+    KEYS,
+    STATE,
+    TIMING,
+    WHERE,
+    read_table,
+    safe,
+    to_csv,
+)
 from cosim.validation import instead
 
 ABOUT, SCHEMA = "study.json", 1
@@ -42,10 +55,10 @@ LEVELS = 4
 
 MEANS = ["economic_cost", "mean_violation", "violating_share"]
 RUN_COLUMNS = [
-    *store.STATE, "J", "regret", "regret_low", "regret_high", "gap_closed", *MEANS, "failures",
+    *STATE, "J", "regret", "regret_low", "regret_high", "gap_closed", *MEANS, "failures",
 ]  # fmt: skip
 SUMMARY_COLUMNS = [
-    *store.WHERE, "samples", "plant_samples", "finished", "runs", "regret_median",
+    *WHERE, "samples", "plant_samples", "finished", "runs", "regret_median",
     "regret_median_low", "regret_median_high", "regret_worst", "regret_iqm", "regret_iqm_low",
     "regret_iqm_high", "J_median", "J_worst", "J_iqm", "gap_closed_median", *MEANS, "failures",
     "regret_wide_low", "regret_wide_high", "rank", "against", "difference", "difference_low",
@@ -88,13 +101,13 @@ class StudyResults(Shown):
         return cls(
             folder,
             about,
-            store.read_table(folder / RUNS, store.STATE, {"samples": int, "plant_samples": int}),
-            store.read_table(
-                folder / store.EVALUATION,
-                [*store.KEYS, "seed", "steps", *store.INDICATORS],
+            read_table(folder / RUNS, STATE, {"samples": int, "plant_samples": int}),
+            read_table(
+                folder / EVALUATION,
+                [*KEYS, "seed", "steps", *INDICATORS],
                 {"seed": int, "steps": int},
             ),
-            store.read_table(folder / CURVES, [*store.KEYS, *store.CURVE], {"samples": "Int64"}),
+            read_table(folder / CURVES, [*KEYS, *CURVE], {"samples": "Int64"}),
         )
 
     @classmethod
@@ -111,18 +124,18 @@ class StudyResults(Shown):
         figures.keep(plan, out)
         drawn = figures.draw(plan, out) if draw else []
         tables = {
-            store.EVALUATION: found.evaluation,
+            EVALUATION: found.evaluation,
             CURVES: found.curves,
             RUNS: found.runs,
             SUMMARY: found.summary,
-            store.TIMING: store.timing(stores),
+            TIMING: store.timing(stores),
         }
         if found.about.get("operation"):
-            tables[OPERATION], tables[store.GREEDY] = operation.collected(runs)
+            tables[OPERATION], tables[GREEDY] = operation.collected(runs)
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
-            write_atomically(out / name, store.to_csv(table))
+            write_atomically(out / name, to_csv(table))
         about = dict(found.about) | {"pictures": drawn}
         write_atomically(out / ABOUT, json.dumps(about, indent=1, sort_keys=True) + "\n")
         return replace(found, about=about)
@@ -156,14 +169,14 @@ class StudyResults(Shown):
     def _arrays(self) -> dict[tuple[str, str], dict[str, Array]]:
         """Seeds, steps and indicators (R, S) by scenario and case."""
         found: dict[tuple[str, str], dict[str, Array]] = {}
-        rows = self.state[store.KEYS].merge(self.evaluation, on=store.KEYS, how="left")
-        for where, runs in self.state.groupby(store.WHERE, sort=False):
+        rows = self.state[KEYS].merge(self.evaluation, on=KEYS, how="left")
+        for where, runs in self.state.groupby(WHERE, sort=False):
             own = rows[(rows.scenario == where[0]) & (rows.case == where[1])]
             if own.seed.isna().any() or len(own) % len(runs):
                 raise StudyError(f"the tables in '{self.folder}' are damaged: {where}")
             found[where] = {
                 name: own[name].to_numpy(dtype=np.float64).reshape(len(runs), -1)
-                for name in ("seed", "steps", *store.INDICATORS)
+                for name in ("seed", "steps", *INDICATORS)
             }
         return found
 
@@ -201,7 +214,7 @@ class StudyResults(Shown):
     def runs(self) -> pd.DataFrame:
         """A row for each run: its state, J, regret with its interval over noise, indicators."""
         rows = []
-        for (scenario, case), state in self.state.groupby(store.WHERE, sort=False):
+        for (scenario, case), state in self.state.groupby(WHERE, sort=False):
             own = self._arrays[scenario, case]
             for run, known in enumerate(state.to_dict("records")):
                 found = self.regret(case, scenario, [run])
@@ -413,7 +426,7 @@ class StudyResults(Shown):
         return {
             scenario: save_set(
                 (
-                    (f"{kind}-{store.safe(scenario)}" if scenario else kind, drawn)
+                    (f"{kind}-{safe(scenario)}" if scenario else kind, drawn)
                     for kind, maker in self._makers.items()
                     if (scenario or kind == "profile") and (drawn := maker(scenario)) is not None
                 ),
@@ -445,7 +458,7 @@ class StudyResults(Shown):
         own = self.curves[self.curves.scenario == scenario]
         levels = own[own.training_seed.isna()].set_index("case").greedy_J
         trained = own[own.training_seed.notna()]
-        if not (trained.dropna(subset="greedy_J").groupby(store.KEYS).size() > 1).any():
+        if not (trained.dropna(subset="greedy_J").groupby(KEYS).size() > 1).any():
             return None
         best = float(levels.get(self.about["optimum"].get(scenario), np.nan))
         known = np.isfinite(best)
@@ -456,7 +469,7 @@ class StudyResults(Shown):
         }
         if not curves:
             return None
-        ends = trained.dropna(subset="greedy_J").groupby(store.KEYS).greedy_J.last()
+        ends = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J.last()
         ends = ends.groupby("case").median()
         first, optimum = (self.about[kind].get(scenario) for kind in ("naive", "optimum"))
         marks = {
@@ -471,17 +484,17 @@ class StudyResults(Shown):
         return figures.curves_figure(curves, drawn, self._looks, relative=bool(known))
 
     def _judged(self, scenario: str) -> operation.Judged:
-        lives = store.read_table(self.folder / OPERATION, types={"samples": int})
-        greedy = store.read_table(self.folder / store.GREEDY, types={"samples": int, "seed": int})
+        lives = read_table(self.folder / OPERATION, types={"samples": int})
+        greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
         return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
 
     def _seconds(self, scenario: str) -> dict[str, float]:
         """Median processor time in s of a case's runs, up to their last sample."""
-        path = self.folder / store.TIMING
+        path = self.folder / TIMING
         if not path.is_file():
             return {}
-        clock = store.read_table(path, types={"run": str}).set_index("run").training_seconds
+        clock = read_table(path, types={"run": str}).set_index("run").training_seconds
         last = self.about["operation"][scenario]["columns"][-1]
         own = self.state[(self.state.scenario == scenario) & self.state.training_seed.notna()]
         names = own.case + " on " + scenario + ", seed " + own.training_seed.astype(str)
@@ -538,7 +551,7 @@ class StudyResults(Shown):
             "command": ["cosim", "study", "run", self.about.get("file") or f"{self.name}.toml"],
             "made": f"Made with {made['versions']}; code {made['code_hash']}"
             + (f"; commit {made['commit']}" if made.get("commit") else ""),
-            "date": report.date(self.folder / store.TIMING),
+            "date": report.date(self.folder / TIMING),
         }
 
     def _noise(self, scenario: str) -> str:

@@ -116,7 +116,7 @@ class ActorCritic(Algorithm):
     def _update(self, number: int) -> Update:
         settings = self.configuration
         gradient, fisher, errors = self.gradient()
-        floor = settings.ridge * float(np.trace(fisher)) / gradient.size
+        floor = settings.ridge * float(fisher.trace()) / gradient.size
         metric = fisher + (floor + np.finfo(float).tiny) * np.eye(gradient.size)
         fit = policy_gradient_fit(gradient, settings.step_size, metric)
         # A step that the policy does not feel has no length here, and is none to take.
@@ -125,7 +125,7 @@ class ActorCritic(Algorithm):
         # From the one radius to the other by equal ratios.
         share = min(number / self.samples, 1.0)
         radius = settings.radius * (settings.radius_end / settings.radius) ** share
-        fit = fit.within(radius, lambda d: float(max(d @ fisher @ d, 0.0)) ** 0.5)
+        fit = fit.within(radius, lambda d: max(float(d @ fisher @ d), 0.0) ** 0.5)
         return self._step.take(fit, float(np.sqrt(np.mean(errors * errors))))
 
 

@@ -378,7 +378,10 @@ def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome
 async def _identity(dask: Any, address: str) -> dict[str, Any]:
     """A scheduler's identity; raises TimeoutError without an answer."""
     security = dask.Security().get_connection_args("client")
-    async with asyncio.timeout(ANSWER_SECONDS), dask.rpc(address, connection_args=security) as scheduler:
+    async with (
+        asyncio.timeout(ANSWER_SECONDS),
+        dask.rpc(address, connection_args=security) as scheduler,
+    ):
         return dict(await scheduler.identity())
 
 

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.linalg import null_space, solve_discrete_are
 
 from controllers.errors import TuningError
-from controllers.model import discretise
+from controllers.model import discretise, runge_kutta
 from controllers.problem import Problem
 from controllers.theta import Parameters, ThetaBlocks, symmetric_matrix
 from cosim.protocols import Array
@@ -362,9 +362,24 @@ def accurate_substeps(problem: Problem) -> int:
     steps. The problem's own number is doubled until doubling it once more changes less. Raises
     TuningError where that does not come about in 1024 steps.
     """
-    substeps, present = problem.substeps, np.hstack(linear_model(problem))
+    model, (x, u, d, p), h = problem.model, problem.model.symbols(), ca.SX.sym("h")
+    following = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, 1)
+    jacobian = ca.jacobian(following, ca.vertcat(x, u))
+    step = ca.Function("step", [x, u, d, p, h], [following, jacobian])
+    given = problem.reference_action, model.nominal_disturbance, model.nominal_parameters
+    length, n, m = problem.sampling_time / model.time_unit, problem.n_states, problem.n_actions
+
+    def linear(substeps: int) -> Array:
+        """A and B side by side."""
+        at, moved = problem.reference_state, np.eye(n, n + m)
+        for _ in range(substeps):
+            at, slope = (part.full() for part in step(at, *given, length / substeps))
+            moved = slope @ np.vstack([moved, np.eye(m, n + m, n)])
+        return moved
+
+    substeps, present = problem.substeps, linear(problem.substeps)
     while substeps <= 1024:
-        finer = np.hstack(linear_model(dataclasses.replace(problem, substeps=2 * substeps)))
+        finer = linear(2 * substeps)
         if (np.abs(finer - present) <= 1e-8 * (1.0 + np.abs(present))).all():
             return substeps
         substeps, present = 2 * substeps, finer

@@ -75,7 +75,7 @@ class Model:
         )
 
 
-def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float, substeps: int) -> ca.SX:
+def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float | ca.SX, substeps: int) -> ca.SX:
     """x after `substeps` classical RK4 steps of length h of x' = rate(x)."""
     for _ in range(substeps):
         k1 = rate(x)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import re
 import sys
@@ -175,6 +177,10 @@ def main() -> None:
     Bad input ends in one line on standard error and exit code 2, what nobody foresaw in one line,
     a report with the traceback and exit code 70.
     """
+    # Modules and CasADi's expressions are many objects, and hardly garbage: the collector's passes
+    # over them, while they are made and at exit, are a fifth of a short run.
+    gc.set_threshold(50_000)
+    atexit.register(gc.freeze)
     _open_streams()
     with command_process():
         _run()

@@ -1,5 +1,7 @@
 """How the CPU time of a sample grows with horizon and θ, interpreted beside compiled."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from benchmarks.measuring import clock, figure
@@ -18,7 +20,7 @@ def measure(scenario, steps=SAMPLES):
     """Time the phases for each horizon, and at the scenario's own for larger θ."""
     cases = [(horizon, "paper's θ", {}) for horizon in HORIZONS]
     cases += [(scenario.controller.horizon, kind, more) for kind, more in KINDS.items()]
-    rows = []
+    rows, sums = [], {}
     for horizon, kind, more in cases:
         problem = Problem.from_scenario(scenario.replace({"controller": {"horizon": horizon}}))
         theta = Parameters.naive(problem, ThetaBlocks.of(problem, **more))
@@ -26,9 +28,13 @@ def measure(scenario, steps=SAMPLES):
         interpreted = [walk(controller, steps) for _ in range(REPETITIONS)]
         compile_functions(controller)
         compiled = [walk(controller, steps) for _ in range(REPETITIONS)]
+        sums[horizon, kind] = [sum(mean.values()) for mean in compiled]
         for phase in PHASES:
             own, others = ([mean[phase] for mean in times] for times in (compiled, interpreted))
             rows.append(figure(f"N = {horizon}, {kind}: {phase}", own, "interpreter", others))
+    for shorter, longer in pairwise(HORIZONS):
+        own, others = (sums[horizon, "paper's θ"] for horizon in (shorter, longer))
+        rows.append(figure(f"N = {shorter}: all of it, compiled", own, f"N = {longer}", others))
     return rows
 
 

@@ -32,7 +32,7 @@ from cosim.trajectory import (
 )
 from cosim.validation import known_keywords
 
-BLOCK = 500
+BLOCK = 2000
 
 
 def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:

@@ -7,6 +7,7 @@ import io
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from math import nan
 from operator import attrgetter
 from pathlib import Path
@@ -15,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal, TextIO
 import numpy as np
 
 from cosim.errors import TrajectoryError
-from cosim.files import replacing, write_atomically
+from cosim.files import replacing
 from cosim.protocols import Array, Solution, Step
-from cosim.result import Result, csv_text
+from cosim.result import Result
 from cosim.scenario import VIOLATING, Scenario
 
 if TYPE_CHECKING:
@@ -331,7 +332,9 @@ class Trajectory(Result):
         """Write the wall-clock times in µs to a file of their own, one row per sample."""
         header = [f"{name} [us]" for name in self.timing]
         rows = ([f"{1e6 * v:.3f}" for v in row] for row in _rows(list(self.timing.values())))
-        return write_atomically(path, csv_text(header, rows))
+        with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
+            csv.writer(stream, lineterminator="\n").writerows(chain([header], rows))
+        return Path(path)
 
     def _write(self, stream: TextIO) -> None:
         signals = list(self.signals.values())

@@ -21,6 +21,7 @@ from cosim.scenario import Scenario
 
 SOURCES = Path(__file__).parent / "sources"
 QP_SOURCES = ("qp.h", "qp_enter.h", "qp_refine.h", "qp_residual.h", "qp_set.h")
+SOLVERS = ("condensed.h", *QP_SOURCES), ("stages.h", "qp_set.h")
 RULES = {"gauss-newton": "gauss_newton.h", "exact": "exact.h"}
 # A sample's arrays live on the stack, of which a thread has 1 MB on some platforms.
 STACK_LIMIT = 400_000
@@ -80,10 +81,16 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
 def controller_sources(
     problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, StackedFunction]
 ) -> dict[str, bytes]:
-    """C files by name of a controller made of `functions`, by the prefix of their constants."""
-    wanted = ("core.h", "rti.h", *QP_SOURCES, "costs.h", "rotation.h", RULES[hessian])
+    """C files by name of a controller made of `functions`, by the prefix of their constants.
+
+    With `LINEARISED` among them its QP is solved stage by stage.
+    """
+    stagewise = "LINEARISED" in functions
+    wanted = ("core.h", "rti.h", *SOLVERS[stagewise], "costs.h", "rotation.h", RULES[hessian])
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
-    sources["functions.h"] = _functions(list(functions.values())).encode()
+    unused = {"PREPARED", "EMBEDDED"} if stagewise else set()
+    called = [function for name, function in functions.items() if name not in unused]
+    sources["functions.h"] = _functions(called).encode()
     sources["problem.h"] = _constants(problem, blocks, hessian, functions).encode()
     return sources
 
@@ -138,6 +145,8 @@ def _constants(
         end_discount=repr(float(gamma**horizon)),
         floor=repr(Exact.FLOOR),
         rule=RULES[hessian],
+        solver=SOLVERS["LINEARISED" in functions][0],
+        stagewise=str(int("LINEARISED" in functions)),
         **slack,
     )
 
@@ -216,8 +225,11 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
 def _joined(core: Core) -> str:
     """`core.h` with each file that it includes in the place of its first inclusion."""
     files = {name: data.decode() for name, data in core.sources.items()}
-    (rule,) = re.findall(r'#define HESSIAN_RULE "([\w.]+)"', files["problem.h"])
-    text = files["core.h"].replace("#include HESSIAN_RULE", f'#include "{rule}"')
+    for macro, name in re.findall(r'#define (\w+_RULE) "([\w.]+)"', files["problem.h"]):
+        files = {
+            each: text.replace(f"#include {macro}", f'#include "{name}"')
+            for each, text in files.items()
+        }
     seen: set[str] = set()
 
     def replace(found: re.Match[str]) -> str:
@@ -226,4 +238,4 @@ def _joined(core: Core) -> str:
         seen.add(name)
         return _INCLUDE.sub(replace, files[name])
 
-    return _INCLUDE.sub(replace, text)
+    return _INCLUDE.sub(replace, files["core.h"])

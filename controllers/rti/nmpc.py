@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ControllerError, ParameterError, QpError
-from controllers.export.core import SOURCES, STATUSES, controller_sources, stack_needed
+from controllers.export.core import SOURCES, STACK_LIMIT, STATUSES, controller_sources, stack_needed
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
 from controllers.qp import (
@@ -24,7 +24,15 @@ from controllers.qp import (
     make_backend,
     multipliers_at_kink,
 )
-from controllers.rti.preparation import Lift, embedding, make_hessian, preparation, qp_of, readout
+from controllers.rti.preparation import (
+    Lift,
+    embedding,
+    linearisation,
+    make_hessian,
+    preparation,
+    qp_of,
+    readout,
+)
 from controllers.sensitivities import (
     SOLUTION,
     adjoint_directions,
@@ -65,9 +73,15 @@ class Functions:
     gradient: StackedFunction
     policy: Callable[[], StackedFunction]
 
-
-Jacobians = Callable[[Vector, Vector], tuple[Matrix, Matrix] | None]
-"""dπ/dθ and dπ/ds of a prepared QP and its solution by compiled code; None where it cannot."""
+    def condense(self, before: Vector, after: Vector) -> None:
+        """Write the condensed QP into copies of both memories."""
+        own = self.preparation.memory, self.readout.memory
+        kept = [memory.copy() for memory in own]
+        own[0][:], own[1][:] = before, after
+        self.preparation()
+        self.embedding()
+        before[:], after[:] = own
+        own[0][:], own[1][:] = kept
 
 
 @dataclass(eq=False)
@@ -75,15 +89,15 @@ class Prepared:
     """What the preparation phase fixed, kept for read-outs after the next one has begun.
 
     `memory` is a copy of the preparation's, `parameters` the θ; `spectrum` says what convexified
-    the Hessians, None for Gauss–Newton; `functions` are the maker's, and its `jacobians` where it
-    is compiled.
+    the Hessians, None for Gauss–Newton; `functions` are the maker's, `engine` its compiled code.
+    Where that goes stage by stage nothing is condensed until somebody asks for the QP.
     """
 
     memory: Vector
     parameters: Parameters
     spectrum: Lift | None
     functions: Functions
-    jacobians: Jacobians | None = None
+    engine: Engine | None = None
 
     def part(self, name: str) -> Vector:
         """An input, result or other part of the preparation's memory, flat."""
@@ -127,6 +141,8 @@ class RtiSolution:
     def qp(self) -> SoftQp:
         """The condensed QP that was solved."""
         functions, prepared = self.prepared.functions, self.prepared
+        if prepared.engine is not None and prepared.engine.stagewise:
+            functions.condense(prepared.memory, self.memory)
         return qp_of(functions.preparation, functions.readout, prepared.memory, self.memory)
 
     @cached_property
@@ -171,14 +187,14 @@ class RtiSolution:
     @cached_property
     def residual(self) -> float:
         """Largest KKT residual; compiled code has measured it when it solved."""
-        if self.prepared.jacobians is not None and not self.enforced:
+        if self.prepared.engine is not None and not self.enforced:
             return float(self.memory[self.prepared.functions.readout.places["residual"]][0])
         return self.multipliers.residual(self.qp)
 
     @property
     def iterations(self) -> int | None:
         """Steps of the compiled QP solver; None where another one solved."""
-        if self.prepared.jacobians is None:
+        if self.prepared.engine is None:
             return None
         return int(self.memory[self.prepared.functions.readout.places["iterations"]][0])
 
@@ -200,7 +216,7 @@ class RtiSolution:
     @cached_property
     def value_gradient(self) -> Vector:
         """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
-        if self.prepared.jacobians is not None:
+        if self.prepared.engine is not None:
             return self.memory[self.prepared.functions.readout.places["gradient"]]
         function = self.prepared.functions.gradient
         self._write_solution(function)
@@ -225,8 +241,8 @@ class RtiSolution:
                 "call feedback(s) without an action"
             )
         m, prepared = self.action.size, self.prepared
-        if prepared.jacobians is not None:
-            found = prepared.jacobians(prepared.memory, self.memory)
+        if prepared.engine is not None:
+            found = prepared.engine.policy(prepared.memory, self.memory)
             if found is not None:
                 return found
         dv, dt, dlam = adjoint_directions(self.qp, self.multipliers, m)
@@ -267,8 +283,6 @@ class RtiSolution:
         )
 
 
-MOST = 700_000
-"""Bytes of a sample's largest arrays beyond which CasADi's interpreter and DAQP do the work."""
 NOT_FINITE = STATUSES.index("not finite")
 
 
@@ -279,7 +293,8 @@ class Engine:
     action to enforce is written.
     """
 
-    def __init__(self, path: str, functions: Functions) -> None:
+    def __init__(self, path: str, functions: Functions, stagewise: bool) -> None:
+        self.stagewise = stagewise
         self._library = library_ = ctypes.CDLL(path)
         before, after = functions.preparation.memory, functions.readout.memory
         library_.engine_sizes.restype = library_.engine_loop_size.restype = ctypes.c_size_t
@@ -306,9 +321,9 @@ class Engine:
 
     @classmethod
     def load(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
-        """Compiled engine of a Gauss–Newton controller, or None if unavailable.
+        """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
-        That is without a compiler, where COSIM_COMPILE says `never`, and for long horizons.
+        A QP that is too large for an exported controller is solved stage by stage.
         """
         named = {
             "PREPARED": functions.preparation,
@@ -317,13 +332,14 @@ class Engine:
             "GRADIENT": functions.gradient,
             "POLICY": functions.policy(),
         }
-        if stack_needed(functions.problem, named) > MOST:
-            return None
+        stagewise = stack_needed(functions.problem, named) > STACK_LIMIT
+        if stagewise:
+            named["LINEARISED"] = linearisation(functions.problem, blocks)
         sources = controller_sources(functions.problem, blocks, "gauss-newton", named)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources, ["engine.c"])
-        return None if path is None else cls(str(path), functions)
+        return None if path is None else cls(str(path), functions, stagewise)
 
     def prepare(self) -> int:
         """Preparation phase at the point and θ that the memory holds."""
@@ -444,6 +460,7 @@ class RtiNmpc:
         # The point of linearisation and the read-out's next one, each in one piece: a shift copies.
         places = self._prepare.places
         self._point = before[places["x"].start : places["u"].stop]
+        self._dense = places["H"].start, places["F"].stop
         places = self._readout.places
         self._next_point = slice(places["next_x"].start, places["next_u"].stop)
         self._next_costates, self._value = places["next_chi"], places["value"].start
@@ -457,9 +474,8 @@ class RtiNmpc:
         """Compile if a run of `samples` is worth it; to be called before the first sample.
 
         COSIM_COMPILE says `never`, or `now` for any number. Without a compiler, for the exact
-        Hessian, for backends other than `daqp` and for long horizons, whose arrays are large,
-        CasADi's interpreter stays. Both give the same to rounding and to DAQP's accuracy
-        (`tests/controllers/rti/test_engine.py` holds the bounds).
+        Hessian and for backends other than `daqp` CasADi's interpreter stays. Both give the same to
+        rounding and to DAQP's accuracy (`tests/controllers/rti/test_engine.py` holds the bounds).
         """
         if not self._compilable or (samples < LONG and switch() != "now"):
             return
@@ -577,13 +593,24 @@ class RtiNmpc:
                 "the QP is not finite: the model has no finite value or derivative at the point of "
                 "linearisation",
                 status="QP not finite",
-                qp=self._qp.copy(),
+                qp=self._present_qp(),
             )
         if self._engine is None:
             self._backend.load(self._qp)
-        jacobians = None if self._engine is None else self._engine.policy
-        memory, spectrum = prepare.memory.copy(), self._hessian.spectrum
-        self._prepared = Prepared(memory, self._parameters, spectrum, self._functions, jacobians)
+        if self._engine is not None and self._engine.stagewise:  # all but what was not condensed
+            memory, first, last = np.empty_like(prepare.memory), *self._dense
+            memory[:first], memory[last:] = prepare.memory[:first], prepare.memory[last:]
+        else:
+            memory = prepare.memory.copy()
+        made = self._parameters, self._hessian.spectrum, self._functions, self._engine
+        self._prepared = Prepared(memory, *made)
+
+    def _present_qp(self) -> SoftQp:
+        """Copy of the QP for a QpError."""
+        if self._engine is not None and self._engine.stagewise:
+            self._prepare()
+            self._embed()
+        return self._qp.copy()
 
     @property
     def linearisation_point(self) -> LinearisationPoint:
@@ -649,7 +676,8 @@ class RtiNmpc:
             raise self._not_finite(s, a)
         if status:
             reason = STATUSES[status]
-            raise QpError(f"the QP was not solved: {reason}", status=reason, qp=self._qp.copy())
+            message = f"the QP was not solved: {reason}"
+            raise QpError(message, status=reason, qp=self._present_qp())
 
     def _solve_interpreted(self, s: Vector, a: Vector | None) -> None:
         qp, read = self._qp, self._readout
@@ -676,7 +704,7 @@ class RtiNmpc:
         return QpError(
             f"the QP is not finite: state {s}, action {a!r}",
             status="state or action not finite",
-            qp=self._qp.copy(),
+            qp=self._present_qp(),
         )
 
     def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:

@@ -7,15 +7,15 @@
 #include "sensitivities.h"
 
 size_t engine_sizes(int what) {
-    return what == 0 ? sizeof(RtiPrepared) : what == 1 ? sizeof(RtiSolved) : sizeof(QpWork);
+    return what == 0 ? sizeof(RtiPrepared) : what == 1 ? sizeof(RtiSolved) : sizeof(RtiWork);
 }
 
-int engine_prepare(RtiPrepared *prepared, QpWork *work) {
+int engine_prepare(RtiPrepared *prepared, RtiWork *work) {
     const int status = rti_prepare(prepared);
     return status == RTI_SOLVED ? rti_load(prepared, work) : status;
 }
 
-int engine_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved, const double a[]) {
+int engine_feedback(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solved, const double a[]) {
     const int status = rti_feedback(prepared, work, solved, a);
     if (status == RTI_SOLVED) rti_gradient(prepared, solved);
     return status;
@@ -25,7 +25,7 @@ int engine_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved
  * linearisation. `failed`, and nothing written, where there is no solution. `slopes`, unless it is null, gets dV/ds,
  * dV/dθ, dQ/da, dπ/dθ and dπ/ds as far as a row has them; `failed` is −1 where the active constraints'
  * gradients are dependent. A QP's preparation serves the rows behind it that have its θ and point. */
-void engine_batch(RtiPrepared *prepared, RtiSolved *solved, QpWork *work, long long count,
+void engine_batch(RtiPrepared *prepared, RtiSolved *solved, RtiWork *work, long long count,
                   const double (*s)[N_X], const double (*enforced)[N_U],
                   const double (*theta)[N_THETA], const double (*x)[HORIZON][N_X],
                   const double (*u)[HORIZON][N_U], double (*actions)[N_U], double values[],
@@ -56,7 +56,7 @@ void engine_batch(RtiPrepared *prepared, RtiSolved *solved, QpWork *work, long l
     }
 }
 
-int engine_policy(const RtiPrepared *prepared, const RtiSolved *solved, QpWork *work,
+int engine_policy(const RtiPrepared *prepared, const RtiSolved *solved, RtiWork *work,
                   double policy[]) {
     return rti_policy(prepared, solved, work, policy);
 }
@@ -124,7 +124,7 @@ static double seconds(void) {
 typedef struct {
     RtiPrepared *prepared;
     RtiSolved *solved;
-    QpWork *work;
+    RtiWork *work;
     double applied[N_U];
     long long pending;
 } Loop;
@@ -139,7 +139,7 @@ static void rti_start(RtiPrepared *prepared) {
 
 size_t engine_loop_size(void) { return sizeof(Loop); }
 
-void engine_begin(Loop *loop, RtiPrepared *prepared, RtiSolved *solved, QpWork *work) {
+void engine_begin(Loop *loop, RtiPrepared *prepared, RtiSolved *solved, RtiWork *work) {
     loop->prepared = prepared;
     loop->solved = solved;
     loop->work = work;

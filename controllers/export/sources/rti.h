@@ -9,7 +9,7 @@
 
 #define QP_N (HORIZON * N_U)
 #define QP_ROWS (HORIZON * N_X)
-#include "qp.h"
+#include "qp_set.h"
 #include "rotation.h"
 
 enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE };
@@ -60,18 +60,10 @@ static int well_posed(const double theta[]) {
     return 1;
 }
 
-static Qp rti_qp(const RtiPrepared *prepared, const RtiSolved *solved) {
-    const Qp qp = {prepared->stack + PREPARED_H,       solved->embedded + EMBEDDED_f,
-                   solved->lower,                      solved->upper,
-                   prepared->stack + PREPARED_Gamma,   solved->embedded + EMBEDDED_lower,
-                   solved->embedded + EMBEDDED_upper,  prepared->w,
-                   prepared->W};
-    return qp;
-}
+#include QP_RULE
 
-/* Linearise and condense; `rti_load` is what its QP's solver does beforehand. Apart, so that CasADi's
- * work vector and the solver's may share their place on a stack. */
-static QP_APART int rti_prepare(RtiPrepared *prepared) {
+/* Linearise; `rti_load` is what the QP's solver does beforehand. */
+static int rti_prepare(RtiPrepared *prepared) {
     const double *const theta = prepared->theta;
     for (int k = 0; k < HORIZON; k++)
         for (int i = 0; i < N_X; i++) {
@@ -81,57 +73,19 @@ static QP_APART int rti_prepare(RtiPrepared *prepared) {
     prepared->constant = stage_costs(prepared->x[0], prepared->u[0], prepared->costates[0], theta,
                                      prepared->L, prepared->q);
     terminal_cost(theta, prepared->L_N, prepared->q_N);
-    {
-        const double *arguments[PREPARED_ARG] = {prepared->x[0], prepared->u[0], prepared->L,
-                                                 prepared->q,    prepared->L_N,  prepared->q_N,
-                                                 theta};
-        QP_SCRATCH double w[PREPARED_W + 1];
-        double *results[PREPARED_RES] = {prepared->stack};
-        long long int iw[PREPARED_IW + 1];
-        preparation(arguments, results, iw, w, 0);
-    }
-    return all_finite(prepared->stack, PREPARED_SIZE) ? RTI_SOLVED : QP_NOT_FINITE;
-}
-
-static int rti_load(const RtiPrepared *prepared, QpWork *work) {
-    Qp qp = {0}; /* the matrices alone */
-    qp.H = prepared->stack + PREPARED_H;
-    qp.rows = prepared->stack + PREPARED_Gamma;
-    return qp_load(&qp, work);
-}
-
-/* A guess of the working set: the limits at which the guess of states and controls is. */
-static double limit_reached(double value, double lower, double upper, int soft) {
-    const double below = 1e-9 * (1.0 + fabs(lower)), above = 1e-9 * (1.0 + fabs(upper));
-    if (value <= lower + below) return soft && value < lower - below ? -2.0 : -1.0;
-    if (value >= upper - above) return soft && value > upper + above ? 2.0 : 1.0;
-    return 0.0;
-}
-
-static void rti_guess(const RtiPrepared *prepared, double set[QP_LIMITS]) {
-    const double *const theta = prepared->theta;
-    for (int k = 0; k < HORIZON; k++) {
-        const int next = k + 1 < HORIZON ? k + 1 : k; /* the guess ends at stage N − 1 */
-        for (int i = 0; i < N_U; i++)
-            set[k * N_U + i] =
-                limit_reached(prepared->u[k][i], ACTION_LOWER[i], ACTION_UPPER[i], 0);
-        for (int i = 0; i < N_X; i++)
-            set[QP_N + k * N_X + i] = limit_reached(prepared->x[next][i], theta[THETA_x_l + i],
-                                                    theta[THETA_x_u + i], 1);
-    }
+    return rti_linearise(prepared);
 }
 
 /* Of all multipliers of Q(s, a) at a kink, those that make dQ/da as small as they can: see
  * `controllers.qp.multipliers_at_kink`. Least squares by one-sided Jacobi rotations. */
 static void rti_kink(const RtiPrepared *prepared, RtiSolved *solved) {
-    const double *const rows = prepared->stack + PREPARED_Gamma;
-    const double *const low = solved->embedded + EMBEDDED_lower;
-    const double *const high = solved->embedded + EMBEDDED_upper;
+    double rows[N_X][N_U], low[N_X], high[N_X];
     double G[N_X][N_U], V[N_X][N_X], total[N_U], chosen[N_X];
     int near[N_X], inside[N_U], count = 0;
+    rti_first_rows(prepared, solved, rows, low, high);
     for (int i = 0; i < N_X; i++) {
         double y = 0.0;
-        for (int j = 0; j < N_U; j++) y += rows[i * QP_N + j] * solved->v[j];
+        for (int j = 0; j < N_U; j++) y += rows[i][j] * solved->v[j];
         if (qp_min(fabs(y - low[i]), fabs(y - high[i])) < 1e-8 * (1.0 + fabs(y))) near[count++] = i;
     }
     if (count == 0) return;
@@ -141,8 +95,8 @@ static void rti_kink(const RtiPrepared *prepared, RtiSolved *solved) {
                     v < ACTION_UPPER[j] - REFERENCE_ACTION[j] - width;
         total[j] = solved->nu[j];
         for (int c = 0; c < count; c++) {
-            G[c][j] = inside[j] ? rows[near[c] * QP_N + j] : 0.0;
-            total[j] += solved->lam[near[c]] * rows[near[c] * QP_N + j];
+            G[c][j] = inside[j] ? rows[near[c]][j] : 0.0;
+            total[j] += solved->lam[near[c]] * rows[near[c]][j];
         }
     }
     for (int c = 0; c < count; c++)
@@ -179,44 +133,27 @@ static void rti_kink(const RtiPrepared *prepared, RtiSolved *solved) {
     for (int c = 0; c < count; c++) {
         const int i = near[c];
         double y = 0.0;
-        for (int j = 0; j < N_U; j++) y += rows[i * QP_N + j] * solved->v[j];
+        for (int j = 0; j < N_U; j++) y += rows[i][j] * solved->v[j];
         const int over = fabs(y - high[i]) < fabs(y - low[i]);
         solved->lam[i] =
             qp_clip(chosen[c], over ? 0.0 : -prepared->w[i], over ? prepared->w[i] : 0.0);
-        for (int j = 0; j < N_U; j++) total[j] -= solved->lam[i] * rows[i * QP_N + j];
+        for (int j = 0; j < N_U; j++) total[j] -= solved->lam[i] * rows[i][j];
     }
     memcpy(solved->nu, total, sizeof total);
 }
 
 /* V(s) and π(s) of a prepared QP for the state in `solved`, or Q(s, a) where `a` is given. */
-static int rti_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *solved,
+static int rti_feedback(const RtiPrepared *prepared, RtiWork *work, RtiSolved *solved,
                         const double a[]) {
-    const double *const stack = prepared->stack, *const theta = prepared->theta;
-    double set[QP_LIMITS];
-    {
-        const double *arguments[EMBEDDED_ARG] = {
-            solved->s,          theta,          stack + PREPARED_Phi, stack + PREPARED_g,
-            stack + PREPARED_f, stack + PREPARED_F};
-        double *results[EMBEDDED_RES] = {solved->embedded}, w[EMBEDDED_W + 1];
-        long long int iw[EMBEDDED_IW + 1];
-        embedding(arguments, results, iw, w, 0);
-    }
+    const double *const stack = prepared->stack;
     for (int k = 0; k < QP_N; k++) {
         solved->lower[k] = ACTION_LOWER[k % N_U] - REFERENCE_ACTION[k % N_U];
         solved->upper[k] = ACTION_UPPER[k % N_U] - REFERENCE_ACTION[k % N_U];
     }
     for (int i = 0; a && i < N_U; i++) solved->lower[i] = solved->upper[i] = a[i] - REFERENCE_ACTION[i];
-    if (!all_finite(solved->embedded, EMBEDDED_SIZE) || (a && !all_finite(a, N_U)))
-        return QP_NOT_FINITE;
-    const Qp qp = rti_qp(prepared, solved);
-    rti_guess(prepared, set);
-    const QpStatus status = qp_solve(&qp, work, set);
+    if (a && !all_finite(a, N_U)) return QP_NOT_FINITE;
+    const int status = rti_solve(prepared, work, solved, a != 0);
     if (status != QP_SOLVED) return status;
-    memcpy(solved->v, work->v, sizeof solved->v);
-    memcpy(solved->lam, work->lam, sizeof solved->lam);
-    memcpy(solved->nu, work->nu, sizeof solved->nu);
-    solved->residual = qp_residual(&qp, work);
-    solved->iterations = work->iterations;
     if (!(solved->residual <= RTI_RESIDUAL)) return RTI_INACCURATE;
     if (a) rti_kink(prepared, solved);
     solved->constant = prepared->constant;
@@ -224,7 +161,7 @@ static int rti_feedback(const RtiPrepared *prepared, QpWork *work, RtiSolved *so
         const double *arguments[READ_ARG] = {
             solved->s,     solved->v,   solved->lam, stack + PREPARED_A, stack + PREPARED_B,
             stack + PREPARED_r, prepared->L, prepared->q, prepared->L_N, prepared->q_N,
-            &solved->constant, theta};
+            &solved->constant, prepared->theta};
         double *results[READ_RES] = {solved->read}, w[READ_W + 1];
         long long int iw[READ_IW + 1];
         readout(arguments, results, iw, w, 0);

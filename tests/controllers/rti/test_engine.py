@@ -5,6 +5,7 @@ import pytest
 
 from controllers import Parameters, Problem, QpError, RtiNmpc, ThetaBlocks, functions
 from controllers.factories import tuned
+from controllers.rti import nmpc
 from cosim import FmuPlant, Scenario, simulate
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.sampling import evaporator_problem, random_parameters
@@ -43,8 +44,10 @@ def both(problem, parameters):
     return found
 
 
-@pytest.fixture(autouse=True)
-def compiled(monkeypatch):
+@pytest.fixture(autouse=True, params=["condensed", "stage by stage"])
+def compiled(request, monkeypatch):
+    if request.param == "stage by stage":
+        monkeypatch.setattr(nmpc, "STACK_LIMIT", 0)
     monkeypatch.delenv("COSIM_COMPILE", raising=False)
     # Without contraction every level gives the same digits, and this one in a tenth of the time.
     monkeypatch.setattr(functions, "FLAGS", ("-O0", *functions.FLAGS[1:]))

@@ -363,9 +363,8 @@ def accurate_substeps(problem: Problem) -> int:
     TuningError where that does not come about in 1024 steps.
     """
     model, (x, u, d, p), h = problem.model, problem.model.symbols(), ca.SX.sym("h")
-    following = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, 1)
-    jacobian = ca.jacobian(following, ca.vertcat(x, u))
-    step = ca.Function("step", [x, u, d, p, h], [following, jacobian])
+    after = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, 1)
+    step = ca.Function("step", [x, u, d, p, h], [after, ca.jacobian(after, ca.vertcat(x, u))])
     given = problem.reference_action, model.nominal_disturbance, model.nominal_parameters
     length, n, m = problem.sampling_time / model.time_unit, problem.n_states, problem.n_actions
 

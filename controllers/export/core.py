@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from string import Template
 
@@ -81,11 +82,8 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
 def controller_sources(
     problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, StackedFunction]
 ) -> dict[str, bytes]:
-    """C files by name of a controller made of `functions`, by the prefix of their constants.
-
-    With `LINEARISED` among them its QP is solved stage by stage.
-    """
-    stagewise = "LINEARISED" in functions
+    """C files by name of a controller made of `functions`, by the prefix of their constants."""
+    stagewise = "LINEARISED" in functions  # its QP is solved stage by stage
     wanted = ("core.h", "rti.h", *SOLVERS[stagewise], "costs.h", "rotation.h", RULES[hessian])
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
     unused = {"PREPARED", "EMBEDDED"} if stagewise else set()
@@ -225,11 +223,9 @@ def plain_c(core: Core, name: str, scenario: Scenario, *, single: bool = False) 
 def _joined(core: Core) -> str:
     """`core.h` with each file that it includes in the place of its first inclusion."""
     files = {name: data.decode() for name, data in core.sources.items()}
-    for macro, name in re.findall(r'#define (\w+_RULE) "([\w.]+)"', files["problem.h"]):
-        files = {
-            each: text.replace(f"#include {macro}", f'#include "{name}"')
-            for each, text in files.items()
-        }
+    chosen = re.findall(r'#define (\w+_RULE) "([\w.]+)"', files["problem.h"])
+    for (macro, name), text in product(chosen, list(files)):
+        files[text] = files[text].replace(f"#include {macro}", f'#include "{name}"')
     seen: set[str] = set()
 
     def replace(found: re.Match[str]) -> str:

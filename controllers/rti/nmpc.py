@@ -363,8 +363,7 @@ class Engine:
         """Copies of dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
         # In another workspace: the next feedback needs what the preparation factorised.
         given = (ctypes.c_void_p(array.ctypes.data) for array in (before, after))
-        status = self._policy(*given, self._other, self._jacobians_at)
-        if status:
+        if self._policy(*given, self._other, self._jacobians_at):
             return None
         parts = self._jacobians[: self._split], self._jacobians[self._split :]
         by_theta, by_state = (part.reshape(self._m, -1).copy() for part in parts)
@@ -606,10 +605,9 @@ class RtiNmpc:
         self._prepared = Prepared(memory, *made)
 
     def _present_qp(self) -> SoftQp:
-        """Copy of the QP for a QpError."""
-        if self._engine is not None and self._engine.stagewise:
-            self._prepare()
-            self._embed()
+        """Copy of the QP for a QpError; compiled code may have left it uncondensed."""
+        self._prepare()
+        self._embed()
         return self._qp.copy()
 
     @property

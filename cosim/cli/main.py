@@ -177,8 +177,7 @@ def main() -> None:
     Bad input ends in one line on standard error and exit code 2, what nobody foresaw in one line,
     a report with the traceback and exit code 70.
     """
-    # Modules and CasADi's expressions are many objects, and hardly garbage: the collector's passes
-    # over them, while they are made and at exit, are a fifth of a short run.
+    # Passes of the collector over modules and CasADi's expressions are a fifth of a short run.
     gc.set_threshold(50_000)
     atexit.register(gc.freeze)
     _open_streams()

@@ -32,7 +32,7 @@ from cosim.trajectory import (
 )
 from cosim.validation import known_keywords
 
-BLOCK = 2000
+BLOCK = 500
 
 
 def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:

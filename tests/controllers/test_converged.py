@@ -228,15 +228,3 @@ def test_the_gradient_is_that_of_the_cost(function, case):
             moved[i] += h
             ends.append(measured(function, theta, s, moved[:count], moved[count:])[0])
         assert gradient[i] == pytest.approx((ends[0] - ends[1]) / 0.2, rel=1e-6, abs=1e-6)
-
-
-def test_ipopts_value_is_the_merit_of_its_own_trajectory(function, blocks, problem, case):
-    theta, s, _, _ = case
-    answer = IpoptNmpc(problem, blocks).solve(theta, s)
-    cost, penalty, infeasibility, _ = measured(
-        function, theta, s, answer.states[1:], answer.controls
-    )
-    assert answer.success
-    assert infeasibility < 1e-8
-    assert cost + penalty == pytest.approx(answer.value, rel=1e-8)
-    np.testing.assert_array_equal(answer.action, answer.controls[0])

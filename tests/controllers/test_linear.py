@@ -93,8 +93,5 @@ def test_states_and_actions_are_paired_by_relative_gains():
     ]
     with pytest.raises(ControllerError, match="2 states and 2 actions make no PI loops"):
         pairing(np.array([[1.0, 1.0], [1.0, 1.0]]))
-
-
-def test_other_numbers_of_states_than_of_actions_are_refused():
     with pytest.raises(ControllerError, match="4 states and 2 actions make no PI loops"):
         PiLoops(Problem.from_scenario(Scenario.load("tanks")))

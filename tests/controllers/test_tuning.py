@@ -1,39 +1,15 @@
 from dataclasses import replace
 
 import casadi as ca
-import clarabel
 import numpy as np
 import pytest
 import scipy.linalg
 
 from controllers import LinearisationPoint, Model, Quantity, RtiNmpc
-from controllers.economic import convexify, optimal_steady_state, rotation, solve_conic, svec, tune
+from controllers.economic import convexify, optimal_steady_state, rotation, tune
 from controllers.errors import TuningError
 from controllers.model import discretise, economic_cost
 from tests.helpers.sampling import evaporator_problem
-
-
-def random_symmetric(rng, size):
-    root = rng.normal(size=(size, size))
-    return root + root.T
-
-
-def test_the_nearest_semidefinite_matrix_is_the_clipped_one(rng):
-    size = 4
-    target = random_symmetric(rng, size)
-    count = size * (size + 1) // 2
-    x, status = solve_conic(
-        np.eye(count),
-        -svec(target),
-        -np.eye(count),
-        np.zeros(count),
-        [clarabel.PSDTriangleConeT(size)],
-    )
-    values, vectors = np.linalg.eigh(target)
-    clipped = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    assert status == "Solved"
-    np.testing.assert_allclose(x, svec(clipped), atol=1e-6)
-
 
 PROBLEMS = {
     "paper": evaporator_problem(),

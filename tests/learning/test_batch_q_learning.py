@@ -83,6 +83,7 @@ def test_replay_sees_the_present_theta(scenario, collected):
         after = buffer.replay(average_cost(scenario))
     finally:
         controller.theta = theta
+    assert_same(buffer.replay(average_cost(scenario)), before)
     slope = (after.action_value - before.action_value) / h
     assert slope == pytest.approx(before.gradient[:, position], rel=1e-3, abs=1e-3)
 
@@ -141,17 +142,10 @@ def test_qps_that_fail_are_counted_and_their_rows_left_out(scenario, collected):
     assert found.rows.tolist() == np.flatnonzero(np.logical_not(explored)).tolist()
 
 
-def test_another_theta_and_a_new_batch_know_nothing_of_the_one_before(scenario, collected):
+def test_a_new_batch_knows_nothing_of_the_one_before(scenario, collected):
     controller, samples = collected
-    start = controller.theta
     buffer = filled(controller, samples)
-    first = buffer.replay(average_cost(scenario))
-    try:
-        controller.theta = start + 1e-3
-        assert not np.array_equal(buffer.replay(average_cost(scenario)).gradient, first.gradient)
-    finally:
-        controller.theta = start
-    assert_same(buffer.replay(average_cost(scenario)), first)
+    buffer.replay(average_cost(scenario))
     buffer.clear()
     for sample in samples[30:]:
         buffer.add(sample)

@@ -51,16 +51,13 @@ def value_hessian(controller):
     return np.array([[diagonal[0], cross / 2], [cross / 2, diagonal[1]]])
 
 
-def test_exact_parameters_give_the_riccati_value_and_gain(linear_quadratic):
+def test_exact_parameters_alone_give_the_riccati_value_and_gain(linear_quadratic):
+    wrong = RtiNmpc(linear_quadratic.problem, linear_quadratic.wrong())
+    assert np.abs(gain(wrong) - linear_quadratic.K).max() > 0.05
+    assert np.abs(value_hessian(wrong) - linear_quadratic.P).max() > 0.5
     controller = RtiNmpc(linear_quadratic.problem, linear_quadratic.exact())
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-7)
     assert value_hessian(controller) == pytest.approx(linear_quadratic.P, abs=1e-6)
-
-
-def test_wrong_parameters_do_not(linear_quadratic):
-    controller = RtiNmpc(linear_quadratic.problem, linear_quadratic.wrong())
-    assert np.abs(gain(controller) - linear_quadratic.K).max() > 0.05
-    assert np.abs(value_hessian(controller) - linear_quadratic.P).max() > 0.5
 
 
 EXPLORATION = {"exploration_probability": 0.5, "exploration_deviation": (1.0,)}
@@ -69,26 +66,20 @@ ONLINE = {"prior_width": 1.0, "prior_samples": 50, "step_every": 10, **LQ}
 BATCH = {"prior_width": 3.0, "batch_size": 50, "first_batch": None, "variance_memory": 50.0, **LQ}
 
 
-def test_online_q_learning_finds_the_riccati_solution(linear_quadratic):
-    settings = {"parameter_drift": 1e-3, "variance_memory": 50.0, **ONLINE}
-    controller = learn(linear_quadratic, QLearning, 4000, 0.0, **settings)
+RULES = [
+    (QLearning, {"parameter_drift": 1e-3, "variance_memory": 50.0, **ONLINE}),
+    (BatchQLearning, BATCH),
+]
+
+
+@pytest.mark.parametrize(("rule", "settings"), RULES)
+def test_q_learning_finds_the_riccati_solution(linear_quadratic, rule, settings):
+    controller = learn(linear_quadratic, rule, 4000, 0.0, **settings)
     assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-3)
     assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
 
 
-def test_batch_q_learning_finds_the_riccati_solution(linear_quadratic):
-    controller = learn(linear_quadratic, BatchQLearning, 4000, 0.0, **BATCH)
-    assert gain(controller) == pytest.approx(linear_quadratic.K, abs=1e-3)
-    assert value_hessian(controller) == pytest.approx(linear_quadratic.P, rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("rule", "settings"),
-    [
-        (QLearning, {"parameter_drift": 1e-3, "variance_memory": 50.0, **ONLINE}),
-        (BatchQLearning, BATCH),
-    ],
-)
+@pytest.mark.parametrize(("rule", "settings"), RULES)
 def test_td_errors_of_the_mean_cost_lead_to_its_riccati_gain(linear_quadratic, rule, settings):
     exact = linear_quadratic.riccati(1.0)[1]
     assert np.abs(exact - linear_quadratic.K).max() > 0.04

@@ -60,19 +60,13 @@ def test_a_sample_is_consistent(plant, problem):
         assert np.array_equal(after.s, before.next_s)
         assert after.policy is before.next_policy
         assert after.point is before.next_point
+        assert after.cost - after.stage_cost == pytest.approx(before.next_penalty, abs=1e-6)
         assert before.explored == (before.action_value is not before.policy)
         if before.explored:
             assert before.action_value.value >= before.policy.value - 1e-6
+    assert any(sample.next_penalty > 0 for sample in samples)
     assert {sample.explored for sample in samples} == {True, False}
     assert loop.counts.explored == sum(sample.explored for sample in samples)
-
-
-def test_penalty_is_moved_by_one_sample(plant, problem):
-    loop, _ = interaction(plant, problem)
-    samples = [loop.next()[0] for _ in range(60)]
-    for before, after in itertools.pairwise(samples):
-        assert after.cost - after.stage_cost == pytest.approx(before.next_penalty, abs=1e-6)
-    assert any(sample.next_penalty > 0 for sample in samples)
 
 
 def test_literal_exploration_saturates_every_explored_sample(plant, problem):

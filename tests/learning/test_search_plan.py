@@ -171,18 +171,6 @@ def test_the_inputs_weights_are_found_each_with_its_own_back_off(lines, far):
     assert 0 < comparison.least < 1e-2, "smaller weights are admissible from now on"
 
 
-def test_a_line_is_searched_both_ways_in_steps_that_double(lines, far):
-    comparison = lines.comparison
-    plant = Bowl(far.replace({}), 1.0)
-    # From 2.5 too high: the first way is the wrong one.
-    high = far.replace({"x_l": far["x_l"] + [2.5, 0.0]})
-    comparison.incumbent.theta = high.theta
-    plant.drive(comparison.renew(BLOCKS))
-    reach = plant.drive(lines._along(lines._tightening(), 1.0))
-    assert reach > 1.0
-    assert plant.cost(comparison.incumbent.theta) < 0.4 * (plant.cost(high.theta) - 6300.0) + 6300.0
-
-
 SAMPLES = 20_000
 
 

@@ -1,4 +1,4 @@
-"""Steps of θ: fits against their programmes, definiteness, constraints, and the prior."""
+"""Steps of θ: fits against their programmes, definiteness and constraints."""
 
 import numpy as np
 import pytest
@@ -11,16 +11,14 @@ from learning.configuration import Configuration
 from learning.step import (
     ConstrainedStep,
     Fit,
-    certificate,
     clip_eigenvalues,
     definite,
     matrix_of,
     policy_gradient_fit,
-    prior_deviation,
+    smallest_eigenvalue,
     td_fit,
     td_step,
 )
-from tests.helpers.other_units import factors
 from tests.helpers.training import Carrier
 
 SIZE = 6
@@ -106,19 +104,19 @@ def test_every_step_is_definite_and_certified(blocks, parameters, rng):
     theta = parameters.theta
     corrected = 0
     for _ in range(30):
-        new, vouched = definite(blocks, theta, random_fit(blocks, rng), SMALLEST)
-        assert vouched.smallest >= SMALLEST * (1 - 1e-9)
-        assert vouched.smallest == pytest.approx(certificate(blocks, new).smallest)
-        assert not vouched.refused
-        corrected += vouched.corrected
+        new, outcome = definite(blocks, theta, random_fit(blocks, rng), SMALLEST)
+        assert outcome.smallest >= SMALLEST * (1 - 1e-9)
+        assert outcome.smallest == pytest.approx(smallest_eigenvalue(blocks, new))
+        assert not outcome.refused
+        corrected += outcome.corrected
     assert corrected > 20
 
 
 def test_a_free_step_that_is_definite_is_taken_as_it_is(blocks, parameters, rng):
     fit = random_fit(blocks, rng, size=1e-3)
-    new, vouched = definite(blocks, parameters.theta, fit, SMALLEST)
+    new, outcome = definite(blocks, parameters.theta, fit, SMALLEST)
     assert np.array_equal(new, parameters.theta + blocks.scale * fit.minimiser)
-    assert not vouched.corrected
+    assert not outcome.corrected
 
 
 def test_lmi_step_equals_a_generic_conic_solution(blocks, parameters, rng):
@@ -127,8 +125,8 @@ def test_lmi_step_equals_a_generic_conic_solution(blocks, parameters, rng):
         root = rng.normal(size=(blocks.size, blocks.size)) / np.sqrt(blocks.size)
         metric = root @ root.T + 0.3 * np.eye(blocks.size)
         fit = fit_towards(2.0 * rng.normal(size=blocks.size), metric)
-        new, vouched = definite(blocks, theta, fit, SMALLEST)
-        assert vouched.corrected
+        new, outcome = definite(blocks, theta, fit, SMALLEST)
+        assert outcome.corrected
         reference = projected_gradient(blocks, theta, fit)
         assert objective(blocks, theta, new, fit) == pytest.approx(
             objective(blocks, theta, reference, fit), rel=1e-6
@@ -160,7 +158,7 @@ def test_a_hessian_keeps_its_units_in_other_coordinates(controller):
     step = ConstrainedStep(controller, Configuration(), scale)
     update = step.take(towards(step.blocks, c_lambda=1.0), td_error=1.0)
     parameters = controller.parameters
-    assert update.smallest_eigenvalue == certificate(parameters.blocks, parameters.theta).smallest
+    assert update.smallest_eigenvalue == smallest_eigenvalue(parameters.blocks, parameters.theta)
 
 
 def test_take_moves_theta_by_the_scaled_step(controller):
@@ -203,10 +201,10 @@ def test_a_trust_region_holds_after_the_lmi(controller, rng):
         minimiser = rng.normal(size=size) * 3.0
         fit = Fit(metric @ minimiser, minimiser, lambda metric=metric: metric)
         before = controller.theta.copy()
-        new, vouched = step.proposal(fit.within(3.0, np.linalg.norm))
+        new, outcome = step.proposal(fit.within(3.0, np.linalg.norm))
         assert np.linalg.norm((new - before) / step.scale) <= 3.0 * (1 + 1e-9)
-        assert vouched.smallest >= least * (1 - 1e-9)
-        corrected += vouched.corrected
+        assert outcome.smallest >= least * (1 - 1e-9)
+        corrected += outcome.corrected
         controller.theta = new
     assert corrected > 20, "the test must meet corrected steps"
 
@@ -228,34 +226,3 @@ def test_a_projection_keeps_what_is_admissible_and_mends_the_rest(controller):
     theta[step.blocks.slices["B_Vf"]] = [-1.0, 0.0, 2.0]
     assert step.move(theta).corrected
     assert controller.parameters["B_Vf"] == pytest.approx(np.diag([1e-3, 2.0]), abs=1e-5)
-
-
-def parameters(problem, rng):
-    blocks = ThetaBlocks.of(problem, slack_weights=True)
-    root = rng.normal(size=(4, 4))
-    naive = Parameters.naive(problem, blocks, value_offset=6e5)
-    return naive.replace(
-        {
-            "B_l": (root @ root.T + (root @ root.T).T) / 2,
-            "B_Vf": np.diag(rng.uniform(1.0, 2.0, 2)),
-            "b_l": rng.normal(size=4),
-            "b_lambda": rng.normal(size=2),
-        }
-    )
-
-
-def test_other_units_of_states_inputs_and_cost_give_the_same_prior(problem, rng):
-    start = parameters(problem, rng)
-    state, action, cost = np.array([10.0, 0.1]), np.array([1e-3, 7.0]), 50.0
-    factor = factors(start.blocks, state, action, cost)
-    moved, erred, explored = np.array([1.5, 2.0]), np.array([1.0, 0.1]), np.array([10.0, 10.0])
-    width = prior_deviation(start, moved, erred, explored, 6e5, 0.3)
-    other = prior_deviation(
-        start.with_theta(factor * start.theta),
-        state * moved,
-        state * erred,
-        action * explored,
-        cost * 6e5,
-        0.3,
-    )
-    assert other == pytest.approx(factor * width)

@@ -48,22 +48,16 @@ STATED = {
 }
 
 
-def test_what_the_scenario_states_takes_the_place_of_defaults(scenario):
-    configuration = QLearning.Configuration().for_scenario(scenario.replace(STATED))
+def test_what_the_scenario_states_takes_the_place_of_defaults_not_of_what_the_user_sets(scenario):
+    stated = scenario.replace(STATED)
+    configuration = QLearning.Configuration().for_scenario(stated)
     strategy = configuration.strategy(scenario)
-    assert strategy.kind == "literal"
+    assert (strategy.kind, configuration.value_offset) == ("literal", "stage-cost")
     assert (strategy.probability, strategy.deviation.tolist()) == (0.2, [3.0, 4.0])
-    assert configuration.value_offset == "stage-cost"
-
-
-def test_what_the_user_sets_stands_against_the_scenario(scenario):
     chosen = Configuration(value_offset="discounted", exploration_probability=0.7)
-    configuration = chosen.for_scenario(scenario.replace(STATED))
-    assert (configuration.value_offset, configuration.exploration_probability) == (
-        "discounted",
-        0.7,
-    )
-    assert configuration.exploration == "literal"
+    found = chosen.for_scenario(stated)
+    assert (found.value_offset, found.exploration_probability) == ("discounted", 0.7)
+    assert found.exploration == "literal"
 
 
 def test_a_file_keeps_its_blocks_and_gets_those_it_lacks(problem, tmp_path):

@@ -7,7 +7,7 @@ from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
 from learning.configuration import Configuration
-from learning.step import ConstrainedStep, Fit, least_eigenvalue
+from learning.step import ConstrainedStep, Fit, least_allowed
 from learning.training import starting_parameters
 from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
 from tests.helpers.training import Carrier, looped
@@ -70,8 +70,8 @@ def test_definiteness_and_the_least_slack_weights_are_the_same_in_other_units(sc
     configuration = Configuration()
     own, other = (Carrier(start) for start in starts(scenario, configuration))
     steps = [ConstrainedStep(carrier, configuration) for carrier in (own, other)]
-    assert least_eigenvalue(configuration, own.parameters) == pytest.approx(
-        least_eigenvalue(configuration, other.parameters)
+    assert least_allowed(configuration, own.parameters) == pytest.approx(
+        least_allowed(configuration, other.parameters)
     )
     corrected = 0
     for _ in range(10):

@@ -15,8 +15,6 @@ from controllers.dynamic_programming import (
     nelder_mead,
     scan,
 )
-from controllers.evaporator import model
-from controllers.model import discretise
 
 GRID = Grid((np.array([0.0, 0.5, 2.0]), np.array([-1.0, 1.0, 1.5, 4.0]), np.array([0.0, 1.0])))
 
@@ -167,17 +165,6 @@ def test_every_operation_agrees_with_casadi(name):
     np.testing.assert_allclose(
         np.broadcast_to(values, 200), function.map(200)(points).full()[0], rtol=1e-14
     )
-
-
-def test_sampled_evaporator_agrees_with_casadi_to_rounding():
-    evaporator = model()
-    function = discretise(evaporator, 60.0, 4)
-    generator = np.random.default_rng(5)
-    x, u = generator.uniform(25, 60, (2, 300)), generator.uniform(100, 400, (2, 300))
-    d = evaporator.nominal_disturbance[:, None] * generator.uniform(0.8, 1.2, (4, 300))
-    p = evaporator.nominal_parameters
-    expected = function.map(300)(x, u, d, np.tile(p[:, None], (1, 300))).full()
-    np.testing.assert_allclose(Elementwise(function)(x, u, d, p), expected, rtol=1e-13)
 
 
 LOWER, UPPER = np.array([-4.0, -4.0]), np.array([4.0, 4.0])

@@ -137,14 +137,6 @@ def test_a_state_that_is_not_finite_is_refused_and_the_next_one_solved(learnt):
     assert ours.feedback(learnt[0].reference_state).status == "solved"
 
 
-def test_a_hessian_that_is_not_convex_is_refused(learnt):
-    problem, parameters = learnt
-    ours, _ = both(problem, parameters.replace({"B_l": -np.eye(4)}))
-    ours.prepare()
-    with pytest.raises(QpError, match="not convex"):
-        ours.feedback(problem.reference_state)
-
-
 @pytest.mark.parametrize("scenario", ["paper", "fouled"])
 def test_its_own_loop_gives_the_bytes_of_pythons(monkeypatch, scenario):
     loaded = Scenario.load(scenario)

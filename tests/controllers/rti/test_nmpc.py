@@ -3,7 +3,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from controllers import ConvergedNmpc, LinearisationPoint, Parameters, RtiNmpc, ThetaBlocks
+from controllers import ConvergedNmpc, Parameters, RtiNmpc, ThetaBlocks
 from controllers.errors import ControllerError, ParameterError, QpError
 from tests.helpers.differences import Feedback, assert_close, derivative, natural_scale
 from tests.helpers.sampling import (
@@ -74,19 +74,6 @@ def test_prepare_shifts_the_last_solution(nmpc, rng):
     np.testing.assert_array_equal(u[:-1], last.predicted_actions[1:])
     np.testing.assert_array_equal(u[-1], last.predicted_actions[-1])
     np.testing.assert_allclose(costates[:-1], last.costates[2:] / 0.99, rtol=1e-15)
-
-
-def test_repeated_iterations_at_one_state_converge(nmpc):
-    s = np.array([27.0, 52.0])
-    for _ in range(40):
-        solution = nmpc.feedback(s)
-        nmpc.prepare_at(
-            LinearisationPoint(
-                solution.predicted_states[:-1], solution.predicted_actions, solution.costates[1:]
-            )
-        )
-    again = nmpc.feedback(s).predicted_actions
-    np.testing.assert_allclose(again, solution.predicted_actions, rtol=1e-9)
 
 
 def test_the_policy_keeps_the_bounds(nmpc):

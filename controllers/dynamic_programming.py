@@ -82,10 +82,8 @@ class Grid:
     """The product of increasing axes, one per state, at least two points each.
 
     `smooth` has an interval per state within which interpolation is cubic; elsewhere, and without
-    it, it is multilinear. Multilinear weights are non-negative and sum to one, so that they are the
-    row of a stochastic matrix: the interpolated dynamic programme is that of a Markov chain on the
-    grid, with the contraction and the gain bounds that belong to it. Cubic ones sum to one, too,
-    but some are negative. A state outside is moved to the nearest state of the box.
+    it, it is multilinear. Weights sum to one; multilinear ones are non-negative, too: they make the
+    programme that of a Markov chain. A state outside is moved to the nearest state of the box.
     """
 
     axes: tuple[Array, ...]
@@ -660,11 +658,10 @@ def finer_grid(
     """Grid that resolves the support of a policy's distribution with cells·2^level cells a state.
 
     At a bound that the closed loop touches the cells are 2^-level of the standard deviation of one
-    sample's disturbance: the penalty's kink reaches the value of a slow state smoothed by no more
-    than that. The grid extends as far again beyond the support on either side, and at least a
-    twentieth of the bounds' span: farther states are so rare that the policy at the box's edge
-    serves them. Without disturbance the support is a point, which says nothing of that, and the box
-    stays. `smooth`: cubic interpolation within the support, else linear everywhere.
+    sample's disturbance, which alone smooths the penalty's kink in the value of a slow state. The
+    grid extends as far again beyond the support on either side, and at least a twentieth of the
+    bounds' span; without disturbance, where the support is a point, it keeps its box. `smooth`:
+    cubic interpolation within the support, else linear everywhere.
     """
     problem = operator.problem
     span = problem.state_upper - problem.state_lower
@@ -737,10 +734,9 @@ def nelder_mead(
     `objective(rows, points)` evaluates functions `rows` (r,) at points (r, m); `start` (B, m);
     `size` (B, m) is the first simplex's edge; a function is done when its simplex's values lie
     within `precision` of each other. Returns minimisers (B, m) and values (B,), never worse than
-    the start. The simplex method of Nelder and Mead (1965) with its standard
-    coefficients and projection on the box: it needs no derivative, which the expected penalty
-    of a nearly deterministic plant lacks, and it follows the penalty's narrow, skew valley, where
-    a search along the coordinates stalls. SciPy's one runs one problem at a time.
+    the start. Nelder and Mead (1965), with projection on the box: the expected penalty of a nearly
+    deterministic plant has no derivative, and its valley is narrow and skew. SciPy's method
+    minimises one function at a time.
     """
     count, m = start.shape
     everyone = np.arange(count)
@@ -840,7 +836,7 @@ class Optimum:
         return float(self.distribution[self.grid.boundary].sum())
 
 
-def evaluate(
+def evaluate_policy(
     operator: BellmanOperator, grid: Grid, actions: Array, anchor: int
 ) -> tuple[Array, float, Array]:
     """Value W (G,), gain and stationary distribution (G,) of a policy (G, m).
@@ -868,12 +864,12 @@ def begin(operator: BellmanOperator, grid: Grid, actions: Array, share: float = 
     """Evaluate a first policy (G, m); its `step` is a tenth of the action box times `share`."""
     problem = operator.problem
     width = problem.action_upper - problem.action_lower
-    W, gain, mass = evaluate(operator, grid, actions, grid.nearest(problem.reference_state))
+    W, gain, mass = evaluate_policy(operator, grid, actions, grid.nearest(problem.reference_state))
     step = share * np.tile(0.1 * width, (grid.size, 1))
     return Optimum(grid, actions, W, gain, mass, operator.accuracy, step=step)
 
 
-def improve(operator: BellmanOperator, iterate: Optimum, scan_points: int) -> Optimum:
+def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int) -> Optimum:
     """Improve the policy once and bound what is left to gain.
 
     A local search in each state from its present action or, where one is better, from one of
@@ -903,15 +899,8 @@ def improve(operator: BellmanOperator, iterate: Optimum, scan_points: int) -> Op
     )
 
 
-class Progress(NamedTuple):
-    """Where the solver is: grid level, round on it, size of the grid, gain and its bounds."""
-
-    level: int
-    round: int
-    states: int
-    gain: float
-    lower: float
-    upper: float
+Progress = Callable[[int, int, Optimum], None]
+"""Told the grid's level, the round on it and what it has led to."""
 
 
 TOLERANCE = 5e-4
@@ -950,7 +939,7 @@ def solve(
     settings: Settings | None = None,
     *,
     workers: int = 2,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Progress | None = None,
 ) -> Optimum:
     """Solve for the optimal policy of the stochastic plant by Howard's policy iteration.
 
@@ -987,7 +976,7 @@ def refine(
     *,
     level: int | None = None,
     accuracy: Accuracy | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Progress | None = None,
 ) -> Optimum:
     """Solve again from a solution, on the grid of another level or with another accuracy.
 
@@ -1006,7 +995,7 @@ def _iterate(
     iterate: Optimum,
     level: int,
     settings: Settings,
-    progress: Callable[[Progress], None] | None,
+    progress: Progress | None,
     *,
     scan_points: int = 3,
     enough: Callable[[Optimum, Optimum], bool] | None = None,
@@ -1014,13 +1003,12 @@ def _iterate(
     """Improve and evaluate until `enough(before, after)`, without it until the bounds meet."""
     anchor = iterate.grid.nearest(operator.problem.reference_state)
     for k in range(settings.rounds):
-        before, better = iterate, improve(operator, iterate, scan_points)
-        W, gain, distribution = evaluate(operator, better.grid, better.actions, anchor)
+        before, better = iterate, improve_policy(operator, iterate, scan_points)
+        W, gain, distribution = evaluate_policy(operator, better.grid, better.actions, anchor)
         iterate = replace(better, W=W, gain=gain, distribution=distribution)
-        lower, upper = iterate.lower, iterate.upper
         if progress is not None:
-            progress(Progress(level, k, iterate.grid.size, gain, lower, upper))
-        met = upper - lower <= settings.tolerance * abs(gain)
+            progress(level, k, iterate)
+        met = iterate.upper - iterate.lower <= settings.tolerance * abs(gain)
         if enough(before, iterate) if enough else met:
             break
     return iterate
@@ -1088,7 +1076,7 @@ def certify(
     *,
     paths: int = 2000,
     steps: int = 5000,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Progress | None = None,
 ) -> Optimum:
     """The refinement of a solution, which is nearer to J* and is what is kept, certified.
 

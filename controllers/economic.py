@@ -308,19 +308,13 @@ class EconomicTuning:
 def tune(
     problem: Problem, blocks: ThetaBlocks | None = None, *, value_offset: float | None = None
 ) -> EconomicTuning:
-    """Tune the NMPC: its local feedback becomes the economic optimum's.
+    """Tune the NMPC: its local feedback becomes the economic optimum's (docs/method.md).
 
-    The economic cost is rotated by the costate λ of the optimal steady state, which leaves its
-    gradient q only along the active constraints, and convexified to H̃ (`convexify`, ρ = 1e-3 as
-    published). For this the model is integrated in as many steps as bring the relative error of a
-    sample's A and B below 1e-8, as published; the controller's own model keeps its `substeps`.
-    Then ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B], V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx with P
-    the value of H̃ under γ = 1: the term in 1−γ, which the published procedure for γ = 1 does not
-    need, makes P and its feedback those of the discounted problem as well, for any γ and horizon.
-    Without it a discounted NMPC would act as if what it postpones were cheaper. λ_θ undoes both
-    rotations, so that V_θ is to second order the economic value. `value_offset` is c_λ where it
-    shall not be ℓ_s. θ is rounded to six digits. Raises TuningError where steady state, local
-    optimum or convexification do not exist.
+    ℓ_θ = ½ΔwᵀMΔw + qᵀΔw with M = H̃ + (1−γ)[A B]ᵀP[A B] and V^f_θ = ½ΔxᵀPΔx + q_xᵀΔx: H̃ is the
+    convexified Hessian, q the gradient along the active constraints, P the value of H̃ under γ = 1.
+    λ_θ undoes the rotations by costate and storage, so that V_θ is to second order the economic
+    value. `value_offset` is c_λ where it shall not be ℓ_s. θ is rounded to six digits. Raises
+    TuningError where steady state, local optimum or convexification do not exist.
     """
     steady = optimal_steady_state(dataclasses.replace(problem, substeps=accurate_substeps(problem)))
     n, A, B = problem.n_states, steady.A, steady.B

@@ -7,7 +7,7 @@ import io
 import itertools
 import json
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import isfinite, modf
@@ -34,7 +34,7 @@ from controllers.errors import ModelError, OptimumError, QpError
 from controllers.model import Model
 from controllers.problem import VECTORS, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
-from cosim.protocols import Decision, Vector
+from cosim.protocols import Controller, Decision, Vector
 from cosim.scenario import Scenario
 
 VERSION = 2
@@ -147,14 +147,12 @@ def read_optimum(path: Path, key: str) -> Optimum:
 # the optimal policy ---------------------------------------------------------------------------
 
 
-class OptimalPolicy:
+class OptimalPolicy(Controller):
     """π* and V* = penalty + W of a problem under a disturbance law, from a solved grid.
 
     V* is the differential value: the cost in excess of J* that a start in s brings, up to a
-    constant. Between grid states π* and W are interpolated multilinearly; a state outside the
-    grid's box is served by the nearest one inside.
-    Interpolating π* costs nothing that can be measured, since π* is smooth where the plant lives
-    and Q* is flat at its minimum, while minimising Q* anew in each sample costs milliseconds.
+    constant. Between grid states π* and W are interpolated multilinearly, which costs nothing that
+    can be measured; a state outside the grid's box is served by the nearest one inside.
     """
 
     name = "optimal"
@@ -176,7 +174,7 @@ class OptimalPolicy:
         scenario: Scenario,
         *,
         overrides: Mapping[str, float | None] | None = None,
-        progress: Callable[[Progress], None] | None = None,
+        progress: Progress | None = None,
     ) -> OptimalPolicy:
         """Optimal policy of a scenario: shipped, cached, or solved now and then cached.
 
@@ -210,12 +208,6 @@ class OptimalPolicy:
     def gain(self) -> float:
         """J*: mean of economic cost and penalty per sample under this policy."""
         return self.optimum.gain
-
-    def reset(self) -> None:
-        """Do nothing: the policy has no memory."""
-
-    def prepare(self) -> None:
-        """Do nothing: all was prepared when the problem was solved."""
 
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
         """π*(s) and V*(s), or Q*(s, a) with `a`; s (n,), a (m,); `clamped` outside the grid.
@@ -412,7 +404,7 @@ class QuasiStaticPolicy:
 
     @classmethod
     def from_scenario(
-        cls, scenario: Scenario, *, progress: Callable[[Progress], None] | None = None
+        cls, scenario: Scenario, *, progress: Progress | None = None
     ) -> QuasiStaticPolicy:
         """Policy of a changing scenario; solves missing optima. Raises OptimumError."""
         law = change_of(scenario)

@@ -40,19 +40,12 @@ class BackOffSearch:
 
     σ is the standard deviation of the model's one-step prediction error in each state, so that κ
     has no unit; a bound is active where it binds in the QP (dV/dx_l or dV/dx_u ≠ 0) now and then.
-    Each has a line search of three rounds. That of the bound which binds most often at κ = 0 has
-    the first round, which shows what others there are, and, with those in place, the last two.
-
-    A round runs a few κ, on a simulator all on the same noise. What is fitted to the samples near a
-    κ is how the loop moves with it: mean stage cost and the mean of the other states linearly, the
-    bounded state with its bound. The known penalty is then that of the very states that were seen,
-    moved so. Every sample near it thus serves each κ; to compare costs alone would take many times
-    the samples, since one violation in a thousand decides.
-
-    No true bound is loosened: x_l stays at or above the scenario's, x_u at or below. Of back-offs
-    whose estimates differ by less than `PLATEAU` the smallest is taken. Where the estimate falls
-    up to the end of what the samples speak for, the best back-off that was run is taken, and the
-    next round is about it; `refused` says so of the latest round.
+    Each has a line search of three rounds (docs/method.md). That of the bound which binds most
+    often at κ = 0 has the first round, which shows what others there are, and, with those in place,
+    the last two. No true bound is loosened. Of back-offs whose estimates differ by less than
+    `PLATEAU` the smallest is taken. Where the estimate falls up to the end of what the samples
+    speak for, the best back-off that was run is taken, and the next round is about it; `refused`
+    says so of the latest round.
 
     Raises ConfigurationError on a budget that is too small to see anything.
     """

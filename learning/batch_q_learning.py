@@ -46,10 +46,8 @@ class BatchQLearning(ValueRule):
         min_d Σ (δ − ∇Qᵀ(d − d_now))²/r + (d − m)ᵀΛ(d − m),  then Λ ← Λ + GᵀG/r, m ← d
 
     This is done `relinearisations` times a batch, linearised anew where the last step led: the
-    iterated filter (Gauss–Newton on the posterior). TD errors hold the next penalty's expectation
-    and are cut at ±`innovation_clip`·√r. Where a step moves an entry by more than `largest_step`,
-    it and what the batch tells are both cut by the same share, as online. The first batch gives
-    noise, widths and c_f as well.
+    iterated filter (Gauss–Newton on the posterior). The first batch gives noise, widths and c_f as
+    well.
     """
 
     Configuration = BatchQLearningConfiguration

@@ -273,12 +273,9 @@ class TrainingLoop:
 
 
 def _stored(name: str, point: LinearisationPoint | None) -> dict[str, Vector]:
-    if point is None:
-        return {}
-    return {f"{name}_{key}": value for key, value in point._asdict().items()}
+    return {} if point is None else prefixed(f"{name}_", point._asdict())
 
 
 def _point(name: str, arrays: dict[str, Vector]) -> LinearisationPoint | None:
-    if f"{name}_x" not in arrays:
-        return None
-    return LinearisationPoint(*(arrays[f"{name}_{key}"] for key in LinearisationPoint._fields))
+    parts = group(arrays, f"{name}_")
+    return LinearisationPoint(**parts) if parts else None

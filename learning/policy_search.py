@@ -16,7 +16,7 @@ from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.baselines import GreedyConfiguration
 from learning.configuration import Count, Positive
-from learning.step import HESSIANS, certificate, moved
+from learning.step import HESSIANS, moved, smallest_eigenvalue
 
 
 class PolicySearchConfiguration(GreedyConfiguration):
@@ -33,11 +33,9 @@ class PolicySearchConfiguration(GreedyConfiguration):
 class Coordinates:
     """θ about a start by coordinates z that have no unit: θ(0) is the start.
 
-    A Hessian B = LLᵀ becomes L exp(Z) Lᵀ, which is positive definite for every symmetric Z; its
-    linear term b − 2B·δ, which moves the minimum by δ to first order; c_f, x_l and x_u move by δ.
-    δ is in units of the bounds' width (of the reference where one is infinite), a tenth of that for
-    c_f, which acts in each sample. The initial cost λ_θ and the slack weights stay: the policy
-    knows nothing of the first.
+    A Hessian B = LLᵀ becomes L exp(Z) Lᵀ, positive definite for every symmetric Z; its linear term
+    b − 2B·δ; c_f, x_l and x_u move by δ. δ is in units of the bounds' width (of the reference where
+    one is infinite), a tenth of that for c_f. Initial cost and slack weights stay.
     """
 
     def __init__(self, start: Parameters, scenario: Scenario, width: float) -> None:
@@ -149,7 +147,7 @@ class PolicySearch(Algorithm):
         self.controller.theta = candidate.theta
         blocks, episode = candidate.blocks, self._noise if self._simulated else None
         return moved(blocks, before, self.theta, episode=episode)._replace(
-            smallest_eigenvalue=certificate(blocks, candidate.theta).smallest
+            smallest_eigenvalue=smallest_eigenvalue(blocks, candidate.theta)
         )
 
     def _tell(self, population: NDArray[np.float64], costs: list[float]) -> None:

@@ -191,11 +191,8 @@ class QLearning(ValueRule):
         δ = ℓ + p(s) + γ[V_θ(s₊) − p(s₊) + mean_i p(f(s, a) + e_i)] − Q_θ(s, a)
 
     with f the controller's nominal model and e_i its latest prediction errors. Every `step_every`
-    samples d goes into θ under the constraints on θ, in the metric P⁻¹. Where that moves an entry
-    by more than `largest_step` prior deviations, ∇Q no longer holds (a bound that begins to bind):
-    d and what its samples have told are both cut by the same share. The first `prior_samples` leave
-    θ as it is, but for c_f, which becomes the mean of e. Kalman temporal differences after
-    Geist and Pietquin (2010), linearised and with the target held.
+    samples d goes into θ under the constraints on θ, in the metric P⁻¹. The first `prior_samples`
+    leave θ as it is, but for c_f, which becomes the mean of e (docs/method.md).
     """
 
     Configuration = QLearningConfiguration
@@ -337,11 +334,9 @@ class KalmanRegression:
 class AverageCost:
     """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
 
-    At γ = 1 the constant c_lambda cancels out of δ, and what the fit would have it do is to take
-    up the mean of δ. That is what g, the mean cost per sample, has to do: so the step of
-    c_lambda goes to g, and c_lambda stays. It serves the yardstick J itself, which a discounted
-    optimum need not. With a `memory` g is no part of the fit, and each sample takes g ← g +
-    δ/memory: differential Q-learning after Wan, Naik and Sutton (2021).
+    At γ = 1 the constant c_lambda cancels out of δ: its step, which takes up the mean of δ, goes to
+    g, and c_lambda stays. With a `memory` g is no part of the fit, and each sample takes
+    g ← g + δ/memory: differential Q-learning after Wan, Naik and Sutton (2021).
 
     `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
     """

@@ -28,7 +28,7 @@ from learning.configuration import Configuration, Count
 from learning.errors import ConfigurationError, DivergenceError
 from learning.prediction_errors import OneStepModel, SortedErrors, expected_penalties
 from learning.q_learning import QLearning
-from learning.step import certificate, clip_eigenvalues, moved, prior_deviation
+from learning.step import clip_eigenvalues, moved, prior_deviation, smallest_eigenvalue
 
 RULES: dict[str, type[Algorithm]] = {
     "q-learning": QLearning,
@@ -165,7 +165,7 @@ class PairedComparison:
         self._penalty = scenario.state_penalty
         self._parameters, self._start = start.blocks, start.theta
         self.block, self.blocks = block, blocks
-        self.least = 0.5 * max(certificate(start.blocks, start.theta).smallest, 0.0)
+        self.least = 0.5 * max(smallest_eigenvalue(start.blocks, start.theta), 0.0)
         """Least eigenvalue that the Hessians of a candidate may have."""
         self.spent, self.limit = 0, samples
         self.expected = float("nan")
@@ -296,7 +296,7 @@ class PairedComparison:
         blocks = self._parameters
         if not np.isfinite(theta).all():
             return None
-        if certificate(blocks, theta).smallest < self.least:
+        if smallest_eigenvalue(blocks, theta) < self.least:
             theta = clip_eigenvalues(blocks, theta, self.least)
         with suppress(ParameterError):
             Parameters(blocks, theta).require_well_posed()
@@ -317,21 +317,13 @@ def _patience(costs: Vector) -> float:
 
 
 class SearchPlan:
-    """Phases of learning, each followed by line searches on common noise.
+    """Phases of learning, each followed by line searches on common noise (docs/method.md).
 
-    One round: the rule learns from the incumbent; the incumbent of the round before and the θ that
-    the rule passed through are compared with it; then come line searches along the back-off of all
-    state bounds and over the order of magnitude of the inputs' weights. A candidate takes the
-    incumbent's place only if it is cheaper on the same noise. If no learnt θ did, comparisons
-    become twice as long, the next phase begins anew with half the width, a trust region about the
-    incumbent, and before it come line searches along the back-off of each state, along the
-    directions in θ that move the policy most (leading eigenvectors of E[∇π ∇πᵀ] in the prior's
-    coordinates, turned at random so that no ridge stays in the way), and along the round's whole
-    way. All comparisons of a round begin at the plant as it was when the round's learning ended,
-    with the same noise to come; so slow states are where operation takes them, and each round has
-    new noise. The last samples go to a longer comparison, in a new episode, between the incumbent,
-    the start and earlier incumbents. Without a rule θ rests in the phases of learning, which then
-    only measure what the coordinates of the line searches need (`prior_deviation`).
+    All comparisons of a round begin at the plant as it was when the round's learning ended, with
+    the same noise to come: slow states are where operation takes them. Where no learnt θ won,
+    comparisons become twice as long and the next phase has half the width. Without a rule θ rests
+    in the phases of learning, which then only measure what the coordinates of the line searches
+    need (`prior_deviation`).
 
     `scenario` gives bounds and penalty, `action_deviation` (m,) the exploration's σ, `samples` the
     budget, `block` samples make a block, at most `blocks` of them a comparison, `phase` a phase.
@@ -513,7 +505,7 @@ class SearchPlan:
         while True:
             kept, least = comparison.incumbent, comparison.least
             theta = self._weighted(10.0**decades)
-            comparison.least = min(least, 0.5 * certificate(self._start.blocks, theta).smallest)
+            comparison.least = min(least, 0.5 * smallest_eigenvalue(self._start.blocks, theta))
             comparison.base = Candidate(theta)
             pays = False
             try:

@@ -102,8 +102,8 @@ def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix) -> F
     return Fit(half, minimiser, lambda: metric / step_size)
 
 
-class Certificate(NamedTuple):
-    """What vouches for a step: the `smallest` eigenvalue of B_l and B_Vf after it.
+class Outcome(NamedTuple):
+    """What a step has led to: the `smallest` eigenvalue of B_l and B_Vf after it.
 
     `corrected` says that the free step would have violated the constraint, `refused` that no
     admissible step was found and θ stays.
@@ -114,12 +114,10 @@ class Certificate(NamedTuple):
     refused: bool = False
 
 
-def certificate(
-    blocks: ThetaBlocks, theta: Vector, *, corrected: bool = False, refused: bool = False
-) -> Certificate:
-    """Least eigenvalue of B_l and B_Vf at θ."""
+def smallest_eigenvalue(blocks: ThetaBlocks, theta: Vector) -> float:
+    """Least eigenvalue of B_l and B_Vf at θ, in their own units."""
     least = [np.linalg.eigvalsh(matrix_of(blocks, theta, name))[0] for name in HESSIANS]
-    return Certificate(float(min(least)), corrected, refused)
+    return float(min(least))
 
 
 def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
@@ -130,7 +128,7 @@ def matrix_of(blocks: ThetaBlocks, theta: Vector, name: str) -> Matrix:
 
 def definite(
     blocks: ThetaBlocks, theta: Vector, fit: Fit, smallest: float, scale: Vector | None = None
-) -> tuple[Vector, Certificate]:
+) -> tuple[Vector, Outcome]:
     """The fit's own minimiser under B ⪰ εI, by Clarabel where the free minimiser violates it.
 
     min dᵀMd − 2bᵀd  s.t.  B_l(θ+Sd) ⪰ εI, B_Vf(θ+Sd) ⪰ εI with scaled steps d (S = diag scale):
@@ -140,9 +138,8 @@ def definite(
     """
     scale = blocks.scale if scale is None else scale
     free = theta + scale * fit.minimiser
-    found = certificate(blocks, free)
-    if found.smallest >= smallest:
-        return free, found
+    if (found := smallest_eigenvalue(blocks, free)) >= smallest:
+        return free, Outcome(found)
     matrices, offsets, cones = [], [], []
     for name in HESSIANS:
         block, where = blocks.block(name), blocks.slices[name]
@@ -165,10 +162,10 @@ def definite(
         cones,
     )
     if step is None:
-        return theta, certificate(blocks, theta, corrected=True, refused=True)
+        return theta, Outcome(smallest_eigenvalue(blocks, theta), corrected=True, refused=True)
     # An interior-point solution may miss the cone by its tolerance; ε is meant to hold.
     theta = clip_eigenvalues(blocks, theta + scale * step, smallest)
-    return theta, certificate(blocks, theta, corrected=True)
+    return theta, Outcome(smallest_eigenvalue(blocks, theta), corrected=True)
 
 
 def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vector:
@@ -200,11 +197,11 @@ class ConstrainedStep:
         self._controller = controller
         self.blocks = controller.parameters.blocks
         self.scale: Vector = self.blocks.scale if scale is None else scale
-        self._smallest = least_eigenvalue(configuration, controller.parameters)
+        self._smallest = least_allowed(configuration, controller.parameters)
         self._least = {block.name: np.array(block.least) for block in self.blocks if block.least}
 
-    def proposal(self, fit: Fit) -> tuple[Vector, Certificate]:
-        """The new θ that a fit leads to, and its certificate; the controller stays as it is.
+    def proposal(self, fit: Fit) -> tuple[Vector, Outcome]:
+        """The new θ that a fit leads to, and what it has led to; the controller stays as it is.
 
         A step that definiteness corrects beyond the fit's cap or trust region is scaled back: the
         θ with definite Hessians are a convex set, in which the whole way lies.
@@ -212,7 +209,7 @@ class ConstrainedStep:
         theta = self._controller.theta
         if not np.isfinite(fit.minimiser).all():
             raise DivergenceError("the step of θ is not finite")
-        new, vouched = definite(self.blocks, theta, fit, self._smallest, self.scale)
+        new, outcome = definite(self.blocks, theta, fit, self._smallest, self.scale)
         new = new.copy()
         for name, minimum in self._least.items():
             where = self.blocks.slices[name]
@@ -221,19 +218,20 @@ class ConstrainedStep:
         reach = 0.0 if fit.reach is None else fit.reach((new - theta) / self.scale)
         if reach > 1.0:
             new = theta + (new - theta) / reach
-            vouched = certificate(self.blocks, new, corrected=vouched.corrected)
+            outcome = outcome._replace(smallest=smallest_eigenvalue(self.blocks, new))
         lower, upper = self.blocks.slices["x_l"], self.blocks.slices["x_u"]
         if not (new[lower] < new[upper]).all():
-            return theta, certificate(self.blocks, theta, corrected=True, refused=True)
-        return new, vouched
+            kept = smallest_eigenvalue(self.blocks, theta)
+            return theta, Outcome(kept, corrected=True, refused=True)
+        return new, outcome
 
     def take(self, fit: Fit, td_error: float) -> Update:
         """Set the controller's θ to the fit's proposal and say what happened."""
         old = self._controller.theta
-        new, vouched = self.proposal(fit)
+        new, outcome = self.proposal(fit)
         self._controller.theta = new
         size = float(np.linalg.norm((new - old) / self.scale))
-        return Update(td_error, size, *vouched)
+        return Update(td_error, size, *outcome)
 
     def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
         """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), and say so.
@@ -249,14 +247,14 @@ def moved(blocks: ThetaBlocks, old: Vector, new: Vector, **said: Any) -> Update:
     return Update(
         td_error=float("nan"),
         step=float(np.linalg.norm((new - old) / blocks.scale)),
-        smallest_eigenvalue=certificate(blocks, new).smallest,
+        smallest_eigenvalue=smallest_eigenvalue(blocks, new),
         **said,
     )
 
 
-def least_eigenvalue(configuration: Configuration, start: Parameters) -> float:
+def least_allowed(configuration: Configuration, start: Parameters) -> float:
     """ε of B ⪰ εI for a run that begins at `start`."""
-    own = certificate(start.blocks, start.theta).smallest
+    own = smallest_eigenvalue(start.blocks, start.theta)
     chosen = configuration.smallest_eigenvalue
     return min(chosen, own / 2) if own > 0 else chosen
 
@@ -271,13 +269,10 @@ def prior_deviation(
 ) -> Vector:
     """Standard deviation of each entry of θ about its start, (n_θ,).
 
-    With B a Hessian of the start and D = diag(B)^½: entries of B get `width`·D_i D_j, so that a
-    change keeps B's proportions; gradients `width`·D_i √κ, a shift of the minimum that costs about
-    κ = max_i B_ii σ_i², the dearest typical move, or a share of the gradient that is there. λ_θ,
-    which the policy does not feel, is as wide as V^f_θ or as its own start. Bounds get
-    2·width/0.3 deviations of e, or of a slow state's movement; c_f little, since the mean of e says
-    what it must be; slack weights `width` of themselves. `state_deviation` and `error_deviation`
-    (n,), `action_deviation` (m,) are σ of s, e and the exploration, `level` the size of c_lambda.
+    With B a Hessian of the start, D = diag(B)^½ and κ = max_i B_ii σ_i² what the dearest typical
+    move costs, entries of B get `width`·D_i D_j and gradients `width`·D_i √κ (docs/method.md).
+    `state_deviation` and `error_deviation` (n,), `action_deviation` (m,) are σ of s, e and the
+    exploration, `level` the size of c_lambda.
     """
     move = np.concatenate([np.maximum(state_deviation, error_deviation), action_deviation])
     stage, terminal = _root_diagonal(start["B_l"]), _root_diagonal(start["B_Vf"])

@@ -39,7 +39,7 @@ from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError, PrivilegeError
 from learning.loop import TrainingLoop
-from learning.step import certificate
+from learning.step import smallest_eigenvalue
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -673,9 +673,9 @@ class _Session:
         del figures["number"]
         figures |= {
             "samples": number,
-            # The least certificate of the updates since the last row, whichever step gave it.
+            # The least eigenvalue of the updates since the last row, whichever step gave it.
             "smallest_eigenvalue": min(
-                self.totals.smallest_eigenvalue, certificate(answer.blocks, answer.theta).smallest
+                self.totals.smallest_eigenvalue, smallest_eigenvalue(answer.blocks, answer.theta)
             ),
             "plant_samples": counts["number"],
         }

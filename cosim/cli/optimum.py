@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +11,7 @@ import typer
 from cosim.cli import output as cli
 
 if TYPE_CHECKING:
-    from controllers.dynamic_programming import Progress
+    from controllers.dynamic_programming import Optimum, Progress
     from controllers.optimum import QuasiStaticPolicy
     from cosim.scenario import Scenario
 
@@ -109,13 +108,13 @@ def _solve(task: Scenario, refine: bool, recompute: bool, out_: cli.Output) -> d
     }
 
 
-def _told(out_: cli.Output) -> Callable[[Progress], None]:
+def _told(out_: cli.Output) -> Progress:
     """Tell of each round on a terminal: the grid and the closing bounds."""
 
-    def tell(p: Progress) -> None:
+    def tell(level: int, number: int, found: Optimum) -> None:
         if out_.live:
-            where = f"grid {p.level} ({p.states} states), round {p.round}"
-            out_.note(f"{where}: {p.lower:.1f} ≤ J* ≤ {p.upper:.1f}")
+            where = f"grid {level} ({found.grid.size} states), round {number}"
+            out_.note(f"{where}: {found.lower:.1f} ≤ J* ≤ {found.upper:.1f}")
 
     return tell
 

@@ -2,13 +2,14 @@
 
 import re
 import shutil
-import struct
 import subprocess
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from macholib import mach_o
+from macholib.MachO import MachO
+from macholib.SymbolTable import SymbolTable
 
 import fmus
 from fmus import PLATFORMS
@@ -43,24 +44,31 @@ def test_there_is_a_library_for_each_platform(binaries, version: int) -> None:
 
 
 def test_macos_libraries_export_the_functions_of_the_standard_and_need_the_system_alone(
-    binaries, functions, version: int
+    binaries, functions, version: int, tmp_path: Path
 ) -> None:
     found = []
     for name, data in binaries.items():
         if not name.endswith(".dylib"):
             continue
-        for part in slices(data):
-            library = read(part)
-            assert library.exports - NOT_OURS == functions
-            assert library.needs == ("/usr/lib/libSystem.B.dylib",)
-            assert library.name == f"{EVAPORATOR.identifier}.dylib"
-            assert library.least_version == (11, 0)
-            assert library.signed or library.architecture == "x86_64"
-            found.append((name.split("/")[0], library.architecture))
+        (tmp_path / "library").write_bytes(data)
+        file = MachO(str(tmp_path / "library"))
+        for part in file.headers:
+            commands = {load.cmd: (command, text) for load, command, text in part.commands}
+            exports = {symbol.decode()[1:] for _, symbol in SymbolTable(file, part).extdefsyms}
+            assert exports - NOT_OURS == functions
+            assert [path for *_, path in part.walkRelocatables()] == ["/usr/lib/libSystem.B.dylib"]
+            own = commands[mach_o.LC_ID_DYLIB][1].rstrip(b"\0").decode()
+            assert (part.filetype, own) == ("dylib", f"{EVAPORATOR.identifier}.dylib")
+            built = commands[mach_o.LC_BUILD_VERSION][0]
+            assert (built.platform, built.minos) == (mach_o.PLATFORM_MACOS, 11 << 16)
+            architecture = mach_o.CPU_TYPE_NAMES[part.header.cputype]
+            assert mach_o.LC_CODE_SIGNATURE in commands or architecture == "x86_64"
+            assert part.offset % 2**14 == 0  # a page
+            found.append((name.split("/")[0], architecture))
     on_x86 = [("x86_64-darwin", "x86_64")]
     if version == 2:
-        on_x86 = [("darwin64", "x86_64"), ("darwin64", "aarch64")]
-    assert found == [("aarch64-darwin", "aarch64"), *on_x86]
+        on_x86 = [("darwin64", "x86_64"), ("darwin64", "ARM64")]
+    assert found == [("aarch64-darwin", "ARM64"), *on_x86]
 
 
 def test_windows_library_exports_the_functions_and_needs_what_windows_10_has(
@@ -103,74 +111,3 @@ def objdump(tmp_path: Path):
         ).stdout
 
     return run
-
-
-ARCHITECTURES = {0x01000007: "x86_64", 0x0100000C: "aarch64"}
-_SYMTAB, _LOAD_DYLIB, _ID_DYLIB, _SIGNATURE, _BUILD_VERSION = 0x2, 0xC, 0xD, 0x1D, 0x32
-_DYLIB, _EXTERNAL, _DEFINED_IN_SECTION, _MACOS = 6, 0x01, 0x0E, 1
-
-
-@dataclass(frozen=True)
-class Library:
-    """A 64-bit Mach-O dynamic library."""
-
-    architecture: str
-    name: str
-    needs: tuple[str, ...]
-    least_version: tuple[int, int]
-    exports: frozenset[str]
-    signed: bool
-
-
-def slices(data: bytes) -> list[bytes]:
-    """The libraries in a universal binary, or the one that `data` is."""
-    magic, count = struct.unpack_from(">II", data)
-    if magic != 0xCAFEBABE:
-        return [data]
-    found = []
-    for i in range(count):
-        cpu, _, offset, size, alignment = struct.unpack_from(">IIIII", data, 8 + 20 * i)
-        assert cpu in ARCHITECTURES
-        assert offset % (1 << alignment) == 0
-        assert offset + size <= len(data)
-        found.append(data[offset : offset + size])
-    return found
-
-
-def read(data: bytes) -> Library:
-    magic, cpu, _, kind, count, _ = struct.unpack_from("<IIIIII", data)
-    assert (magic, kind) == (0xFEEDFACF, _DYLIB)
-    name, version, signed = "", (0, 0), False
-    needs: list[str] = []
-    exports: set[str] = set()
-    position = 32
-    for _ in range(count):
-        command, size = struct.unpack_from("<II", data, position)
-        body = data[position : position + size]
-        if command & 0xFF == _SYMTAB:
-            exports = _exports(data, *struct.unpack_from("<IIII", body, 8))
-        elif command & 0xFF == _LOAD_DYLIB:
-            needs.append(_text(body, struct.unpack_from("<I", body, 8)[0]))
-        elif command == _ID_DYLIB:
-            name = _text(body, struct.unpack_from("<I", body, 8)[0])
-        elif command == _SIGNATURE:
-            signed = True
-        elif command == _BUILD_VERSION:
-            platform, least = struct.unpack_from("<II", body, 8)
-            assert platform == _MACOS
-            version = (least >> 16, least >> 8 & 0xFF)
-        position += size
-    return Library(ARCHITECTURES[cpu], name, tuple(needs), version, frozenset(exports), signed)
-
-
-def _text(data: bytes, offset: int) -> str:
-    return data[offset : data.index(b"\0", offset)].decode()
-
-
-def _exports(data: bytes, symbols: int, count: int, strings: int, _: int) -> set[str]:
-    found = set()
-    for i in range(count):
-        name, kind, _, _, _ = struct.unpack_from("<IBBHQ", data, symbols + 16 * i)
-        if kind & _EXTERNAL and kind & 0x0E == _DEFINED_IN_SECTION and not kind & 0x10:
-            found.add(_text(data, strings + name).removeprefix("_"))
-    return found

@@ -28,25 +28,6 @@ def test_packing_undoes_unpacking_bit_for_bit(entries):
     assert MATRIX.pack(MATRIX.unpack(packed)).tobytes() == packed.tobytes()
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        [[1.0, 2.0], [2.0, 1.0]],
-        [[1, 0, 0], [0, 1, 0], [1e-9, 0, 1]],
-        [[np.nan, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [[1, 0, 0], [0, np.inf, 0], [0, 0, 1]],
-        [[1, 0], [0, 1, 0]],
-        "identity",
-        {"a": 1},
-        10**400,
-        [[True, False, False], [False, True, False], [False, False, True]],
-    ],
-)
-def test_a_bad_value_is_refused(value):
-    with pytest.raises(ParameterError):
-        MATRIX.pack(value)
-
-
 def test_model_parameters_scale_with_their_nominal_value(problem):
     blocks = ThetaBlocks.of(problem, model_parameters=("UA2", "h"))
     np.testing.assert_allclose(blocks.scale[blocks.slices["p"]], [0.684, 0.016])

@@ -98,20 +98,6 @@ def test_a_failure_repeats_the_action_is_counted_and_learned_from_no_more(
     assert loop.counts.failures == 1
 
 
-def test_restart_changes_nothing_that_a_resume_would_not(plant, problem):
-    loop, _ = interaction(plant, problem)
-    for _ in range(10):
-        loop.next()
-    snapshot = plant.snapshot()
-    loop.restart()
-    state = loop.state()
-    first = [loop.next()[1] for _ in range(20)]
-    other, _ = interaction(plant, problem)
-    plant.restore(snapshot)
-    other.restore(*state)
-    assert [other.next()[1] for _ in range(20)] == first
-
-
 def make_run(scenario, seed=3):
     configuration = QLearning.Configuration.from_dict({"prior_samples": 20, "step_every": 20})
     return TrainingRun("q-learning", scenario, 100, seed, configuration)

@@ -47,19 +47,6 @@ def test_the_papers_rule_takes_the_closed_form_step(plant, problem):
     assert update.td_error == pytest.approx(abs(delta))
 
 
-def test_state_and_restore_carry_all_memory(plant, problem):
-    bench, other = (Bench(plant, problem, prior_samples=20, step_every=30) for _ in range(2))
-    samples = [bench.interaction.next()[0] for _ in range(50)]
-    for sample in samples[:30]:
-        bench.algorithm.observe(sample)
-    other.controller.theta = bench.controller.theta
-    other.algorithm.restore({k: v.copy() for k, v in bench.algorithm.state().items()})
-    for sample in samples[30:]:
-        first, second = bench.algorithm.observe(sample), other.algorithm.observe(sample)
-    assert first == second
-    assert np.array_equal(bench.controller.theta, other.controller.theta)
-
-
 def regression(size, variance, **changes):
     settings = {"clip": np.inf, "memory": np.inf, **changes}
     return KalmanRegression(np.zeros(size), np.eye(size), variance, **settings)

@@ -2,13 +2,10 @@ import numpy as np
 import pytest
 
 from controllers.problem import Problem
-from controllers.rti import RtiNmpc
 from controllers.theta import Parameters
-from cosim import FmuPlant
-from cosim.simulation import indicators_of
 from learning.algorithm import Update
 from learning.q_learning import QLearning
-from learning.training import HELD_OUT, run_training, to_csv
+from learning.training import run_training, to_csv
 from tests.helpers import training
 from tests.helpers.training import killed_and_resumed
 
@@ -74,31 +71,6 @@ def test_a_step_that_is_not_finite_stops_the_run(scenario):
     assert not np.array_equal(result.parameters.theta, result.start.theta)
 
 
-class Reporting(QLearning):
-    """Behaves with one θ and hands over another; draws from the generator of its own."""
-
-    def __init__(self, controller, *rest):
-        super().__init__(controller, *rest)
-        self._rng, self._blocks = rest[-1], controller.parameters.blocks
-        self.theta = controller.theta.copy()
-
-    def observe(self, sample):
-        self.theta[self._blocks.slices["x_l"]] = [25.0 + self._rng.random(), 40.0]
-        return super().observe(sample)
-
-
-def test_log_files_and_evaluation_are_of_the_theta_that_is_reported(scenario, tmp_path):
-    run = make_run(scenario, "q-learning", samples=200)
-    result = run_training(run, tmp_path, rule=Reporting)
-    stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))
-    assert 25.0 < result.parameters["x_l"][0] < 26.0
-    assert np.array_equal(stored.theta, result.parameters.theta)
-    assert result.rows[-1].parameters["x_l"][0] == result.parameters["x_l"][0]
-    with FmuPlant(scenario) as plant:
-        own = RtiNmpc(Problem.from_scenario(scenario), result.parameters)
-        assert result.evaluation["J"] == indicators_of(plant, own, [HELD_OUT], 20)["J"]
-
-
 class Trying(QLearning):
     """Hands over its start while the controller carries a candidate without any back-off."""
 
@@ -112,10 +84,11 @@ class Trying(QLearning):
         return Update(td_error=0.0, step=1.0, smallest_eigenvalue=1.0)
 
 
-def test_no_run_ends_as_diverged_by_a_candidate_that_is_tried(scenario, tmp_path):
+def test_all_is_of_the_theta_that_is_handed_over_not_of_a_candidate(scenario, tmp_path):
     run = make_run(scenario, "q-learning", samples=200, divergence=1.01)
     result = run_training(run, tmp_path, rule=Trying)
     assert result.status == "finished" and result.rows[-1]["J"] > 2 * result.J
+    assert result.J == result.start_J == result.rows[-1]["greedy_J"]
     for row in result.rows:
         assert np.array_equal(row.parameters.theta, result.start.theta)
     stored = Parameters.load(tmp_path / "parameters.toml", Problem.from_scenario(scenario))

@@ -6,11 +6,9 @@ import pytest
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from learning import ActorCritic, BatchQLearning, QLearning
-from learning.configuration import Configuration
-from learning.step import ConstrainedStep, Fit, least_allowed
 from learning.training import starting_parameters
 from tests.helpers.other_units import ACTION, COST, STATE, NoisyModel, factors, problems, recounted
-from tests.helpers.training import Carrier, looped
+from tests.helpers.training import looped
 
 SAMPLES = 160
 SETTINGS = {
@@ -64,27 +62,3 @@ def test_a_rule_learns_the_same_policy_in_other_units(scenario, cls):
     other_way = (other.theta - other_start.theta) / other.blocks.scale
     assert other_way == pytest.approx(way, abs=1e-5 * np.abs(way).max())
     assert corrected == other_corrected
-
-
-def test_definiteness_and_the_least_slack_weights_are_the_same_in_other_units(scenario, rng):
-    configuration = Configuration()
-    own, other = (Carrier(start) for start in starts(scenario, configuration))
-    steps = [ConstrainedStep(carrier, configuration) for carrier in (own, other)]
-    assert least_allowed(configuration, own.parameters) == pytest.approx(
-        least_allowed(configuration, other.parameters)
-    )
-    corrected = 0
-    for _ in range(10):
-        root = rng.normal(size=(own.theta.size, own.theta.size))
-        metric = root @ root.T + np.eye(own.theta.size)
-        target = 3.0 * rng.normal(size=own.theta.size)
-        fit = Fit(metric @ target, target, lambda metric=metric: metric)
-        updates = [step.take(fit, 0.0) for step in steps]
-        corrected += updates[0].corrected
-        assert updates[0].smallest_eigenvalue == pytest.approx(
-            updates[1].smallest_eigenvalue, rel=1e-6
-        )
-        moved = factors(own.parameters.blocks) * own.theta
-        error = (other.theta - moved) / other.parameters.blocks.scale
-        assert np.abs(error).max() < 1e-6
-    assert corrected > 5, "the test must meet corrected steps"

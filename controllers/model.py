@@ -89,13 +89,8 @@ def runge_kutta(rate: Callable[[ca.SX], ca.SX], x: ca.SX, h: float | ca.SX, subs
 def discretise(model: Model, sampling_time: float, substeps: int) -> ca.Function:
     """Discrete-time model f(x, u, d, p) → x₊ for inputs held over one sample.
 
-    `sampling_time` in seconds. Raises ModelError where it or `substeps` is not positive.
+    `sampling_time` in seconds, in so many RK4 steps.
     """
-    if not sampling_time > 0 or substeps < 1:
-        raise ModelError(
-            f"model '{model.name}': sampling time {sampling_time} s and {substeps} substeps must "
-            "both be positive"
-        )
     x, u, d, p = model.symbols()
     h = sampling_time / model.time_unit / substeps
     x_next = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, substeps)

@@ -13,10 +13,10 @@ from scipy.optimize import linear_sum_assignment
 from controllers.economic import linear_model, local_feedback, tune
 from controllers.errors import ControllerError
 from controllers.problem import Problem
-from cosim.protocols import Array, Controller, Decision
+from cosim.protocols import Array, Decision
 
 
-class Lqr(Controller):
+class Lqr:
     """u = u_s − K (x − x_s), clipped to the action bounds.
 
     `gain` K (m, n) is that of the linear-quadratic problem whose weights are the convexified
@@ -27,6 +27,12 @@ class Lqr(Controller):
         H = tune(problem).convexification.hessian
         self.problem = problem
         self.gain = -local_feedback(*linear_model(problem), H, np.zeros((0, len(H)))).gain
+
+    def reset(self) -> None:
+        """Nothing is remembered."""
+
+    def prepare(self) -> None:
+        """Nothing can be prepared."""
 
     def feedback(self, s: Array, a: Array | None = None) -> Decision:
         """Action (m,) at the state s (n,), `a` (m,) where it is given."""

@@ -34,7 +34,7 @@ from controllers.errors import ModelError, OptimumError, QpError
 from controllers.model import Model
 from controllers.problem import VECTORS, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
-from cosim.protocols import Controller, Decision, Vector
+from cosim.protocols import Decision, Vector
 from cosim.scenario import Scenario
 
 VERSION = 2
@@ -147,7 +147,7 @@ def read_optimum(path: Path, key: str) -> Optimum:
 # the optimal policy ---------------------------------------------------------------------------
 
 
-class OptimalPolicy(Controller):
+class OptimalPolicy:
     """π* and V* = penalty + W of a problem under a disturbance law, from a solved grid.
 
     V* is the differential value: the cost in excess of J* that a start in s brings, up to a
@@ -208,6 +208,12 @@ class OptimalPolicy(Controller):
     def gain(self) -> float:
         """J*: mean of economic cost and penalty per sample under this policy."""
         return self.optimum.gain
+
+    def reset(self) -> None:
+        """Do nothing: the policy has no memory."""
+
+    def prepare(self) -> None:
+        """Do nothing: all was prepared when the problem was solved."""
 
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
         """π*(s) and V*(s), or Q*(s, a) with `a`; s (n,), a (m,); `clamped` outside the grid.

@@ -38,7 +38,7 @@ FACTORS = ((0.72, 0.85, 1.18, 1.4), (0.93, 1.07), (0.97, 1.03))
 """Of a back-off, in the three sweeps about the best point of the grid."""
 ROOM = 0.45
 """Largest back-off, as a share of the distance of the bounds."""
-DOUBT = 2.0
+DOUBT = 1.0
 """Standard deviations of a difference of costs within which the model cannot tell."""
 PLATEAU = 2e-5
 """Least deviation of such a difference, as a share of the cost."""
@@ -304,16 +304,14 @@ class BackOffs:
 
         First a grid, at once over the bounds whose penalty shows anywhere, up to two, and one by
         one over what others there are; then each about the best point, on longer rollouts. Bounds
-        whose penalty shows nowhere have a spare back-off, and a larger one is given up for it.
+        whose penalty shows nowhere have a spare back-off.
         """
         grids = [
             self._rounded(i, [max(level * unit, least[i]) for level in LEVELS])
             for i, unit in enumerate(self._unit)
         ]
         active: list[int] = []
-        spared = np.maximum(np.minimum(delta, self._spare * self._unit), least)
-        spared = np.concatenate([self._rounded(i, [value]) for i, value in enumerate(spared)])
-        points = [delta, spared, least]
+        points = [delta, least]
         while True:
             delta = self._least(points)
             order = np.argsort(-self._worth)

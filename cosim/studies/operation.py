@@ -254,20 +254,30 @@ def tables(
     last = lives[lives.samples == marks[-1]].groupby("case", sort=False)
     header = (
         "case", "runs", "first change, samples", "violating % since", "dearest 100 samples %",
-        "480 samples dearer than at first (most %)", "updates", "model samples", "processor s",
+        "updates", "model samples", "processor s",
     )  # fmt: skip
     middle = last.median(numeric_only=True)
     rows = [
         [
             case, str(last.size()[case]), _whole(row.first_change),
             f"{100 * row.violating:.2f}", f"{100 * row.dearest:.1f}",
-            f"{_whole(row.dearer)} ({100 * row.excess:.2f})" if row.dearer >= 0 else "",
-            _whole(row.updates),
-            _whole(row.model_samples), _whole(seconds.get(str(case), np.nan)),
+            _whole(row.updates), _whole(row.model_samples),
+            _whole(seconds.get(str(case), np.nan)),
         ]
         for case, row in middle.iterrows()
     ]  # fmt: skip
     result.append((f"What {times[-1]} of operation took on `{scenario}`, medians", header, rows))
+    shifts = lives[(lives.samples == marks[-1]) & lives.dearer.notna()].groupby("case", sort=False)
+    rows = [
+        [str(case), f"{_whole(own.dearer.median())} ({_whole(own.dearer.max())})",
+         f"{100 * own.excess.median():.2f} ({100 * own.excess.max():.2f})"]
+        for case, own in shifts
+    ]  # fmt: skip
+    if rows:
+        title = (
+            f"Shifts of {SHIFT} samples dearer than θ as it starts, median (worst): `{scenario}`"
+        )
+        result.append((title, ("case", "shifts", "largest excess %"), rows))
     rows = []
     for case, other in against.items():
         pairs = [found.greedy.get(str(name), {}) for name in (case, other)]

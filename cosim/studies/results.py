@@ -485,6 +485,7 @@ class StudyResults(Shown):
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
+        lives = lives.reindex(columns=operation.COLUMNS)  # an older table lacks the latest ones
         greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
         return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))

@@ -130,8 +130,6 @@ def test_a_bound_that_does_not_bind_has_a_spare_back_off(search):
     spared = search.best(np.zeros(4), np.zeros(4))
     assert spared[0] == pytest.approx(0.8, abs=0.06)
     assert spared[2] == pytest.approx(18.0 * search._unit[2], abs=0.05)
-    present = np.array([0.8, 0.0, 1.5 * spared[2], 0.0])
-    assert search.best(present, np.zeros(4))[2] == spared[2]
 
 
 def test_a_loop_that_goes_where_the_plant_has_not_been_promises_nothing(search):

@@ -202,7 +202,7 @@ WRONG = [
     "train --algorithm q-learning --set step_size=zero",
     "train --algorithm q-learning --resume",
     "train --algorithm q-learning --controller mpc",
-    "train --algorithm q-learning --evaluate-every 70",
+    "train --algorithm q-learning --evaluate-every 70 --log-every 60",
     "fmu info none.fmu",
     "fmu info blocked",
     "fmu check none.fmu",

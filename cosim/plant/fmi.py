@@ -643,9 +643,13 @@ class Fmi3Instance(Instance):
         """The arguments that ask for the states at each internal step; none if they are not had."""
         if self._wiring.intermediate is None or not self._interface.providesIntermediateUpdate:
             return {}
-        # fmpy does not read the attribute.
+        # fmpy does not read the attribute, an xs:boolean.
         elements = ElementTree.parse(self.fmu.folder / DESCRIPTION).iter()
-        offered = {e.get("valueReference") for e in elements if e.get("intermediateUpdate")}
+        offered = {
+            e.get("valueReference")
+            for e in elements
+            if e.get("intermediateUpdate") in ("true", "1")
+        }
         states = {place.reference for place in self._wiring.states}
         told = {str(state) for state in states} <= offered
         update = {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}

@@ -483,6 +483,8 @@ class FmuPlant:
     def deserialise(self, data: bytes) -> Snapshot:
         """Return the snapshot that `serialise` wrote, of any plant with the very same FMU file."""
         fmi = self._instance
+        if len(data) < _HEADER.size:
+            raise PlantError("these bytes are not a serialised plant state")
         k, digest = _HEADER.unpack_from(data)
         if digest.hex() != self.fmu_sha256:
             raise PlantError(f"this state was serialised from another FMU ({digest.hex()[:16]}…)")

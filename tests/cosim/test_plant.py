@@ -230,3 +230,9 @@ def test_a_change_takes_effect_at_its_sample_and_ends_with_the_reset(fmu):
 def test_a_change_of_what_cannot_be_changed_is_refused(name, message):
     with pytest.raises(PlantError, match=message):
         FmuPlant(_changed(name, 1.0))
+
+
+def test_bytes_that_are_no_plant_state_are_refused(plant):
+    plant.reset(0)
+    with pytest.raises(PlantError, match="not a serialised plant state"):
+        plant.deserialise(b"cut")

@@ -13,7 +13,7 @@ from math import inf
 from pathlib import Path
 
 from fmus.build import PACKAGE, RESOURCES, SOURCES, assemble, files_of, sources_of
-from fmus.model import FmiVersion, Kind, Model, Type, Unit, Variable, read_variables, render, unit
+from fmus.model import FmiVersion, Kind, Model, Type, Variable, read_variables, render, unit
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (
@@ -186,10 +186,7 @@ def model(name: str) -> Model:
                 )
             )  # fmt: skip
     description, sampling_time = PLANTS[name]
-    table = plant_model(name, description=description, sampling_time=sampling_time, **signals)
-    # Stored results name the shipped files by their bytes: units without their SI forms.
-    units = [Unit(u.name, exponents=u.exponents if u.name == "s" else ()) for u in table.units]
-    return replace(table, units=tuple(units))
+    return plant_model(name, description=description, sampling_time=sampling_time, **signals)
 
 
 def equations(name: str) -> bytes:

@@ -207,7 +207,9 @@ def dot_rows(axes: Axes, rows: Sequence[Dots], looks: Mapping[str, Look]) -> NDA
             )  # fmt: skip
         if np.isfinite([dots.low, dots.high]).all():
             axes.hlines(row, dots.low, dots.high, color=INK, linewidth=1.1, zorder=4)
-        axes.vlines(dots.middle, row - 0.3, row + 0.3, color=INK, linewidth=1.4, zorder=5)
+        # A single value lies under its middle, which then has its case's colour.
+        color = INK if count > 1 else looks[dots.case].color
+        axes.vlines(dots.middle, row - 0.3, row + 0.3, color=color, linewidth=1.4, zorder=5)
     axes.set_yticks(range(len(rows)), [shown_case(dots.case) for dots in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)

@@ -141,7 +141,8 @@ def curves_figure(
         for axes in grid[1]:
             style.samples_axis(axes, end, "training samples")
         if len(starts) > 1:
-            drawn.legend(handles=[*handles.values()], loc="outside lower center", ncols=4)
+            columns = max(1, 132 // (max(map(len, handles)) + 10))  # of characters across the page
+            drawn.legend(handles=[*handles.values()], loc="outside lower center", ncols=columns)
         style.label_ends(drawn, named)
     return drawn
 
@@ -165,8 +166,9 @@ def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Lo
     axis = np.geomspace(FLOOR, 1.3 * max(float(finite.max(initial=1.0)), 10 * FLOOR), 200)
     with style.figure(max(2.6, 0.16 * len(strata) + 0.6)) as drawn:
         axes: Axes = drawn.subplots()
+        lines = palette(list(strata))
         for name, runs in strata.items():
-            color, line = looks[name]
+            color, line = looks[name].color, lines[name].line
             below = [(stratum[:, None] <= axis).astype(float) for stratum in runs]
             share = np.concatenate(below).mean(axis=0)
             axes.step(axis, share, where="post", c=color, ls=line, lw=1.3, label=shown_case(name))

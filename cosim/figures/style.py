@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from colorsys import hls_to_rgb, rgb_to_hls
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -13,7 +14,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter
 from numpy.typing import NDArray
@@ -130,6 +131,15 @@ def palette(names: Sequence[str]) -> dict[str, Look]:
         looks[name] = Look(own, _LINES[used.get(own, 0) % len(_LINES)])
         used[own] = used.get(own, 0) + 1
     return looks
+
+
+def lit(color: str) -> str:
+    """A colour, lightened where a dark ground would hide it."""
+    rgb = to_rgb(color)
+    if max(rgb) > 0.55:
+        return color
+    hue, lightness, saturation = rgb_to_hls(*rgb)
+    return to_hex(hls_to_rgb(hue, max(lightness, 0.85 - lightness), saturation))
 
 
 def plain(text: str) -> str:

@@ -7,7 +7,6 @@ import os
 import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from colorsys import hls_to_rgb, rgb_to_hls
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -286,7 +285,7 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
     The signals are `<run>/<signal>` for every signal that all runs have, and, of two runs,
     `difference/<signal>`; bounds are those that the first run knows. `about` is Markdown.
     """
-    from cosim.figures.style import palette  # noqa: PLC0415 - matplotlib: a third of a second
+    from cosim.figures.style import lit, palette  # noqa: PLC0415 - matplotlib: a third of a second
 
     first, *others = runs.values()
     times_of = {
@@ -294,7 +293,7 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
         for name, run in runs.items()
     }
     rows = {name: times(np.arange(len(time)), time) for name, time in times_of.items()}
-    colors = {name: _lit(look.color) for name, look in palette(list(runs)).items()}
+    colors = {name: lit(look.color) for name, look in palette(list(runs)).items()}
     overlaid, differences = [], []
     for signal, own in first.signals.items():
         if signal == "time" or not all(signal in run.signals for run in others):
@@ -537,16 +536,6 @@ def _style(channels: Sequence[Channel]) -> rr.SeriesLines | rr.SeriesPoints:
         aggregation_policy=policy.MinMax,
         interpolation_mode=mode.StepAfter if first.step else mode.Linear,
     )
-
-
-def _lit(color: str) -> str:
-    """A figure's colour, lightened where the viewer's dark ground would hide it."""
-    red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
-    if max(red, green, blue) > 0.55:
-        return color
-    hue, lightness, saturation = rgb_to_hls(red, green, blue)
-    lit = hls_to_rgb(hue, max(lightness, 0.85 - lightness), saturation)
-    return "#" + "".join(f"{round(255 * part):02X}" for part in lit)
 
 
 def packed_color(color: str) -> int:

@@ -297,12 +297,9 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
             for kind in table.figures if found else ():
                 stem = f"{kind}-{safe(name)}-{table.name}"
                 if kind == "trajectory":
-                    beside = list(found.values())
                     for case, one in found.items():
-                        yield (
-                            f"{stem}-{safe(case)}",
-                            trajectory_figure(one, scenario, beside=beside),
-                        )
+                        drawn = trajectory_figure(one, scenario, beside=[*found.values()])
+                        yield f"{stem}-{safe(case)}", drawn
                 elif kind == "overlay":
                     yield stem, overlay_figure(found)
                 elif kind == "density":

@@ -560,14 +560,12 @@ class StudyResults(Shown):
         own = self.evaluation[self.evaluation.scenario == scenario]
         if own.empty:
             return "No run is finished."
-        text = f"Table, regret and profile: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
-        text += "samples."
-        text += " Learning curves: "
-        if noise := self.about.get("curves", {}).get(scenario):
-            text += f"{noise[0]} other seeds × {noise[1]} samples."
-        else:  # of an older version
-            text += "other noise, and fewer samples."
-        return text + " Regrets of a case differ between the two."
+        seeds, steps = self.about["curves"][scenario]
+        return (
+            f"Table, regret and profile: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
+            f"samples. Learning curves: {seeds} other seeds × {steps} samples. "
+            "Regrets of a case differ between the two."
+        )
 
 
 def _columns(name: str, value: float, interval: Interval) -> dict[str, float]:

@@ -316,7 +316,9 @@ def tune(
     value. `value_offset` is c_λ where it shall not be ℓ_s. θ is rounded to six digits. Raises
     TuningError where steady state, local optimum or convexification do not exist.
     """
-    steady = optimal_steady_state(dataclasses.replace(problem, substeps=accurate_substeps(problem)))
+    steady = optimal_steady_state(
+        dataclasses.replace(problem, substeps=linearisation_substeps(problem))
+    )
     n, A, B = problem.n_states, steady.A, steady.B
     try:
         economic = local_feedback(A, B, steady.hessian, steady.C)
@@ -349,7 +351,7 @@ def tune(
     return EconomicTuning(parameters, steady, convex, economic, tuned)
 
 
-def accurate_substeps(problem: Problem) -> int:
+def linearisation_substeps(problem: Problem) -> int:
     """Runge–Kutta steps a sample with a relative error below 1e-8, at the reference.
 
     The error is that of A and B: a steady state itself is integrated exactly by any number of

@@ -291,7 +291,7 @@ class Fouling:
     period: float
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Fouling | None:
+    def from_scenario(cls, scenario: Scenario) -> Fouling | None:
         """Fouling law of a scenario's condenser, or None."""
         given = scenario.plant.parameters
         rate, floor, period = (
@@ -351,7 +351,7 @@ class Jumps:
     plants: tuple[Mapping[str, float], ...]
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Jumps | None:
+    def from_scenario(cls, scenario: Scenario) -> Jumps | None:
         """Parameter jump of a scenario's plant, or None."""
         changes = scenario.plant.changes
         if not changes:
@@ -378,7 +378,7 @@ class Jumps:
 
 def change_of(scenario: Scenario) -> Fouling | Jumps | None:
     """Change of a scenario's plant, or None."""
-    fouling, jumps = Fouling.of(scenario), Jumps.of(scenario)
+    fouling, jumps = Fouling.from_scenario(scenario), Jumps.from_scenario(scenario)
     if fouling and jumps:
         raise OptimumError("a condenser that fouls and plant.changes have no common reference")
     return fouling or jumps

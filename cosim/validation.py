@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from cosim.errors import ArgumentError
 
-Model = TypeVar("Model", bound=BaseModel)
+Document = TypeVar("Document", bound=BaseModel)
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -22,7 +22,9 @@ _EXPECTED = {"tuple_type": "must be a list"} | dict.fromkeys(
 )
 
 
-def validated(model: type[Model], document: Any, origin: str, error: type[Exception]) -> Model:
+def validated(
+    model: type[Document], document: Any, origin: str, error: type[Exception]
+) -> Document:
     """The document as a model; raises `error` that names its origin, field and allowed values."""
     try:
         return model.model_validate(document)

@@ -23,7 +23,7 @@ from cosim.files import replacing, temporary_folder
 from fmus import PLATFORMS, UNIVERSAL, BuildError, Platform, present
 from fmus.model import (
     FmiVersion,
-    Model,
+    FmuModel,
     Variable,
     build_description,
     c_header,
@@ -287,7 +287,7 @@ def files_of(folder: str) -> dict[str, bytes]:
 
 
 def sources_of(
-    model: Model,
+    model: FmuModel,
     version: FmiVersion,
     own: Mapping[str, bytes],
     rows: Sequence[Variable] | None = None,
@@ -308,7 +308,7 @@ def sources_of(
 
 
 def assemble(
-    model: Model,
+    model: FmuModel,
     version: FmiVersion,
     sources: Mapping[str, bytes],
     target: str | Path,

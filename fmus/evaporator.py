@@ -21,7 +21,7 @@ from fmus.build import (
 from fmus.model import (
     LICENSE,
     FmiVersion,
-    Model,
+    FmuModel,
     build_description,
     c_header,
     model_description,
@@ -41,7 +41,7 @@ UNITS = tuple(
 
 VARIABLES = tuple(read_variables(RESOURCES / "evaporator.csv"))
 
-EVAPORATOR = Model(
+EVAPORATOR = FmuModel(
     name="Evaporator",
     identifier="evaporator",
     version="1.0.0",

@@ -147,7 +147,7 @@ def unit(name: str) -> Unit:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class FmuModel:
     """A model: its name, C identifier, table of variables with their units, and interfaces.
 
     A variable's value reference is its position in the table. `stop_time` and `step_size` [s] are
@@ -216,7 +216,7 @@ class Model:
 
 
 @cache
-def closure(name: str, model: Model) -> frozenset[str]:
+def closure(name: str, model: FmuModel) -> frozenset[str]:
     """All variables that calculated variable `name` depends on, states not resolved further."""
     found: set[str] = set()
     for used in model.by_name[name].uses:
@@ -226,7 +226,7 @@ def closure(name: str, model: Model) -> frozenset[str]:
     return frozenset(found)
 
 
-def continuous_dependencies(name: str, model: Model) -> tuple[str, ...]:
+def continuous_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
     """States and inputs that `name` depends on during the simulation, in table order."""
     if model.by_name[name].kind is Kind.STATE:
         return (name,)
@@ -234,7 +234,7 @@ def continuous_dependencies(name: str, model: Model) -> tuple[str, ...]:
     return tuple(n for n in model.names(Kind.STATE, Kind.INPUT) if n in known)
 
 
-def initial_dependencies(name: str, model: Model) -> tuple[str, ...]:
+def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
     """Parameters and inputs that `name` depends on at initialisation, in table order."""
     names = set(closure(name, model))
     for state in [n for n in names if model.by_name[n].kind is Kind.STATE]:
@@ -300,7 +300,7 @@ _CAUSALITY = {
 }
 
 
-def model_description(version: FmiVersion, token: str, model: Model) -> str:
+def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
     """The text of modelDescription.xml for FMI `version` with GUID or instantiation `token`."""
     return render(
         "modelDescription.xml",
@@ -319,18 +319,18 @@ def model_description(version: FmiVersion, token: str, model: Model) -> str:
     )
 
 
-def terminals(model: Model, icon: bool = False) -> dict[str, bytes]:
+def terminals(model: FmuModel, icon: bool = False) -> dict[str, bytes]:
     """FMI 3.0's terminalsAndIcons.xml by its path, if the `model` has a terminal; with an icon."""
     text = render("terminalsAndIcons.xml", model=model, icon=icon)
     return {"terminalsAndIcons/terminalsAndIcons.xml": text.encode()} if model.terminal else {}
 
 
-def build_description(version: FmiVersion, model: Model) -> str:
+def build_description(version: FmiVersion, model: FmuModel) -> str:
     """The text of sources/buildDescription.xml: one C99 source file, linked with libm."""
     return render("buildDescription.xml", version=version, model=model)
 
 
-def _common_attributes(variable: Variable, model: Model) -> Attributes:
+def _common_attributes(variable: Variable, model: FmuModel) -> Attributes:
     """The attributes that every variable has in FMI 2.0 and 3.0."""
     causality, variability, initial = _CAUSALITY[variable.kind]
     if variable.kind is Kind.OUTPUT and model.sampled:
@@ -347,7 +347,7 @@ def _common_attributes(variable: Variable, model: Model) -> Attributes:
     }
 
 
-def _type(version: FmiVersion, variable: Variable, model: Model) -> tuple[str, Attributes]:
+def _type(version: FmiVersion, variable: Variable, model: FmuModel) -> tuple[str, Attributes]:
     """The element of a variable's type and its attributes."""
     if variable.type is Type.BOOLEAN:
         return "Boolean", {"start": "true" if variable.start else "false"}
@@ -375,7 +375,7 @@ def _type(version: FmiVersion, variable: Variable, model: Model) -> tuple[str, A
     return "Real" if version == 2 else "Float64", attributes
 
 
-def _numbering(version: FmiVersion, model: Model) -> Callable[[str], int]:
+def _numbering(version: FmiVersion, model: FmuModel) -> Callable[[str], int]:
     """How the description points to a variable: FMI 2.0 by its position, from 1."""
     if version == 3:
         return model.value_reference
@@ -392,7 +392,7 @@ _UNKNOWNS = (
 """FMI 3.0's element of an unknown, FMI 2.0's around them, which they are, what they depend on."""
 
 
-def _structure(version: FmiVersion, model: Model) -> list[tuple[str, str, list[Attributes]]]:
+def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, list[Attributes]]]:
     """The unknowns of ModelStructure, group by group, and what they depend on."""
     number = _numbering(version, model)
     shown = {model.by_name[variable.name].name for variable in model.exported(version)}

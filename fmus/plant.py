@@ -13,7 +13,7 @@ from math import inf
 from pathlib import Path
 
 from fmus.build import PACKAGE, RESOURCES, SOURCES, assemble, files_of, sources_of
-from fmus.model import FmiVersion, Kind, Model, Type, Variable, read_variables, render, unit
+from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable, read_variables, render, unit
 
 # Of the evaporator's sources what serves any plant; the rest is its own or generated.
 _SHARED = (
@@ -64,7 +64,7 @@ def plant_model(
     parameters: Sequence[Signal] = (),
     sampling_time: float,
     description: str = "",
-) -> Model:
+) -> FmuModel:
     """The table of an FMU from the signals of a plant.
 
     Each state x has a derivative ``der(x)`` (in C ``VR_der_x``) and a start parameter ``x_start``,
@@ -112,7 +112,7 @@ def plant_model(
         table.append(s.variable(Kind.FIXED, name=f"{s.name}_start", description=start))
     table += [s.variable(Kind.TUNABLE) for s in parameters]
     units = dict.fromkeys(v.unit for v in table if v.unit)
-    return Model(
+    return FmuModel(
         name=name,
         identifier=name,
         version="1.0.0",
@@ -127,7 +127,7 @@ def plant_model(
 
 
 def build_plant(
-    model: Model,
+    model: FmuModel,
     equations: str | bytes,
     target: str | Path,
     version: FmiVersion = 2,
@@ -173,7 +173,7 @@ PLANTS = {
 _ROLES = ("states", "inputs", "disturbances", "outputs", "parameters")
 
 
-def model(name: str) -> Model:
+def model(name: str) -> FmuModel:
     """The table of a plant of `PLANTS`."""
     signals: dict[str, list[Signal]] = {role: [] for role in _ROLES}
     with (RESOURCES / f"{name}.csv").open(encoding="utf-8", newline="") as file:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fmus import BuildError
 from fmus.build import SOURCES, assemble, files_of, sources_of
-from fmus.model import FmiVersion, Kind, Model, Variable, render, unit
+from fmus.model import FmiVersion, FmuModel, Kind, Variable, render, unit
 
 _SAMPLES = 100
 
@@ -43,13 +43,13 @@ class SampledSystem:
                 raise BuildError(f"two variables of {self.name} are called '{twice}'")
 
     @cached_property
-    def model(self) -> Model:
+    def model(self) -> FmuModel:
         """The table of variables with its units."""
         time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
         known = tuple(v.name for v in self.signals if v.settable)
         table = (time, *(v if v.settable else replace(v, uses=known) for v in self.signals))
         names = dict.fromkeys(variable.unit for variable in table)
-        return Model(
+        return FmuModel(
             name=self.name,
             identifier=self.identifier,
             version="1.0.0",
@@ -87,7 +87,7 @@ def sampled_sources(system: SampledSystem, version: FmiVersion) -> dict[str, byt
     return sources_of(system.model, version, own, rows)
 
 
-def _array_sources(model: Model) -> dict[str, bytes]:
+def _array_sources(model: FmuModel) -> dict[str, bytes]:
     """FMI 3.0's functions for scalars, and the adapter for the model's arrays."""
     elements = dict.fromkeys(range(len(model.variables)), (1, 0))
     for array in model.arrays.values():

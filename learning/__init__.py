@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from learning.actor_critic import ActorCritic as ActorCritic
     from learning.algorithm import Algorithm as Algorithm
+    from learning.algorithm import Strategy as Strategy
     from learning.algorithm import Transition as Transition
     from learning.algorithm import Update as Update
     from learning.algorithm import algorithms as algorithms
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
     from learning.checkpoint import arrays_of as arrays_of
     from learning.checkpoint import take_up as take_up
     from learning.configuration import Configuration as Configuration
-    from learning.configuration import Strategy as Strategy
     from learning.errors import AlgorithmLookupError as AlgorithmLookupError
     from learning.errors import CheckpointError as CheckpointError
     from learning.errors import ConfigurationError as ConfigurationError
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 # Imported on first use: a command that trains nothing must not pay for SciPy.
 _HOMES = {
     "actor_critic": "ActorCritic",
-    "algorithm": "Algorithm Transition Update algorithms",
+    "algorithm": "Algorithm Strategy Transition Update algorithms",
     "batch_q_learning": "BatchQLearning",
     "checkpoint": "arrays_of take_up",
-    "configuration": "Configuration Strategy",
+    "configuration": "Configuration",
     "errors": "AlgorithmLookupError CheckpointError ConfigurationError DivergenceError "
     "LearningError PrivilegeError",
     "q_learning": "QLearning",

@@ -61,7 +61,7 @@ class ActorCritic(Algorithm):
         settings, scenario = self.configuration, self.scenario
         self._step = ConstrainedStep(self.controller, settings)
         # Actions count in the exploration's standard deviations.
-        self._unit = np.broadcast_to(settings.deviation(scenario), scenario.action_lower.shape)
+        self._unit = np.broadcast_to(self.strategy.deviation, scenario.action_lower.shape)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
         rows = settings.batch_size
         self._batch: dict[str, NDArray[Any]] = {

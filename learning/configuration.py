@@ -1,18 +1,14 @@
-"""Hyperparameters: typed, documented, validated, by `name=value`; the exploration they describe."""
+"""Hyperparameters: typed, documented, validated, by `name=value`."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from scipy.special import ndtr
 
 from controllers.model import Model
-from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from cosim.validation import validated
 from learning.errors import ConfigurationError
@@ -26,47 +22,6 @@ ExplorationProbability = Annotated[Share, Field(description="share of samples th
 ExplorationShare = Annotated[
     Positive, Field(description="standard deviation of e as a share of the input's range")
 ]
-
-
-@dataclass(frozen=True)
-class Strategy:
-    """Draws the actions that explore: a = sat(c + e), e ~ N(0, diag σ²), on a share of the samples.
-
-    The centre c is the policy's action (`additive`) or zero (`literal`, as the paper prints it).
-    `probability` is the share and `deviation` σ (m,) or (1,) in the actions' units; `lower` and
-    `upper` (m,) bound the action. The loop saturates.
-    """
-
-    kind: str
-    lower: Vector
-    upper: Vector
-    probability: float
-    deviation: Vector
-
-    def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
-        """Exploring action (m,) in place of the policy's `action`; None: greedy."""
-        # Drawn in every sample, so that paired runs stay in step whatever the probability.
-        draw, e = rng.random(), rng.standard_normal(self.lower.size)
-        if draw >= self.probability:
-            return None
-        explored: Vector = self._centre(action) + self.deviation * e
-        return explored
-
-    def bias(self, actions: Matrix) -> Matrix:
-        """E[a − π | explored] of samples with policies π, (K, m).
-
-        From the moments of the censored normal distribution; zero but for saturation and a centre
-        that is not π.
-        """
-        centres = self._centre(actions)
-        sigma = np.maximum(self.deviation, np.finfo(float).tiny)
-        low, high = (self.lower - centres) / sigma, (self.upper - centres) / sigma
-        density = (np.exp(-(low**2) / 2) - np.exp(-(high**2) / 2)) / np.sqrt(2 * np.pi)
-        mean: Matrix = sigma * (density + low * ndtr(low) + high * ndtr(-high))
-        return mean + (centres - actions)
-
-    def _centre(self, action: Vector) -> Vector:
-        return action if self.kind == "additive" else np.zeros_like(action)
 
 
 class Configuration(BaseModel):
@@ -137,25 +92,6 @@ class Configuration(BaseModel):
             stated["value_offset"] = scenario.controller.value_offset
         chosen = self.model_fields_set
         return self.model_copy(update={k: v for k, v in stated.items() if k not in chosen})
-
-    def deviation(self, scenario: Scenario) -> Vector:
-        """Standard deviation of the exploration in the units of u, (m,) or (1,)."""
-        if self.exploration_deviation is not None:
-            return np.array(self.exploration_deviation)
-        return self.exploration_share * (scenario.action_upper - scenario.action_lower)
-
-    def strategy(self, scenario: Scenario) -> Strategy:
-        """The exploration; ConfigurationError on a wrong number of deviations."""
-        lower, upper = scenario.action_lower, scenario.action_upper
-        deviation = np.asarray(self.deviation(scenario), dtype=np.float64)
-        if deviation.size not in (1, lower.size):
-            raise ConfigurationError(
-                f"exploration_deviation has {deviation.size} entries; give one, or one for each of "
-                f"the {lower.size} actions"
-            )
-        if self.exploration == "none":
-            return Strategy("additive", lower, upper, 0.0, deviation)
-        return Strategy(self.exploration, lower, upper, self.exploration_probability, deviation)
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """Names of the model parameters that θ has."""

@@ -10,10 +10,9 @@ from pydantic import Field
 from controllers.problem import Problem
 from cosim.protocols import Array, Step
 from cosim.scenario import Scenario
-from learning.algorithm import Transition, Update
+from learning.algorithm import PlantInOperation, TrainingLoop, Transition, Update
 from learning.configuration import Count
 from learning.empirical_model import WINDOWS, EmpiricalModel, Features, PlantData
-from learning.loop import PlantInOperation, TrainingLoop
 from learning.q_learning import QLearning, QLearningConfiguration
 from learning.step import moved
 

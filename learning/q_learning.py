@@ -172,7 +172,7 @@ class ValueRule(Algorithm):
             start,
             states.std(axis=0),
             errors.std(axis=0),
-            settings.deviation(self.scenario),
+            self.strategy.deviation,
             max(abs(float(start["c_lambda"])), noise),
             settings.prior_width,
         )

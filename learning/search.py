@@ -665,7 +665,7 @@ class Search(Algorithm):
         self._learnt, self._rules_made = 0, 0
         seed = int(self.rng.integers(2**63))
         self._rule = self._make_rule(self.samples, 1.0)
-        self._deviation = np.broadcast_to(settings.deviation(scenario), scenario.action_lower.shape)
+        self._deviation = np.broadcast_to(self.strategy.deviation, scenario.action_lower.shape)
         self._model = OneStepModel(scenario)
         block, blocks = settings.block, settings.blocks
         search = SearchPlan(

@@ -33,12 +33,18 @@ from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
 from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
-from learning.algorithm import Algorithm, Privilege, Update, load_algorithm
+from learning.algorithm import (
+    Algorithm,
+    Privilege,
+    Strategy,
+    TrainingLoop,
+    Update,
+    load_algorithm,
+)
 from learning.checkpoint import Checkpoint
 from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
 from learning.errors import CheckpointError, ConfigurationError, DivergenceError, PrivilegeError
-from learning.loop import TrainingLoop
 from learning.step import smallest_eigenvalue
 
 if TYPE_CHECKING:
@@ -160,7 +166,7 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
     All random numbers come from the run's seed.
     """
     controller = nmpc(run.scenario, run.starting_parameters(), run.controller)
-    strategy = run.configuration.strategy(run.scenario)
+    strategy = Strategy.of(run.configuration, run.scenario)
     plant_seed, rng = spawn_seeds(run.seed)
     # The third child of the run's seed sequence; `spawn_seeds` takes the first two.
     own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])

@@ -22,6 +22,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # pytest's own filter ends with this process; what tests start has to be as strict.
 os.environ.setdefault("PYTHONWARNINGS", "error")
+# Some of them are a fifth slower where each command compiles the packages' Python anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Compiled controllers have tests of their own (tests/controllers/rti/test_engine.py); a
 # cache that begins empty would have every test process compile them anew beside the others.
 os.environ.setdefault("COSIM_COMPILE", "never")

@@ -287,7 +287,7 @@ NOT_FINITE = STATUSES.index("not finite")
 
 
 class Engine:
-    """Prepares and solves in the memory of a controller's `functions`; `load` makes one.
+    """Prepares and solves in the memory of a controller's `functions`; `compile` makes one.
 
     `prepare` and `feedback` return 0, or a status of the QP solver's. `action` (m,) is where the
     action to enforce is written.
@@ -320,7 +320,7 @@ class Engine:
         self._split, self._m = size * m, m
 
     @classmethod
-    def load(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
+    def compile(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
         """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
         A QP that is too large for an exported controller is solved stage by stage.
@@ -478,7 +478,7 @@ class RtiNmpc:
         """
         if not self._compilable or (samples < LONG and switch() != "now"):
             return
-        self._engine = Engine.load(self._functions, self._parameters.blocks)
+        self._engine = Engine.compile(self._functions, self._parameters.blocks)
         self.functions = INTERPRETED if self._engine is None else COMPILED
         self._compilable = self._engine is not None  # where it failed once it is not tried again
         self._prepared = None

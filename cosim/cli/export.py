@@ -47,6 +47,7 @@ def export(
 
         from cosim.cli import controller_fmu
         from cosim.errors import CosimError
+        from cosim.files import check_target
         from cosim.plant import FmuPlant
         from cosim.scenario import Scenario
         from fmus import PLATFORMS, present
@@ -55,6 +56,8 @@ def export(
         for target in [out] if ssp is None else [out, ssp]:
             if not target.parent.is_dir():
                 raise CosimError(f"{target}: there is no folder {target.parent} to write it to")
+            if format_ == "fmu":  # before the minutes that compilers may take
+                check_target(target)
         loaded = Scenario.load(scenario)
         rti = controller_fmu.rti_controller(controller, loaded)
         if format_ == "c":

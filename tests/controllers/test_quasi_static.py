@@ -19,7 +19,7 @@ def policy(drifting):
 
 
 def test_the_law_of_fouling_is_the_fmus(drifting):
-    fouling = Fouling.of(drifting)
+    fouling = Fouling.from_scenario(drifting)
     seen = drifting.replace(
         {
             "sampling_time": 21600.0,
@@ -36,12 +36,12 @@ def test_the_law_of_fouling_is_the_fmus(drifting):
 
 
 def test_a_condenser_that_does_not_foul_has_no_law():
-    assert Fouling.of(Scenario.load("paper")) is None
+    assert Fouling.from_scenario(Scenario.load("paper")) is None
     still = Scenario.load("drifting").replace({"plant": {"parameters": {"fouling_floor": 1.0}}})
-    assert Fouling.of(still) is None
+    assert Fouling.from_scenario(still) is None
     never = Scenario.load("drifting").replace({"plant": {"parameters": {"cleaning_period": 0.0}}})
     with pytest.raises(OptimumError):
-        Fouling.of(never)
+        Fouling.from_scenario(never)
 
 
 def test_the_reference_is_the_mean_of_the_optima_along_the_cycle(policy):

@@ -58,7 +58,7 @@ class Interrupt(Grow):
             raise KeyboardInterrupt
 
 
-def case(name, kind="Grow", samples=600, **more):
+def case(name, kind="Grow", samples=200, **more):
     return {"name": name, "algorithm": f"{HERE}:{kind}", "samples": samples} | more
 
 

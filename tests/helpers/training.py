@@ -9,8 +9,7 @@ import pytest
 
 from controllers.rti import RtiNmpc
 from cosim import Scenario
-from learning.algorithm import Algorithm, load_algorithm
-from learning.loop import TrainingLoop
+from learning.algorithm import Algorithm, Strategy, TrainingLoop, load_algorithm
 from learning.training import Training, TrainingRun, run_training
 
 
@@ -64,7 +63,7 @@ def looped(
     seed: int,
 ) -> TrainingLoop:
     """A rule in its loop, at the start of the plant's noise `seed`."""
-    strategy, own = configuration.strategy(plant.scenario), np.random.default_rng(0)
+    strategy, own = Strategy.of(configuration, plant.scenario), np.random.default_rng(0)
     algorithm = rule(controller, plant.scenario, configuration, samples, strategy, own)
     rng = np.random.default_rng(exploration)
     loop = TrainingLoop(plant, controller, algorithm, strategy, rng)

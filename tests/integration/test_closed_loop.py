@@ -73,8 +73,14 @@ def test_solved_to_convergence_it_settles_too(nominal):
     settle(nominal, controller, STARTS[5], steps=400)
 
 
-@pytest.mark.parametrize("backend", ["daqp", "proxqp"])
-@pytest.mark.parametrize("steps", [1000, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("backend", "steps"),
+    [
+        ("daqp", 1000),
+        pytest.param("daqp", 10_000, marks=pytest.mark.slow),
+        pytest.param("proxqp", 10_000, marks=pytest.mark.slow),
+    ],
+)
 def test_thousands_of_samples_take_one_qp_each_solved_to_a_millionth(backend, steps, paper):
     problem = Problem.from_scenario(paper.scenario)
     controller = RtiNmpc(problem, Parameters.naive(problem), backend=lambda: Counting(backend))

@@ -6,7 +6,7 @@ import pytest
 from controllers.theta import Parameters
 from learning import ActorCritic
 from learning.actor_critic import AdvantageRegression, lstdv
-from learning.algorithm import Transition
+from learning.algorithm import Strategy, Transition
 from tests.helpers.training import Carrier
 
 
@@ -20,7 +20,7 @@ def algorithm(problem, scenario, **settings):
         batch_size=400, forgetting=0.0, parametrisation="paper", **settings
     )
     carrier = Carrier(Parameters.naive(problem))
-    strategy = configuration.strategy(scenario)
+    strategy = Strategy.of(configuration, scenario)
     return carrier, ActorCritic(
         carrier, scenario, configuration, 4000, strategy, np.random.default_rng(0)
     )

@@ -154,7 +154,7 @@ def test_identification_again_and_again_follows_a_parameter():
     )
     run = make_run("identified", scenario=scenario, configuration=configuration, start="naive")
     rows = run_training(run).rows
-    law = Fouling.of(scenario).heat_transfer
+    law = Fouling.from_scenario(scenario).heat_transfer
     for row in rows[3::3]:
         # The fit is of the 150 samples before it, that is of their middle.
         last = row["samples"] - row["samples"] % 150

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from learning import ActorCritic, BatchQLearning, QLearning
-from learning.algorithm import load_algorithm
-from learning.configuration import Strategy
+from learning.algorithm import Strategy, load_algorithm
 from learning.errors import ConfigurationError
 from learning.search import Search
 

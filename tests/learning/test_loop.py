@@ -11,9 +11,8 @@ from controllers.rti import RtiNmpc
 from cosim import FmuPlant, simulate
 from cosim.simulation import spawn_seeds
 from learning import QLearning
-from learning.algorithm import Update
+from learning.algorithm import PlantInOperation, Strategy, TrainingLoop, Update
 from learning.errors import PrivilegeError
-from learning.loop import PlantInOperation, TrainingLoop
 from learning.training import HELD_OUT, TrainingRun, begin, run_training, starting_parameters
 
 
@@ -34,7 +33,7 @@ class Idle:
 def interaction(plant, problem, controller=None, **settings):
     configuration = QLearning.Configuration.from_dict(settings)
     controller = controller or RtiNmpc(problem, starting_parameters(problem, configuration))
-    strategy = configuration.strategy(plant.scenario)
+    strategy = Strategy.of(configuration, plant.scenario)
     plant_seed, rng = spawn_seeds(4)
     made = TrainingLoop(plant, controller, Idle(), strategy, rng)
     made.start(plant.reset(plant_seed))

@@ -84,7 +84,7 @@ FMI3 = {"plant": {"fmu": "evaporator_fmi3"}, "disturbance": {"law": "normal"}}
 )
 def test_the_example_runs_any_plants_loop(cosim, tmp_path, name, changes, fmi):
     """Of FMI 2.0, of FMI 3.0, which is SSP 2.0, and of both."""
-    scenario = Scenario.load(name).replace(changes)
+    scenario = Scenario.load(name).replace(changes | {"controller": {"horizon": 3}})
     (tmp_path / "s.toml").write_text(scenario.to_toml())
     files = f"-o {tmp_path / 'c.fmu'} --ssp {tmp_path / 'l.ssp'} -s {tmp_path / 's.toml'}"
     assert cosim(*f"export naive {files} --fmi {fmi} --seed 5 --local".split())[0] == 0

@@ -33,14 +33,6 @@ def test_a_library_is_made_once_for_its_content(folder):
     assert sorted(folder.glob("*.lib")) == sorted([first, other])
 
 
-@needs_compiler
-def test_a_library_in_a_folder_open_to_others_is_not_loaded(folder):
-    first = answer(42)
-    folder.chmod(0o777)
-    functions.cache_folder.__globals__["_caches"].clear()
-    assert answer(42).parent != first.parent
-
-
 def test_without_a_compiler_there_is_none_and_the_description_says_so(folder, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
     assert answer(42) is None
@@ -80,12 +72,9 @@ def test_a_compiler_that_breaks_its_surroundings_is_survived(folder, monkeypatch
     assert ctypes.CDLL(str(answer(42))).answer() == 42
 
 
-def test_never_means_never(folder, monkeypatch):
+def test_never_means_never_and_an_unknown_word_in_the_switch_is_refused(folder, monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "never")
     assert answer(42) is None
-
-
-def test_an_unknown_word_in_the_switch_is_refused(folder, monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "yes")
     with pytest.raises(ControllerError):
         answer(42)

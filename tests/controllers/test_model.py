@@ -72,17 +72,6 @@ def test_rate_and_cost_are_those_of_the_paper(samples):
         assert float(cost(*arguments)) == pytest.approx(expected, rel=1e-13)
 
 
-def test_a_parameter_given_in_p_is_used(samples):
-    model = evaporator()
-    x, u, d, p = model.symbols()
-    f = ca.Function("f", [x, u, d, p], [model.ode(x, u, d, p)])
-    changed = model.nominal_parameters
-    changed[model.parameter_indices(("UA2", "h"))] = 7.0, 0.17
-    x, u, d = samples[0]
-    rate, _ = rate_and_cost(x, u, d, UA2=7.0, h=0.17)
-    np.testing.assert_allclose(np.array(f(x, u, d, changed)).ravel(), rate, rtol=1e-12)
-
-
 def test_a_sample_follows_an_accurate_integration_to_fourth_order(samples):
     model = evaporator()
     errors = []

@@ -1,6 +1,7 @@
 """QPs: residuals, active sets, the KKT system, multipliers at a kink, and the solvers."""
 
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -40,10 +41,10 @@ CASES = {
 }
 
 
-def moved(answer, name, index, step):
-    parts = {part: value.copy() for part, value in answer._asdict().items()}
-    parts[name][index] += step
-    return QpSolution(**parts)
+def enforced(f, v):
+    qp = scalar_qp(f)
+    qp.lower[:] = qp.upper[:] = v
+    return qp
 
 
 def rows_qp(rows):
@@ -66,18 +67,13 @@ def rows_qp(rows):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_residuals_vanish_at_the_solution(case):
+def test_residuals_vanish_at_the_solution_and_any_change_of_it_shows(case):
     (f, w, W), expected = CASES[case]
-    assert solution(*expected).residual(scalar_qp(f, w=w, W=W)) < 1e-14
-
-
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("name", ["v", "nu", "lam"])
-@pytest.mark.parametrize("step", [-1e-3, 1e-3])
-def test_any_change_of_the_solution_shows(case, name, step):
-    (f, w, W), expected = CASES[case]
-    changed = moved(solution(*expected), name, 0, step)
-    assert changed.residual(scalar_qp(f, w=w, W=W)) > 1e-5
+    qp, answer = scalar_qp(f, w=w, W=W), solution(*expected)
+    assert answer.residual(qp) < 1e-14
+    for name, step in product(answer._fields, (-1e-3, 1e-3)):
+        changed = answer._replace(**{name: getattr(answer, name) + step})
+        assert changed.residual(qp) > 1e-5
 
 
 # activity -------------------------------------------------------------------------------------
@@ -98,17 +94,12 @@ def test_active_names_the_branch(case):
         (scalar_qp(-1.0), (1.0, 0.0, 0.0)),  # reaches the limit with λ = 0
         (scalar_qp(-2.0), (1.0, 0.0, 1.0)),  # about to leave the limit: λ = w
         (scalar_qp(-10.0, limit=50.0), (10.0, 0.0, 0.0)),  # reaches the bound with ν = 0
+        (enforced(-1.5, 1.0), (1.0, 0.0, 0.5)),  # at the limit, and nothing moves it
     ],
 )
 def test_weak_activity_is_flagged(qp, answer):
     assert solution(*answer).residual(qp) == 0.0
     assert solution(*answer).weakly_active(qp)
-
-
-def test_a_row_at_its_limit_that_nothing_moves_is_flagged():
-    qp = scalar_qp(-1.5)
-    qp.lower[:] = qp.upper[:] = 1.0
-    assert solution(1.0, 0.0, 0.5).weakly_active(qp)
 
 
 # licq -----------------------------------------------------------------------------------------
@@ -169,12 +160,6 @@ def test_dependent_rows_get_the_least_multipliers():
 FREE = np.array([-10.0]), np.array([10.0])
 
 
-def enforced(f, v):
-    qp = scalar_qp(f)
-    qp.lower[:] = qp.upper[:] = v
-    return qp
-
-
 def test_away_from_the_kink_nothing_changes():
     qp = enforced(-3.0, 2.0)
     before = solution(2.0, -2.0, 3.0)
@@ -182,21 +167,16 @@ def test_away_from_the_kink_nothing_changes():
 
 
 @pytest.mark.parametrize("lam", [0.0, 0.3, 1.0])
-def test_at_the_policy_the_multipliers_are_those_of_the_value(lam):
-    # f = −1.5: the policy is v = 1 with λ = 0.5, ν = 0; any λ in [0, 1] solves Q(s, 1).
-    settled = multipliers_at_kink(enforced(-1.5, 1.0), solution(1.0, 0.5 - lam, lam), *FREE)
-    np.testing.assert_allclose(np.ravel(settled), [1.0, 0.0, 0.5], atol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("f", "expected"),
     [
+        (-1.5, (1.0, 0.0, 0.5)),  # the policy is v = 1 itself: the multipliers are the value's
         (-3.0, (1.0, 1.0, 1.0)),  # the policy lies above: one more unit of a gains 1
         (0.5, (1.0, -1.5, 0.0)),  # the policy lies below
     ],
 )
-def test_elsewhere_the_multipliers_stay_within_their_range(f, expected):
-    settled = multipliers_at_kink(enforced(f, 1.0), solution(1.0, -f - 1.0 - 0.3, 0.3), *FREE)
+def test_of_all_multipliers_at_the_kink_those_nearest_to_the_policys_are_taken(f, expected, lam):
+    settled = multipliers_at_kink(enforced(f, 1.0), solution(1.0, -f - 1.0 - lam, lam), *FREE)
     np.testing.assert_allclose(np.ravel(settled), expected, atol=1e-15)
 
 
@@ -261,23 +241,16 @@ def test_a_closed_form_solution_is_found(backend, case):
 
 @pytest.mark.parametrize("backend", EVERY)
 def test_a_fixed_variable_stays_and_has_its_multiplier(backend):
-    qp = scalar_qp(-3.0)
-    qp.lower[:] = qp.upper[:] = 2.0
-    solver = make_backend(backend)
+    qp, solver = enforced(-3.0, 2.0), make_backend(backend)
     solver.load(qp)
     # v + f + ν + λ = 0 with λ = 1 + 2·1
     np.testing.assert_allclose(np.ravel(solver.solve(qp)), [2.0, -2.0, 3.0], rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("every", [11, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("backend", QPSOLVERS)
-def test_qpsolvers_agrees_on_a_part_of_the_stored_set(backend):
-    assert_agreement(backend, range(0, len(qps()), 11))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", QPSOLVERS)
-def test_qpsolvers_agrees_on_the_whole_stored_set(backend):
-    assert_agreement(backend, range(len(qps())))
+def test_qpsolvers_agrees_on_the_stored_set(backend, every):
+    assert_agreement(backend, range(0, len(qps()), every))
 
 
 def test_daqp_gives_the_same_bits_whatever_it_solved_before():
@@ -294,29 +267,17 @@ def test_daqp_gives_the_same_bits_whatever_it_solved_before():
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("backend", EVERY)
-def test_an_infeasible_qp_raises_and_is_carried(backend):
-    qp = scalar_qp(-1.0)
-    qp.lower[:], qp.upper[:] = 2.0, 1.0
-    solver = make_backend(backend)
+@pytest.mark.parametrize(("part", "value"), [("lower", 20.0), ("H", -1.0)])
+def test_a_qp_without_a_solution_raises_and_is_carried(backend, part, value):
+    qp, solver = scalar_qp(-1.0), make_backend(backend)
+    getattr(qp, part)[:] = value
     with pytest.raises(QpError) as caught:
         solver.load(qp)
         solver.solve(qp)
-    assert caught.value.status
-    assert caught.value.is_solver_failure
+    assert (caught.value.status == "not convex") == (part == "H")
+    assert caught.value.status and caught.value.is_solver_failure
     assert caught.value.qp is not qp
-    np.testing.assert_array_equal(caught.value.qp.lower, qp.lower)
-
-
-@pytest.mark.parametrize("backend", EVERY)
-def test_a_qp_that_is_not_convex_raises_and_is_carried(backend):
-    qp = scalar_qp(-1.0)
-    qp.H[:] = -1.0
-    solver = make_backend(backend)
-    with pytest.raises(QpError) as caught:
-        solver.load(qp)
-        solver.solve(qp)
-    assert caught.value.status == "not convex"
-    np.testing.assert_array_equal(caught.value.qp.H, qp.H)
+    np.testing.assert_array_equal(getattr(caught.value.qp, part), getattr(qp, part))
 
 
 @pytest.mark.parametrize("backend", ["daqp", "proxqp"])

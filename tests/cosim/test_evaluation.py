@@ -122,6 +122,7 @@ def test_a_plug_in_that_exits_ends_in_an_error(paper):
         (BOTH, [-1], 1),
         (BOTH, [1 << 64], 1),
         (BOTH, 1, 0),
+        ({"optimal": "naive"}, 1, 1),
     ],
 )
 def test_a_malformed_request_is_refused(paper, controllers, seeds, steps):

@@ -85,25 +85,11 @@ def test_a_document_that_is_none_is_one_line_that_names_it(tmp_path, read, conte
     assert str(caught.value).startswith("the document ")
 
 
-@posix
-def test_a_fifo_is_no_document_and_does_not_block(tmp_path):
-    os.mkfifo(tmp_path / "fifo")
-    with pytest.raises(LookupError, match="not a regular file"):
-        read_toml(tmp_path / "fifo", "it", LookupError)
-
-
 @pytest.fixture
 def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(files, "_caches", {})
     return tmp_path / "cache"
-
-
-@posix
-def test_the_cache_is_made_and_closed_to_others(own_cache):
-    folder = cache_folder("compiled")
-    assert folder == own_cache / "compiled"
-    assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(own_cache.stat().st_mode) == 0o700
 
 
 @posix

@@ -7,25 +7,6 @@ from cosim.errors import ScenarioError
 from cosim.scenario import Penalty, Scenario, presets
 
 
-def test_paper_holds_the_numbers_of_the_paper(paper):
-    assert paper.sampling_time == 60.0
-    assert paper.discount == 0.99
-    assert paper.plant.states == ("X2", "P2")
-    assert paper.plant.actions == ("P100", "F200")
-    assert paper.disturbance.law == "uniform"
-    assert paper.disturbance.nominal == (5.0, 10.0, 40.0, 25.0)
-    assert paper.disturbance.ranges == (1.0, 2.0, 8.0, 5.0)
-    np.testing.assert_array_equal(paper.state_lower, [25, 40])
-    np.testing.assert_array_equal(paper.state_upper, [100, 80])
-    np.testing.assert_array_equal(paper.action_lower, [100, 100])
-    np.testing.assert_array_equal(paper.action_upper, [400, 400])
-    np.testing.assert_array_equal(paper.penalty_linear, [1e5, 1e5])
-    np.testing.assert_array_equal(paper.penalty_quadratic, [1, 1])
-    assert paper.controller.horizon == 10
-    assert paper.controller.value_offset is None, "left to the algorithm"
-    assert paper.exploration is None, "left to the algorithm"
-
-
 def test_the_plant_as_it_is_at_a_time_is_a_scenario_of_its_own(paper):
     jump, fouled = Scenario.load("jump"), Scenario.load("fouled")
     first, second = (change.time for change in jump.plant.changes)

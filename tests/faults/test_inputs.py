@@ -111,10 +111,12 @@ def test_any_value_of_any_field_is_kept_or_refused_by_name(path, value):
             assert same(value, at(scenario.to_dict(), path))
 
 
-@pytest.mark.parametrize("name", algorithms())
-def test_any_value_of_any_hyperparameter_is_kept_or_refused(name):
-    configuration = load_algorithm(name).Configuration
+# Of the rules that have the same, the last one's name.
+CONFIGURATIONS = {load_algorithm(name).Configuration: name for name in algorithms()}
 
+
+@pytest.mark.parametrize("configuration", CONFIGURATIONS, ids=CONFIGURATIONS.get)
+def test_any_value_of_any_hyperparameter_is_kept_or_refused(configuration):
     @settings(OPTIONS, max_examples=100)
     @given(st.sampled_from(sorted(configuration.model_fields)), values)
     def attack(field, value):

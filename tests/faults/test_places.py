@@ -105,12 +105,6 @@ def test_an_output_never_replaces_what_is_no_file(cosim, limited, tmp_path, word
     assert before.items() <= seen(tmp_path).items()
 
 
-def test_the_optimum_cannot_be_given_to_another_controller(cosim, tmp_path):
-    code, _, err = cosim("evaluate", "-c", "optimal=naive,naive", "--seeds", 1, "-n", 5)
-    assert code == 2
-    assert "'optimal'" in err
-
-
 @pytest.mark.parametrize("kind", [np.int8, np.int64, np.uint64])
 def test_a_seed_may_be_any_integer(kind):
     with FmuPlant(PAPER) as plant:

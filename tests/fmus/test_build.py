@@ -72,6 +72,7 @@ def test_two_local_builds_are_byte_identical(tmp_path: Path) -> None:
 
 
 @needs_compiler
+@pytest.mark.slow  # two builds by cmake
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
     from fmpy.build import build_platform_binary

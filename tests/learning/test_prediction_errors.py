@@ -20,14 +20,6 @@ def test_the_penalty_of_many_states_is_that_of_each(scenario, rng):
     assert known_penalty(scenario.state_penalty, states) == pytest.approx(each)
 
 
-def test_the_model_rests_at_the_reference_steady_state(scenario):
-    reference = scenario.controller
-    predicted = OneStepModel(scenario)(
-        np.array(reference.reference_state), np.array(reference.reference_action)
-    )
-    assert predicted == pytest.approx(reference.reference_state, abs=1e-6)
-
-
 def test_the_expected_penalty_has_the_mean_of_the_realised_one_and_less_spread(scenario, rng):
     """Plant s₊ = f + e with uniform e, as the model has it: both estimate E[p(s₊) | s, a]."""
     penalty, errors = scenario.state_penalty, PredictionErrors(scenario, 4000)

@@ -15,11 +15,11 @@ from tests.helpers.toy_study import GROW, run_toy
 
 ROOT = Path(__file__).parents[3]
 CASES = [
-    {"name": "grow", "algorithm": GROW, "samples": 400, "settings": {"rate": [5.0, 45.0]}},
+    {"name": "grow", "algorithm": GROW, "samples": 200, "settings": {"rate": [5.0, 45.0]}},
     {
         "name": "lost",
         "algorithm": GROW,
-        "samples": 400,
+        "samples": 200,
         "settings": {"rate": -50.0},
         "group": "others",
     },

@@ -8,20 +8,16 @@ import pytest
 DISCARD, ERROR = 2, 3
 
 
-@pytest.mark.parametrize("size", [0.0, -1.0, math.nan, math.inf])
-def test_step_size_must_be_positive_and_finite(refused, plant, size: float) -> None:
-    plant.initialise()
-    status, text = refused(plant, lambda: plant.step(0.0, size))
-    assert status == ERROR
-    assert "step size" in text
+WRONG_STEPS = [(0.0, size, "step size") for size in (0.0, -1.0, math.nan, math.inf)]
+WRONG_STEPS += [(t, 60.0, "communication point") for t in (60.0, -60.0, 1e-3, math.nan, math.inf)]
 
 
-@pytest.mark.parametrize("time", [60.0, -60.0, 1e-3, math.nan, math.inf])
-def test_communication_point_must_be_the_current_time(refused, plant, time: float) -> None:
+@pytest.mark.parametrize(("time", "size", "words"), WRONG_STEPS)
+def test_a_step_begins_now_and_is_positive_and_finite(refused, plant, time, size, words) -> None:
     plant.initialise()
-    status, text = refused(plant, lambda: plant.step(time, 60.0))
+    status, text = refused(plant, lambda: plant.step(time, size))
     assert status == ERROR
-    assert "communication point" in text
+    assert words in text
 
 
 def test_step_past_the_stop_time_is_an_error_and_changes_nothing(refused, plant) -> None:

@@ -61,10 +61,10 @@ class Transition(NamedTuple):
 class Update(NamedTuple):
     """An update of θ: fields for the log, and requests to the plant.
 
-    `td_error` is the root mean square TD error that the update saw, `step` the norm of the scaled
-    step, `smallest_eigenvalue` that of B_l and B_Vf at the new θ; `corrected` and `refused` say
-    that the step was changed to keep them definite, or not taken, as the best back-off that lies at
-    the end of what was tried; `failures` counts QPs of the algorithm's own that failed.
+    `td_error` is the root mean square TD error of the update's samples, `step` the norm of the
+    scaled step, `smallest_eigenvalue` that of B_l and B_Vf at the new θ; `corrected` says that the
+    step was changed to keep them definite, `refused` that it was not taken, or that the best
+    back-off was the last one tried; `failures` counts the algorithm's own QPs that failed.
 
     The last three are for algorithms that ask for a simulator; PrivilegeError otherwise. `episode`
     resets the plant to the scenario's initial state with this seed of its noise. `mark` remembers

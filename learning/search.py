@@ -36,7 +36,7 @@ RULES: dict[str, type[Algorithm]] = {
     "actor-critic": ActorCritic,
 }
 PRIOR_WIDTH = 0.3
-"""Of a rule within the search, which judges each θ: wider than that of the rule alone."""
+"""Prior width of a rule within the search: wider than alone, since the search judges each θ."""
 RULE_DEFAULTS = {
     "prior_width": PRIOR_WIDTH,
     "variance_memory": 2000.0,
@@ -563,7 +563,7 @@ class SearchConfiguration(Configuration):
         return rule.from_dict(shared | own)
 
     def without_part(self) -> Mapping[str, str]:
-        """The settings that only a search with a rule has."""
+        """Settings without effect in a search without a rule."""
         names = ("phase", "rule_settings", "q_learning_first") if self.rule == "none" else ()
         return dict.fromkeys(names, "a search without a rule")
 
@@ -587,7 +587,7 @@ class SearchConfiguration(Configuration):
 
 
 class EpisodeData:
-    """The `done` of `length` samples of a request; `deviation` (m,) is the exploration's σ."""
+    """What `done` of a request's `length` samples gave; `deviation` (m,) is the exploration's σ."""
 
     KEPT = (
         *("done", "length", "_stage_cost", "_penalty", "_rows", "_candidates", "_metric"),

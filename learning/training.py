@@ -33,14 +33,7 @@ from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
 from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
-from learning.algorithm import (
-    Algorithm,
-    Privilege,
-    Strategy,
-    TrainingLoop,
-    Update,
-    load_algorithm,
-)
+from learning.algorithm import Algorithm, Privilege, Strategy, TrainingLoop, Update, load_algorithm
 from learning.checkpoint import Checkpoint
 from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
@@ -51,10 +44,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SAMPLES = 50_000
-"""Of a run where neither user nor algorithm says how many."""
+"""Length of a run where neither user nor algorithm states one."""
 STARTS = ("naive", "tuned", "commissioned", "cautious")
 FRAMES = 40
-"""Of an animation, at most."""
+"""Most frames of an animation."""
 SHOWN = {"J": "J", "greedy_J": "greedy J", "regret": "regret", "td_error": "TD"}
 """Columns of the log behind the progress bar, with their text there."""
 EVERY = ("log_every", "evaluate_every", "checkpoint_every")
@@ -237,7 +230,7 @@ COLUMNS = (
     "greedy_failures", "regret", "gap_closed",
 )  # fmt: skip
 DAMAGED = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, PlantError)
-"""What a checkpoint raises that is whole, and of something else."""
+"""What the restoring of a whole checkpoint with other content raises."""
 
 
 class LogRow(dict[str, float]):

@@ -49,3 +49,12 @@ def paper():
 @pytest.fixture
 def rng():
     return np.random.default_rng(20200513)
+
+
+@pytest.fixture
+def quickly_built(monkeypatch):
+    """FMUs are compiled without optimisation: the same digits, in half of the time."""
+    from fmus import build
+
+    flags = [flag.replace("-O2", "-O0") for flag in build.COMPILER_FLAGS]
+    monkeypatch.setattr(build, "COMPILER_FLAGS", flags)

@@ -232,6 +232,7 @@ def test_a_plant_of_ones_own(version):
     hold(build_description(version, model).encode(), BUILD["sources/buildDescription.xml"])
 
 
+@pytest.mark.usefixtures("quickly_built")
 def test_an_exported_controller_and_its_loop(tmp_path):
     scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})
     system = sampled_controller(rti_controller("naive", scenario), scenario, {"X2": "%"})

@@ -79,6 +79,7 @@ def test_fmpy_alone_runs_the_loop_as_cosim_does(exported):
 FMI3 = {"plant": {"fmu": "evaporator_fmi3"}, "disturbance": {"law": "normal"}}
 
 
+@pytest.mark.usefixtures("quickly_built")
 @pytest.mark.parametrize(
     ("name", "changes", "fmi"), [("reactor", {}, 2), ("tanks", {}, 3), ("paper", FMI3, 3)]
 )
@@ -149,6 +150,7 @@ def test_another_instance_goes_on_from_its_bytes_with_the_same_bits(exported, tm
     other.close()
 
 
+@pytest.mark.usefixtures("quickly_built")
 @pytest.mark.parametrize("version", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_theta_may_change_between_samples(tmp_path, version):
     """All of it, a bound alone, a parameter of the model: as the Python controller's θ."""
@@ -185,6 +187,7 @@ def test_theta_may_change_between_samples(tmp_path, version):
     assert len({tuple(action) for action in actions}) == len(actions)
 
 
+@pytest.mark.usefixtures("quickly_built")
 @pytest.mark.parametrize("version", [2, 3])
 def test_automatic_goes_on_from_what_the_operator_did_in_manual(tmp_path, version):
     """As the Python controller that is told of the actions; outside the bounds they are clipped."""

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from cosim import FmuPlant, Scenario, simulate
-from cosim.figures.style import palette, shown_case
+from cosim.figures.style import lit, palette, shown_case
 from cosim.studies.figures import (
     LearningCurve,
     curves_figure,
@@ -55,9 +55,15 @@ def test_a_curve_averages_training_since_the_point_before_and_holds_diverged_run
 
 def test_a_profile_is_the_share_of_runs_at_most_so_bad():
     values = np.array([0.1, 1.0, 10.0, np.inf])
-    axes = profile_figure({"q": [values]}, palette(["q"])).axes[0]
+    axes = profile_figure({"q": [values]}, palette(["search+q", "q"])).axes[0]
+    assert axes.lines[0].get_linestyle() == "-"
     regret, share = axes.lines[0].get_data()
     assert share.tolist() == [np.mean(values <= level) for level in regret]
+
+
+def test_a_dark_ground_hides_no_controller():
+    looks = palette(["naive", "q-learning", "optimal", "dyna"]).values()
+    assert [lit(look.color) for look in looks] == ["#7f7f7f", "#0072B2", "#c8c8c8", "#523ace"]
 
 
 def test_increments_are_of_each_block_since_its_first_row():
@@ -66,10 +72,8 @@ def test_increments_are_of_each_block_since_its_first_row():
 
 
 def test_a_cases_settings_are_set_after_its_name():
-    assert (
-        shown_case("q-learning(start=naive prior_width=0.3)")
-        == "q-learning, naive, prior width 0.3"
-    )
+    shown = shown_case("q-learning(start=naive prior_width=0.3)")
+    assert shown == "q-learning, naive, prior width 0.3"
     assert shown_case("two-fouled(tuned-two-fouled)") == "two-fouled"
 
 

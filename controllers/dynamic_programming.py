@@ -9,19 +9,21 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from controllers.errors import ModelError, OptimumError
 from controllers.model import discretise, economic_cost
 from controllers.problem import Problem, load_model
 from cosim.protocols import Array, Vector
 from cosim.scenario import Scenario
+
+# A stored optimum is read without SciPy, which takes longer to load than the optimum.
+if TYPE_CHECKING:
+    from scipy import sparse
 
 Indices = NDArray[np.intp]
 
@@ -496,6 +498,7 @@ class BellmanOperator:
 
         The cost is E[ℓ + penalty(s₊)].
         """
+        from scipy import sparse  # noqa: PLC0415
 
         def block(part: slice) -> tuple[sparse.csr_array, Array]:
             cost, x_next = self._expected_cost(grid.points[part], actions[part])
@@ -844,6 +847,9 @@ def evaluate_policy(
     W + g = c + P W with W[anchor] = 0, by one sparse factorisation. Raises OptimumError where the
     chain cannot be evaluated.
     """
+    from scipy import sparse  # noqa: PLC0415
+    from scipy.sparse.linalg import splu  # noqa: PLC0415
+
     matrix, cost = operator.chain(actions, grid)
     size = grid.size
     unit = sparse.csr_array(([1.0], ([0], [anchor])), shape=(1, size))

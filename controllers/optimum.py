@@ -17,7 +17,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PchipInterpolator
 
 from controllers.dynamic_programming import (
     Accuracy,
@@ -444,6 +443,8 @@ class QuasiStaticPolicy:
 
     def gain_at(self, time: ArrayLike) -> Vector:
         """J* of the plant as it is at times in s, between the nodes by monotone cubics."""
+        from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 - half a second
+
         gains = [policy.gain for policy in self.policies]
         found: Vector = PchipInterpolator(np.arange(len(gains)), gains)(self.law.position(time))
         return found

@@ -34,16 +34,8 @@ from cosim.statistics import (
 )
 from cosim.studies.plan import NAIVE
 from cosim.studies.run import Report, Runner
-from cosim.studies.store import (
-    EVALUATION,
-    TIMING,
-    Case,
-    Noise,
-    Run,
-    RunKey,
-    check_folders,
-    to_csv,
-)
+from cosim.studies.store import EVALUATION, TIMING, check_folders, to_csv
+from cosim.studies.work import Case, Noise, Run, RunKey
 from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:

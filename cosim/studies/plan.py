@@ -17,18 +17,8 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
 from cosim.scenario import Scenario, resolved
 from cosim.studies.document import DEFAULT, CaseTable, StudyTable, TrajectoryTable, read
-from cosim.studies.store import (
-    EVALUATION,
-    GREEDY,
-    ONLINE,
-    Case,
-    Noise,
-    Run,
-    RunKey,
-    TrainingTask,
-    check_folders,
-    greedy_file,
-)
+from cosim.studies.store import EVALUATION, GREEDY, ONLINE, check_folders, greedy_file
+from cosim.studies.work import Case, Noise, Run, RunKey, TrainingTask
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError

@@ -5,47 +5,28 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-import signal
-import threading
 import time
-import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from time import perf_counter
 from typing import Any
 
 import loky
 
-from controllers import compile_functions
 from cosim.errors import EvaluationError, FailedRunsError
-from cosim.files import temporary_folder, write_atomically
-from cosim.plant import FmuPlant
-from cosim.plant.fmi import unpack
-from cosim.plugins import OURS, build_controller, code_hash, import_from
-from cosim.processes import Terminated, follow_parent, out_of_reach_of_ctrl_c
+from cosim.files import write_atomically
+from cosim.processes import out_of_reach_of_ctrl_c
 from cosim.progress import told
-from cosim.protocols import Controller
-from cosim.simulation import measure, simulate
 from cosim.studies import operation
 from cosim.studies.plan import Plan, Study, plan
 from cosim.studies.results import StudyResults
-from cosim.studies.store import (
-    CHECKPOINT,
-    EVALUATION,
-    FAILURE,
-    Measured,
-    Noise,
-    Run,
-    RunStore,
-    Trained,
-)
+from cosim.studies.store import EVALUATION, FAILURE, RunStore
+from cosim.studies.work import Failure, Item, Outcome, Run, Trained, begin, perform
 from cosim.validation import known_keywords
-from learning.training import COLUMNS, LogRow, run_training, to_csv
 
 ANSWER_SECONDS = 10.0
 """Time in which a scheduler answers."""
@@ -53,130 +34,8 @@ WORKER_SECONDS = 300.0
 """Time for which a cluster may be without a worker while there is work."""
 BLOCK = 20_000
 """Samples of an item of evaluation, about: a few seconds of work."""
-NONE = Noise((), 0)
 ROUNDS = 3
 """Times that workers may die without having finished one item."""
-
-
-@dataclass(frozen=True)
-class Item:
-    """Unit of work of one process, independent of the machine.
-
-    The run's training to its end, its checkpoint in `folder` where the workers share this disk;
-    or, with a `file`, its controller on some `noise`: that of the run, or, of a training, that of
-    the θ in `parameters` (TOML) or of another `theta`. Plug-ins are looked up in `folders`.
-    """
-
-    run: Run
-    folders: tuple[str, ...]
-    folder: Path | None = None
-    file: str = ""
-    noise: Noise = NONE
-    parameters: str = ""
-    theta: tuple[float, ...] = ()
-
-    def enter(self) -> None:
-        """Let plug-ins be imported; raises EvaluationError on other code or another FMU here."""
-        for folder in self.folders:
-            import_from(Path(folder))
-        facts = self.run.facts
-        if (here := code_hash()) != facts["rti-cosim"]:
-            raise EvaluationError(
-                f"a worker runs other code ({here}) than the work was given out with "
-                f"({facts['rti-cosim']}); install the same version of rti-cosim everywhere"
-            )
-        if (found := unpack(self.run.scenario.plant.fmu)).sha256 != facts["fmu"]:
-            raise EvaluationError(
-                f"FMU '{found.path}' was replaced, or is another one on this worker (SHA-256 "
-                f"{found.sha256[:16]}…, not {facts['fmu'][:16]}…); what is finished is stored: put "
-                "the FMU back, or begin anew with it"
-            )
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A failed item: message, traceback, and the class of our own errors."""
-
-    message: str
-    traceback: str
-    kind: type[Exception] | None = None
-
-    def error(self) -> Exception:
-        """The error once more; an EvaluationError for that of a plug-in."""
-        if self.kind is not None and self.kind.__init__ is Exception.__init__:
-            return self.kind(self.message.partition(": ")[2])
-        return EvaluationError(self.message)
-
-
-Outcome = Trained | Measured | str | Failure
-
-
-def perform(item: Item) -> tuple[Item, Outcome]:
-    """Do an item; whatever it raises becomes a Failure, `sys.exit` in a plug-in too."""
-    try:
-        item.enter()
-        return item, _simulate(item) if item.file else _train(item.run, item.folder)
-    except (KeyboardInterrupt, Terminated):
-        raise
-    except BaseException as error:
-        text = " ".join(f"{error}".split()) or type(error).__name__
-        message = f"{type(error).__name__}: {text}"
-        kind = type(error) if isinstance(error, Exception) else None
-        if kind is not None and kind.__module__.partition(".")[0] not in OURS:
-            kind = None
-        return item, Failure(message, traceback.format_exc(), kind)
-
-
-def _train(run_: Run, folder: Path | None) -> Trained:
-    assert run_.training is not None
-    run, marks, begin = run_.training.prepare(), run_.marks, perf_counter()
-    if marks:
-        lived, status, clock, taken = operation.live(run, marks)
-        log, theta = to_csv(lived), lived[-1].parameters.to_toml()
-        return Trained(marks[-1], status, log, theta, taken, perf_counter() - begin, clock)
-    with temporary_folder("cosim-training-") as own:
-        out = folder or own
-        result = run_training(run, out, resume=(out / CHECKPOINT).is_file())
-    rows = result.rows
-    # The log of a study starts with θ at the start, from which its increments are counted.
-    start = dict.fromkeys(rows[0] if rows else COLUMNS, float("nan")) | {"samples": 0.0}
-    return Trained(
-        int(rows[-1]["samples"]) if rows else 0,
-        result.status,
-        to_csv([LogRow(start, result.start), *rows]),
-        result.parameters.to_toml(),
-        result.plant_samples,
-        perf_counter() - begin,
-    )
-
-
-def _simulate(item: Item) -> Measured | str:
-    controller, run = _controller(item), item.run
-    compile_functions(controller, sum(noise.samples for noise in run.noise.values()))
-    scenario, (seeds, steps, burn_in, block, whole, mark) = run.scenario, item.noise
-    if mark:
-        scenario = operation.plant_at(scenario, mark * scenario.sampling_time)
-    with FmuPlant(scenario) as plant:
-        if whole:
-            return simulate(plant, controller, steps, seeds[0]).to_csv()
-        if block:
-            found = simulate(plant, controller, steps, seeds[0], residuals=False)
-            cost = found["stage_cost"] + found["penalty"]
-            firsts = range(0, steps, block)
-            return {seeds[0]: ({"J": [float(cost[k : k + block].mean()) for k in firsts]}, {})}
-        return {seed: measure(plant, controller, seed, steps, burn_in) for seed in seeds}
-
-
-def _controller(item: Item) -> Controller:
-    run = item.run
-    if run.training is not None:
-        return run.training.controller(item.parameters, item.theta)
-    if item.noise.mark:
-        return operation.optimum_at(run.scenario, item.noise.mark)
-    if isinstance(run.controller, str):
-        return build_controller(run.controller, run.scenario)
-    controller: Controller = run.controller(run.scenario)
-    return controller
 
 
 Report = Callable[[int, str, str], None]
@@ -309,7 +168,7 @@ def _outcomes(
         return
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     workers = loky.ProcessPoolExecutor(
-        min(jobs, len(items)), initializer=_begin, initargs=(os.getpid(),), env=one_thread
+        min(jobs, len(items)), initializer=begin, initargs=(os.getpid(),), env=one_thread
     )
     try:
         with out_of_reach_of_ctrl_c():
@@ -318,13 +177,6 @@ def _outcomes(
             yield future.result()
     finally:
         workers.shutdown(wait=True, kill_workers=True)
-
-
-def _begin(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and end with it."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    follow_parent(parent)
 
 
 def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome]]:

@@ -1,4 +1,4 @@
-"""A run: what it is made of, and what it has finished: a folder, readable and found again.
+"""What a run has finished: a folder, readable and found again.
 
     OUT/runs/SCENARIO/CASE/SEED/   run.json  checkpoint.npz | learning.csv parameters.toml
                                    evaluation.csv  greedy.csv  online.csv
@@ -12,30 +12,20 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from controllers.factories import nmpc
-from controllers.problem import Problem
-from controllers.theta import Parameters
 from cosim.errors import StudyError
-from cosim.files import read_json, temporary_folder, write_atomically
+from cosim.files import read_json, write_atomically
 from cosim.plugins import changed
-from cosim.protocols import Controller
-from cosim.scenario import Scenario
-from cosim.studies.document import TrajectoryTable
-from learning.training import TrainingRun, prepare
+from cosim.studies.work import CHECKPOINT, Figures, Measured, Run, RunKey, Trained
 
 EVALUATION, GREEDY, ONLINE = "evaluation.csv", "greedy.csv", "online.csv"
-RUNS = "runs"
-RUN, CHECKPOINT = "run.json", "checkpoint.npz"
+RUN = "run.json"
 TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
 FAILURE, TIMING = "failure.txt", "timing.csv"
 EVALUATED = "evaluated"
@@ -54,150 +44,11 @@ TYPES: dict[str, Any] = {"scenario": str, "case": str, "training_seed": "Int64",
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 PAUSE = 20
 """Of the time that tables took to write, what passes at least until they are written again."""
-Figures = dict[str, Any]
-Measured = dict[int, tuple[Figures, Figures]]
-"""Indicators, or the mean cost of each block as `J`, and what the clock said, by noise seed."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One point of a grid: a controller, or an algorithm with one set of settings.
-
-    `scenarios` are names; `training_seeds` is empty for a controller. `group` is the panel of the
-    figures that shows it; `against` the case that its paired difference is taken from.
-    """
-
-    name: str
-    scenarios: tuple[str, ...]
-    group: str
-    controller: str | None = None
-    algorithm: str | None = None
-    samples: int = 0
-    start: str = ""
-    nmpc: str = ""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    training: Mapping[str, Any] = field(default_factory=dict)
-    training_seeds: tuple[int, ...] = ()
-    against: str | None = None
-
-    @property
-    def target(self) -> str:
-        """The algorithm or the controller."""
-        return self.algorithm or self.controller or ""
-
-
-@dataclass(frozen=True)
-class TrainingTask:
-    """Arguments of `learning`'s `prepare`: equal ones give equal θ on any worker."""
-
-    algorithm: str
-    scenario: Scenario
-    samples: int
-    settings: Mapping[str, Any]
-    options: Mapping[str, Any]
-
-    def prepare(self) -> TrainingRun:
-        """The training run, checked; raises LearningError in one line."""
-        return prepare(self.algorithm, self.scenario, self.samples, self.settings, self.options)
-
-    def controller(self, parameters: str, theta: Sequence[float] = ()) -> Controller:
-        """The greedy controller of the θ that a TOML text holds, or of another θ of its blocks."""
-        problem = Problem.from_scenario(self.scenario)
-        with temporary_folder("cosim-theta-") as folder:
-            path = folder / "parameters.toml"
-            path.write_text(parameters, "utf-8")
-            found = Parameters.load(path, problem)
-        found = found.with_theta(np.array(theta)) if theta else found
-        return nmpc(self.scenario, found, self.options["controller"])
-
-
-class Noise(NamedTuple):
-    """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`.
-
-    Indicators are kept; mean costs over `block` samples, where that is not 0; the run sample by
-    sample, if it is `whole`. A policy of a run in operation is that of the sample `mark`.
-    """
-
-    seeds: tuple[int, ...]
-    steps: int
-    burn_in: int = 0
-    block: int = 0
-    whole: bool = False
-    mark: int = 0
-
-    @property
-    def samples(self) -> int:
-        """Plant samples on all seeds."""
-        return len(self.seeds) * (self.burn_in + self.steps)
 
 
 def greedy_file(mark: int) -> str:
     """File of a run's greedy evaluation of θ after `mark` samples of operation."""
     return f"greedy-{mark}.csv"
-
-
-def safe(name: str) -> str:
-    """A folder's name on any system."""
-    return re.sub(r"[^\w.+=()\[\]-]", "_", name)
-
-
-@dataclass(frozen=True)
-class RunKey:
-    """A run: scenario, case, and training seed (None for a controller).
-
-    Raises StudyError where a name is made of dots, or has a separator of folders.
-    """
-
-    scenario: str
-    case: str
-    seed: int | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse names that lead out of the study's folder."""
-        for name in (self.scenario, self.case):
-            if not name.strip(". ") or "/" in name or "\\" in name:
-                raise StudyError(
-                    f"'{name}' cannot name a scenario, case or controller: it would name a folder "
-                    "elsewhere; give it another name"
-                )
-
-    @property
-    def folder(self) -> Path:
-        """Where its files are, relative to the study's folder."""
-        parts = [safe(self.scenario), safe(self.case)]
-        return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
-
-    def __str__(self) -> str:
-        """As messages name it."""
-        seed = "" if self.seed is None else f", seed {self.seed}"
-        return f"{self.case} on {self.scenario}{seed}"
-
-
-@dataclass(frozen=True)
-class Run:
-    """One run: a controller, or a training and the θ that comes of it.
-
-    `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `noise` is what it is measured on, by the file that keeps what is found;
-    `trajectories` are those that it takes part in. `marks` are the samples of operation at which
-    θ, or the optimum, is judged.
-    """
-
-    key: RunKey
-    case: Case
-    scenario: Scenario
-    controller: Any
-    training: TrainingTask | None
-    facts: Mapping[str, Any]
-    noise: Mapping[str, Noise]
-    trajectories: tuple[TrajectoryTable, ...] = ()
-    marks: tuple[int, ...] = ()
-
-    @property
-    def samples(self) -> int:
-        """Plant samples of the run; those of greedy evaluations while training apart."""
-        trained = 0 if self.training is None else self.training.samples
-        return trained + sum(noise.samples for noise in self.noise.values())
 
 
 def check_folders(runs: list[Run]) -> None:
@@ -240,21 +91,6 @@ def _converted(texts: pd.Series[str], kind: Any) -> Any:
 def to_csv(frame: pd.DataFrame) -> str:
     """A frame as CSV; floats read back to the same bits, what is undefined is empty."""
     return str(frame.to_csv(index=False, lineterminator="\n"))
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A training at its end: `status` is `finished` or `diverged: …`, `log` learning.csv,
-    `parameters` θ as text, `plant_samples` all that the plant gave for it; `clock` the processor
-    time in s up to each mark of operation."""
-
-    samples: int
-    status: str
-    log: str
-    parameters: str
-    plant_samples: int
-    wall_seconds: float
-    clock: Mapping[int, float] = field(default_factory=dict)
 
 
 class RunStore:

@@ -20,7 +20,8 @@ from cosim.studies.document import read as read_study
 from cosim.studies.figures import LOGS, TRAJECTORIES
 from cosim.studies.report import rendered
 from cosim.studies.results import ABOUT, CURVES, StudyResults
-from cosim.studies.store import EVALUATION, KEYS, RUNS, TIMING, to_csv
+from cosim.studies.store import EVALUATION, KEYS, TIMING, to_csv
+from cosim.studies.work import RUNS
 from cosim.trajectory import Signal
 from cosim.validation import instead, validated
 

@@ -323,7 +323,7 @@ class Engine:
     def compile(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
         """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
-        A QP that is too large for an exported controller is solved stage by stage.
+        A QP of many stages, or too large for an exported controller, is solved stage by stage.
         """
         named = {
             "PREPARED": functions.preparation,
@@ -332,10 +332,13 @@ class Engine:
             "GRADIENT": functions.gradient,
             "POLICY": functions.policy(),
         }
-        stagewise = stack_needed(functions.problem, named) > STACK_LIMIT
+        problem = functions.problem
+        # From there on no preset's sample is slower so; the evaporator's is not from 12 stages on.
+        stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
+        stagewise = stagewise or stack_needed(problem, named) > STACK_LIMIT
         if stagewise:
-            named["LINEARISED"] = linearisation(functions.problem, blocks)
-        sources = controller_sources(functions.problem, blocks, "gauss-newton", named)
+            named["LINEARISED"] = linearisation(problem, blocks)
+        sources = controller_sources(problem, blocks, "gauss-newton", named)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources, ["engine.c"])

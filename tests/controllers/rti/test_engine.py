@@ -54,12 +54,13 @@ def compiled(request, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def learnt():
-    problem = evaporator_problem()
+def learnt(request):
+    problem = evaporator_problem(horizon=getattr(request, "param", 10))
     blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=("UA2",))
     return problem, random_parameters(problem, blocks, np.random.default_rng(7))
 
 
+@pytest.mark.parametrize("learnt", [10, 20], indirect=True)
 def test_it_gives_what_the_interpreter_gives(learnt):
     problem, parameters = learnt
     ours, reference = both(problem, parameters)

@@ -25,7 +25,7 @@ from cosim.protocols import Array, Controller
 from cosim.scenario import VIOLATING, Scenario
 from cosim.statistics import LEVEL, TD_WINDOW, regrets, td_error_mean
 from cosim.studies.document import TrajectoryTable
-from cosim.studies.operated import Judged
+from cosim.studies.operation import Judged
 from cosim.studies.plan import Plan
 from cosim.studies.report import FOLDER
 from cosim.studies.store import LOG, PARAMETERS, read_table

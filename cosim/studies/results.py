@@ -29,7 +29,7 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import figures, operated, report, store
+from cosim.studies import figures, operation, report, store
 from cosim.studies.plan import BASELINES, NAIVE, Plan
 from cosim.studies.report import COLUMNS, SHORT
 from cosim.studies.store import (
@@ -131,7 +131,7 @@ class StudyResults(Shown):
             TIMING: store.timing(stores),
         }
         if found.about.get("operation"):
-            tables[OPERATION], tables[GREEDY] = operated.collected(runs)
+            tables[OPERATION], tables[GREEDY] = store.lives(runs)
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
@@ -389,7 +389,7 @@ class StudyResults(Shown):
         against = {name: case.get("against") for name, case in self.cases.items()}
         for scenario, about in (self.about.get("operation") or {}).items():
             judged, seconds = self._judged(scenario), self._seconds(scenario)
-            found += operated.tables(judged, scenario, about, against, seconds)
+            found += operation.tables(judged, scenario, about, against, seconds)
         if "paper" in self.about["tables"]:
             found.append(self.paper())
         return found
@@ -483,12 +483,12 @@ class StudyResults(Shown):
         drawn = {name: shown(marks[name]) for name in chosen}
         return figures.curves_figure(curves, drawn, self._looks, relative=bool(known))
 
-    def _judged(self, scenario: str) -> operated.Judged:
+    def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
-        lives = lives.reindex(columns=operated.COLUMNS)  # an older table lacks the latest ones
+        lives = lives.reindex(columns=store.LIVES)  # an older table lacks the latest ones
         greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
-        return operated.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
+        return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
 
     def _seconds(self, scenario: str) -> dict[str, float]:
         """Median processor time in s of a case's runs, up to their last sample."""

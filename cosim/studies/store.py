@@ -17,11 +17,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from cosim.errors import StudyError
 from cosim.files import read_json, write_atomically
 from cosim.plugins import changed
+from cosim.studies.operation import LIFE
 from cosim.studies.work import CHECKPOINT, Figures, Measured, Run, RunKey, Trained
 
 EVALUATION, GREEDY, ONLINE = "evaluation.csv", "greedy.csv", "online.csv"
@@ -39,6 +41,7 @@ BLOCKS = ["seed", "steps", "block"]
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]
+LIVES = [*KEYS, "samples", *LIFE]
 CURVE = ["samples", "J", "greedy_J", "td_error"]
 TYPES: dict[str, Any] = {"scenario": str, "case": str, "training_seed": "Int64", "status": str}
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
@@ -319,6 +322,35 @@ def _tables(store: RunStore) -> list[pd.DataFrame]:
     curve = curve.astype({"samples": "Int64"} | dict.fromkeys(CURVE[1:], float))
     tables = (pd.DataFrame([state]), evaluation, curve)
     return [table.assign(**key).astype({"training_seed": "Int64"}) for table in tables]
+
+
+def lives(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows of the lives, by run and mark, and of the greedy evaluations, by noise seed, too.
+
+    The optimum has a life on the noise of every training seed, of which J is known.
+    """
+    alive, greedy = [], []
+    for store in (store for store in stores if store.run.marks):
+        run, key = store.run, store.run.key
+        names = {"scenario": key.scenario, "case": key.case}
+        for mark in run.marks:
+            rows = store.measured(greedy_file(mark)).rename_axis("seed").reset_index()
+            greedy.append(rows.assign(**names, training_seed=key.seed, samples=mark))
+        if run.training is not None:
+            rows = read_table(store.folder / LOG, types={"samples": int})
+            alive.append(rows.assign(**names, training_seed=key.seed))
+        elif ONLINE in run.noise:
+            for seed, blocks in sorted(store.indicators(ONLINE).items()):
+                ends = run.noise[ONLINE].block * np.arange(1, len(blocks["J"]) + 1)
+                so_far = pd.Series(blocks["J"]).expanding().mean()
+                rows = pd.DataFrame({"samples": ends, "J": so_far})
+                rows = rows[rows.samples.isin(run.marks)]
+                alive.append(rows.assign(**names, training_seed=seed))
+    tables = []
+    for found, columns in ((alive, LIVES), (greedy, [*KEYS, "samples", "seed", "J"])):
+        table = pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=columns)
+        tables.append(table.reindex(columns=columns).astype({"training_seed": "Int64"}))
+    return tables[0], tables[1]
 
 
 def timing(stores: Iterable[RunStore]) -> pd.DataFrame:

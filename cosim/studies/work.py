@@ -294,13 +294,22 @@ def _train(run_: Run, folder: Path | None) -> Trained:
 
 
 def _simulate(item: Item) -> Measured | str:
-    controller, run = _controller(item), item.run
-    compile_functions(controller, sum(noise.samples for noise in run.noise.values()))
-    scenario, (seeds, steps, burn_in, block, whole, mark) = run.scenario, item.noise
+    run, (seeds, steps, burn_in, block, whole, mark) = item.run, item.noise
+    scenario, factory = run.scenario, run.controller
     if mark:
-        from cosim.studies.operation import plant_at  # noqa: PLC0415
+        from cosim.studies.operation import optimum_at, plant_at  # noqa: PLC0415
 
         scenario = plant_at(scenario, mark * scenario.sampling_time)
+    controller: Controller
+    if run.training is not None:
+        controller = run.training.controller(item.parameters, item.theta)
+    elif mark:
+        controller = optimum_at(run.scenario, mark)
+    elif isinstance(factory, str):
+        controller = build_controller(factory, scenario)
+    else:
+        controller = factory(scenario)
+    compile_functions(controller, sum(noise.samples for noise in run.noise.values()))
     with FmuPlant(scenario) as plant:
         if whole:
             return simulate(plant, controller, steps, seeds[0]).to_csv()
@@ -310,20 +319,6 @@ def _simulate(item: Item) -> Measured | str:
             firsts = range(0, steps, block)
             return {seeds[0]: ({"J": [float(cost[k : k + block].mean()) for k in firsts]}, {})}
         return {seed: measure(plant, controller, seed, steps, burn_in) for seed in seeds}
-
-
-def _controller(item: Item) -> Controller:
-    run = item.run
-    if run.training is not None:
-        return run.training.controller(item.parameters, item.theta)
-    if item.noise.mark:
-        from cosim.studies.operation import optimum_at  # noqa: PLC0415
-
-        return optimum_at(run.scenario, item.noise.mark)
-    if isinstance(run.controller, str):
-        return build_controller(run.controller, run.scenario)
-    controller: Controller = run.controller(run.scenario)
-    return controller
 
 
 def begin(parent: int) -> None:

@@ -60,8 +60,8 @@ def learnt(request):
     return problem, random_parameters(problem, blocks, np.random.default_rng(7))
 
 
-@pytest.mark.parametrize("learnt", [10, 20], indirect=True)
-def test_it_gives_what_the_interpreter_gives(learnt):
+@pytest.mark.parametrize(("learnt", "gap"), [(10, 1e-12), (20, 1e-11)], indirect=["learnt"])
+def test_it_gives_what_the_interpreter_gives(learnt, gap):
     problem, parameters = learnt
     ours, reference = both(problem, parameters)
     rng, worst = np.random.default_rng(0), dict.fromkeys(BOUNDS, 0.0)
@@ -74,7 +74,7 @@ def test_it_gives_what_the_interpreter_gives(learnt):
             wanted.action + rng.normal(0, 10, 2), problem.action_lower, problem.action_upper
         )
         enforced, expected = ours.feedback(s, a), reference.feedback(s, a)
-        assert got.residual < 1e-9 and enforced.residual < 1e-9 and duality_gap(enforced) < 1e-12
+        assert got.residual < 1e-9 and enforced.residual < 1e-9 and duality_gap(enforced) < gap
         pairs = {name: (getattr(got, name), getattr(wanted, name)) for name in list(BOUNDS)[:6]}
         pairs["action value"] = enforced.value, expected.value
         pairs["action value's gradient"] = enforced.value_gradient, expected.value_gradient

@@ -15,12 +15,12 @@
 #include "problem.h"
 
 /* CasADi's code for a long horizon: gcc makes nothing faster of it by -O3, in three times as long. */
-#if STAGEWISE && defined(__GNUC__) && !defined(__clang__)
+#if STAGEWISE && defined(__OPTIMIZE__) && !defined(__clang__)
 #pragma GCC push_options
 #pragma GCC optimize("O1")
 #endif
 #include "functions.h"
-#if STAGEWISE && defined(__GNUC__) && !defined(__clang__)
+#if STAGEWISE && defined(__OPTIMIZE__) && !defined(__clang__)
 #pragma GCC pop_options
 #endif
 

@@ -147,7 +147,7 @@ def test_its_own_loop_gives_the_bytes_of_pythons(monkeypatch, scenario):
     with FmuPlant(loaded) as plant:
         for _ in range(2):
             seen = []
-            run = simulate(plant, controller, 1100, 3, progress=seen.append)
+            run = simulate(plant, controller, 550, 3, progress=seen.append)
             runs.append((run.to_csv(), run.status, run.final_state.tobytes(), seen, plant.k))
             monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
     assert runs[0] == runs[1]

@@ -238,7 +238,7 @@ def tables(
     result.append((f"What {times[-1]} of operation took on `{scenario}`, medians", header, rows))
     shifts = lives[(lives.samples == marks[-1]) & lives.dearer.notna()].groupby("case", sort=False)
     rows = [
-        [str(case), f"{_whole(own.dearer.median())} ({_whole(own.dearer.max())})",
+        [str(case), str(len(own)), f"{_whole(own.dearer.median())} ({_whole(own.dearer.max())})",
          f"{100 * own.excess.median():.2f} ({100 * own.excess.max():.2f})"]
         for case, own in shifts
     ]  # fmt: skip
@@ -246,7 +246,7 @@ def tables(
         title = (
             f"Shifts of {SHIFT} samples dearer than θ as it starts, median (worst): `{scenario}`"
         )
-        result.append((title, ("case", "shifts", "largest excess %"), rows))
+        result.append((title, ("case", "runs", "shifts", "largest excess %"), rows))
     rows = []
     for case, other in against.items():
         pairs = [found.greedy.get(str(name), {}) for name in (case, other)]

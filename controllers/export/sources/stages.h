@@ -261,7 +261,8 @@ static int stages_look(const RtiPrepared *prepared, RtiWork *work, int first) {
     return moved;
 }
 
-/* Where along the step, of length 1 at most, what is minimised is least. */
+/* Where along the step, of length 1 at most, what is minimised is least: at its end where no envelope
+ * changes its branch on the way, which rounding of the slope does not decide. */
 static double stages_length(const RtiPrepared *prepared, const RtiWork *work, int first) {
     double slope = 0.0, curvature = 0.0, low = 0.0, high = 1.0;
     for (int j = first * N_U; j < QP_N; j++) slope += work->gradient[j] * work->dv[j];
@@ -280,13 +281,16 @@ static double stages_length(const RtiPrepared *prepared, const RtiWork *work, in
     for (int trial = 0; trial < 40; trial++) {
         const double t = trial == 0 ? 1.0 : 0.5 * (low + high);
         double rise = slope + t * curvature, weight;
+        int moved = 0;
         for (int i = 0; i < QP_LIMITS; i++) {
             QpMode mode;
             if (i < first * N_U || (i >= QP_N && i < QP_N + first * N_X)) continue;
             const double by = i < QP_N ? work->dv[i] : work->dxi[N_X + i - QP_N];
             const double y = stages_value(work, i) + t * by;
             rise += by * (stages_envelope(prepared, work, i, y, &weight, &mode) - work->estimate[i]);
+            moved |= mode != work->mode[i];
         }
+        if (trial == 0 && !moved) return t;
         if (fabs(rise) <= 1e-3 * steep || (trial == 0 && rise < 0.0)) return t;
         *(rise < 0.0 ? &low : &high) = t;
     }

@@ -151,6 +151,7 @@ def test_its_own_loop_gives_the_bytes_of_pythons(monkeypatch, scenario):
             runs.append((run.to_csv(), run.status, run.final_state.tobytes(), seen, plant.k))
             monkeypatch.setattr(RtiNmpc, "compiled_loop", lambda self, scenario: None)
     assert runs[0] == runs[1]
+    assert set(run.status) == {"solved"}
 
 
 def test_its_loop_meets_the_plants_changes(monkeypatch):

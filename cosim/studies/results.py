@@ -560,11 +560,12 @@ class StudyResults(Shown):
         own = self.evaluation[self.evaluation.scenario == scenario]
         if own.empty:
             return "No run is finished."
-        seeds, steps = self.about["curves"][scenario]
+        curves = "other noise, and fewer samples"  # of a folder that an older version wrote
+        if noise := self.about.get("curves", {}).get(scenario):
+            curves = f"{noise[0]} other seeds × {noise[1]} samples"
         return (
             f"Table, regret and profile: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
-            f"samples. Learning curves: {seeds} other seeds × {steps} samples. "
-            "Regrets of a case differ between the two."
+            f"samples. Learning curves: {curves}. Regrets of a case differ between the two."
         )
 
 

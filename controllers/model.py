@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -64,6 +64,33 @@ class Model:
                     f"model '{self.name}' has no parameter '{name}'; it has {', '.join(known)}"
                 )
         return [known.index(name) for name in names]
+
+    def measuring(self, names: tuple[str, ...]) -> Model:
+        """Copy whose named disturbances are its last parameters, so that θ may hold them.
+
+        Raises ModelError where a name is no disturbance of the model, or comes twice.
+        """
+        known = [quantity.name for quantity in self.disturbances]
+        if len(set(names)) < len(names) or not set(names) <= set(known):
+            raise ModelError(
+                f"model '{self.name}' cannot measure {', '.join(names)}: name some of its "
+                f"disturbances, {', '.join(known)}, once each"
+            )
+        moved = [self.disturbances[known.index(name)] for name in names]
+        rest = [quantity for quantity in self.disturbances if quantity not in moved]
+        order = [[*rest, *moved].index(quantity) for quantity in self.disturbances]
+        own = len(self.parameters)
+
+        def of(expression: Expression) -> Expression:
+            return lambda x, u, d, p: expression(x, u, ca.vertcat(d, p[own:])[order], p[:own])
+
+        return replace(
+            self,
+            disturbances=tuple(rest),
+            parameters=(*self.parameters, *moved),
+            ode=of(self.ode),
+            economic_cost=of(self.economic_cost),
+        )
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Fresh symbols (x, u, d, p)."""

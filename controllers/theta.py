@@ -247,6 +247,16 @@ class Parameters(Shown):
             theta[self.blocks.slices[name]] = packed
         return Parameters(self.blocks, theta)
 
+    def placed_in(self, other: Parameters) -> Parameters:
+        """Copy of `other`, which has all blocks of this θ, with the values of this θ in them.
+
+        A longer block p of `other` keeps its last entries.
+        """
+        values = {block.name: self[block.name] for block in self.blocks}
+        if "p" in values:
+            values["p"] = np.concatenate([values["p"], other["p"][values["p"].size :]])
+        return other.replace(values)
+
     def with_theta(self, theta: ArrayLike) -> Parameters:
         """Copy with another flat vector."""
         return Parameters(self.blocks, np.asarray(theta, dtype=np.float64))

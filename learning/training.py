@@ -26,7 +26,7 @@ from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, depends_on
 from cosim.progress import told
-from cosim.protocols import Array, Controller, Plant, Vector
+from cosim.protocols import Array, Controller, Plant
 from cosim.result import Result, csv_text
 from cosim.scenario import Scenario
 from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds
@@ -210,12 +210,8 @@ def starting_parameters(
     else:
         found = Parameters.naive(problem, blocks, value_offset=offset)
     names = [name for name in ("w_sigma", "W_sigma") if name in blocks]
-    values: dict[str, Vector] = {name: blocks.scale[blocks.slices[name]] for name in names}
-    if file is not None:
-        values |= {block.name: file[block.name] for block in file.blocks}
-    if given:
-        values["p"] = np.concatenate([values["p"], found["p"][len(given) :]])
-    return found.replace(values)
+    found = found.replace({name: blocks.scale[blocks.slices[name]] for name in names})
+    return found if file is None else file.placed_in(found)
 
 
 CHECKPOINT, FIGURE = "checkpoint.npz", "learning.png"

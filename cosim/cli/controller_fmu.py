@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from controllers import RtiNmpc
+from controllers import Parameters, RtiNmpc
 from controllers.export import STATUSES, core, plain_c
+from controllers.theta import ThetaBlocks
 from cosim.errors import ControllerLookupError
 from cosim.files import write_atomically
 from cosim.plant.fmi import unpack
@@ -27,23 +29,32 @@ SATURATE = "saturate"
 RECORD = "extra/org.rti-cosim/controller.json"
 
 
-def rti_controller(name: str, scenario: Scenario) -> RtiNmpc:
-    """The controller `name`; raises ControllerLookupError where it is no RTI-NMPC."""
+def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()) -> RtiNmpc:
+    """The controller `name`, whose θ ends with the `measured` disturbances of its model.
+
+    Raises ControllerLookupError where it is no RTI-NMPC, ModelError on a name that the model lacks.
+    """
     found: Any = build_controller(name, scenario)
     if type(found) is not RtiNmpc or found.iterations != 1:
         raise ControllerLookupError(
             f"controller '{name}' is no RTI-NMPC and cannot be exported; give "
             "naive, tuned or a parameters file (.toml) of a training"
         )
-    return found
+    if not measured:
+        return found
+    problem = replace(found.problem, model=found.problem.model.measuring(measured))
+    given = found.parameters.blocks
+    names = (*(given.block("p").labels if "p" in given else ()), *measured)
+    blocks = ThetaBlocks.of(problem, slack_weights="w_sigma" in given, model_parameters=names)
+    return RtiNmpc(problem, found.parameters.placed_in(Parameters.naive(problem, blocks)))
 
 
 def sampled_controller(
-    controller: RtiNmpc, scenario: Scenario, units: dict[str, str]
+    controller: RtiNmpc, scenario: Scenario, units: dict[str, str], measured: tuple[str, ...] = ()
 ) -> SampledSystem:
     """The controller as a sampled system; raises ControllerError where it cannot be exported.
 
-    `units` are those of the plant's variables by name.
+    `units` are those of the plant's variables by name, `measured` what `rti_controller` was given.
     """
     hessian = scenario.controller.hessian
     origin = f"{scenario.hash} {hessian} {controller.parameters.hash}"
@@ -63,6 +74,9 @@ def sampled_controller(
     )
     about = "action in manual; acts within the bounds of the action"
     signals += [signal(Kind.INPUT, f"manual_{u}", about, u, start=start[u]) for u in actions]
+    about = "measured disturbance, held over the horizon; not a number: that of theta.p instead"
+    theta = dict(zip(blocks.labels, parameters.theta.tolist(), strict=True))
+    signals += [signal(Kind.INPUT, d, about, d, start=theta[f"p[{d}]"]) for d in measured]
     for u in actions:
         low, high = scenario.limits[u]
         signals.append(signal(Kind.OUTPUT, u, "action, within its bounds", u, min=low, max=high))
@@ -84,9 +98,7 @@ def sampled_controller(
     meanings = [block.meaning for block in blocks for _ in range(block.size)]
     signals += [
         Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
-        for label, about, value in zip(
-            blocks.labels, meanings, parameters.theta.tolist(), strict=True
-        )
+        for (label, value), about in zip(theta.items(), meanings, strict=True)
     ]
     return SampledSystem(
         name=f"RTI-NMPC {scenario.name}",
@@ -145,8 +157,10 @@ def write_fmu(
     )
 
 
-def write_loop(controller: Path, scenario: Scenario, seed: int, target: Path) -> Path:
-    """Write an SSP with the same trajectory as `cosim simulate --seed`.
+def write_loop(
+    controller: Path, scenario: Scenario, seed: int, target: Path, measured: tuple[str, ...] = ()
+) -> Path:
+    """Write an SSP with the same trajectory as `cosim simulate --seed`, unless it has `measured`.
 
     The controller comes first: it acts on the state at the sample, then the plant takes the step.
     Where the plant can, its inputs saturate, as the loop of `simulate` does it, so that a master
@@ -166,6 +180,7 @@ def write_loop(controller: Path, scenario: Scenario, seed: int, target: Path) ->
             del starts[name]
             starts[f"{name}_number"] = ("Integer", value)
     length = SAMPLES * scenario.sampling_time
+    signals = (*plant.states, *measured)
     return write_ssp(
-        target, controller, archive.path, plant.states, plant.actions, starts, stop_time=length
+        target, controller, archive.path, signals, plant.actions, starts, stop_time=length
     )

@@ -24,6 +24,9 @@ def export(
     single: Annotated[
         bool, typer.Option("--single", help="With --format c: float in place of double.")
     ] = False,
+    measured: Annotated[
+        str, typer.Option("--measured", help="Disturbances that are inputs, as X1,T1.")
+    ] = "",
     fmi: Annotated[int, typer.Option("--fmi", help="FMI version: 2 or 3.", min=2, max=3)] = 2,
     local: Annotated[
         bool, typer.Option("--local", help="Build for this machine alone, by $CC or cc.")
@@ -59,7 +62,10 @@ def export(
             if format_ == "fmu":  # before the minutes that compilers may take
                 check_target(target)
         loaded = Scenario.load(scenario)
-        rti = controller_fmu.rti_controller(controller, loaded)
+        names = tuple(filter(None, measured.split(",")))
+        if ssp is not None and (missing := set(names) - set(loaded.plant.disturbances)):
+            raise CosimError(f"--ssp: the plant has no disturbance {', '.join(sorted(missing))}")
+        rti = controller_fmu.rti_controller(controller, loaded, names)
         if format_ == "c":
             if ssp is not None:
                 raise CosimError("--ssp connects FMUs: leave --format c out")
@@ -72,7 +78,7 @@ def export(
         out_.announce(loaded.plant.fmu)
         with FmuPlant(loaded) as plant:
             units = plant.units
-        system = controller_fmu.sampled_controller(rti, loaded, units)
+        system = controller_fmu.sampled_controller(rti, loaded, units, names)
         every_platform = not local and find_spec("ziglang") is not None
         version: FmiVersion = 3 if fmi == 3 else 2
         path = controller_fmu.write_fmu(system, rti, loaded, out, version, every_platform)
@@ -88,6 +94,6 @@ def export(
             "sampling_time": loaded.sampling_time,
         }
         if ssp is not None:
-            document["ssp"] = str(controller_fmu.write_loop(path, loaded, seed, ssp))
+            document["ssp"] = str(controller_fmu.write_loop(path, loaded, seed, ssp, names))
             out_.note(f"wrote {ssp}")
         out_.json(document)

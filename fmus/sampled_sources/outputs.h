@@ -47,7 +47,8 @@ static int plausible_model(const State *state) {
 static void distrust(State *state) { (void)state; }
 
 static void evaluate_sample(State *state) {
-    core_evaluate(&state->model.core, state->v + FIRST_INPUT, state->v + FIRST_PARAMETER);
+    core_evaluate(&state->model.core, state->v + FIRST_INPUT, FIRST_OUTPUT - FIRST_INPUT,
+                  state->v + FIRST_PARAMETER);
     core_outputs(&state->model.core, state->v + FIRST_OUTPUT);
     state->model.fresh = 1;
 }

@@ -130,9 +130,16 @@ static void core_act(CoreState *state, const double s[], const double manual[],
     memcpy(state->action, a, sizeof a);
 }
 
-/* The inputs of the table of variables: the state, whether the action is manual, the manual action. */
-static inline void core_evaluate(CoreState *state, const double inputs[], const double theta[]) {
-    core_act(state, inputs, inputs[N_X] != 0.0 ? inputs + N_X + 1 : 0, theta);
+/* The n inputs of the table of variables: the state, whether the action is manual, the manual action,
+ * and what is measured, for the last entries of theta; one that is not finite leaves theta's own. */
+static inline void core_evaluate(CoreState *state, const double inputs[], int n,
+                                 const double theta[]) {
+    const double *const manual = inputs + N_X + 1;
+    double present[N_THETA];
+    memcpy(present, theta, sizeof present);
+    for (int i = N_X + 1 + N_U; i < n; i++)
+        if (isfinite(inputs[i])) present[N_THETA - n + i] = inputs[i];
+    core_act(state, inputs, inputs[N_X] != 0.0 ? manual : 0, present);
 }
 
 static void core_commit(CoreState *state) {

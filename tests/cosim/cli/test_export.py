@@ -220,6 +220,33 @@ def test_automatic_goes_on_from_what_the_operator_did_in_manual(tmp_path, versio
             assert found[1:3] == tuple(given.tolist())
 
 
+@pytest.mark.usefixtures("quickly_built")
+def test_a_measured_feed_spares_violations(tmp_path):
+    """The actions are the Python controller's with this p; it is θ's own where the sensor fails."""
+    thinner = {"changes": [{"time": 600.0, "parameters": {"X1_nominal": 4.5}}]}
+    scenario, violation = Scenario.load("paper").replace({"plant": thinner}), [0.0, 0.0]
+    controller = rti_controller("tuned", scenario, ("X1",))
+    system = sampled_controller(controller, scenario, {}, ("X1",))
+    fmpy.extract(str(build_sampled(system, tmp_path / "c.fmu")), str(tmp_path / "c"))
+    for measured in (False, True):
+        fmu = Instance(tmp_path / "c", 2).initialise()
+        controller.reset()
+        with FmuPlant(scenario) as plant:
+            s = plant.reset(3)
+            for k in range(100):
+                sensor = np.nan if k == 50 else 4.5 if measured and k >= 10 else 5.0
+                fmu.set(X2=s[0], P2=s[1], X1=sensor)
+                fmu.step(60.0 * k)
+                controller.theta = np.r_[controller.theta[:-1], np.nan_to_num(sensor, nan=5.0)]
+                controller.prepare()
+                action = fmu.get("P100", "F200")
+                ours = controller.feedback(s).action
+                np.testing.assert_allclose(ours, action, rtol=0, atol=1e-10)
+                s = plant.step(action).s
+                violation[measured] += max(25.0 - s[0], 0.0)
+    assert violation[True] < 0.9 * violation[False]
+
+
 @pytest.mark.parametrize(
     ("name", "package"), [("libcosim", "libcosimpy"), ("ecos", "ecospy.EcosSimulation")]
 )
@@ -251,6 +278,7 @@ def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
     [
         (["converged", "--out", "c.fmu"], "is no RTI-NMPC and cannot be exported"),
         (["nothing.toml", "--out", "c.fmu"], "nothing.toml' does not exist"),
+        (["naive", "--out", "c.fmu", "--measured", "UA2"], "cannot measure UA2: name some of its"),
         (["naive", "--out", "no/such/folder/c.fmu", "--local"], "no/such/folder"),
     ],
 )

@@ -19,8 +19,8 @@ CORE = b"""
 typedef struct { double sum, seen, y; int64_t status; } CoreState;
 static const char *const CORE_MESSAGES[] = {"fine", "the input is negative"};
 static void core_reset(CoreState *s) { s->sum = s->seen = s->y = 0.0; s->status = 0; }
-static void core_evaluate(CoreState *s, const double u[], const double gain[]) {
-    s->status = !(u[0] >= 0.0);
+static void core_evaluate(CoreState *s, const double u[], int n, const double gain[]) {
+    s->status = n == 1 && !(u[0] >= 0.0);
     s->seen = isfinite(u[0]) ? u[0] : 0.0;
     if (s->status == 0) s->y = gain[0] * u[0] + s->sum;
 }

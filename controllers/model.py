@@ -68,17 +68,14 @@ class Model:
     def measuring(self, names: tuple[str, ...]) -> Model:
         """Copy whose named disturbances are its last parameters, so that θ may hold them.
 
-        Raises ModelError where a name is no disturbance of the model, or comes twice.
+        Raises ModelError where a name is no disturbance of the model.
         """
-        known = [quantity.name for quantity in self.disturbances]
-        if len(set(names)) < len(names) or not set(names) <= set(known):
-            raise ModelError(
-                f"model '{self.name}' cannot measure {', '.join(names)}: name some of its "
-                f"disturbances, {', '.join(known)}, once each"
-            )
-        moved = [self.disturbances[known.index(name)] for name in names]
-        rest = [quantity for quantity in self.disturbances if quantity not in moved]
-        order = [[*rest, *moved].index(quantity) for quantity in self.disturbances]
+        rest = {quantity.name: quantity for quantity in self.disturbances}
+        for name in names:
+            if name not in rest:
+                raise ModelError(f"model '{self.name}' has no disturbance '{name}' to measure")
+        moved = [rest.pop(name) for name in dict.fromkeys(names)]
+        order = [[*rest.values(), *moved].index(quantity) for quantity in self.disturbances]
         own = len(self.parameters)
 
         def of(expression: Expression) -> Expression:
@@ -86,7 +83,7 @@ class Model:
 
         return replace(
             self,
-            disturbances=tuple(rest),
+            disturbances=tuple(rest.values()),
             parameters=(*self.parameters, *moved),
             ode=of(self.ode),
             economic_cost=of(self.economic_cost),

@@ -62,7 +62,7 @@ def export(
             if format_ == "fmu":  # before the minutes that compilers may take
                 check_target(target)
         loaded = Scenario.load(scenario)
-        names = tuple(filter(None, measured.split(",")))
+        names = tuple(dict.fromkeys(filter(None, measured.split(","))))
         if ssp is not None and (missing := set(names) - set(loaded.plant.disturbances)):
             raise CosimError(f"--ssp: the plant has no disturbance {', '.join(sorted(missing))}")
         rti = controller_fmu.rti_controller(controller, loaded, names)

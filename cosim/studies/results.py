@@ -15,7 +15,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cosim.errors import StudyError
-from cosim.figures.style import Dots, Look, palette, save_set
+from cosim.figures.style import FLOOR, Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
@@ -512,13 +512,19 @@ class StudyResults(Shown):
         return figures.operation_figure(judged, about, self._looks, self.baselines)
 
     def _profile(self, scenario: str) -> Figure | None:
-        """Profile of one scenario or, for "", of all (several) with known J*."""
+        """Profile of one scenario or, for "", of all (several) with known J*.
+
+        It has the cases that a study in operation says are drawn; None where no regret is on it.
+        """
         scenarios = self.known if not scenario else [s for s in self.known if s == scenario]
         if not scenarios or (not scenario and len(scenarios) < 2):
             return None
-        strata = {n: [100 * self.regrets(n, one) for one in scenarios] for n in self.trained}
+        drawn = {n for each in (self.about.get("operation") or {}).values() for n in each["drawn"]}
+        cases = [n for n in self.trained if not drawn or n in drawn]
+        strata = {n: [100 * self.regrets(n, one) for one in scenarios] for n in cases}
         strata = {n: v for n, v in strata.items() if all(map(len, v)) and sum(map(len, v)) > 1}
-        return figures.profile_figure(strata, self._looks) if strata else None
+        most = max((float(one.max()) for each in strata.values() for one in each), default=0.0)
+        return figures.profile_figure(strata, self._looks) if most > FLOOR else None
 
     def report(self, folder: Path | None = None) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""

@@ -376,7 +376,7 @@ class Jumps:
 
 
 def change_of(scenario: Scenario) -> Fouling | Jumps | None:
-    """Change of a scenario's plant, or None."""
+    """Change of a scenario's plant, or None; raises OptimumError where it has two."""
     fouling, jumps = Fouling.from_scenario(scenario), Jumps.from_scenario(scenario)
     if fouling and jumps:
         raise OptimumError("a condenser that fouls and plant.changes have no common reference")

@@ -54,9 +54,9 @@ class SoftQp:
 class QpSolution(NamedTuple):
     """Primal-dual solution `v`, `nu`, `lam`: Hv + f + ν + Γᵀλ = 0.
 
-    A multiplier is positive where an upper limit pushes and negative where a lower one does; ν
-    belongs to the bounds (for fixed variables it is the multiplier of that equation), λ to the
-    rows, with |λ_i| ≤ w_i unless row i is violated, and then |λ_i| = w_i + 2 W_i t_i.
+    A multiplier is positive where an upper limit pushes and negative where a lower one does. ν
+    belongs to the bounds; for a fixed variable it is the multiplier of that equation. λ belongs to
+    the rows: |λ_i| ≤ w_i unless row i is violated, and then |λ_i| = w_i + 2 W_i t_i.
     """
 
     v: Vector
@@ -93,10 +93,9 @@ class QpSolution(NamedTuple):
     def weakly_active(self, qp: SoftQp, tolerance: float = 1e-6) -> bool:
         """Whether some bound or row is about to change its activity.
 
-        It is where a limit is reached (within `tolerance`, relative to 1 + |limit|) with a
-        multiplier below `tolerance`·max(1, ‖multipliers‖∞), a row sits at its limit with a
-        multiplier as close to w, or no free variable moves a row that sits at its limit.
-        Derivatives of the solution are then one-sided.
+        A limit is reached within `tolerance`, relative to 1 + |limit|. It is about to change if its
+        multiplier is below `tolerance`·max(1, ‖multipliers‖∞), a row's also if that is as close to
+        w, or if no free variable moves the row. Derivatives of the solution are then one-sided.
         """
         v, nu, lam = self
         small = tolerance * max(1.0, float(np.abs(nu).max()))

@@ -90,11 +90,11 @@ def sensitivities(
     """Gradient of the value in θ, and what makes its derivatives along the KKT adjoints.
 
     The first maps a solution (xi, v, t, lam, chi), the linearisation points x, u and theta to
-    `gradient` (n_θ). The second, which takes the longest to make and is asked for by few, maps
-    that, the QP's A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam
-    (nN, m) to `policy` (n_θ, m), which is dπ/dθ transposed, and `state` (n, m), dπ/ds transposed.
-    With `exact` both need M and χ̄ (see `_theta_part` and `_parameter_gradient`), the second also
-    dM, the directional derivative of M.
+    `gradient` (n_θ). The second takes the longest to make and few ask for it. It maps that, the
+    QP's A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam (nN, m). Its
+    results are `policy` (n_θ, m), dπ/dθ transposed, and `state` (n, m), dπ/ds transposed. With
+    `exact` both need M and χ̄ (see `_theta_part` and `_parameter_gradient`), the second also dM, the
+    directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)

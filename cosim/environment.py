@@ -109,9 +109,9 @@ class PlantEnv(gymnasium.Env[Array, Array]):
 class NormalisedEnv(gymnasium.Wrapper[Single, Any, Array, Any]):
     """A `PlantEnv` whose states, actions and rewards are float32 numbers of the size of one.
 
-    A state counts from the operating point in tenths of its magnitude (of its bounds' width where
-    that is 0), an action from −1 to 1 across its range, a reward is minus the cost beyond the
-    operating point's in tenths of that cost: none of this moves an optimum. `info` stays in
+    A state counts from the operating point in tenths of its magnitude, or of its bounds' width
+    where that is 0. An action goes from −1 to 1 across its range. A reward is minus the cost beyond
+    the operating point's, in tenths of that cost. None of this moves an optimum. `info` stays in
     physical units.
     """
 

@@ -39,8 +39,8 @@ def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     """Return the plant's seed (64 bits) and the exploration's generator for a run's seed.
 
     `SeedSequence(seed).spawn(2)`: the first child's first 64-bit word seeds the plant, the second
-    child the generator. So two controllers run with one seed meet the same disturbances and
-    the same exploration noise (common random numbers).
+    child the generator. So two controllers run with one seed meet the same disturbances and the
+    same exploration noise (common random numbers). Raises CosimError on a negative seed.
     """
     if seed < 0:
         raise CosimError(f"seed must not be negative, not {seed}")

@@ -33,7 +33,7 @@ class Checkpoint:
 
 
 def save(path: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint under a temporary name and rename it; raises OSError."""
+    """Write a checkpoint under a temporary name and rename it; raises OSError, CheckpointError."""
     about = {"schema": SCHEMA, "run": checkpoint.run, "state": checkpoint.state}
     entries = dict(checkpoint.arrays)
     entries["about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)

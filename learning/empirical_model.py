@@ -1,9 +1,9 @@
 """A model of a plant from its own operation: what the controller's nominal model lacks.
 
-(s₊, ℓ) = y(s, a) + G(s, a) c + W (1, s, a) + h(s, a) r: y is the nominal model and economic cost, G
-has their derivatives with respect to each parameter and nominal disturbance times its value, h is
-the size that disturbances in proportion to their values would give the error. c, one coefficient
-a parameter for all outputs, and W are estimated by Bayesian generalised least squares from
+(s₊, ℓ) = y(s, a) + G(s, a) c + W (1, s, a) + h(s, a) r, where y is nominal model and economic cost.
+G has the derivatives of y in each parameter and nominal disturbance, times its value. h is the size
+of the error that disturbances in proportion to their values would make. c, one coefficient a
+parameter for all outputs, and W are estimated by Bayesian generalised least squares from
 transitions; the residuals r are kept and drawn anew. It knows no parameter of the plant and no law
 of its disturbances.
 """

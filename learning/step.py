@@ -203,8 +203,8 @@ class ConstrainedStep:
     def proposal(self, fit: Fit) -> tuple[Vector, Outcome]:
         """The new θ that a fit leads to, and what it has led to; the controller stays as it is.
 
-        A step that definiteness corrects beyond the fit's cap or trust region is scaled back: the
-        θ with definite Hessians are a convex set, in which the whole way lies.
+        A step that definiteness corrects beyond the fit's cap or trust region is scaled back: the θ
+        with definite Hessians are a convex set. Raises DivergenceError on a step not finite.
         """
         theta = self._controller.theta
         if not np.isfinite(fit.minimiser).all():

@@ -62,7 +62,7 @@ class TrainingRun:
 
     The `algorithm` by name, its `configuration`, completed by what the `scenario` states; the other
     fields' meaning is their help in `cosim train`. A run has diverged, and ends, where its greedy J
-    exceeds that of the naive θ and that of the start by more than (`divergence` − 1) of their
+    exceeds the larger of the naive θ's and the start's by more than (`divergence` − 1) of its
     magnitude, twice in a row or at the end.
 
     Raises ConfigurationError on counts that make no run.

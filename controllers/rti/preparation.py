@@ -76,11 +76,11 @@ def stage_curvature(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
 def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> ca.Function:
     """One stage's ∇_p of the QP's Lagrangian in the model parameters p that θ holds.
 
-    That is ∇_p [χᵀ(f + J Δw) + ⟨M, D⟩] with f and its Jacobian J at (x, u), Δw = w − (x, u) the
-    step to the QP's solution, and with `exact` the curvature D of χ̄ᵀf under the weights M. The
-    multipliers are contracted before anything is differentiated, so that one tangent goes through
-    the model in place of n + m. Arguments x, u, theta, w (n+m) in absolute units, chi (n) and, with
-    `exact`, M (n+m, n+m) and guess (n); result `gradient` (n_p).
+    That is ∇_p [χᵀ(f + J Δw) + ⟨M, D⟩] with f and its Jacobian J at (x, u) and the step
+    Δw = w − (x, u) to the QP's solution. With `exact`, D is the curvature of χ̄ᵀf under weights M.
+    The multipliers are contracted before anything is differentiated, so that one tangent goes
+    through the model in place of n + m. Arguments x, u, theta, w (n+m) in absolute units, chi (n)
+    and, with `exact`, M (n+m, n+m) and guess (n); result `gradient` (n_p).
     """
     n, m = problem.n_states, problem.n_actions
     x, u, symbols = _point(problem, blocks)

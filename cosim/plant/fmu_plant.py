@@ -462,7 +462,7 @@ class FmuPlant:
         return Snapshot(self, handle, self._k)
 
     def restore(self, snapshot: Snapshot) -> Array:
-        """Go back to a snapshot of this very plant; return its state (n,)."""
+        """Go back to a snapshot; return its state (n,). Raises PlantError on another plant's."""
         fmi = self._instance
         if snapshot.plant is not self:
             raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
@@ -472,7 +472,7 @@ class FmuPlant:
         return self._copy_states()
 
     def serialise(self, snapshot: Snapshot) -> bytes:
-        """Return a snapshot as bytes for `deserialise`, also in another process."""
+        """A snapshot as bytes, for any process; raises PlantError on another plant's."""
         fmi = self._instance
         if snapshot.plant is not self:
             raise PlantError("this snapshot was taken from another plant")
@@ -481,7 +481,7 @@ class FmuPlant:
         )
 
     def deserialise(self, data: bytes) -> Snapshot:
-        """Return the snapshot that `serialise` wrote, of any plant with the very same FMU file."""
+        """A snapshot from its bytes; raises PlantError where they are not of the same FMU file."""
         fmi = self._instance
         if len(data) < _HEADER.size:
             raise PlantError("these bytes are not a serialised plant state")

@@ -68,14 +68,13 @@ class Model:
     def measuring(self, names: tuple[str, ...]) -> Model:
         """Copy whose named disturbances are its last parameters, so that θ may hold them.
 
-        Raises ModelError where a name is no disturbance of the model.
+        Raises ModelError where a name is no disturbance of the model, or comes twice.
         """
-        rest = {quantity.name: quantity for quantity in self.disturbances}
-        for name in names:
-            if name not in rest:
-                raise ModelError(f"model '{self.name}' has no disturbance '{name}' to measure")
-        moved = [rest.pop(name) for name in dict.fromkeys(names)]
-        order = [[*rest.values(), *moved].index(quantity) for quantity in self.disturbances]
+        moved = [quantity for quantity in self.disturbances if quantity.name in names]
+        rest = [quantity for quantity in self.disturbances if quantity.name not in names]
+        if len(moved) != len(names):
+            raise ModelError(f"model '{self.name}' has not all of {', '.join(names)} to measure")
+        order = [[*rest, *moved].index(quantity) for quantity in self.disturbances]
         own = len(self.parameters)
 
         def of(expression: Expression) -> Expression:
@@ -83,7 +82,7 @@ class Model:
 
         return replace(
             self,
-            disturbances=tuple(rest.values()),
+            disturbances=tuple(rest),
             parameters=(*self.parameters, *moved),
             ode=of(self.ode),
             economic_cost=of(self.economic_cost),

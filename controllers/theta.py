@@ -248,10 +248,7 @@ class Parameters(Shown):
         return Parameters(self.blocks, theta)
 
     def placed_in(self, other: Parameters) -> Parameters:
-        """Copy of `other`, which has all blocks of this θ, with the values of this θ in them.
-
-        A longer block p of `other` keeps its last entries.
-        """
+        """`other`, which has all of this θ's blocks, with its values; a longer p keeps its end."""
         values = {block.name: self[block.name] for block in self.blocks}
         if "p" in values:
             values["p"] = np.concatenate([values["p"], other["p"][values["p"].size :]])

@@ -512,15 +512,12 @@ class StudyResults(Shown):
         return figures.operation_figure(judged, about, self._looks, self.baselines)
 
     def _profile(self, scenario: str) -> Figure | None:
-        """Profile of one scenario or, for "", of all (several) with known J*.
-
-        It has the cases that a study in operation says are drawn; None where no regret is on it.
-        """
+        """Profile of one scenario or, for "", of all (several) with known J*; of drawn cases."""
         scenarios = self.known if not scenario else [s for s in self.known if s == scenario]
         if not scenarios or (not scenario and len(scenarios) < 2):
             return None
         drawn = {n for each in (self.about.get("operation") or {}).values() for n in each["drawn"]}
-        cases = [n for n in self.trained if not drawn or n in drawn]
+        cases = [name for name in self.trained if not drawn or name in drawn]
         strata = {n: [100 * self.regrets(n, one) for one in scenarios] for n in cases}
         strata = {n: v for n, v in strata.items() if all(map(len, v)) and sum(map(len, v)) > 1}
         most = max((float(one.max()) for each in strata.values() for one in each), default=0.0)

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import fmpy
 import numpy as np
 import pytest
+from fmpy.validation import validate_fmu
 from lxml import etree
 
 import fmus
@@ -235,11 +236,13 @@ def test_a_plant_of_ones_own(version):
 @pytest.mark.usefixtures("quickly_built")
 def test_an_exported_controller_and_its_loop(tmp_path):
     scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})
-    system = sampled_controller(rti_controller("naive", scenario), scenario, {"X2": "%"})
+    controller = rti_controller("naive", scenario, ("X1",))
+    system = sampled_controller(controller, scenario, {"X2": "%"}, ("X1",))
     for version in (2, 3):
         fmu = build_sampled(system, tmp_path / f"c{version}.fmu", version)
         assert len(hold_archive(fmu, FMI[version] | BUILD)) == version
+        assert validate_fmu(str(fmu)) == []
     for version, plant in ((2, "evaporator"), (2, "evaporator_fmi3"), (3, "evaporator")):
         either = scenario.replace({"plant": {"fmu": plant}})
-        loop = write_loop(tmp_path / f"c{version}.fmu", either, 3, tmp_path / "loop.ssp")
+        loop = write_loop(tmp_path / f"c{version}.fmu", either, 3, tmp_path / "loop.ssp", ("X1",))
         assert len(hold_archive(loop, SSP[1 if (version, plant) == (2, "evaporator") else 2])) == 2

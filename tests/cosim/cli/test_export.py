@@ -278,7 +278,7 @@ def test_other_masters_run_the_ssp_with_an_error_of_first_order_in_their_step(
     [
         (["converged", "--out", "c.fmu"], "is no RTI-NMPC and cannot be exported"),
         (["nothing.toml", "--out", "c.fmu"], "nothing.toml' does not exist"),
-        (["naive", "--out", "c.fmu", "--measured", "UA2"], "has no disturbance 'UA2' to measure"),
+        (["naive", "--out", "c.fmu", "--measured", "UA2"], "has not all of UA2 to measure"),
         (["naive", "--out", "no/such/folder/c.fmu", "--local"], "no/such/folder"),
     ],
 )

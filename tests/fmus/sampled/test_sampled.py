@@ -8,14 +8,9 @@ from pathlib import Path
 import fmpy
 import pytest
 from fmpy.fmi1 import FMICallException
-from fmpy.validation import validate_fmu
 
 from fmus import evaporator
 from fmus.sampled import SampledSystem, build_sampled, sampled_sources
-
-
-def test_the_model_description_is_valid(built: tuple[int, Path]) -> None:
-    assert validate_fmu(str(built[1])) == []
 
 
 def test_a_rebuild_repeats_its_bytes(

@@ -16,7 +16,8 @@ import numpy as np
 
 from controllers import OptimalPolicy, factories
 from controllers import optimum as store
-from controllers.dynamic_programming import SEARCH, Figure, PlantProblem, Settings, objection
+from controllers.dynamic_programming import SEARCH, Figure, Settings, objection
+from controllers.problem import PlantProblem
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 from cosim.simulation import indicators_of

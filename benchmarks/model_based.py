@@ -16,7 +16,7 @@ import numpy as np
 
 from controllers import compile_functions
 from controllers.factories import nmpc, optimal
-from controllers.optimum import stored
+from controllers.optimum import stored_optimum
 from cosim.plant import FmuPlant
 from cosim.protocols import Controller
 from cosim.scenario import Scenario
@@ -80,7 +80,7 @@ def main() -> None:
                 continue
             now = scenario.at(number * scenario.sampling_time)
             if now.hash not in best:
-                known = stored(now) is not None
+                known = stored_optimum(now) is not None
                 best[now.hash] = greedy(now, optimal(now)) if known else float("nan")
             judged.theta = loop.parameters.theta
             J = greedy(now, judged)

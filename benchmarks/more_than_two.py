@@ -16,11 +16,12 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import minimize
 
-from controllers.dynamic_programming import PlantProblem, accurate_substeps
+from controllers.dynamic_programming import accurate_substeps
 from controllers.export.core import core
 from controllers.factories import tuned
 from controllers.functions import c_source, library
 from controllers.model import discretise, economic_cost
+from controllers.problem import PlantProblem
 from controllers.theta import Parameters, ThetaBlocks
 from cosim import Scenario
 

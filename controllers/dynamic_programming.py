@@ -1,232 +1,29 @@
-"""Dynamic programming on a state grid: interpolation, the Bellman operator, policy iteration."""
+"""Dynamic programming on a state grid: the Bellman operator, policy iteration, the certificate."""
 
 from __future__ import annotations
 
 import itertools
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controllers.errors import ModelError, OptimumError
+from controllers.grid import Grid, graded_axis
 from controllers.model import discretise, economic_cost
-from controllers.problem import Problem, load_model
-from cosim.protocols import Array, Vector
-from cosim.scenario import Scenario
+from controllers.problem import DisturbanceLaw, PlantProblem, Problem
+from cosim.protocols import Array
 
 # A stored optimum is read without SciPy, which takes longer to load than the optimum.
 if TYPE_CHECKING:
     from scipy import sparse
-
-Indices = NDArray[np.intp]
-
-
-POINTS = 4
-
-
-@dataclass(frozen=True)
-class AxisInterpolant:
-    """The polynomials through the points of an axis, one a cell.
-
-    In cell c, x = axis[c] + t, the weight of point `first`[c] + j is Σ_i `weights`[i, j, c] tⁱ,
-    `weights` (powers, stencil points, cells).
-    """
-
-    axis: Array
-    first: Indices
-    weights: Array
-
-    def locate(self, x: Array) -> tuple[Indices, Array]:
-        """Cells of coordinates and offsets in them; outside the axis, those of its ends."""
-        inside = np.clip(x, self.axis[0], self.axis[-1])
-        cell = np.searchsorted(self.axis[1:-1], inside, side="right")
-        return cell, inside - self.axis[cell]
-
-
-def axis_interpolant(axis: Array, smooth: tuple[float, float] | None) -> AxisInterpolant:
-    """Cubic through four points in the cells that lie within `smooth`, linear in the others.
-
-    The cubic of a cell runs through its two ends and the next point on either side; at an end of
-    the cubic cells through the four points nearest to it that they have, so that none reaches
-    out to where there may be a kink. Fewer than four points within `smooth` leave all linear.
-    """
-    cells = np.arange(len(axis) - 1)
-    lower, upper = smooth or (np.inf, -np.inf)
-    tolerance = 1e-9 * (axis[-1] - axis[0])
-    cubic = (axis[:-1] >= lower - tolerance) & (axis[1:] <= upper + tolerance)
-    count = POINTS if cubic.sum() >= POINTS - 1 else 2
-    first = np.clip(cells - (count // 2 - 1), 0, len(axis) - count)
-    if count == POINTS:
-        within = np.flatnonzero(cubic)
-        first[cubic] = np.clip(first[cubic], within[0], within[-1] + 2 - POINTS)
-    weights = np.zeros((count, count, len(cells)))
-    for c in cells:
-        start, points = (first[c], POINTS) if count == POINTS and cubic[c] else (c, 2)
-        for j in range(start, start + points):
-            polynomial = np.ones(1)
-            for k in range(start, start + points):
-                if k != j:
-                    step = axis[j] - axis[k]
-                    polynomial = np.convolve(polynomial, [(axis[c] - axis[k]) / step, 1 / step])
-            weights[: len(polynomial), j - first[c], c] = polynomial
-    return AxisInterpolant(axis, first, weights)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """The product of increasing axes, one per state, at least two points each.
-
-    `smooth` has an interval per state within which interpolation is cubic; elsewhere, and without
-    it, it is multilinear. Weights sum to one; multilinear ones are non-negative, too: they make the
-    programme that of a Markov chain. A state outside is moved to the nearest state of the box.
-    """
-
-    axes: tuple[Array, ...]
-    smooth: tuple[tuple[float, float], ...] | None = None
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of points per state."""
-        return tuple(len(axis) for axis in self.axes)
-
-    @property
-    def size(self) -> int:
-        """Number of grid states G."""
-        return int(np.prod(self.shape))
-
-    @cached_property
-    def points(self) -> Array:
-        """Grid states, shape (G, n), the last state running fastest."""
-        mesh = np.meshgrid(*self.axes, indexing="ij")
-        return np.stack([axis.reshape(-1) for axis in mesh], axis=1)
-
-    @cached_property
-    def boundary(self) -> NDArray[np.bool_]:
-        """Which grid states lie on the edge of the box, shape (G,)."""
-        on_edge = np.zeros(self.size, dtype=bool)
-        for axis, column in zip(self.axes, self.points.T, strict=True):
-            on_edge |= (column == axis[0]) | (column == axis[-1])
-        return on_edge
-
-    def nearest(self, state: Sequence[float] | Array) -> int:
-        """Index of the grid state nearest to `state` in each coordinate."""
-        index = [int(np.abs(axis - x).argmin()) for axis, x in zip(self.axes, state, strict=True)]
-        return int(np.ravel_multi_index(index, self.shape))
-
-    def weights(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
-        """Grid indices and weights of interpolation at states given as one array per entry."""
-        positions, factors = [], []
-        strides = np.cumprod((1, *self.shape[:0:-1]))[::-1]
-        for interpolant, stride, values in zip(self._interpolants, strides, x, strict=True):
-            cell, offset = interpolant.locate(values)
-            start = interpolant.first[cell]
-            points = interpolant.weights.shape[1]
-            positions.append([stride * (start + j) for j in range(points)])
-            factors.append(
-                [_horner(interpolant.weights[:, j], cell, [offset]) for j in range(points)]
-            )
-        result = []
-        for stencil in itertools.product(*(range(len(row)) for row in positions)):
-            index, weight = np.zeros((), dtype=np.intp), np.ones(())
-            for position, factor, j in zip(positions, factors, stencil, strict=True):
-                index, weight = index + position[j], weight * factor[j]
-            result.append((index, weight))
-        return result
-
-    def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
-        """Function that interpolates `values` (G,) at states given as one array per entry."""
-        table = values.reshape(self.shape)
-        for interpolant in self._interpolants:
-            stencil = interpolant.first + np.arange(interpolant.weights.shape[1])[:, None]
-            # The first axis becomes (power, cell), and both go last.
-            table = np.einsum("ijc,jc...->...ic", interpolant.weights, table[stencil])
-        n = len(self.axes)
-        table = table.transpose(*range(0, 2 * n, 2), *range(1, 2 * n, 2))
-        table = np.ascontiguousarray(table.reshape(*table.shape[:n], -1))
-
-        def function(x: Sequence[Array]) -> Array:
-            index: Indices = np.zeros((), dtype=np.intp)
-            offsets = []
-            for interpolant, entry in zip(self._interpolants, x, strict=True):
-                cell, offset = interpolant.locate(entry)
-                index = index * (len(interpolant.axis) - 1) + cell
-                offsets.append(offset)
-            return _horner(table, index, offsets)
-
-        return function
-
-    @cached_property
-    def _interpolants(self) -> list[AxisInterpolant]:
-        smooth = self.smooth or (None,) * len(self.axes)
-        return [axis_interpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
-
-    def resample(self, values: Array, other: Grid) -> Array:
-        """Values (G, k), interpolated multilinearly at the states of another grid."""
-        x, linear = list(other.points.T), Grid(self.axes)
-        return np.stack([linear.interpolant(column)(x) for column in values.T], axis=1)
-
-
-def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
-    if not offsets:
-        return np.asarray(table[index])
-    first, *rest = offsets
-    total = _horner(table[-1], index, rest)
-    for part in table[-2::-1]:
-        total = total * first + _horner(part, index, rest)
-    return total
-
-
-@dataclass(frozen=True)
-class DisturbanceLaw:
-    """Independent disturbances, drawn anew each sample and held over it.
-
-    `uniform`: `nominal` ± `ranges`; `normal`: mean `nominal`, standard deviations `ranges`; `none`:
-    always nominal. Both arrays have shape (n_d,).
-    """
-
-    kind: Literal["uniform", "normal", "none"]
-    nominal: Array
-    ranges: Array
-
-    @property
-    def deterministic(self) -> bool:
-        """Whether the disturbances never leave their nominal values."""
-        return self.kind == "none" or not self.ranges.any()
-
-    def draw(self, generator: np.random.Generator, count: int) -> Array:
-        """Draw `count` independent disturbances, shape (count, n_d)."""
-        size = (count, len(self.nominal))
-        if self.kind == "uniform":
-            return self.nominal + self.ranges * generator.uniform(-1.0, 1.0, size)
-        if self.kind == "normal":
-            return self.nominal + self.ranges * generator.standard_normal(size)
-        return np.tile(self.nominal, (count, 1))
-
-    def rule(self, counts: tuple[int, ...]) -> ProductRule:
-        """Gauss rule with the given number of nodes per disturbance.
-
-        Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one; a disturbance that
-        does not vary takes one node. Exact for polynomials of degree 2·count−1 in each.
-        """
-        axes, weights = [], np.ones(1)
-        for count, nominal, spread in zip(counts, self.nominal, self.ranges, strict=True):
-            if self.kind == "none" or spread == 0:
-                x, w = np.zeros(1), np.ones(1)
-            elif self.kind == "uniform":
-                x, w = np.polynomial.legendre.leggauss(count)
-            else:
-                x, w = np.polynomial.hermite_e.hermegauss(count)
-            axes.append(nominal + spread * x)
-            weights = np.multiply.outer(weights, w / w.sum()).reshape(-1)
-        mesh = [axis.reshape(-1) for axis in np.meshgrid(*axes, indexing="ij")]
-        return ProductRule(axes, np.stack(mesh, axis=1) if mesh else np.zeros((1, 0)), weights)
 
 
 class ProductRule(NamedTuple):
@@ -241,12 +38,28 @@ class ProductRule(NamedTuple):
     weights: Array
 
 
-class Refinement:
-    """Values at one product rule's nodes carried to another's by polynomial interpolation.
+def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> ProductRule:
+    """Gauss rule with the given number of nodes per disturbance.
 
-    A smooth function known at few Gauss nodes is known everywhere to spectral accuracy; what is
-    not smooth is then applied on the finer rule without evaluating the function anew.
+    Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one; a disturbance that
+    does not vary takes one node. Exact for polynomials of degree 2·count−1 in each.
     """
+    axes, weights = [], np.ones(1)
+    for count, nominal, spread in zip(counts, law.nominal, law.ranges, strict=True):
+        if law.kind == "none" or spread == 0:
+            x, w = np.zeros(1), np.ones(1)
+        elif law.kind == "uniform":
+            x, w = np.polynomial.legendre.leggauss(count)
+        else:
+            x, w = np.polynomial.hermite_e.hermegauss(count)
+        axes.append(nominal + spread * x)
+        weights = np.multiply.outer(weights, w / w.sum()).reshape(-1)
+    mesh = [axis.reshape(-1) for axis in np.meshgrid(*axes, indexing="ij")]
+    return ProductRule(axes, np.stack(mesh, axis=1) if mesh else np.zeros((1, 0)), weights)
+
+
+class Refinement:
+    """Polynomial interpolation of a smooth function from one product rule's nodes to another's."""
 
     def __init__(self, coarse: ProductRule, fine: ProductRule) -> None:
         self.weights = fine.weights
@@ -279,59 +92,6 @@ def lagrange_matrix(nodes: ArrayLike, targets: ArrayLike) -> Array:
             if k != j:
                 matrix[:, j] *= (t - x[k]) / (x[j] - x[k])
     return matrix
-
-
-MEND = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
-
-
-@dataclass(frozen=True)
-class PlantProblem:
-    """The control problem with the plant's own model, and what is random in it.
-
-    `parameters` (n_p,) are the plant's physical ones.
-    """
-
-    problem: Problem
-    law: DisturbanceLaw
-    parameters: Vector
-
-    @classmethod
-    def from_scenario(
-        cls, scenario: Scenario, overrides: Mapping[str, float | None] | None = None
-    ) -> PlantProblem:
-        """What a scenario says of its plant; `overrides` replaces plant parameters by name.
-
-        One that is overridden by None is left out. The plant's model is `plant.model`, where the
-        scenario names one, else the controller's. Raises OptimumError where it does not fit the
-        plant, ModelError where it cannot be loaded.
-        """
-        problem = Problem.from_scenario(scenario)
-        plant, table = scenario.plant, scenario.disturbance
-        if plant.model is not None:
-            problem = replace(problem, model=load_model(plant.model))
-        model, needed = problem.model, "the optimum needs a model of the plant"
-        for kind in ("states", "actions", "disturbances"):
-            ours = [quantity.name for quantity in getattr(model, kind)]
-            if ours != (theirs := list(getattr(plant, kind))):
-                raise OptimumError(
-                    f"{needed}: model '{model.name}' has the {kind} {', '.join(ours)}, the plant "
-                    f"{', '.join(theirs)}; {MEND}"
-                )
-        nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
-        ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
-        parameters = {quantity.name: quantity.nominal for quantity in model.parameters}
-        for name, value in {**plant.parameters, **(overrides or {})}.items():
-            if value is None:
-                continue
-            if name not in parameters:
-                raise OptimumError(
-                    f"{needed}: plant.parameters sets '{name}', which model '{model.name}' does "
-                    f"not have: give the model that parameter, {MEND}, or, where it only shapes "
-                    "the noise, name it in plant.mapping.ranges and set disturbance.ranges"
-                )
-            parameters[name] = value
-        law = DisturbanceLaw(table.law, nominal, ranges)
-        return cls(problem, law, np.array([*parameters.values()], dtype=np.float64))
 
 
 _OPERATIONS: dict[int, Callable[..., Any]] = {
@@ -370,12 +130,11 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
 
 
 class Elementwise:
-    """An SX function f(x, u, …) → y that takes and returns lists of arrays, broadcast as usual.
+    """An SX function f(x, u, …) → y over arrays that broadcast.
 
     Each argument is a sequence with one array per scalar entry; the result is the list of the
-    first output's entries. CasADi's own `map` runs one interpreter pass per point; here each
-    operation runs over all points, five to ten times faster on large arrays. Raises ModelError
-    on an operation that has no NumPy counterpart here.
+    first output's entries. Five to ten times faster on large arrays than CasADi's `map`. Raises
+    ModelError on an operation that has no NumPy counterpart here.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -469,10 +228,10 @@ class BellmanOperator:
         )
         self._cost = Elementwise(economic_cost(problem.model))
         self._parameters = plant.parameters
-        rule = law.rule(accuracy.nodes)
+        rule = gauss_rule(law, accuracy.nodes)
         self._weights = rule.weights
         self._disturbance = [rule.nodes[None, :, i] for i in range(rule.nodes.shape[1])]
-        self._refine = Refinement(rule, law.rule(accuracy.penalty_nodes))
+        self._refine = Refinement(rule, gauss_rule(law, accuracy.penalty_nodes))
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
 
     def deviation(self, state: Array, action: Array) -> Array:
@@ -626,10 +385,6 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     )
 
 
-Feature = tuple[float, float, float]
-"""First and last point of an interval of an axis, and the width that its cells shall not exceed."""
-
-
 def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) -> Grid:
     """Grid over all states within the bounds and a tenth beyond.
 
@@ -696,26 +451,6 @@ def finer_grid(
         # Beyond a bound the value has kinks wherever one more sample is needed to return.
         intervals.append((max(first, problem.state_lower[i]), min(last, problem.state_upper[i])))
     return Grid(tuple(axes), tuple(intervals) if smooth else None)
-
-
-def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: float) -> Array:
-    """Axis through all `marks`, dense at features, each cell outwards about `growth` times wider.
-
-    The width of a cell at x is the least over the features of spacing + (growth − 1)·distance.
-    """
-    parts = []
-    for lower, upper in pairwise(marks):
-        fine = np.linspace(lower, upper, 4001)
-        middle = 0.5 * (fine[1:] + fine[:-1])
-        width = np.full(len(middle), upper - lower)
-        for first, last, spacing in features:
-            distance = np.maximum(np.maximum(first - middle, middle - last), 0.0)
-            np.minimum(width, spacing + (growth - 1.0) * distance, out=width)
-        count = np.append(0.0, np.cumsum(np.diff(fine) / width))
-        cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
-        inner = np.interp(np.arange(1, cells) * (count[-1] / cells), count, fine)
-        parts.append(np.concatenate([[lower], inner]))
-    return np.concatenate([*parts, [marks[-1]]])
 
 
 Rows = NDArray[np.intp]

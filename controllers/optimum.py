@@ -10,7 +10,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from math import isfinite, modf
+from math import isfinite, modf, prod
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +22,15 @@ from controllers.dynamic_programming import (
     Accuracy,
     BellmanOperator,
     Figure,
-    Grid,
     Optimum,
-    PlantProblem,
     Progress,
     Settings,
     solve,
 )
 from controllers.errors import ModelError, OptimumError, QpError
+from controllers.grid import Grid
 from controllers.model import Model
-from controllers.problem import VECTORS, load_model
+from controllers.problem import VECTORS, PlantProblem, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
 from cosim.protocols import Decision, Vector
 from cosim.scenario import Scenario
@@ -160,7 +159,8 @@ class OptimalPolicy:
         self.problem, self.optimum = plant.problem, optimum
         self._plant = plant
         self._axes = [axis.tolist() for axis in optimum.grid.axes]
-        self._strides = [int(np.prod(optimum.grid.shape[i + 1 :])) for i in range(len(self._axes))]
+        sizes = [len(axis) for axis in self._axes]
+        self._strides = [prod(sizes[i + 1 :]) for i in range(len(sizes))]
         self._table = np.column_stack([optimum.actions, optimum.W]).tolist()
         self._corners = [
             (corner, sum(s for s, high in zip(self._strides, corner, strict=True) if high))
@@ -185,23 +185,6 @@ class OptimalPolicy:
         key = optimum_key(plant, Settings())
         path = stored_file(key) or keep(key, solve(plant, progress=progress))
         return cls(plant, read_optimum(path, key))
-
-    @classmethod
-    def stored(
-        cls, scenario: Scenario, *, overrides: Mapping[str, float | None] | None = None
-    ) -> OptimalPolicy | None:
-        """Optimal policy of a scenario if its solution is shipped or cached, else None.
-
-        None too where the scenario is none that could be solved. Raises OptimumError on a damaged
-        file.
-        """
-        try:
-            plant = PlantProblem.from_scenario(scenario, overrides)
-        except (ModelError, OptimumError):
-            return None
-        key = optimum_key(plant, Settings())
-        path = stored_file(key)
-        return None if path is None else cls(plant, read_optimum(path, key))
 
     @property
     def gain(self) -> float:
@@ -420,15 +403,6 @@ class QuasiStaticPolicy:
         ]
         return cls(law, policies, scenario.sampling_time)
 
-    @classmethod
-    def stored(cls, scenario: Scenario) -> QuasiStaticPolicy | None:
-        """Policy of a changing scenario if all of its optima are stored, else None."""
-        law = change_of(scenario)
-        assert law is not None
-        found = [OptimalPolicy.stored(scenario, overrides=plant) for plant in law.plants]
-        policies = [policy for policy in found if policy is not None]
-        return cls(law, policies, scenario.sampling_time) if len(policies) == len(found) else None
-
     @property
     def gains(self) -> list[tuple[Mapping[str, float | None], float]]:
         """(plant parameters, J* of that plant), in the order of the law's plants."""
@@ -478,17 +452,21 @@ def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
     return kind.from_scenario(scenario)
 
 
-def stored(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy | None:
-    """The stored solution if it is complete, else None; solves nothing."""
-    return (OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy).stored(scenario)
-
-
 def stored_optimum(scenario: Scenario) -> str | None:
-    """`optimal` where it is the plant's optimum and can be had without solving anything.
+    """`optimal` where that is the plant's optimum and all of it is shipped or cached, else None.
 
     A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
     scenario names the plant's own model.
     """
     if scenario.plant.foreign and scenario.plant.model is None:
         return None
-    return None if stored(scenario) is None else "optimal"
+    law = change_of(scenario)
+    try:
+        plants = [
+            PlantProblem.from_scenario(scenario, parameters)
+            for parameters in ([None] if law is None else law.plants)
+        ]
+    except (ModelError, OptimumError):
+        return None
+    stored = all(stored_file(optimum_key(plant, Settings())) for plant in plants)
+    return "optimal" if stored else None

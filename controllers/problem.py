@@ -1,20 +1,22 @@
-"""What a controller is told of its task: model, horizon, bounds, penalty, and its own units."""
+"""The task that a controller is given, in its own units; and the same with the plant's model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import casadi as ca
 import daqp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.errors import ModelError
+from controllers.errors import ModelError, OptimumError
 from controllers.model import Model
 from controllers.qp import FIXED, MEANING, SETTINGS
 from cosim.plugins import blamed, load_plugin
-from cosim.protocols import Vector
+from cosim.protocols import Matrix, Vector
 from cosim.scenario import Penalty, Scenario
 
 Mask = NDArray[np.bool_]
@@ -253,3 +255,82 @@ def load_model(name: str | None) -> Model:
     if not isinstance(model, Model):
         raise ModelError(f"model '{name}' returned {type(model).__name__}, not a controllers.Model")
     return model
+
+
+@dataclass(frozen=True)
+class DisturbanceLaw:
+    """Independent disturbances, drawn anew each sample and held over it.
+
+    `uniform`: `nominal` ± `ranges`; `normal`: mean `nominal`, standard deviations `ranges`; `none`:
+    always nominal. Both arrays have shape (n_d,).
+    """
+
+    kind: Literal["uniform", "normal", "none"]
+    nominal: Vector
+    ranges: Vector
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether the disturbances never leave their nominal values."""
+        return self.kind == "none" or not self.ranges.any()
+
+    def draw(self, generator: np.random.Generator, count: int) -> Matrix:
+        """Draw `count` independent disturbances, shape (count, n_d)."""
+        size = (count, len(self.nominal))
+        if self.kind == "uniform":
+            return self.nominal + self.ranges * generator.uniform(-1.0, 1.0, size)
+        if self.kind == "normal":
+            return self.nominal + self.ranges * generator.standard_normal(size)
+        return np.tile(self.nominal, (count, 1))
+
+
+MEND = 'name the plant\'s own model as model = "module:factory" in the table [plant]'
+
+
+@dataclass(frozen=True)
+class PlantProblem:
+    """The control problem with the plant's own model, and what is random in it.
+
+    `parameters` (n_p,) are the plant's physical ones.
+    """
+
+    problem: Problem
+    law: DisturbanceLaw
+    parameters: Vector
+
+    @classmethod
+    def from_scenario(
+        cls, scenario: Scenario, overrides: Mapping[str, float | None] | None = None
+    ) -> PlantProblem:
+        """The problem of a scenario; `overrides` replaces plant parameters by name, None omits one.
+
+        The plant's model is `plant.model`, else the controller's. Raises OptimumError where it does
+        not fit the plant, ModelError where it cannot be loaded.
+        """
+        problem = Problem.from_scenario(scenario)
+        plant, table = scenario.plant, scenario.disturbance
+        if plant.model is not None:
+            problem = replace(problem, model=load_model(plant.model))
+        model, needed = problem.model, "the optimum needs a model of the plant"
+        for kind in ("states", "actions", "disturbances"):
+            ours = [quantity.name for quantity in getattr(model, kind)]
+            if ours != (theirs := list(getattr(plant, kind))):
+                raise OptimumError(
+                    f"{needed}: model '{model.name}' has the {kind} {', '.join(ours)}, the plant "
+                    f"{', '.join(theirs)}; {MEND}"
+                )
+        nominal = np.array(table.nominal if len(table.nominal) else model.nominal_disturbance)
+        ranges = np.array(table.ranges if len(table.ranges) else np.zeros(len(nominal)))
+        parameters = {quantity.name: quantity.nominal for quantity in model.parameters}
+        for name, value in {**plant.parameters, **(overrides or {})}.items():
+            if value is None:
+                continue
+            if name not in parameters:
+                raise OptimumError(
+                    f"{needed}: plant.parameters sets '{name}', which model '{model.name}' does "
+                    f"not have: give the model that parameter, {MEND}, or, where it only shapes "
+                    "the noise, name it in plant.mapping.ranges and set disturbance.ranges"
+                )
+            parameters[name] = value
+        law = DisturbanceLaw(table.law, nominal, ranges)
+        return cls(problem, law, np.array([*parameters.values()], dtype=np.float64))

@@ -1,8 +1,8 @@
 """The search: a simulator decides which θ is kept, with or without a learning rule.
 
-`SearchPlan` says what to try next, and which of two θ is the better one: a generator that yields
-what the plant shall be run for (`Learn`, `Settle`, `Trial`) and is sent what came of it (`Learned`,
-`Block`); it knows no plant, controller or rule. `Search` carries it out as an algorithm.
+`SearchPlan` decides what to try next. It is a generator that yields requests (`Learn`, `Settle`,
+`Trial`), is sent results (`Learned`, `Block`), and knows no plant, controller or rule. `Search`
+carries the requests out as an algorithm.
 """
 
 from __future__ import annotations
@@ -47,18 +47,17 @@ RULE_DEFAULTS = {
 CANDIDATES = 3
 """θ of a phase of learning that are compared, at equal distances in samples."""
 SENSITIVITIES = 100
-"""Policy Jacobians, at most, that the metric of a block is the mean of."""
+"""Largest number of policy Jacobians in the metric of a block."""
 LATEST = 1000
 """Samples of a phase of learning whose prediction errors are kept."""
 ROUNDING = 1e-9
-"""Share of a cost that the solver's last digits may make of moves that the policy does not feel."""
+"""Share of a cost that counts as rounding."""
 
 
 class Learn(NamedTuple):
     """Let the rule learn from θ (n_θ,) for some samples.
 
-    A rule that `goes_on` keeps what it has learnt so far; a new one has a prior or trust region
-    `width` times as wide as the configured one.
+    It `goes_on` with what it knows, or is new, its prior or trust region times `width`.
     """
 
     theta: Vector
@@ -68,9 +67,9 @@ class Learn(NamedTuple):
 
 
 class Settle(NamedTuple):
-    """Run θ (n_θ,) greedily for a block, and remember the plant as it is then.
+    """Run θ (n_θ,) greedily for a block, then take a snapshot of the plant.
 
-    With `episode` the plant is reset first, and this is the seed of its noise.
+    The plant is reset before, where `episode` gives the seed of its noise.
     """
 
     theta: Vector
@@ -78,9 +77,9 @@ class Settle(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """Run θ (n_θ,) greedily for a block, from the remembered plant or on from the last block.
+    """Run θ (n_θ,) greedily for a block, from the snapshot (`begins`) or on from the last block.
 
-    The remembered plant includes its noise to come. `sensitive` asks for dπ/dθ.
+    The snapshot includes the noise to come. `sensitive` asks for dπ/dθ.
     """
 
     theta: Vector
@@ -89,10 +88,9 @@ class Trial(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What a phase of learning gives.
+    """Result of `Learn`: `candidates` (K, n_θ), the last one where it ended.
 
-    `candidates` (K, n_θ), the last is where it ended; `errors` (M, n) one-step prediction errors;
-    `state_deviation` and `error_deviation` (n,).
+    `errors` (M, n) are one-step prediction errors; `state_deviation` and `error_deviation` (n,).
     """
 
     candidates: Matrix
@@ -102,11 +100,11 @@ class Learned(NamedTuple):
 
 
 class Block(NamedTuple):
-    """What a block gives: mean `stage_cost` and `penalty` a sample, `predictions` f(s, a) (K, n).
+    """Result of `Settle` and `Trial`: mean `stage_cost` and `penalty` per sample.
 
-    `errors` (K, n) beside them are e = s₊ − f(s, a); `metric` is E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ) if it
-    was asked for, with Σ the exploration's variance. `expected` is the penalty that a
-    comparison expects of the predictions, None where it has not judged them yet.
+    `predictions` f(s, a) (K, n); `errors` s₊ − f(s, a) (K, n); `metric` E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ)
+    if asked for, with Σ the exploration's variance; `expected` the penalty expected of the
+    predictions, None before a comparison has computed it.
     """
 
     stage_cost: float
@@ -137,10 +135,10 @@ class Candidate:
 
     @property
     def costs(self) -> Vector:
-        """The dearer of the two readings, block by block: neither may flatter.
+        """The larger of both readings, block by block.
 
-        The realised penalty is rare spikes; the expected one is dear by what the errors depend on
-        the state, 10 to 20 a sample near the best back-off of `paper`.
+        The realised penalty is rare spikes. The expected one is too large where the errors depend
+        on the state, by 10 to 20 a sample near the best back-off of `paper`.
         """
         return np.maximum(self.realised, self.expected)
 
@@ -148,16 +146,15 @@ class Candidate:
 class PairedComparison:
     """Decides which of two θ is cheaper; counts the samples spent.
 
-    A round's comparisons begin at one state of the plant, with the same noise to come. The
-    `incumbent` is the best θ so far: it has won a comparison, or it is the start. Candidates are
-    compared with `base`. That is the incumbent, but for a line search about a θ that has not won
-    yet. `scenario` gives bounds and penalty, `samples` the budget, a comparison has up
-    to `blocks` blocks of `block` samples.
+    All comparisons of a round begin at one snapshot, with the same noise to come. The `incumbent`
+    has won a comparison, or is the start. Candidates are compared with `base`: the incumbent, or
+    the centre of a line search that has not won yet. `scenario` gives bounds and penalty,
+    `samples` the budget; a comparison has up to `blocks` blocks of `block` samples.
     """
 
     KEPT = ("_errors", "pooled")
     MEMORY = 6000
-    """Prediction errors over which a penalty is expected: the tail is what counts."""
+    """Prediction errors kept for expected penalties, whose tail counts."""
 
     def __init__(
         self, scenario: Scenario, start: Parameters, samples: int, *, block: int, blocks: int
@@ -210,7 +207,7 @@ class PairedComparison:
         self.remember(block.errors)
 
     def _expected(self, block: Block) -> float:
-        """Penalty expected of a block's predictions, its own where there is no pool yet."""
+        """Expected penalty of a block; the realised one where there is no pool yet."""
         if block.expected is not None:
             return block.expected
         if len(block.predictions) and len(self._pool):
@@ -219,10 +216,10 @@ class PairedComparison:
         return block.penalty
 
     def renew(self, blocks: int, episode: int | None = None) -> Generator[Request, Result, None]:
-        """Run the incumbent on from where the plant is, or in a new episode, on new noise."""
+        """Run the incumbent on new noise: on from where the plant is, or in a new episode."""
         self.spend(self.block)
         yield Settle(self.incumbent.theta, episode)
-        # One pool for the whole round, or two θ would not be judged alike.
+        # One pool for the whole round, so that all θ are judged alike.
         self.pooled = self._errors
         self.base = self.incumbent = Candidate(self.incumbent.theta)
         for _ in range(blocks):
@@ -232,8 +229,7 @@ class PairedComparison:
         """Whether θ takes the base's place: cheaper on the same noise by a standard error.
 
         Stops once θ's summed cost exceeds the base's; with `patient`, once the remaining blocks can
-        no longer make up for it. To win, θ must run all blocks: a slow state shows late what a
-        policy does to it.
+        no longer make up for it. A winner has run all blocks, since slow states show effects late.
         """
         costs = self.base.costs
         patience = _patience(costs) if patient else 0.0
@@ -262,11 +258,11 @@ class PairedComparison:
     def final(
         self, rivals: list[Vector], blocks: int, episode: int
     ) -> Generator[Request, Result, None]:
-        """Leave the cheapest of the incumbent and its rivals (n_θ,), each run over `blocks` blocks.
+        """Make the cheapest of the incumbent and its rivals (n_θ,) the incumbent.
 
-        In a new episode, so that no θ has to mend what another one left. A rival is given up where
-        its remaining blocks could no longer make good what it has lost. The start, if it lasts, is
-        left only for a θ that is cheaper by a standard error: the best of many is partly luck.
+        Each runs over `blocks` blocks of a new episode. A rival is given up once its remaining
+        blocks can no longer make up for its loss. The start is left only for a θ that is cheaper
+        by a standard error: the best of many is partly luck.
         """
         yield from self.renew(blocks, episode)
         costs = self.incumbent.costs
@@ -319,14 +315,14 @@ def _patience(costs: Vector) -> float:
 class SearchPlan:
     """Phases of learning, each followed by line searches on common noise (docs/method.md).
 
-    All comparisons of a round begin at the plant as it was when the round's learning ended, with
-    the same noise to come: slow states are where operation takes them. Where no learnt θ won,
+    A round's comparisons begin at the snapshot at the end of its learning. Where no learnt θ won,
     comparisons become twice as long and the next phase has half the width. Without a rule θ rests
-    in the phases of learning, which then only measure what the coordinates of the line searches
-    need (`prior_deviation`).
+    in the phases of learning, which then only measure the coordinates of the line searches
+    (`prior_deviation`).
 
     `scenario` gives bounds and penalty, `action_deviation` (m,) the exploration's σ, `samples` the
-    budget, `block` samples make a block, at most `blocks` of them a comparison, `phase` a phase.
+    budget, `block` the samples of a block, `blocks` those of a comparison, `phase` the samples of
+    a phase.
     """
 
     FINAL = 0.25
@@ -380,14 +376,14 @@ class SearchPlan:
             return
 
     def _rounds(self) -> Plan:
-        """Rounds without end; the samples are what ends them."""
+        """Rounds until the samples are used up."""
         comparison = self.comparison
         back_off, weights, reach = 1.0, -1.0, np.full(self.DIRECTIONS, 0.5)
         bounds = [0.5] * self._states
         width, number, better, rescaled, failed, rest = 1.0, 0, True, False, 0, 0
         while True:
             before = comparison.incumbent.theta
-            # What is left at the end may be too little to learn from, not to search with.
+            # At the end too few samples may be left for learning, not for a search.
             enough = (
                 comparison.limit - comparison.spent
                 >= self._phase + comparison.blocks * comparison.block
@@ -422,14 +418,14 @@ class SearchPlan:
                 self._past.append(before)
 
     def _renew(self) -> Plan:
-        """Run the incumbent on new noise, and compare the one before with it once more."""
+        """Run the incumbent on new noise, and compare its predecessor with it once more."""
         comparison, past = self.comparison, self._past[-1]
         yield from comparison.renew(comparison.blocks)
         if not np.array_equal(past, comparison.incumbent.theta):
             yield from comparison.compare(past, patient=True)
 
     def _learn(self, width: float, *, goes_on: bool) -> Step:
-        """Learn from the incumbent and compare what came of it, the latest θ first."""
+        """Learn from the incumbent, then compare the candidates, the latest first."""
         comparison = self.comparison
         comparison.spend(self._phase)
         learned = yield Learn(comparison.incumbent.theta, self._phase, width, goes_on)
@@ -523,7 +519,7 @@ class SearchPlan:
             found = True
 
     def _weighted(self, factor: float) -> Vector:
-        """The incumbent with its input weights multiplied, their minimum where it was, (n_θ,)."""
+        """The incumbent with its input weights times `factor`, the cost's minimum kept, (n_θ,)."""
         comparison = self.comparison
         parameters = self._start.with_theta(comparison.base.theta)
         hessian, gradient = parameters["B_l"], parameters["b_l"]
@@ -648,10 +644,9 @@ class EpisodeData:
 class Search(Algorithm):
     """An algorithm that runs a `SearchPlan`, with or without a learning rule.
 
-    `theta` is the incumbent: what the run hands over, while the controller carries the θ that is
-    being tried. The samples of learning and of comparisons are all the run's. A checkpoint keeps
-    the results that the plan was given, but for prediction errors that no longer count. `restore`
-    gives them to the plan once more, which is deterministic and so ends where it was.
+    `theta` is the incumbent; the controller carries the θ that is being tried. A checkpoint keeps
+    the results that the plan was given, without prediction errors that no longer count; `restore`
+    gives them to the deterministic plan once more.
     """
 
     Configuration = SearchConfiguration
@@ -703,7 +698,7 @@ class Search(Algorithm):
         return self._comparison.incumbent.theta
 
     def observe(self, transition: Transition) -> Update | None:
-        """Take one sample; the last of an episode begins the next one."""
+        """Take one sample; the last of a request begins the next one."""
         if self._request is None:
             return None
         update: Update | None = None
@@ -714,14 +709,14 @@ class Search(Algorithm):
         return self._next() if self._episode.done >= self._episode.length else update
 
     def failed(self, cost: float) -> Update | None:
-        """Count a sample at which the controller failed; its cost is the episode's."""
+        """Count a sample at which the controller failed, and its cost."""
         if self._request is None:
             return None
         self._episode.fail(cost)
         return self._next() if self._episode.done >= self._episode.length else None
 
     def _open(self) -> None:
-        """Make ready for the request that the plan has put."""
+        """Set θ, rule and data for the plan's request."""
         request, controller = self._request, self.controller
         controller.theta = self.theta if request is None else request.theta
         learns = isinstance(request, Learn)
@@ -736,15 +731,14 @@ class Search(Algorithm):
         self.needs_points = rule is not None and rule.needs_points
 
     def _learn(self, transition: Transition) -> Update | None:
-        """Let the rule have a sample."""
         if self._rule is None:
             self._episode.take(transition)
             return None
         try:
-            # To a new rule the run begins anew, its schedules with it.
+            # A new rule counts from 0: its schedules begin anew.
             update = self._rule.observe(transition._replace(number=self._learnt))
         except DivergenceError:
-            # The phase ends here; what it passed through before may still be good.
+            # The phase ends here; its earlier candidates may still be good.
             self._episode.length = self._episode.done + 1
             self._episode.take(transition)
             return None
@@ -753,7 +747,7 @@ class Search(Algorithm):
         return update
 
     def _next(self) -> Update:
-        """Give the plan what came of its request; begin the episode of the next one."""
+        """Send the plan its result; begin the next request."""
         old, answered = self.controller.theta, self._request
         self._advance(self._episode.result(self._model))
         theta, blocks = self.controller.theta, self.controller.parameters.blocks
@@ -779,7 +773,7 @@ class Search(Algorithm):
         self._open()
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Every result so far, the errors that count, the open episode's data, the rule's state."""
+        """Results so far, errors that count, the open request's data, the rule's state."""
         state = super().state() | {"results": np.array(len(self._results))}
         for k, result in enumerate(self._results):
             kept = {name: part for name, part in result._asdict().items() if part is not None}
@@ -787,7 +781,7 @@ class Search(Algorithm):
         return state
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave."""
+        """Restore what `state` returned."""
         theta = self.controller.theta
         for k in range(int(state["results"])):
             kept: dict[str, Any] = group(state, f"result {k} ")

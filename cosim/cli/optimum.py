@@ -66,14 +66,8 @@ def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Outp
 def _solve(task: Scenario, refine: bool, recompute: bool, out_: cli.Output) -> dict[str, Any]:
     """Solve or read the optimum, refine it if asked, print its tables; the JSON document."""
     from controllers import optimum as store
-    from controllers.dynamic_programming import (
-        Figure,
-        PlantProblem,
-        Settings,
-        certify,
-        objection,
-        solve,
-    )
+    from controllers.dynamic_programming import Figure, Settings, certify, objection, solve
+    from controllers.problem import PlantProblem
 
     plant, settings = PlantProblem.from_scenario(task), Settings()
     key = store.optimum_key(plant, settings)

@@ -6,15 +6,10 @@ import pytest
 import scipy.stats
 
 from controllers import OptimalPolicy, Quantity, evaporator, factories
-from controllers.dynamic_programming import (
-    BellmanOperator,
-    PlantProblem,
-    Settings,
-    objection,
-)
+from controllers.dynamic_programming import BellmanOperator, Settings, objection
 from controllers.errors import OptimumError
 from controllers.optimum import SHIPPED, optimum_key, read_optimum
-from controllers.problem import Problem
+from controllers.problem import PlantProblem, Problem
 from cosim import FmuPlant, Scenario, simulate
 
 PRESETS = ("paper", "fast-sampling", "nominal", "fouled", "mismatched")

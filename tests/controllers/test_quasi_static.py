@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controllers.errors import OptimumError
-from controllers.optimum import Fouling, QuasiStaticPolicy, change_of, stored
+from controllers.optimum import Fouling, QuasiStaticPolicy, change_of, optimal, stored_optimum
 from cosim import FmuPlant, Scenario
 
 
@@ -15,7 +15,7 @@ def drifting():
 
 @pytest.fixture(scope="module")
 def policy(drifting):
-    return QuasiStaticPolicy.stored(drifting)
+    return QuasiStaticPolicy.from_scenario(drifting)
 
 
 def test_the_law_of_fouling_is_the_fmus(drifting):
@@ -77,7 +77,7 @@ def test_the_policy_follows_the_clock_between_the_tables(policy):
 
 def test_a_plant_that_jumps_has_the_optimum_of_the_plant_as_it_is():
     jump = Scenario.load("jump")
-    policy, before, after = stored(jump), *(stored(Scenario.load(n)) for n in ("paper", "fouled"))
+    policy, before, after = map(optimal, (jump, Scenario.load("paper"), Scenario.load("fouled")))
     first, second = (change.time for change in jump.plant.changes)
     times = [0.0, first - 60.0, first, second - 60.0, second, 1e9]
     expected = [before.gain] * 2 + [after.gain] * 2 + [before.gain] * 2
@@ -101,6 +101,7 @@ def test_a_plant_cannot_foul_and_jump():
 
 def test_what_is_not_stored_is_not_had(tmp_path, monkeypatch):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    assert stored(Scenario.load("paper").replace({"plant": {"parameters": {"UA2": 6.5}}})) is None
+    other = Scenario.load("paper").replace({"plant": {"parameters": {"UA2": 6.5}}})
+    assert stored_optimum(other) is None
     slower = Scenario.load("drifting").replace({"plant": {"parameters": {"cleaning_period": 7.0}}})
-    assert stored(slower) is None
+    assert stored_optimum(slower) is None

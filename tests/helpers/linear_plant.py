@@ -5,7 +5,7 @@ import numpy as np
 import scipy.linalg
 
 from controllers import Model, Problem, Quantity
-from controllers.dynamic_programming import DisturbanceLaw, PlantProblem
+from controllers.problem import DisturbanceLaw, PlantProblem
 
 
 class LinearPlant:

@@ -6,7 +6,6 @@ from scipy import sparse
 
 from controllers.dynamic_programming import (
     Figure,
-    Grid,
     Settings,
     certify,
     evaluate_policy,
@@ -16,6 +15,7 @@ from controllers.dynamic_programming import (
     solve,
 )
 from controllers.errors import OptimumError
+from controllers.grid import Grid
 from tests.helpers.linear_plant import PLANE, SCALAR, LinearPlant
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from controllers import optimum as store
-from controllers.dynamic_programming import DisturbanceLaw, Figure, PlantProblem, Settings, solve
+from controllers.dynamic_programming import Figure, Settings, solve
 from controllers.errors import OptimumError
-from controllers.problem import Problem
+from controllers.problem import DisturbanceLaw, PlantProblem, Problem
 from cosim import Scenario
 from tests.helpers.linear_plant import SCALAR
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 class ProductRule(NamedTuple):
     """A product quadrature rule: E[g(d)] ≈ Σ_i weights_i g(nodes_i).
 
-    `axes` holds the nodes of each disturbance; `nodes` (q, n_d) all of them, the last disturbance
-    running fastest, and `weights` (q,) have the sum 1.
+    `axes` holds the nodes of each disturbance; `nodes` (q, n_d) their product, the last disturbance
+    fastest; `weights` (q,) sum to 1.
     """
 
     axes: list[Array]
@@ -41,8 +41,8 @@ class ProductRule(NamedTuple):
 def gauss_rule(law: DisturbanceLaw, counts: tuple[int, ...]) -> ProductRule:
     """Gauss rule with the given number of nodes per disturbance.
 
-    Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one; a disturbance that
-    does not vary takes one node. Exact for polynomials of degree 2·count−1 in each.
+    Gauss–Legendre for the uniform law, Gauss–Hermite for the normal one, one node for a disturbance
+    that does not vary. Exact for polynomials of degree 2·count−1 in each.
     """
     axes, weights = [], np.ones(1)
     for count, nominal, spread in zip(counts, law.nominal, law.ranges, strict=True):
@@ -175,17 +175,17 @@ class Elementwise:
 
 
 T = TypeVar("T")
-# Entries of an array, states × quadrature nodes, worked on at once: fewer leave two threads
-# waiting for the interpreter's lock between short operations, more leave the cores' caches.
+# Entries of an array (states × nodes) a task: fewer wait for the interpreter's lock, more do not
+# fit the cores' caches.
 _ENTRIES = 100_000
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How the stochastic plant is evaluated: integrator and quadrature.
+    """Integrator and quadrature of the stochastic plant.
 
-    `substeps` RK4 steps a sample; `nodes` Gauss nodes per disturbance for all that is smooth;
-    `penalty_nodes` for the expected penalty, whose kink lies where the policy operates.
+    `substeps` RK4 steps a sample; Gauss nodes per disturbance: `nodes` for smooth functions,
+    `penalty_nodes` for the penalty, which has a kink where the policy operates.
     """
 
     substeps: int
@@ -193,7 +193,7 @@ class Accuracy:
     penalty_nodes: tuple[int, ...]
 
     def draft(self) -> Accuracy:
-        """A quarter of the work, for a first grid whose only use is as a start."""
+        """A quarter of the work, for grids that only give a start."""
         return Accuracy(
             max(self.substeps // 2, 1),
             tuple(min(count, 5) for count in self.nodes),
@@ -201,9 +201,9 @@ class Accuracy:
         )
 
     def finer(self) -> Accuracy:
-        """Half the integration step, two more nodes a disturbance, half as many again for the kink.
+        """Half the integration step, two more `nodes`, half as many again `penalty_nodes`.
 
-        A disturbance that is integrated with one node keeps it.
+        A disturbance with one node keeps it.
         """
         return Accuracy(
             2 * self.substeps,
@@ -215,8 +215,8 @@ class Accuracy:
 class BellmanOperator:
     """Q(s, a) = E[ℓ(s, a, d) + penalty(s₊) + W(s₊)] with V = penalty + W.
 
-    The penalty's kink is known in closed form, so only the smooth W is interpolated. `workers`
-    threads share the blocks of states, whose results do not depend on their number.
+    Only the smooth W is interpolated; the penalty is exact. `workers` threads share the states;
+    results do not depend on their number.
     """
 
     def __init__(self, plant: PlantProblem, accuracy: Accuracy, *, workers: int = 1) -> None:
@@ -316,20 +316,20 @@ class BellmanOperator:
 
 
 def _mean(values: Array, weights: Array) -> Array:
-    """Weighted mean of each row, without BLAS, whose own threads would compete with the blocks'."""
+    """Weighted mean of each row, without BLAS, whose threads would compete with ours."""
     return np.asarray(np.einsum("bq,q->b", values, weights))
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How the problem is solved.
+    """Settings of the solver.
 
-    `level` 0 is a first grid over all states, each further level resolves the closed loop's support
+    `level` 0 is a first grid over all states. Each further level resolves the closed loop's support
     (all but `tail` of the samples at each end) with `cells`·2^level cells a state; cells beyond it
-    grow by `growth` each. `nodes` and `penalty_nodes` per disturbance, the influential ones first;
-    empty: 7 and 20 for the first two, 2 and 4 for the third, 2 and 2 for the others.
-    `integration_tolerance` on the sampled model, relative; `tolerance` on the distance of the
-    gain's bounds, relative, to be met within `rounds` policy iterations a grid.
+    grow by `growth` each. `nodes` and `penalty_nodes` are per disturbance; empty: 7 and 20 for the
+    first two, 2 and 4 for the third, 2 and 2 for the others. `integration_tolerance` of the sampled
+    model and `tolerance` of the distance of the gain's bounds are relative; the latter is to be met
+    within `rounds` policy iterations a grid.
     """
 
     level: int = 1
@@ -355,9 +355,9 @@ class Settings:
 def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
     """Least power of two of RK4 substeps whose doubling moves no next state by more than allowed.
 
-    Allowed is `tolerance`·(1 + |x|), tried at 2000 points: states within the first quarter of the
-    bounds' box around the reference, actions in their box, disturbances of the law. Raises
-    OptimumError where 128 substeps do not do.
+    Allowed is `tolerance`·(1 + |x|) at 2000 points: states within a quarter of the bounds' span of
+    the reference, actions in their box, disturbances of the law. Raises OptimumError where 128
+    substeps are too few.
     """
     problem, generator = plant.problem, np.random.default_rng(0)
     reach = 0.25 * (problem.state_upper - problem.state_lower)
@@ -388,8 +388,8 @@ def accurate_substeps(plant: PlantProblem, tolerance: float) -> int:
 def first_grid(problem: Problem, operator: BellmanOperator, settings: Settings) -> Grid:
     """Grid over all states within the bounds and a tenth beyond.
 
-    Its cells are half a standard deviation of one sample's disturbance wide at the reference and
-    at the bounds, where the optimal closed loop may live.
+    At the reference and at the bounds, where the optimal closed loop may live, its cells are half a
+    standard deviation of one sample's disturbance wide.
     """
     deviation = operator.deviation(problem.reference_state, problem.reference_action)
     axes = []
@@ -416,10 +416,9 @@ def finer_grid(
     """Grid that resolves the support of a policy's distribution with cells·2^level cells a state.
 
     At a bound that the closed loop touches the cells are 2^-level of the standard deviation of one
-    sample's disturbance, which alone smooths the penalty's kink in the value of a slow state. The
-    grid extends as far again beyond the support on either side, and at least a twentieth of the
-    bounds' span; without disturbance, where the support is a point, it keeps its box. `smooth`:
-    cubic interpolation within the support, else linear everywhere.
+    sample's disturbance, which alone smooths the penalty's kink. The grid extends beyond the
+    support by the support's width, and at least by a twentieth of the bounds' span; without
+    disturbance it keeps its box. `smooth`: cubic interpolation within the support.
     """
     problem = operator.problem
     span = problem.state_upper - problem.state_lower
@@ -448,7 +447,7 @@ def finer_grid(
         high = min(axis[-1], max(last, reference) + beyond)
         marks = [low, *(x for x in sorted({*bounds, reference}) if low < x < high), high]
         axes.append(graded_axis(marks, features, settings.growth))
-        # Beyond a bound the value has kinks wherever one more sample is needed to return.
+        # Beyond a bound the value has a kink wherever the return takes one more sample.
         intervals.append((max(first, problem.state_lower[i]), min(last, problem.state_upper[i])))
     return Grid(tuple(axes), tuple(intervals) if smooth else None)
 
@@ -472,9 +471,8 @@ def nelder_mead(
     `objective(rows, points)` evaluates functions `rows` (r,) at points (r, m); `start` (B, m);
     `size` (B, m) is the first simplex's edge; a function is done when its simplex's values lie
     within `precision` of each other. Returns minimisers (B, m) and values (B,), never worse than
-    the start. Nelder and Mead (1965), with projection on the box: the expected penalty of a nearly
-    deterministic plant has no derivative, and its valley is narrow and skew. SciPy's method
-    minimises one function at a time.
+    the start. Nelder and Mead (1965), projected on the box; SciPy's minimises one function at a
+    time. The expected penalty of a nearly deterministic plant has no derivative.
     """
     count, m = start.shape
     everyone = np.arange(count)
@@ -532,13 +530,13 @@ def scan(
     return best, values
 
 
-# Each sample starts anew at the anchor with this probability, so that a plant without disturbance,
-# which may come to rest in several places, still has one gain; it shifts J* by 1e-10 of itself.
+# Probability that a sample starts anew at the anchor: so a plant without disturbance, which may
+# come to rest in several places, has one gain. It shifts J* by 1e-10 of itself.
 _RESTART = 1e-9
 
 
 class Figure(NamedTuple):
-    """One way to J*: its value and the interval [lower, upper] that it is known to."""
+    """An estimate of J*: its value and interval [lower, upper]."""
 
     name: str
     value: float
@@ -548,13 +546,12 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True)
 class Optimum:
-    """A policy on a grid with its value; of a solved problem the optimal one, certified or not.
+    """A policy on a grid with its value, in the end the optimal one.
 
-    `actions` (G, m); `W` (G,) smooth part of the value, V = penalty + W, zero at the grid's anchor;
-    `gain` mean cost per sample of the policy, J* in the end; `distribution` (G,) the stationary
-    one; `lower` and `upper`, min and max over the grid of TW − W, enclose the optimal gain (Odoni,
-    1969). `certificate` holds what was compared with the gain (see `certify`), `step` (G, m) the
-    last change of the actions.
+    `actions` (G, m); `W` (G,) smooth part of the value, V = penalty + W, zero at the anchor;
+    `gain` mean cost per sample, in the end J*; `distribution` (G,) the stationary one. `lower` and
+    `upper`, min and max over the grid of TW − W, enclose the optimal gain (Odoni, 1969).
+    `certificate` is that of `certify`, `step` (G, m) the last change of the actions.
     """
 
     grid: Grid
@@ -613,9 +610,9 @@ def begin(operator: BellmanOperator, grid: Grid, actions: Array, share: float = 
 def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int) -> Optimum:
     """Improve the policy once and bound what is left to gain.
 
-    A local search in each state from its present action or, where one is better, from one of
-    `scan_points` actions per dimension over the box: `lower` is a bound as far as these find the
-    global minimum. Returns the improved actions with the value of the former ones and its bounds.
+    Each state has a local search from its present action or from a better one of `scan_points`
+    actions per dimension over the box; `lower` is a bound if that finds the global minimum.
+    Returns the improved actions with the value of the former ones and its bounds.
     """
     problem, grid = operator.problem, iterate.grid
     lower, upper = problem.action_lower, problem.action_upper
@@ -641,7 +638,7 @@ def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int
 
 
 Progress = Callable[[int, int, Optimum], None]
-"""Told the grid's level, the round on it and what it has led to."""
+"""Called with the grid's level, the round on it and its result."""
 
 
 TOLERANCE = 5e-4
@@ -651,7 +648,7 @@ SEARCH = "policy search"
 
 
 def objection(certificate: Sequence[Figure]) -> str | None:
-    """Reason why a certified solution may not be called J*, or None.
+    """Why a certified solution may not be called J*, or None.
 
     All figures but that of a policy search must agree within `TOLERANCE`.
     """
@@ -697,8 +694,8 @@ def solve(
     run = partial(_iterate, settings=settings, progress=progress)
     approach = partial(run, draft, scan_points=5, enough=_settled)
     level = 0
-    # Linear interpolation is monotone, so that it finds its way from anywhere, and it smears the
-    # closed loop over its cells, so that the support is known only once these are fine.
+    # Linear interpolation is monotone, so it converges from any start; it smears the closed loop
+    # over its cells, so the support is known only once these are fine.
     grids = [(1, False), *((k + 1, True) for k in range(settings.level))]
     for finer, smooth in grids if settings.level else ():
         iterate = approach(iterate, level)
@@ -782,9 +779,8 @@ def simulate_policy(
 ) -> tuple[float, float]:
     """Mean cost per sample of a solution's policy on the plant's model, and half its 95 % interval.
 
-    The policy is interpolated as the controller does it. Each path starts in a state drawn from the
-    solution's stationary distribution, and its first 300 samples are left out. The interval
-    is that of the mean of independent paths.
+    The policy is interpolated as in `OptimalPolicy`. Each of the independent paths starts in a
+    state drawn from the stationary distribution; its first 300 samples are left out.
     """
     generator, burn_in = np.random.default_rng(0), 300
     problem = plant.problem
@@ -819,13 +815,12 @@ def certify(
     steps: int = 5000,
     progress: Progress | None = None,
 ) -> Optimum:
-    """The refinement of a solution, which is nearer to J* and is what is kept, certified.
+    """A solution on the grid of the next level, with a certificate.
 
-    The certificate's figures are `solution`: the gain and its bounds on the grid; `refinement`: the
-    same on the grid of the next level; `quadrature`: on the solution's grid with more quadrature
-    nodes and half the integration step; `simulation`: the mean cost of the refinement's policy on
-    the plant's model, 95 %; and, where it is added, `policy search`: the best θ that a search
-    found, compared with that policy on the same noise. Raises OptimumError as `solve` does.
+    Its figures: `solution`, the gain and its bounds on the given grid; `refinement`, those on the
+    next level; `quadrature`, those on the given grid with the `finer` accuracy; `simulation`, the
+    mean cost of the refined policy on the plant's model, 95 %; where it is added, `policy search`,
+    the best θ that a search found, on the same noise. Raises OptimumError as `solve` does.
     """
     refined = refine(plant, settings, optimum, level=settings.level + 1, progress=progress)
     finer = refine(plant, settings, optimum, accuracy=optimum.accuracy.finer(), progress=progress)

@@ -155,7 +155,7 @@ class Grid:
         return [axis_interpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
 
     def resample(self, values: Array, other: Grid) -> Array:
-        """Values (G, k), interpolated multilinearly at the states of another grid."""
+        """Values (G, k) at the states of another grid, interpolated multilinearly."""
         x, linear = list(other.points.T), Grid(self.axes)
         return np.stack([linear.interpolant(column)(x) for column in values.T], axis=1)
 

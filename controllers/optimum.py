@@ -36,7 +36,7 @@ from cosim.protocols import Decision, Vector
 from cosim.scenario import Scenario
 
 VERSION = 2
-"""Part of every key: raise it when the solver changes what it finds."""
+"""Part of every key; to be raised when the solver's results change."""
 SHIPPED = Path(__file__).parent / "optima"
 DAY = 86400.0
 NODES = 6
@@ -49,11 +49,7 @@ FOULING = ("fouling_rate", "fouling_floor", "cleaning_period")
 
 
 def optimum_key(plant: PlantProblem, settings: Settings) -> str:
-    """First 16 hexadecimal digits of the SHA-256 of all that the solution depends on.
-
-    That is: the model's equations, physical parameters, sampling, bounds, penalty, reference,
-    the disturbance's law and the solver's settings.
-    """
+    """First 16 hexadecimal digits of the SHA-256 of all that the solution depends on."""
     problem, law, parameters = plant.problem, plant.law, plant.parameters
     symbols = problem.model.symbols()
     content: dict[str, Any] = {
@@ -92,7 +88,7 @@ def stored_file(key: str) -> Path | None:
 
 
 def keep(key: str, optimum: Optimum) -> Path:
-    """Keep a solved problem in the user's cache, or for this process where others can write it."""
+    """Keep a solved problem in the user's cache; returns its file."""
     return write_optimum(cache_folder("optima") / f"{key}.npz", optimum, key)
 
 
@@ -148,9 +144,8 @@ def read_optimum(path: Path, key: str) -> Optimum:
 class OptimalPolicy:
     """π* and V* = penalty + W of a problem under a disturbance law, from a solved grid.
 
-    V* is the differential value: the cost in excess of J* that a start in s brings, up to a
-    constant. Between grid states π* and W are interpolated multilinearly, which costs nothing that
-    can be measured; a state outside the grid's box is served by the nearest one inside.
+    V* is the differential value: the cost in excess of J* of a start in s, up to a constant. π* and
+    W are interpolated multilinearly; a state outside the grid's box is moved to the nearest inside.
     """
 
     name = "optimal"
@@ -175,11 +170,10 @@ class OptimalPolicy:
         overrides: Mapping[str, float | None] | None = None,
         progress: Progress | None = None,
     ) -> OptimalPolicy:
-        """Optimal policy of a scenario: shipped, cached, or solved now and then cached.
+        """Optimal policy of a scenario: shipped, cached, or solved now and cached.
 
-        The plant is the scenario's model of it with the physical parameters and the law that the
-        scenario sets; `overrides` replaces plant parameters by name. Raises OptimumError where
-        they are not the model's, or a stored file is damaged.
+        The plant is that of `PlantProblem.from_scenario`, whose errors are raised; OptimumError
+        also where a stored file is damaged.
         """
         plant = PlantProblem.from_scenario(scenario, overrides)
         key = optimum_key(plant, Settings())
@@ -200,8 +194,7 @@ class OptimalPolicy:
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
         """π*(s) and V*(s), or Q*(s, a) with `a`; s (n,), a (m,); `clamped` outside the grid.
 
-        Raises QpError, which a closed loop takes as a failure of the controller, where s or a is
-        not finite.
+        Raises QpError where s or a is not finite.
         """
         state: list[float] = np.asarray(s, dtype=np.float64).tolist()
         if len(state) != len(self._axes) or not isfinite(sum(state)):
@@ -261,9 +254,9 @@ class OptimalPolicy:
 class Fouling:
     """p(τ) = p_clean (floor + (1 − floor) e^(−rate·τ)), τ days since the last cleaning.
 
-    `parameter` names p, the one that the plant's model calls uncertain (the evaporator's heat
-    transfer); `clean` is its value after a cleaning, `rate` in 1/d, `floor` the share of p that
-    fouling leaves in the end, `period` of the cleaning in d.
+    `parameter` names p, the first that the plant's model calls uncertain; `clean` is its value
+    after a cleaning, `rate` is in 1/d, `floor` the share of p that fouling leaves, `period` of
+    the cleaning in d.
     """
 
     parameter: str
@@ -375,9 +368,9 @@ def _parameter(scenario: Scenario, model: Model, name: str) -> float:
 class QuasiStaticPolicy:
     """π*(s) of the plant as it is at the time; between the nodes of a law, linear in them.
 
-    It knows the law of the change and the clock, which starts with each `reset` and goes on by one
-    sample with each `prepare`. A reference, not a bound: it looks at no change to come, and for
-    a plant that changed infinitely slowly, or seldom, it would be the optimum.
+    It knows the law of the change and the time, which `reset` sets to 0 and `prepare` advances by
+    one sample. A reference, not a bound: it ignores changes to come. For a plant that changes
+    infinitely slowly it is the optimum.
     """
 
     name = "optimal"

@@ -36,8 +36,8 @@ class Units:
     """Units `state` ρ_x (n,) and `action` ρ_u (m,), of cost κ, and `dearest` max_i μ_i ρ_i.
 
     μ are the multipliers of the state bounds at the reference; κ is the power of ten above
-    `dearest`, so that the slack weights κ/ρ_x are exact. Where no bound is active `dearest` is 0
-    and κ that of the economic cost's curvature, max_i |∂²ℓ/∂w_i²| ρ_i², or of the cost itself.
+    `dearest`, so that slack weights κ/ρ_x are exact. Where no bound is active, `dearest` is 0 and
+    κ is that of the cost's curvature, max_i |∂²ℓ/∂w_i²| ρ_i², or of the cost itself.
     """
 
     state: Vector
@@ -93,8 +93,8 @@ def multipliers(gradient: Vector, rates: Vector, below: Mask, above: Mask) -> Ve
     """|μ| (n+m,) of active bounds: least squares of ∇ℓ + (∂x')ᵀλ = μ, of the bounds' signs.
 
     `gradient` is ∇ℓ (n+m,), `rates` ∂x' (n, n+m); `below` and `above` say which bounds are active.
-    They are those of the QP min ½|w|² + ∇ℓᵀw over what equation and active bounds leave, the
-    projection of −∇ℓ on these directions. Raises ModelError where DAQP finds none.
+    They come from the QP min ½|w|² + ∇ℓᵀw under the equation and the active bounds. Raises
+    ModelError where DAQP finds none.
     """
     size = np.abs(gradient).max()
     if not size or not (np.isfinite(gradient).all() and np.isfinite(rates).all()):
@@ -289,10 +289,7 @@ MEND = 'name the plant\'s own model as model = "module:factory" in the table [pl
 
 @dataclass(frozen=True)
 class PlantProblem:
-    """The control problem with the plant's own model, and what is random in it.
-
-    `parameters` (n_p,) are the plant's physical ones.
-    """
+    """The problem with the plant's own model, its `law` and physical `parameters` (n_p,)."""
 
     problem: Problem
     law: DisturbanceLaw

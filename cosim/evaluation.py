@@ -69,12 +69,9 @@ def evaluate(
 ) -> Evaluation:
     """Run every controller on every seed; the table is the same for any number of workers.
 
-    A seed means the same disturbances to all controllers (common random numbers), so differences
-    are to be taken seed by seed. Where the scenario's optimum is stored it runs too, for J*,
-    without rows of its own unless it is named.
-
-    Raises EvaluationError on a malformed request or failed workers, and whatever building or
-    running a controller raises.
+    On a seed all controllers meet the same disturbances (common random numbers). A stored optimum
+    runs too, for J*, without rows of its own unless it is named. Raises EvaluationError on a
+    malformed request or failed workers, and what building or running a controller raises.
 
     Parameters
     ----------
@@ -214,7 +211,7 @@ class Evaluation(Result):
 
     @property
     def optimum(self) -> str | None:
-        """Name of the controller that gives J*, None if there is none; it need not have a row."""
+        """Name of the controller that gives J*, or None."""
         return OPTIMAL if OPTIMAL in self.columns else None
 
     @property
@@ -387,11 +384,11 @@ def judge(scenario: Scenario, folder: Path) -> pd.DataFrame:
     """A row of indicators for each ``*.csv`` of a folder, whose name ends in the run's seed.
 
     A file has a column for each state and action of the scenario by name (a unit in brackets may
-    follow) and a row a sample: the state, and the action that was then applied. The actions are
-    played back on the seed's noise, and what the file says of the states is checked against it:
-    the figures are those of the playback. Columns `file`, `scenario` and its hash, `seed`, `steps`,
-    `indicators`', and `optimum` and `regret`, J of the stored optimum on the same noise, NaN where
-    there is none. Raises EvaluationError with file, sample and both values.
+    follow) and a row a sample: the state, and the action then applied. The actions are played back
+    on the seed's noise, and the file's states are checked against it; the figures are those of the
+    playback. Columns `file`, `scenario` and its hash, `seed`, `steps`, `indicators`', and `optimum`
+    and `regret`, J of the stored optimum on the same noise, NaN without one. Raises EvaluationError
+    with file, sample and both values.
     """
     paths = sorted(folder.glob("*.csv"))
     if not paths:

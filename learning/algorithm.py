@@ -1,8 +1,7 @@
 """A learning rule, what it asks for, and its loop: plant, controller and rule, by the sample.
 
 An own rule inherits `Algorithm`, is given a `Transition` and returns an `Update`. `TrainingLoop`
-draws the exploration, carries out what an update asks of the plant, and keeps what a checkpoint
-needs.
+draws the exploration and carries out what an update asks of the plant.
 """
 
 from __future__ import annotations
@@ -29,18 +28,17 @@ from learning.errors import AlgorithmLookupError, ConfigurationError, PrivilegeE
 
 Privilege = Literal["operation", "simulator"]
 CHECKED_EVERY = 10
-"""The flags of a solution cost as much as a feedback; of this many samples one pays for them."""
+"""Samples between two checks of a solution's flags, which cost as much as a feedback."""
 
 
 class Transition(NamedTuple):
-    """One transition (s, a, ℓ, s₊) as the training loop saw it, all at one θ.
+    """One transition (s, a, ℓ, s₊), all at one θ; `number` counts from 0.
 
     `policy` is the solution for V(s) and π(s); `action_value` that for Q(s, a), the same object
     where the sample was greedy (then Q = V) or the algorithm does not need it; `next_policy` that
-    for V(s₊), π(s₊); `next_s` is s₊; `explored` says that a is not π(s). `stage_cost` is ℓ, `cost`
+    for V(s₊), π(s₊). `next_s` is s₊; `explored` says that a is not π(s). `stage_cost` is ℓ, `cost`
     ℓ plus the penalty of s, the sample's share of J; `next_penalty` the penalty of s₊. `point` and
-    `next_point` are the linearisation points at s and s₊, None unless the algorithm
-    `needs_points`. `number` counts from 0.
+    `next_point` are the linearisation points at s and s₊, None unless the rule `needs_points`.
     """
 
     number: int
@@ -67,8 +65,8 @@ class Update(NamedTuple):
     back-off was the last one tried; `failures` counts the algorithm's own QPs that failed.
 
     The last three are for algorithms that ask for a simulator; PrivilegeError otherwise. `episode`
-    resets the plant to the scenario's initial state with this seed of its noise. `mark` remembers
-    the plant as it is now, `rewind` puts it back to there, with the same noise to come.
+    resets the plant to the scenario's initial state with this seed of its noise. `mark` takes a
+    snapshot of the plant, `rewind` restores it, with the same noise to come.
     """
 
     td_error: float
@@ -87,8 +85,8 @@ class Strategy:
     """Draws the actions that explore: a = sat(c + e), e ~ N(0, diag σ²), on a share of the samples.
 
     The centre c is the policy's action (`additive`) or zero (`literal`, as the paper prints it).
-    `probability` is the share and `deviation` σ (m,) or (1,) in the actions' units; `lower` and
-    `upper` (m,) bound the action. The loop saturates.
+    `probability` is the share, `deviation` σ (m,) or (1,) in the actions' units. The loop saturates
+    at `lower` and `upper` (m,).
     """
 
     kind: str
@@ -126,8 +124,8 @@ class Strategy:
     def bias(self, actions: Matrix) -> Matrix:
         """E[a − π | explored] of samples with policies π, (K, m).
 
-        From the moments of the censored normal distribution; zero but for saturation and a centre
-        that is not π.
+        The mean of the censored normal distribution less π; zero without saturation if the centre
+        is π.
         """
         centres = self._centre(actions)
         sigma = np.maximum(self.deviation, np.finfo(float).tiny)
@@ -143,16 +141,16 @@ class Strategy:
 class Algorithm:
     """A learning rule. Register its class in the entry-point group `cosim.algorithms`.
 
-    The loop constructs it with a controller that it may move (`controller.theta`), calls `observe`
-    once per sample, and evaluates the policy anew whenever that returned an `Update`. `strategy` is
-    the exploration; `rng` is a generator of its own, spawned from the run's seed, whose state the
-    loop keeps in checkpoints. A class that has all this need not inherit it.
+    The loop constructs it with a controller whose `theta` it may set, calls `observe` once per
+    sample, and solves for the policy anew after an `Update`. `strategy` is the exploration; `rng` a
+    generator of its own, spawned from the run's seed and kept in checkpoints. A class that has all
+    this need not inherit it.
 
     `Configuration` is the class of its hyperparameters. `asks_for` states what it needs of a plant:
     `operation`, one trajectory as it comes, or `simulator`, a plant that can be reset, put back and
-    given the same noise twice. `needs_action_value` says whether `Transition.action_value` must be
-    solved for where the sample explored, `needs_points` whether the linearisation points are kept.
-    `KEPT` names the attributes that a checkpoint has (`learning.checkpoint.arrays_of`).
+    given the same noise twice. `needs_action_value` asks for `Transition.action_value` where the
+    sample explored, `needs_points` for the linearisation points. `KEPT` names the attributes that a
+    checkpoint has (`learning.checkpoint.arrays_of`).
 
     Optional, looked up by name:
 
@@ -222,10 +220,7 @@ def load_algorithm(name: str) -> type[Algorithm]:
 
 
 class PlantInOperation:
-    """What is left of a plant in operation: its next sample.
-
-    It cannot be reset, put back, or told which noise to meet.
-    """
+    """A plant that can only take its next sample: no reset, no snapshot, no choice of noise."""
 
     __slots__ = ("scenario", "step")
 
@@ -240,11 +235,11 @@ class PlantInOperation:
 
 @dataclass
 class Counts:
-    """What a loop has counted since its start.
+    """Counts since a loop's start.
 
     `number` of samples; `failures` of the controller; samples that `explored`, and of these those
-    `saturated` at an actuator's bound; of every tenth sample, the policies whose derivatives are
-    one-sided, `weakly_active`, and those whose active constraints are dependent, `licq_failed`.
+    `saturated` at an actuator's bound; of every tenth sample, policies with one-sided derivatives
+    (`weakly_active`) and with dependent active constraints (`licq_failed`).
     """
 
     number: int = 0
@@ -262,9 +257,8 @@ class TrainingLoop:
     fails, the last action is applied once more, the failure is counted and the controller starts
     from its reference. After `rest_after` samples θ stays and nothing explores.
 
-    `plant` has been reset. An algorithm that asks for `operation` has a `PlantInOperation` here: it
-    gets transitions, and nothing else of the plant. `rng` draws the exploration; `algorithm_rng` is
-    the algorithm's own and goes through checkpoints.
+    `plant` has been reset; for an algorithm that asks for `operation` it is wrapped as a
+    `PlantInOperation`. `rng` draws the exploration, `algorithm_rng` is the algorithm's own.
     """
 
     def __init__(
@@ -315,14 +309,14 @@ class TrainingLoop:
 
     @property
     def rests(self) -> bool:
-        """Whether exploration and learning are over, and the rest is for the record."""
+        """Whether exploration and learning have ended."""
         return self.counts.number >= self._rest_after
 
     def advance(self) -> tuple[float, Update | None]:
         """One sample of plant and rule: its cost, and the update if θ moved.
 
-        Raises DivergenceError where the rule finds that θ means nothing any more, PrivilegeError
-        where it asks more of the plant than it stated.
+        Raises the rule's DivergenceError; PrivilegeError where it asks more of the plant than it
+        stated.
         """
         rests = self.rests
         transition, cost = self.next()
@@ -350,7 +344,7 @@ class TrainingLoop:
         return cost, update
 
     def renew(self) -> None:
-        """Solve once more for the present state, at the guess as it was: θ has moved."""
+        """Solve again for the present state at the same linearisation point, after θ has moved."""
         if self._point is not None:
             self.controller.prepare_at(self._point)
             self._policy = self._solve(self.s)
@@ -427,10 +421,9 @@ class TrainingLoop:
         return None
 
     def restart(self) -> None:
-        """Forget all that a solver may carry from sample to sample but the guess itself.
+        """Reset the controller but for its linearisation point.
 
-        Called at a checkpoint in the run that goes on as in the one that resumes, so that both
-        see the same digits ever after.
+        Done at each checkpoint and on resuming, so that both runs have the same digits.
         """
         self.controller.reset()
         if self._point is None:
@@ -451,9 +444,9 @@ class TrainingLoop:
         return values, stored | prefixed("algorithm ", self.algorithm.state())
 
     def restore(self, values: dict[str, Any], stored: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave; the plant must have been restored before.
+        """Restore what `state` returned; the plant must have been restored before.
 
-        Raises KeyError, TypeError, ValueError or another error where it is not that.
+        Raises KeyError, TypeError, ValueError or another error where it is something else.
         """
         for name, rng in self._generators.items():
             rng.bit_generator.state = values[name]

@@ -58,13 +58,12 @@ LEAST = {"seed": 0} | dict.fromkeys(
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """What identifies a training run; a checkpoint can be resumed only by an identical one.
+    """What identifies a training run; only an identical one can resume a checkpoint.
 
-    The `algorithm` by name, its `configuration`, completed by what the `scenario` states; the other
-    fields' meaning is their help in `cosim train`. A run has diverged, and ends, where its greedy J
-    exceeds the larger of the naive θ's and the start's by more than (`divergence` − 1) of its
-    magnitude, twice in a row or at the end.
-
+    The `configuration` is completed by what the `scenario` states; the other fields are options of
+    `cosim train`. A run has diverged, and ends, where its greedy J exceeds the larger of the naive
+    θ's and the start's by more than (`divergence` − 1) of its magnitude, twice in a row or at the
+    end.
     Raises ConfigurationError on counts that make no run.
     """
 
@@ -181,10 +180,9 @@ def starting_parameters(
     """θ at the start: the paper's naive one, the economically tuned one, or that of a file.
 
     `start` is `naive`, `tuned` or the path of a parameters file. `naive` and `tuned` take c_lambda
-    from the configuration; blocks that a file has stand as they are, those of the configuration's
-    parametrisation that it lacks start as with `naive`. Raises ConfigurationError where the file
-    has slack weights and the parametrisation none, ParameterError on a bad file, TuningError where
-    the tuning fails.
+    from the configuration; blocks that a file lacks start as with `naive`. Raises
+    ConfigurationError where the file has slack weights and the parametrisation none, ParameterError
+    on a bad file, TuningError where the tuning fails.
     """
     if not Path(start).exists() and (meant := suggestion(start, STARTS)) and start not in STARTS:
         raise ConfigurationError(f"there is no start '{start}'{meant}, nor such a parameters file")
@@ -226,7 +224,7 @@ COLUMNS = (
     "greedy_failures", "regret", "gap_closed",
 )  # fmt: skip
 DAMAGED = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, PlantError)
-"""What the restoring of a whole checkpoint with other content raises."""
+"""Raised by the restoring of a checkpoint with other content."""
 
 
 class LogRow(dict[str, float]):
@@ -286,10 +284,7 @@ class Totals:
 
 
 def to_csv(rows: Sequence[LogRow]) -> str:
-    """The log as CSV with exact decimals: its figures, then a column `theta NAME` for each entry.
-
-    What was not measured is left empty.
-    """
+    """The log as CSV: its figures, empty where not measured, and a column `theta NAME` an entry."""
     if not rows:
         return ""
     labels = [f"theta {label}" for label in rows[0].parameters.blocks.labels]
@@ -306,8 +301,7 @@ def _cell(value: float) -> str:
 class Judge:
     """Judges a run's θ by its greedy policy on the held-out seeds.
 
-    `start` is a θ of the run's blocks. `optimum` is a controller whose J on the same seeds is J*,
-    for the regret and the gap closed; without it they are NaN.
+    `start` is a θ of the run's blocks. J of the controller `optimum` on the same seeds is J*.
     """
 
     def __init__(
@@ -360,11 +354,10 @@ class Training(Result):
     """A training that has ended.
 
     `parameters` are θ as the run hands it over, `rows` its log. `evaluation` is the greedy policy
-    on held-out noise (`Judge.verdict`); `start` is θ where it started and `start_J` its greedy J,
-    `baselines` that of `naive` and, where it is known, `optimal` on the same noise. `status` is
-    `finished` or `diverged: …`, which changes nothing of what θ is; `asks_for` what the algorithm
-    asked of the plant. `functions` says whether the controller's were `interpreted` or `compiled`;
-    `without_checkpoint` why there is none, if there should be one.
+    on held-out noise (`Judge.verdict`), `start` the first θ and `start_J` its greedy J, `baselines`
+    J of `naive` and, where known, `optimal` on the same noise. `status` is `finished` or
+    `diverged: …`; `asks_for` the privilege of the algorithm. `functions` says whether the
+    controller's were `interpreted` or `compiled`; `without_checkpoint` why a checkpoint is missing.
     """
 
     run: TrainingRun
@@ -572,11 +565,10 @@ def run_training(
 ) -> Training:
     """Train as `run` says; the other arguments and the errors are those of `train`.
 
-    With `out`, learning.csv, parameters.toml and checkpoint.npz are kept there as the run goes on;
-    a plant that cannot serialise its state leaves no checkpoint, and the result says so. Log,
-    evaluations and files are of the θ that the run would hand over if it ended there. Without an
-    `optimum` regret and gap closed are not known. `rule` is the algorithm's class where it is not
-    to be looked up by its name.
+    With `out`, learning.csv, parameters.toml and checkpoint.npz are kept there during the run; a
+    plant that cannot serialise its state leaves no checkpoint. Log, evaluations and files are of
+    the θ that the run would hand over then. Without an `optimum` regret and gap closed are unknown.
+    `rule` is the algorithm's class where it is not to be looked up by its name.
     """
     clock = time.perf_counter()
     getattr(progress, "start", lambda _: None)(run)
@@ -617,7 +609,7 @@ def run_training(
 
 
 class _Remark(dict[str, float]):
-    """The last value of each column of the log; called, it says some of them behind a bar."""
+    """The last value of each column of the log, and the remark behind a bar made of them."""
 
     def __call__(self, done: int, row: LogRow) -> tuple[int, str]:
         self.update({name: value for name, value in row.items() if not isnan(value)})
@@ -625,7 +617,7 @@ class _Remark(dict[str, float]):
 
 
 class _Session:
-    """A run that goes on: its loop, its log so far, and its checkpoint."""
+    """A run in progress: its loop, its log so far, and its checkpoint."""
 
     def __init__(
         self, run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant, out: Path | None
@@ -683,10 +675,7 @@ class _Session:
         return LogRow(figures, answer)
 
     def trouble(self, row: LogRow, judge: Judge) -> str | None:
-        """Why the run must stop, or None.
-
-        One evaluation above the limit may be an excursion: two in a row end the run, or the last.
-        """
+        """Why the run must stop, or None: two evaluations in a row, or the last, are too dear."""
         greedy = row["greedy_J"]
         if not isfinite(greedy) or not greedy > (limit := judge.limit):
             return None

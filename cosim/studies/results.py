@@ -114,10 +114,9 @@ class StudyResults(Shown):
     def written(
         cls, plan: Plan, out: Path, stores: Collection[store.RunStore], *, draw: bool = True
     ) -> StudyResults:
-        """Write the tables and kept files of a plan's finished runs, and return them.
+        """Write the tables and kept files of a plan's finished runs, study.json last.
 
-        `draw` draws the kept trajectories and logs, too; study.json, which names them, is
-        written last, so that its word is true.
+        `draw` draws the kept trajectories and logs, too.
         """
         runs = _finished(plan, stores)
         found = cls(out, document(plan), *store.frames(runs))
@@ -195,10 +194,7 @@ class StudyResults(Shown):
         return cost[0] if len(cost) else None
 
     def regret(self, case: str, scenario: str, runs: Sequence[int] = (0,)) -> Estimate:
-        """(J − J*)/|J*| of a run, or of the mean of several, paired over the noise seeds.
-
-        `runs` counts the case's runs from 0. NaN where the scenario has no known optimum.
-        """
+        """(J − J*)/|J*| of the mean of `runs` (from 0), paired over noise seeds; NaN without J*."""
         best = self.reference("optimum", scenario)
         cost = self.indicator(case, scenario)[list(runs)].mean(axis=0)
         return Estimate(np.nan) if best is None else regret(cost, best)
@@ -231,8 +227,7 @@ class StudyResults(Shown):
     def summary(self) -> pd.DataFrame:
         """A row for each scenario and case, the least median J first.
 
-        Medians are those of the middle runs (of both, where their number is even), so that the
-        interval of the median regret is that of real runs.
+        The median regret is that of the middle run, or of the mean of both middle ones.
         """
         rows: list[dict[str, Any]] = []
         for scenario in self.scenarios:
@@ -296,7 +291,7 @@ class StudyResults(Shown):
         return one, two
 
     def _ranked(self, scenario: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Give rows that cannot be told from the first of their group its rank."""
+        """Rank the rows; those that do not differ from the first of their group share its rank."""
         first = 0
         for place, row in enumerate(rows):
             leader = rows[first]["case"]
@@ -350,7 +345,7 @@ class StudyResults(Shown):
     ) -> tuple[Sequence[str], list[list[str]]]:
         """Header and rows of a scenario's table as texts; `columns` are keys of `COLUMNS`.
 
-        Without them all, differences only where a case has a counterpart. Raises StudyError for
+        By default all, the last three only where a case has a counterpart. Raises StudyError for
         another column.
         """
         if columns is None:
@@ -399,10 +394,10 @@ class StudyResults(Shown):
         return report.paper_table(self.scenarios, self.trained, self.indicator)
 
     def figure(self, name: str | None = None) -> Figure:
-        """Draw `curves`, `regret`, `profile` or `operation` of a scenario: `curves-paper`, say.
+        """Draw `curves`, `regret`, `profile` or `operation` of a scenario, as `curves-paper`.
 
-        `profile` alone is that of all scenarios; None is the regret on the first one. Raises
-        StudyError for another name, and where there is nothing to draw.
+        `profile` alone is that of all scenarios; None is the first one's regret. Raises StudyError
+        for another name, and where there is nothing to draw.
         """
         names = [f"{kind}-{scenario}" for scenario in self.scenarios for kind in self._makers]
         name = name or f"regret-{self.scenarios[0]}"

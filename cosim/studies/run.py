@@ -39,12 +39,11 @@ ROUNDS = 3
 
 
 Report = Callable[[int, str, str], None]
-"""Gets the plant samples done, the runs done in words, and a line for what just happened; the line
-is empty for mere progress."""
+"""Called with the plant samples done, the runs done in words, and a line about an event, or ""."""
 
 
 class Runner:
-    """Does the runs of a plan; `out` holds what was finished before (`RunStore`)."""
+    """Does the runs of a plan that `out` lacks (`RunStore`)."""
 
     def __init__(self, runs: list[Run], out: Path, folders: tuple[Path, ...], report: Report):
         self._runs = {str(run.key): run for run in runs}
@@ -55,12 +54,12 @@ class Runner:
         self._done = dict.fromkeys(self._runs, 0)
         self._finished: set[str] = set()
         self.remarks = list(dict.fromkeys(x for s in self.stores.values() for x in s.remarks))
-        """What was found changed or damaged, and is done anew."""
+        """What was changed or damaged and is done anew, in words."""
 
     def run(self, jobs: int, scheduler: str | None) -> None:
-        """Do all that is not done: trainings and controllers first, then the learnt policies.
+        """Do all that is not done; failed runs do not stop the others.
 
-        Raises EvaluationError where no worker can work. Every run that can be done is done.
+        Raises EvaluationError where no worker can work.
         """
         if jobs < 1:
             raise EvaluationError(f"jobs must be at least 1, not {jobs}")
@@ -83,7 +82,7 @@ class Runner:
                     store.flush()
 
     def _missing(self, shared_disk: bool) -> list[Item]:
-        """Items that can be done now; the evaluation of a training's θ waits for its end."""
+        """Items that can be done now: a training, or evaluations after its end."""
         items: list[Item] = []
         for name, run in self._runs.items():
             if name in self.failures or name in self._finished:
@@ -115,7 +114,7 @@ class Runner:
                 yield replace(base, file=file, noise=part, theta=theta)
 
     def _take(self, item: Item, outcome: Outcome) -> None:
-        """Store what an item gave and say so."""
+        """Store and report the outcome of an item."""
         name = str(item.run.key)
         store = self.stores[name]
         if isinstance(outcome, Failure):
@@ -182,8 +181,8 @@ def _outcomes(
 def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome]]:
     """Run items on an existing scheduler's workers; yield them as they end.
 
-    Raises EvaluationError, in one line, where the scheduler is none, dies or is silent, where it
-    has no worker, and where a worker cannot do an item.
+    Raises EvaluationError where the scheduler fails, is silent or has no worker, and where a worker
+    cannot do an item.
     """
     try:
         dask: Any = import_module("distributed")

@@ -1,11 +1,11 @@
-"""What a run has finished: a folder, readable and found again.
+"""The folder of a run's results.
 
     OUT/runs/SCENARIO/CASE/SEED/   run.json  checkpoint.npz | learning.csv parameters.toml
                                    evaluation.csv  greedy.csv  online.csv
                                    trajectory-*.csv  timing.csv
 
-Tables are written by the process that runs the study alone; a worker writes no more than the
-checkpoint of the training that it runs, and its log and θ so far.
+Only the process that runs the study writes tables; a worker writes the checkpoint of its training,
+and its log and θ so far.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ CURVE = ["samples", "J", "greedy_J", "td_error"]
 TYPES: dict[str, Any] = {"scenario": str, "case": str, "training_seed": "Int64", "status": str}
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 PAUSE = 20
-"""Of the time that tables took to write, what passes at least until they are written again."""
+"""Least time between two writes of the tables, in multiples of the time that one takes."""
 
 
 def greedy_file(mark: int) -> str:
@@ -97,17 +97,17 @@ def to_csv(frame: pd.DataFrame) -> str:
 
 
 class RunStore:
-    """The files of one run; `run.facts` say all that its results depend on.
+    """The files of one run; `run.facts` is all that its results depend on.
 
-    What is there of other facts, or is not as it was written, is deleted and named in `remarks`.
-    Only files that a run of a study writes are deleted, and only beside a run.json. Raises
-    StudyError where the folder holds other files than ours, or leads out of `out`.
+    Files of other facts, and those that were edited or damaged, are deleted and named in
+    `remarks`: only files that a run of a study writes, and only beside a run.json. Raises
+    StudyError where such files lie there without one, or the folder is outside `out`.
     """
 
     def __init__(self, out: Path, run: Run) -> None:
         self.folder = out / run.key.folder
         self.remarks: list[str] = []
-        """What was found changed or damaged, and is done anew."""
+        """What was changed or damaged and is done anew, in words."""
         self.run = run
         self._facts = json.loads(json.dumps(run.facts))
         self._known: dict[str, dict[int, Figures]] = {}
@@ -196,10 +196,7 @@ class RunStore:
         (self.folder / CHECKPOINT).unlink(missing_ok=True)
 
     def indicators(self, file: str) -> dict[int, Figures]:
-        """What a file holds by noise seed of runs as long as the plan's, read once.
-
-        Nothing of a damaged file, which is named.
-        """
+        """Content of a file by noise seed, of runs as long as the plan's; {} of a damaged one."""
         if file not in self._known:
             try:
                 self._known[file] = self._read(file)
@@ -222,12 +219,12 @@ class RunStore:
         return found
 
     def measured(self, file: str) -> pd.DataFrame:
-        """What a file of a finished run holds, a row for each noise seed, in the plan's order."""
+        """Content of a finished run's file, a row for each noise seed, in the plan's order."""
         rows = pd.DataFrame.from_dict(self.indicators(file), "index")
         return rows.loc[list(self.run.noise[file].seeds)]
 
     def missing(self, file: str) -> tuple[int, ...]:
-        """Noise seeds of which a file says nothing."""
+        """Noise seeds that a file lacks."""
         noise = self.run.noise[file]
         if noise.whole:
             return () if (self.folder / file).is_file() else noise.seeds
@@ -243,8 +240,8 @@ class RunStore:
             self.flush()
 
     def flush(self) -> None:
-        """Write the tables that wait for it."""
-        # The rows of many seeds are written again and again: the pause keeps that a small share.
+        """Write the tables that have changed."""
+        # A table is written whole each time: the pause keeps that a small share of the work.
         begin = time.monotonic()
         while self._unwritten:
             self._write(self._unwritten.pop())
@@ -269,7 +266,7 @@ class RunStore:
         return trained and not any(self.missing(file) for file in self.run.noise)
 
     def seal(self) -> None:
-        """Note the hashes of a finished run's files, so that a torn or edited one is noticed."""
+        """Write the hashes of a finished run's files to run.json."""
         self.flush()
         paths = filter(_ours, self.folder.glob("*"))
         files = {path.name: _digest(path) for path in sorted(paths) if path.name != TIMING}
@@ -277,7 +274,7 @@ class RunStore:
             self.note(files=files)
 
     def unseal(self) -> None:
-        """Forget the hashes before more is written, those of the training's own files excepted."""
+        """Remove the hashes before more is written, but those of the training's own files."""
         files = self.about.get("files", {})
         if files.keys() - TRAINED:
             self.note(files={name: files[name] for name in files.keys() & TRAINED})

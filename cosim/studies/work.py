@@ -1,7 +1,6 @@
 """The work of a study: runs, what they are measured on, and how a worker does a part of one.
 
-A worker of an evaluation imports no more than this: learning, pandas and SciPy's statistics take
-longer than many samples.
+An evaluation's worker imports only this: learning, pandas and SciPy take longer than many samples.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 RUNS, CHECKPOINT = "runs", "checkpoint.npz"
 Figures = dict[str, Any]
 Measured = dict[int, tuple[Figures, Figures]]
-"""Indicators, or the mean cost of each block as `J`, and what the clock said, by noise seed."""
+"""By noise seed the indicators, or the mean cost of each block as `J`, and the times."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +98,8 @@ class TrainingTask:
 class Noise(NamedTuple):
     """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`.
 
-    Indicators are kept; mean costs over `block` samples, where that is not 0; the run sample by
-    sample, if it is `whole`. A policy of a run in operation is that of the sample `mark`.
+    Kept are indicators; with `block` mean costs over so many samples; with `whole` every sample.
+    A policy of a run in operation is that of the sample `mark`.
     """
 
     seeds: tuple[int, ...]
@@ -158,12 +157,11 @@ class RunKey:
 
 @dataclass(frozen=True)
 class Run:
-    """One run: a controller, or a training and the θ that comes of it.
+    """One run: a controller, or a training and its θ.
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `noise` is what it is measured on, by the file that keeps what is found;
-    `trajectories` are those that it takes part in. `marks` are the samples of operation at which
-    θ, or the optimum, is judged.
+    training. `noise` is what it is measured on, by the file that keeps the results; `trajectories`
+    are those that it is in; `marks` the samples of operation at which θ, or the optimum, is judged.
     """
 
     key: RunKey
@@ -202,9 +200,9 @@ class Trained:
 class Item:
     """Unit of work of one process, independent of the machine.
 
-    The run's training to its end, its checkpoint in `folder` where the workers share this disk;
-    or, with a `file`, its controller on some `noise`: that of the run, or, of a training, that of
-    the θ in `parameters` (TOML) or of another `theta`. Plug-ins are looked up in `folders`.
+    Without a `file` the run's training, its checkpoint in `folder` where the workers share this
+    disk. With a `file` the run's controller on some `noise`; of a training it has the θ in
+    `parameters` (TOML) or another `theta`. Plug-ins are looked up in `folders`.
     """
 
     run: Run
@@ -216,7 +214,7 @@ class Item:
     theta: tuple[float, ...] = ()
 
     def enter(self) -> None:
-        """Let plug-ins be imported; raises EvaluationError on other code or another FMU here."""
+        """Make plug-ins importable; raises EvaluationError on other code or another FMU here."""
         for folder in self.folders:
             import_from(Path(folder))
         facts = self.run.facts
@@ -252,7 +250,7 @@ Outcome = Trained | Measured | str | Failure
 
 
 def perform(item: Item) -> tuple[Item, Outcome]:
-    """Do an item; whatever it raises becomes a Failure, `sys.exit` in a plug-in too."""
+    """Do an item; any exception, `sys.exit` too, becomes a Failure."""
     try:
         item.enter()
         return item, _simulate(item) if item.file else _train(item.run, item.folder)

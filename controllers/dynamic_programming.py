@@ -246,11 +246,11 @@ class BellmanOperator:
 
         smooth = grid.interpolant(W)
 
-        def block(part: slice) -> Array:
+        def values_of(part: slice) -> Array:
             cost, x_next = self._expected_cost(states[part], actions[part])
             return cost + _mean(smooth(x_next), self._weights)
 
-        return np.concatenate(list(self._map(block, len(states))))
+        return np.concatenate(list(self._map(values_of, len(states))))
 
     def chain(self, actions: Array, grid: Grid) -> tuple[sparse.csr_array, Array]:
         """Markov chain of a policy (G, m) on the grid: transition matrix (G, G), cost (G,).
@@ -259,7 +259,7 @@ class BellmanOperator:
         """
         from scipy import sparse  # noqa: PLC0415
 
-        def block(part: slice) -> tuple[sparse.csr_array, Array]:
+        def rows_of(part: slice) -> tuple[sparse.csr_array, Array]:
             cost, x_next = self._expected_cost(grid.points[part], actions[part])
             count, nodes = x_next[0].shape
             rows = np.repeat(np.arange(count), nodes)
@@ -271,9 +271,9 @@ class BellmanOperator:
                 )
             return matrix, cost
 
-        blocks = list(self._map(block, grid.size))
-        matrix = sparse.vstack([part for part, _ in blocks], format="csr")
-        return matrix, np.concatenate([cost for _, cost in blocks])
+        found = list(self._map(rows_of, grid.size))
+        matrix = sparse.vstack([rows for rows, _ in found], format="csr")
+        return matrix, np.concatenate([cost for _, cost in found])
 
     def _expected_cost(self, states: Array, actions: Array) -> tuple[Array, list[Array]]:
         """E[ℓ + penalty(s₊)], shape (B,), and s₊ at the nodes, n arrays (B, q)."""
@@ -309,8 +309,8 @@ class BellmanOperator:
         return total
 
     def _map(self, task: Callable[[slice], T], count: int) -> Iterator[T]:
-        blocks = -(-count * len(self._weights) // _ENTRIES)
-        edges = np.linspace(0, count, min(blocks, count) + 1).astype(int)
+        tasks = -(-count * len(self._weights) // _ENTRIES)
+        edges = np.linspace(0, count, min(tasks, count) + 1).astype(int)
         parts = [slice(start, stop) for start, stop in pairwise(edges.tolist())]
         return self._pool.map(task, parts) if self._pool else map(task, parts)
 

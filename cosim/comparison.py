@@ -24,8 +24,8 @@ _ERROR = "residual"
 class RunSignals:
     """A run's `signals` by name, all of K samples, and the status of each ([] if not known).
 
-    `name` is where it was read; `bounds` are (lower, upper) of the signals whose bounds are known;
-    `ordered` says that the order of the signals is that of a file's columns.
+    `name` is its path; `bounds` are (lower, upper) of signals with known bounds; `ordered` says
+    that the order of the signals is that of a file's columns.
     """
 
     name: str
@@ -78,11 +78,11 @@ def _bounds(path: Path) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True)
 class Difference:
-    """How one signal, with its name and unit, differs between runs A and B where both have samples.
+    """Difference of one signal between runs A and B over their common samples.
 
     `maximum` is max |a − b| (infinite where only one is NaN) at sample `at`, with the values `a`
-    and `b` there; `first` is the first sample with |a − b| > `tolerance`, None if there is none.
-    Without a tolerance, None, `first` is the first sample whose bits differ.
+    and `b` there; `first` is the first sample with |a − b| > `tolerance`, or, without a tolerance,
+    whose bits differ; None if there is none.
     """
 
     name: str
@@ -108,11 +108,11 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The `differences` by signal, and what else sets two runs apart.
+    """The `differences` of two runs by signal, and all others.
 
-    `samples` are the two lengths; `only_a` and `only_b` signals that one run has; `units` those
-    whose units differ, with both; `order` the first position at which files order their signals
-    differently; `status` the first sample whose status differs; `times` (K,) in s are those of A.
+    `samples` are the two lengths; `only_a` and `only_b` signals of one run; `units` different units
+    by signal; `order` the first position at which the order of the signals differs; `status` the
+    first sample whose status differs; `times` (K,) in s are those of A.
     """
 
     samples: tuple[int, int]

@@ -28,7 +28,7 @@ _inputs: set[tuple[int, int]] = set()
 
 
 def protect(paths: Iterable[str | Path]) -> None:
-    """Let no writer replace these files, the inputs of the command; forgets those of before."""
+    """Protect these files, the inputs of the command and no others, from all writers."""
     _inputs.clear()
     for path in paths:
         with suppress(OSError, ValueError):
@@ -56,9 +56,9 @@ def check_target(path: str | Path) -> Path:
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` to write to; rename it into place after the block.
 
-    A reader never sees half a file, and what stood under the name before survives any failure.
-    Raises what `check_target` raises, and OSError, which names the file, where the folder cannot be
-    written or is full.
+    A reader never sees half a file, and an older file survives any failure. Raises what
+    `check_target` raises, and OSError, which names the file, where the folder cannot be written or
+    is full.
     """
     path = check_target(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}{path.suffix}")
@@ -114,8 +114,8 @@ def cache_folder(kind: str) -> Path:
     """The folder for cached files of a `kind`: the user's, made if need be, or a temporary one.
 
     The user's lies under the environment's COSIM_CACHE, else where the platform keeps caches.
-    Temporary, until this process ends, where that cannot be written or others could write it:
-    native code is loaded from here.
+    A temporary one, until this process ends, where that cannot be written or others could write it,
+    since native code is loaded from here.
     """
     chosen = os.environ.get(CACHE_VARIABLE)
     root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)

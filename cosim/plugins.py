@@ -58,9 +58,9 @@ def import_from(folder: str | Path) -> None:
 
 @contextmanager
 def _importing(module: str) -> Iterator[None]:
-    """Search the folders of `import_from` and the working directory after all other places.
+    """Search the folders of `import_from` and the working directory last.
 
-    What is imported meanwhile is noted as brought by the module.
+    Modules imported meanwhile are noted as brought by `module`.
     """
     before = set(sys.modules)
     here = [folder for folder in (*_folders, str(Path.cwd())) if Path(folder) != ROOT]
@@ -85,8 +85,7 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
     """Import the object `module:Name`; `what` names it in messages.
 
     Modules are searched in the working directory too, and in the folders of `import_from`. Raises
-    `error` where the text has another form, where the import fails for whatever reason, or where
-    the module has no such name.
+    `error` where the text has another form, the import fails, or the module has no such name.
     """
     if not TARGET.fullmatch(target):
         raise error(f"{what} must be given as module:Name, not '{target}'")
@@ -184,12 +183,11 @@ _looked_at: dict[str, object] = {}
 def depends_on(scenario: Scenario, *parts: Any) -> dict[str, str]:
     """Hashes by name (16 hex digits each, versions as text) of all that a result depends on.
 
-    The versions of what computes, our own code, the scenario, its FMU and models, and of each of
-    the `parts` (controllers, algorithms: a registered name, a `module:Name`, a file's path, a class
-    or factory) its files: a parameters file, or the module and all that it imports from outside
-    installed packages, as they were loaded; what a function will import later, as it is now. Data
-    files that a plug-in reads are not known. Raises the errors of `load_plugin` as
-    ControllerLookupError.
+    Hashed are versions, our own code, the scenario, its FMU and models, and the files of `parts`
+    (controllers, algorithms: a registered name, a `module:Name`, a file's path, a class or
+    factory): a parameters file, or the module and all that it imports from outside installed
+    packages, as loaded, or as it is now if a function will import it later. Data files that a
+    plug-in reads are not detected. Raises the errors of `load_plugin` as ControllerLookupError.
     """
     found = {"versions": versions(), "rti-cosim": code_hash(), "scenario": scenario.hash}
     fmu = Path(scenario.plant.fmu)
@@ -247,7 +245,7 @@ def _closure(module: str) -> dict[str, str]:
 
 
 def _hash_later_module(name: str) -> None:
-    """Note the present source of a user's module that a function will import when it is called."""
+    """Note the present source of a user's module that a function will import later."""
     _sources.pop(name, None)
     path: list[str] | None = None
     for part in accumulate(name.split("."), "{}.{}".format):
@@ -288,7 +286,7 @@ def _imports(module: str) -> list[str]:
 
 
 def _hash_foreign_modules() -> None:
-    """Note the source of users' modules, as soon as they have been loaded."""
+    """Note the source of users' modules that have been loaded."""
     for name, module in list(sys.modules.items()):
         if _looked_at.get(name) is module:
             continue

@@ -66,7 +66,7 @@ def command_process() -> Iterator[None]:
 
 
 def unwound() -> None:
-    """Take no more notice of the signals: the command has unwound."""
+    """Ignore the signals from now on: the command has unwound."""
     _unwound.set()
     _ignore()
 
@@ -77,7 +77,7 @@ def _ignore() -> None:
 
 
 def _raise(number: int, _: FrameType | None) -> None:
-    """Raise the signal's exception, and again after a second where C code has cleared it."""
+    """Raise the signal's exception, and again after a second in case C code has cleared it."""
     found = sys.exception()
     while found is not None and not isinstance(found, KeyboardInterrupt | Terminated):
         found = found.__context__
@@ -96,16 +96,16 @@ def _raise(number: int, _: FrameType | None) -> None:
 
 @contextmanager
 def out_of_reach_of_ctrl_c() -> Iterator[None]:
-    """Start a worker here that Ctrl-C in the terminal does not reach: its parent decides.
+    """Block Ctrl-C for the workers that are started here, and for their threads and children.
 
-    Its threads and its children inherit that. On Windows nothing is done.
+    On Windows nothing is done.
     """
     if os.name == "nt":
         yield
         return
     from multiprocessing.resource_tracker import ensure_running  # noqa: PLC0415
 
-    ensure_running()  # it would be started first, and let Ctrl-C through again
+    ensure_running()  # started later, it would unblock Ctrl-C
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -114,10 +114,9 @@ def out_of_reach_of_ctrl_c() -> Iterator[None]:
 
 
 def follow_parent(number: int) -> None:
-    """End this worker process, without further ado, as soon as its parent has ended.
+    """End this worker process at once when its parent, process `number`, has ended.
 
-    To be called once in a worker, whose work is lost with its parent anyway. `number` is the
-    parent's, which may have ended before the worker could ask for it.
+    The parent may have ended before this call.
     """
     import psutil  # noqa: PLC0415
 
@@ -147,10 +146,10 @@ def child_process(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Start a command; end it, and all that it has started, at the end of the block.
 
-    It belongs to this process's group, so that whatever ends the group, a closed terminal for
-    instance, ends it too; on Linux a kill of this process alone ends the command as well. `folder`
-    is its working directory and takes its temporary files; `env` is its environment; `log` takes
-    what it prints. Raises OSError where the command cannot be started.
+    It belongs to this process's group, so that a closed terminal, say, ends both; on Linux a kill
+    of this process alone ends it as well. `folder` is its working directory and holds its temporary
+    files; `env` is its environment; `log` takes its output. Raises OSError where it cannot be
+    started.
     """
     environment = dict(os.environ if env is None else env)
     if folder is not None:
@@ -171,7 +170,7 @@ def child_process(
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """End a child and its descendants: politely, then, after two seconds, at once."""
+    """Terminate a child and its descendants; kill them after two seconds."""
     import psutil  # noqa: PLC0415
 
     with suppress(psutil.NoSuchProcess):
@@ -193,8 +192,8 @@ _held: dict[Path, filelock.BaseFileLock] = {}
 def hold(folder: Path) -> None:
     """Take a folder's lock until `release`; this process may take it again.
 
-    The system gives the lock back when the process ends, however it ends. Raises CosimError that
-    says who holds it, since when, and what to do, and OSError where the folder cannot be written.
+    The system releases the lock when the process ends, however it ends. Raises CosimError that
+    says who holds it and since when, OSError where the folder cannot be written.
     """
     import filelock  # noqa: PLC0415
 
@@ -217,11 +216,11 @@ def hold(folder: Path) -> None:
 
 
 def release() -> list[Path]:
-    """Give back every lock that this process holds, and leave no trace of them; the folders."""
+    """Release every lock of this process and remove its files; returns the folders."""
     folders = list(_held)
     while _held:
         folder, held = _held.popitem()
-        # Removed while it is held: whoever opens it meanwhile finds it gone and makes another.
+        # Removed while it is held: whoever opens it meanwhile makes another one.
         for name in (HOLDER, LOCK):
             with suppress(OSError):
                 (folder / name).unlink()
@@ -235,9 +234,9 @@ _stdout: list[int] = []
 
 @contextmanager
 def output_turned_aside() -> Iterator[int | None]:
-    """Let what is printed, by native code too, go to standard error; yields the true descriptor.
+    """Redirect standard output, of native code too, to standard error; yields the true descriptor.
 
-    It is None where standard output is not this process's own, a test runner's say.
+    It is None where standard output is not this process's own, as in a test runner.
     """
     try:
         own = sys.stdout.fileno() == 1
@@ -262,9 +261,9 @@ class Finished(BaseException):
 
 
 def run_watched(main: Callable[[], None], parent: int, mark: str) -> NoReturn:
-    """Run the command line for a watching process; create a file at its end.
+    """Run the command line for a watching process; create the file `mark` at its end.
 
-    Foreign code may call `exit(0)` or be killed: then there is none. Threads that foreign code has
+    It is missing where foreign code calls `exit(0)` or is killed. Threads that foreign code has
     left do not keep the process.
     """
     global _watched  # noqa: PLW0603
@@ -284,11 +283,10 @@ def run_watched(main: Callable[[], None], parent: int, mark: str) -> NoReturn:
 
 
 def watch(suspect: str) -> None:
-    """Run this command again in a process of its own, and exit as that does; else return.
+    """Run this command again in a child process, and exit as that does.
 
-    To be called before foreign code is loaded; `suspect` is what messages call it. Returns in that
-    process, and where no command line was called. Raises PlantError where the process ended before
-    the command did.
+    To be called before foreign code, `suspect` in messages, is loaded. Returns in that child, and
+    where no command line was called. Raises PlantError where the child ended before the command.
     """
     if not _commands or _watched:
         return

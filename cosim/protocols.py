@@ -119,13 +119,13 @@ what failed there (0: nothing), and FMI's status.
 
 
 @dataclass(frozen=True)
-class SampleBlock:
+class RunPart:
     """K consecutive samples of a run, as columns; arrays are views that the loop overwrites later.
 
     `first` is the number of the first sample. `columns` maps each name in `trajectory.SIGNALS`
-    to its values, (K,) or for a vector (K, n), which `block[name]` gives; `status` are K words;
+    to its values, (K,) or for a vector (K, n), which `part[name]` gives; `status` are K words;
     `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m) are NaN where the controller
-    gave none, or None if it never did in this block.
+    gave none, or None if it never did in this part.
     """
 
     first: int
@@ -142,7 +142,7 @@ class SampleBlock:
 
 
 class Recorder(Protocol):
-    """Takes a run block by block; the loop calls start, record…, close in this order."""
+    """Takes a run part by part; the loop calls start, record…, close in this order."""
 
     def start(
         self,
@@ -154,8 +154,8 @@ class Recorder(Protocol):
     ) -> None:
         """Open the record; `units` maps each FMU variable's name to its unit."""
 
-    def record(self, block: SampleBlock) -> None:
-        """Append a block; copy what must outlive the call."""
+    def record(self, part: RunPart) -> None:
+        """Append a part; copy what must outlive the call."""
 
     def close(self) -> None:
         """Finish the record; also called when the run fails."""

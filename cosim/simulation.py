@@ -1,4 +1,4 @@
-"""The closed loop, which knows a plant and a controller by their protocols; its indicators."""
+"""The closed loop of a plant and a controller, and its indicators."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cosim.protocols import (
     Controller,
     Plant,
     Recorder,
-    SampleBlock,
+    RunPart,
     Solution,
 )
 from cosim.scenario import Scenario
@@ -32,15 +32,15 @@ from cosim.trajectory import (
 )
 from cosim.validation import known_keywords
 
-BLOCK = 500
+PART = 500
 
 
 def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
     """Return the plant's seed (64 bits) and the exploration's generator for a run's seed.
 
     `SeedSequence(seed).spawn(2)`: the first child's first 64-bit word seeds the plant, the second
-    child the generator. So two controllers run with one seed meet the same disturbances and the
-    same exploration noise (common random numbers). Raises CosimError on a negative seed.
+    child the generator. On one seed two controllers meet the same disturbances and the same
+    exploration noise (common random numbers). Raises CosimError on a negative seed.
     """
     if seed < 0:
         raise CosimError(f"seed must not be negative, not {seed}")
@@ -61,14 +61,13 @@ def simulate(
 ) -> Trajectory:
     """Run a controller on a plant for `steps` samples from the scenario's initial state.
 
-    Each sample: `prepare`, then `feedback(s)`, then the plant steps under the action, which the
-    actuators saturate to the scenario's action bounds. `recorder` gets the run block by block;
-    `progress` the number of samples done; True draws a bar. `residuals` says whether the
-    controller's KKT residuals are wanted, which some compute only when asked: NaN without.
+    Each sample: `prepare`, then `feedback(s)`, then the plant steps under the action, saturated to
+    the scenario's bounds. `recorder` gets the run in parts; `progress` the number of samples done;
+    True draws a bar. Without `residuals` the KKT residuals, which may cost time, are NaN.
 
-    A failed solve is an exception whose class has `is_solver_failure`. The last applied action is
-    then applied again, at the first sample the scenario's reference action. The failure is
-    counted, and the controller is reset. Every other error ends the run and is raised.
+    A failed solve is an exception whose class has `is_solver_failure`. The last applied action
+    (first the scenario's reference action) is then applied again, the failure is counted, and the
+    controller is reset. Every other error is raised.
     """
     if steps < 1:
         raise CosimError(f"steps must be at least 1, not {steps}")
@@ -108,7 +107,7 @@ class _Run:
         self._final_state: Array | None = None
 
     def interpreted(
-        self, record: Callable[[SampleBlock], None] | None, progress: Callable[[int], None]
+        self, record: Callable[[RunPart], None] | None, progress: Callable[[int], None]
     ) -> None:
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
         sampling_time = self._scenario.sampling_time
@@ -117,7 +116,7 @@ class _Run:
         self._controller.reset()
         applied = self._scenario.reference_action
         for k in range(self._steps):
-            s.flags.writeable = False  # a controller reads the state, and changes nothing
+            s.flags.writeable = False  # for the controller
             solution, prepare_time, feedback_time = solve(s)
             action = applied if solution is None else solution.action
             numbers = isinstance(action, np.ndarray) and action.dtype.kind in "fiu"
@@ -144,10 +143,10 @@ class _Run:
             s = step.s
             if record is not None and solution is not None:
                 self._keep_prediction(k, solution)
-            if (k + 1) % BLOCK == 0 or k + 1 == self._steps:
-                block = self._block(k // BLOCK * BLOCK, k + 1)
+            if (k + 1) % PART == 0 or k + 1 == self._steps:
+                part = self._part(k // PART * PART, k + 1)
                 if record is not None:
-                    record(block)
+                    record(part)
                 progress(k + 1)
         self._final_state = s
 
@@ -157,8 +156,8 @@ class _Run:
         s = plant.reset(spawn_seeds(self._seed)[0])
         n, m = s.size, scenario.action_lower.size
         outputs = 1 + len(scenario.plant.disturbances)
-        for first in range(0, self._steps, BLOCK):
-            end = min(first + BLOCK, self._steps)
+        for first in range(0, self._steps, PART):
+            end = min(first + PART, self._steps)
             table = np.empty((end - first, n + m + outputs + 6))
             self._final_state = plant.drive(loop, table)  # type: ignore[attr-defined]
             states, actions, output, rest = np.split(table, [n, n + m, n + m + outputs], axis=1)
@@ -210,19 +209,19 @@ class _Run:
         if states is None or actions is None:
             return
         if self._predicted_states is None or self._predicted_actions is None:
-            self._predicted_states = np.full((BLOCK, *np.shape(states)), np.nan)
-            self._predicted_actions = np.full((BLOCK, *np.shape(actions)), np.nan)
+            self._predicted_states = np.full((PART, *np.shape(states)), np.nan)
+            self._predicted_actions = np.full((PART, *np.shape(actions)), np.nan)
         try:
-            self._predicted_states[k % BLOCK] = states
-            self._predicted_actions[k % BLOCK] = actions
+            self._predicted_states[k % PART] = states
+            self._predicted_actions[k % PART] = actions
         except (TypeError, ValueError) as error:
             raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
 
-    def _block(self, first: int, end: int) -> SampleBlock:
+    def _part(self, first: int, end: int) -> RunPart:
         count = end - first
         states, actions = self._predicted_states, self._predicted_actions
         self._predicted_states = self._predicted_actions = None
-        return SampleBlock(
+        return RunPart(
             first=first,
             columns=self._columns.store(first),
             status=self._status[first:end],
@@ -276,8 +275,7 @@ def controller_name(controller: Any) -> str:
 def indicators(run: Trajectory, burn_in: int = 0) -> dict[str, float]:
     """Indicators of a run after its first `burn_in` samples.
 
-    Its `Trajectory.means`; `input_effort` (see there); `failures`, the number of samples under the
-    fallback action.
+    They are `Trajectory.means`, `input_effort` and `failures`, the samples under the fallback.
     """
     lower, upper = run.scenario.action_lower, run.scenario.action_upper
     return run.means(burn_in) | {
@@ -289,9 +287,9 @@ def indicators(run: Trajectory, burn_in: int = 0) -> dict[str, float]:
 def measure(
     plant: Plant, controller: Controller, seed: int, steps: int, burn_in: int = 0
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Indicators of `steps` samples after `burn_in` on a seed's noise, and what the clock said.
+    """Indicators of `steps` samples after `burn_in` on a seed's noise, and times.
 
-    The clock's figures are `wall_time_s` and quantiles of each phase of a sample in µs.
+    Times are `wall_time_s` and quantiles of each phase of a sample in µs.
     """
     begin = perf_counter()
     run = simulate(plant, controller, burn_in + steps, seed, residuals=False)

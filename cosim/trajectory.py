@@ -43,11 +43,10 @@ NO_SOLUTION = NoSolution()
 
 @dataclass(slots=True)
 class Sample:
-    """What the loop knows of a sample once the plant has stepped.
+    """A sample of the loop.
 
     `time` in s, the measured state `s` (n,), the applied `action` (m,), the plant's `step`, the
-    controller's `solution`, whether the controller `failed`, and what the clock said:
-    `prepare_time`, `feedback_time`, `plant_time` in s.
+    controller's `solution`, whether the controller `failed`, and wall-clock times in s.
     """
 
     time: float
@@ -65,11 +64,10 @@ class Sample:
 class SignalKind:
     """A declared signal: its `name`, what it is `of`, its `unit`.
 
-    `of` is an attribute of a `Sample`, read at every sample, or a function of other signals. A
-    `vector` is a signal per variable that the scenario's plant names under `name`, in the
-    variable's unit; its attribute then holds all of them. `group` is where a recording shows it,
-    None if it is not recorded; `whole` marks 0 or 1, `clock` what a clock measured, which stays out
-    of the trajectory's file.
+    `of` is an attribute of a `Sample`, or a function of other signals. A `vector` has a signal for
+    each variable that the scenario's plant names under `name`, in the variable's unit. `group` is
+    where a recording shows it, None: nowhere; `whole` marks 0 or 1, `clock` wall-clock times, which
+    the trajectory's file leaves out.
     """
 
     name: str
@@ -120,7 +118,7 @@ def clocked() -> frozenset[str]:
 
 
 class SignalColumns:
-    """Every declared signal of a run, read sample by sample and stored by blocks, as `columns`.
+    """Every declared signal of a run, read sample by sample and stored in parts, as `columns`.
 
     Without `residuals` their column is NaN.
     """
@@ -148,7 +146,7 @@ class SignalColumns:
         }
 
     def read(self, sample: Sample) -> None:
-        """Take the values of a sample, since neither plant nor controller need keep theirs."""
+        """Copy the values of a sample, which plant and controller may overwrite."""
         row = list(self._scalars(sample))
         for values in self._vectors(sample):
             row += values.tolist()
@@ -163,7 +161,7 @@ class SignalColumns:
         self._derive(where)
 
     def store(self, first: int) -> dict[str, Array]:
-        """Store what was read, from sample number `first` on, and return it by name."""
+        """Store the samples read, from sample number `first` on, and return them by name."""
         where = slice(first, first + len(self._rows))
         self._table[where, : len(self._rows[0])] = self._rows
         self._rows.clear()
@@ -349,7 +347,7 @@ class Trajectory(Result):
 
 
 def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:
-    """Rows of equally long columns; a part at a time, since Python's numbers take more memory."""
+    """Rows of equally long columns, converted a part at a time to save memory."""
     for first in range(0, len(columns[0]) if columns else 0, PART):
         yield from zip(*(column[first : first + PART].tolist() for column in columns), strict=True)
 

@@ -1,4 +1,4 @@
-"""Writes recordings: a run by blocks of samples, ended runs over each other, a training."""
+"""Writes recordings: a run part by part, ended runs over each other, a training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ import rerun.blueprint as rrb
 from cosim.comparison import RunSignals
 from cosim.errors import RecordingError
 from cosim.files import check_target, publish
-from cosim.protocols import Array, Controller, SampleBlock
+from cosim.protocols import Array, Controller, RunPart
 from cosim.recording.read import SAMPLE, SIGNAL, TIME
 from cosim.scenario import Scenario
 from cosim.simulation import controller_name
@@ -72,7 +72,7 @@ class RerunRecorder:
         steps: int,
         units: dict[str, str],
     ) -> None:
-        """Open the file and write what is known before the first sample."""
+        """Open the file; write layout and properties."""
         name = controller_name(controller)
         self._seconds = steps * scenario.sampling_time
         recorded = [kind for kind in SIGNALS if kind.group is not None]
@@ -103,17 +103,17 @@ class RerunRecorder:
         good = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
         stream.rerun.log(_STATUS, good, static=True)
 
-    def record(self, block: SampleBlock) -> None:
+    def record(self, part: RunPart) -> None:
         """Append K samples: one column of K rows for each signal."""
         stream = self._stream
-        if stream is None or not len(block):
+        if stream is None or not len(part):
             return
-        samples, time = np.arange(block.first, block.first + len(block)), block["time"]
+        samples, time = np.arange(part.first, part.first + len(part)), part["time"]
         rows, ends = times(samples, time), times(samples[[0, -1]], time[[0, -1]])
         bundles: dict[str, tuple[list[Channel], list[np.ndarray]]] = {}
         for kind, channels in self._kinds.items():
             for channel, values in zip(
-                channels, block[kind.name].reshape(len(block), -1).T, strict=True
+                channels, part[kind.name].reshape(len(part), -1).T, strict=True
             ):
                 channel.see(values, tail=0.05 if kind.clock else 0.0)
                 members, columns = bundles.setdefault(channel.entity, ([], []))
@@ -123,13 +123,13 @@ class RerunRecorder:
         for members, columns in bundles.values():
             stream.send(members, rows, np.column_stack(columns))
         with np.errstate(divide="ignore", invalid="ignore"):
-            residual = np.log10(block["residual"])
+            residual = np.log10(part["residual"])
         stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
         self._residual.see(residual)
-        self._changes_of_status(stream, samples, block)
-        self._predictions(stream, rows, block)
+        self._changes_of_status(stream, samples, part)
+        self._predictions(stream, rows, part)
         self._intermediate(stream, samples, time)
-        self._samples += len(block)
+        self._samples += len(part)
 
     def intermediate(self, time: float, states: Array) -> None:
         """Take the states (n,) at a time [s] within a sample."""
@@ -144,18 +144,18 @@ class RerunRecorder:
                 self._stream.discard()
             self._stream = None
 
-    def _changes_of_status(self, stream: Stream, samples: np.ndarray, block: SampleBlock) -> None:
-        before = [self._status, *block.status[:-1]]
-        rows = [i for i, status in enumerate(block.status) if status != before[i]]
-        self._status = block.status[-1]
+    def _changes_of_status(self, stream: Stream, samples: np.ndarray, part: RunPart) -> None:
+        before = [self._status, *part.status[:-1]]
+        rows = [i for i, status in enumerate(part.status) if status != before[i]]
+        self._status = part.status[-1]
         if rows:
-            states = rr.StateChange.columns(state=[drawable(block.status[i]) for i in rows])
-            stream.rerun.send_columns(_STATUS, times(samples[rows], block["time"][rows]), states)
+            states = rr.StateChange.columns(state=[drawable(part.status[i]) for i in rows])
+            stream.rerun.send_columns(_STATUS, times(samples[rows], part["time"][rows]), states)
 
-    def _predictions(self, stream: Stream, rows: list[rr.TimeColumn], block: SampleBlock) -> None:
+    def _predictions(self, stream: Stream, rows: list[rr.TimeColumn], part: RunPart) -> None:
         for group, values in (
-            ("states", block.predicted_states),
-            ("actions", block.predicted_actions),
+            ("states", part.predicted_states),
+            ("actions", part.predicted_actions),
         ):
             if values is None:
                 continue
@@ -364,7 +364,7 @@ class Channel:
     """A signal in a recording: its entity, how it is drawn, and the range `seen` of its values.
 
     `labels` name the lines of a signal with several numbers a row. `step` holds a value until the
-    next one, `points` draws dots, for values between NaN; `bounds` may be infinite.
+    next one, `points` draws dots; `bounds` may be infinite.
     """
 
     entity: str
@@ -379,7 +379,7 @@ class Channel:
 
     @property
     def title(self) -> str:
-        """Name, unit and bounds in words: the viewer's lines have no labels, its font no ≥."""
+        """Name, unit and bounds in words: the viewer's font has no ≥."""
         label = self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"
         sides = zip(("at least", "at most"), self.bounds, strict=True)
         return ", ".join([label, *(f"{side} {b:g}" for side, b in sides if isfinite(b))])
@@ -407,13 +407,11 @@ class Channel:
 
 
 class Stream:
-    """An open recording: `send`, then `close`; an exception in its block discards it.
+    """An open recording: `send`, then `close`; an exception in its context discards it.
 
-    The layout stands first in the file, as Rerun wants it, and `close` can send a better one. The
-    file is written beside `path` under a hidden name and renamed by `close`, so that `path` never
-    holds half a recording; `rerun rrd optimize` repairs what a killed process leaves.
-
-    Raises RecordingError where the folder does not exist or cannot be written.
+    The file is written beside `path` under a hidden name and renamed by `close`, so that `path`
+    never holds half a recording; `rerun rrd optimize` repairs what a killed process leaves. Raises
+    RecordingError where the folder does not exist or cannot be written.
     """
 
     def __init__(self, path: str | Path, name: str, layout: rrb.Blueprint) -> None:
@@ -426,7 +424,7 @@ class Stream:
             raise RecordingError(
                 f"cannot write the recording {self.path}: {error.strerror}"
             ) from None
-        # Without it a column of the wrong shape is dropped with no more than a warning.
+        # Otherwise a column of the wrong shape is dropped with a warning.
         rr.set_strict_mode(True)
         self.rerun = rr.RecordingStream("rti-cosim")
         self.rerun.send_recording_name(drawable(name))
@@ -499,12 +497,12 @@ class Stream:
             self._partial.unlink(missing_ok=True)
 
     def _bounded(self, call: Callable[[], None]) -> None:
-        """Let Rerun write for a limited time: once its writer has ended, it waits for ever."""
+        """Let Rerun write for a limited time: without its writer it would wait for ever."""
         writing = threading.Thread(target=call, daemon=True)
         writing.start()
         writing.join(_WRITE_SECONDS)
         if writing.is_alive():
-            # To drop the stream, or to let Rerun shut down, would wait for ever too.
+            # Dropping the stream, or Rerun's shutdown, would wait for ever too.
             _ABANDONED.append(self.rerun)
             atexit.unregister(rr.rerun_shutdown)
             self._give_up("its writer does not answer")
@@ -544,10 +542,7 @@ def packed_color(color: str) -> int:
 
 
 def drawable(text: str) -> str:
-    """Replace by `?` each character that the viewer's font lacks; the headless viewer aborts on it.
-
-    Names and units are the user's to choose.
-    """
+    """Replace by `?` each character that the viewer's font lacks: the headless viewer aborts."""
     return "".join(
         c if c == "\n" or any(low <= ord(c) <= high for low, high in _DRAWABLE) else "?"
         for c in text

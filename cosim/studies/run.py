@@ -32,7 +32,7 @@ ANSWER_SECONDS = 10.0
 """Time in which a scheduler answers."""
 WORKER_SECONDS = 300.0
 """Time for which a cluster may be without a worker while there is work."""
-BLOCK = 20_000
+ITEM = 20_000
 """Samples of an item of evaluation, about: a few seconds of work."""
 ROUNDS = 3
 """Times that workers may die without having finished one item."""
@@ -105,7 +105,7 @@ class Runner:
         for file, noise in run.noise.items():
             missing = noise._replace(seeds=store.missing(file))
             self._done[name] += noise.samples - missing.samples
-            size = 1 if noise.block else max(1, BLOCK // (noise.burn_in + noise.steps))
+            size = 1 if noise.block else max(1, ITEM // (noise.burn_in + noise.steps))
             theta: tuple[float, ...] = ()
             if noise.mark and missing.seeds and run.training is not None:
                 theta = operation.theta_at(store.log, noise.mark)

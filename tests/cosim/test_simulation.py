@@ -3,7 +3,7 @@ import pytest
 
 from cosim import FmuPlant, Scenario, simulate
 from cosim.plugins import build_controller
-from cosim.simulation import BLOCK, indicators, input_effort, spawn_seeds
+from cosim.simulation import PART, indicators, input_effort, spawn_seeds
 from cosim.trajectory import FALLBACK
 from tests.helpers.loop import Failing, Hold, Proportional
 
@@ -102,15 +102,15 @@ class Predicting(Proportional):
         return answer._replace(predicted_states=states, predicted_actions=actions)
 
 
-def test_a_recorder_gets_the_whole_run_in_blocks(evaporator, paper):
+def test_a_recorder_gets_the_whole_run_in_parts(evaporator, paper):
     recorder, done = Recorder(), []
-    steps = 2 * BLOCK + 17
+    steps = 2 * PART + 17
     trajectory = simulate(
         evaporator, Predicting(paper), steps, seed=9, recorder=recorder, progress=done.append
     )
     assert recorder.calls == [("start", "paper", "proportional", 9, steps, "kPa"), ("close",)]
-    assert [first for first, *_ in recorder.blocks] == [0, BLOCK, 2 * BLOCK]
-    assert done == [BLOCK, 2 * BLOCK, steps]
+    assert [first for first, *_ in recorder.blocks] == [0, PART, 2 * PART]
+    assert done == [PART, 2 * PART, steps]
     states = np.concatenate([states for _, states, *_ in recorder.blocks])
     np.testing.assert_array_equal(states, trajectory.states)
     for _, states, status, block in recorder.blocks:
@@ -127,9 +127,9 @@ def test_recording_does_not_change_the_run(evaporator, paper):
 
 
 def test_the_recorder_is_closed_when_the_run_fails(evaporator, paper):
-    recorder = Recorder(fail_at=BLOCK)
+    recorder = Recorder(fail_at=PART)
     with pytest.raises(OSError, match="disk full"):
-        simulate(evaporator, Proportional(paper), 2 * BLOCK, seed=0, recorder=recorder)
+        simulate(evaporator, Proportional(paper), 2 * PART, seed=0, recorder=recorder)
     assert recorder.calls[-1] == ("close",)
     assert len(recorder.blocks) == 1
 

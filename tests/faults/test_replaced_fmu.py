@@ -36,7 +36,7 @@ HOW = ["another FMU", "nothing"]
 def test_an_evaluation_ends_in_a_line_and_goes_on_with_the_fmu_of_before(
     scenario, tmp_path, how, monkeypatch
 ):
-    monkeypatch.setattr(run, "BLOCK", 20)  # an item a seed
+    monkeypatch.setattr(run, "ITEM", 20)  # an item a seed
     runs = []
 
     def counting(described):

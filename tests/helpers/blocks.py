@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cosim.protocols import SampleBlock
+from cosim.protocols import RunPart
 from cosim.trajectory import SIGNALS
 
 
@@ -15,7 +15,7 @@ def random_block(scenario, rng, first=0, samples=10):
     columns["time"] = np.arange(first, first + samples) * scenario.sampling_time
     columns["residual"] = np.full(samples, np.nan)
     n, m = len(scenario.plant.states), len(scenario.plant.actions)
-    return SampleBlock(
+    return RunPart(
         first=first,
         columns=columns,
         status=["solved"] * samples,

@@ -86,15 +86,14 @@ class ConvergedNmpc(RtiNmpc):
 
     Q, V, π and their sensitivities are those of the nonlinear programme (paper.tex, Sensitivities
     of Fully Converged NMPC): at the solution the QP with the exact Hessian has the programme's KKT
-    matrix. SQP solves that QP, which converges quadratically. Where it is not convex, the Hessian
-    is lifted; an ℓ1 merit function chooses the step length. `tolerance` is on the largest change of
-    states, actions and, relative to 1 + ‖χ‖∞, costates; QpError is raised where `iterations` do not
-    reach it.
+    matrix. SQP on that QP converges quadratically; where it is not convex the Hessian is lifted,
+    and an ℓ1 merit function chooses the step length. `tolerance` is on the largest change of
+    states, actions and, relative to 1 + ‖χ‖∞, costates; QpError where `iterations` do not reach it.
     """
 
     name = "converged"
     memoryless = False
-    """A second feedback starts its SQP where the first one ended."""
+    """A feedback depends on earlier ones: it starts its SQP where the last one ended."""
 
     @known_keywords
     def __init__(
@@ -183,7 +182,7 @@ class ConvergedNmpc(RtiNmpc):
         slope = float(here.gradient @ move) + end.penalty - here.penalty
         slope -= weight * here.infeasibility
         start, length = here.merit(weight), 1.0
-        # Rounding of values near 1e6 must not stop the last, tiny steps.
+        # Rounding of values near 1e6 must not stop the last steps.
         rounding = 1e-12 * abs(start)
         while length > 1e-6:
             if trial.merit(weight) <= start + 1e-4 * length * min(slope, 0.0) + rounding:

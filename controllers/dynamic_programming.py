@@ -563,7 +563,7 @@ class Optimum:
     lower: float = -np.inf
     upper: float = np.inf
     certificate: tuple[Figure, ...] = ()
-    step: Array = field(default_factory=lambda: np.zeros(0))
+    step: Array = field(default_factory=partial(np.zeros, 0))
 
     @property
     def edge_mass(self) -> float:

@@ -31,8 +31,8 @@ class SteadyState:
     `x` (n,), `u` (m,), `cost` ℓ_s; `costate` λ (n,) of f(x, u) − x = 0; `multipliers` (n+m,) of the
     bounds of w = (x, u), positive at a lower and negative at an upper bound; `A` (n, n), `B` (n, m)
     Jacobians of f; `hessian` H = ∇²_w (ℓ + λᵀf) (n+m, n+m); `gradient` (n+m,) of ℓ + λᵀ(f − x),
-    which equals `multipliers`. `C` (n_c, n+m) holds the gradients of the strictly active bounds
-    and `active` says which they are.
+    which equals `multipliers`; `C` (n_c, n+m) gradients of the strictly active bounds, `active`
+    these in words.
     """
 
     x: Array
@@ -137,9 +137,9 @@ class LocalFeedback(NamedTuple):
 def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
     """Solve the Riccati equation on the manifold C w_k = 0, k ≥ 1, of the active constraints.
 
-    A row of `C` (n_c, n+m) that has an entry in u binds from k = 0 on; one of the state alone binds
-    the next state. H (n+m, n+m) may be indefinite. Raises TuningError where the actions cannot
-    keep the constraints, or no stabilising solution exists.
+    A row of `C` (n_c, n+m) with an entry in u binds from k = 0 on, one of the state alone binds the
+    next state. H (n+m, n+m) may be indefinite. Raises TuningError where the actions cannot keep the
+    constraints, or no stabilising solution exists.
     """
     n, m = B.shape
     on_action = np.abs(C[:, n:]).max(axis=1, initial=0.0) > 0
@@ -210,9 +210,9 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     """Best-conditioned convex stage cost with the same local optimum.
 
     min β + ρ‖F‖ s.t. βI ⪰ αH + 𝓗(δP) + CᵀFC ⪰ I over α ≥ 0, β, δP and F, with ρ = `weight`
-    (Zanon, Gros, Diehl 2016). 𝓗(δP) telescopes along a trajectory; CᵀFC vanishes where the active
-    constraints C w = 0 hold: neither changes the optimal feedback. Raises TuningError where there
-    is no solution: then the steady state is not locally optimal under these constraints.
+    (Zanon, Gros, Diehl 2016). 𝓗(δP) telescopes along a trajectory and CᵀFC vanishes where C w = 0,
+    so neither changes the optimal feedback. Raises TuningError where there is no solution: the
+    steady state is not locally optimal under these constraints.
     """
     size, n, n_c = len(H), len(A), len(C)
     basis = [("α", H)]
@@ -354,9 +354,8 @@ def tune(
 def linearisation_substeps(problem: Problem) -> int:
     """Runge–Kutta steps a sample with a relative error below 1e-8, at the reference.
 
-    The error is that of A and B: a steady state itself is integrated exactly by any number of
-    steps. The problem's own number is doubled until doubling it once more changes less. Raises
-    TuningError where that does not come about in 1024 steps.
+    The error is that of A and B. The problem's own number is doubled until doubling it once more
+    changes less. Raises TuningError where 1024 steps are too few.
     """
     model, (x, u, d, p), h = problem.model, problem.model.symbols(), ca.SX.sym("h")
     after = runge_kutta(lambda at: model.ode(at, u, d, p), x, h, 1)

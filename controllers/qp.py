@@ -117,9 +117,8 @@ class QpSolution(NamedTuple):
     def active(self, qp: SoftQp) -> tuple[Mask, Mask, Mask]:
         """Masks: variables held by a bound, rows held at a limit, rows violated.
 
-        They are the branches of the proximal operators in `residual`: of a distance and a
-        multiplier that should exclude each other, the larger decides. `weakly_active` says where
-        that is not safe.
+        They are the branches of the proximal operators in `residual`: of a distance and its
+        multiplier the larger decides, which is unsafe where `weakly_active`.
         """
         v, nu, lam = self
         held = (qp.lower == qp.upper) | (np.minimum(v - qp.lower, qp.upper - v) < np.abs(nu))
@@ -151,12 +150,11 @@ def multipliers_at_kink(
 ) -> QpSolution:
     """Of all multipliers of Q(s, a) at a kink, those that make dQ/da as small as they can.
 
-    With u_0 = a enforced, the state x_1 is known, and where it sits exactly on a soft bound Q has a
-    kink: that row's multiplier may be anything in [0, w], and every backend returns another one.
-    At a = π(s) this is the rule rather than the exception, since the policy drives the state to
-    its bound. The multipliers chosen here minimise ‖dQ/da‖ over the components of `a` strictly
-    between the actuators' bounds `lower` and `upper` (m,), so at a = π(s) they are those of V(s).
-    The first n rows of the QP must be x_1; n is read off the stages that follow.
+    With u_0 = a enforced, x_1 is known. Where it lies on a soft bound, as it often does at
+    a = π(s), Q has a kink: that row's multiplier may be anything in [0, w], and every backend
+    returns another one. Those chosen here minimise ‖dQ/da‖ over the components of `a` strictly
+    between the actuators' bounds `lower` and `upper` (m,); at a = π(s) they are those of V(s). The
+    first n rows of the QP must be x_1.
     """
     v, nu, lam = solution
     m, n = lower.size, qp.w.size * lower.size // v.size
@@ -185,11 +183,11 @@ def kkt_solve(
 ) -> tuple[Matrix, Matrix]:
     """Solve the KKT system of an active set for several right-hand sides, one a row.
 
-    `active` is what `QpSolution.active` returns. Held variables stay at zero, rows at their limit
-    take the values `limits` (k, rows), and a violated row adds its quadratic weight to the Hessian.
-    `seeds` (k, variables) are the right-hand sides of stationarity. Returns the variables
-    (k, variables) and the multipliers of the rows at their limit (k, rows), zero elsewhere. Where
-    the system is singular (LICQ fails) it is solved by least squares.
+    `active` is that of `QpSolution.active`. Held variables stay at zero, rows at their limit take
+    the values `limits` (k, rows), a violated row adds its quadratic weight to the Hessian. `seeds`
+    (k, variables) are the right-hand sides of stationarity. Returns the variables (k, variables)
+    and the multipliers of the rows at their limit (k, rows), zero elsewhere; a singular system
+    (LICQ fails) is solved by least squares.
     """
     held, at_limit, violated = active
     free = ~held
@@ -221,9 +219,8 @@ def kkt_solve(
 def polish(qp: SoftQp, solution: QpSolution, accuracy: float = 1e-10) -> QpSolution:
     """Bring an approximate solution to a residual below `accuracy` by a few Newton steps.
 
-    A step takes the active set that the present iterate shows and solves for it exactly; near the
-    solution this primal-dual active-set method (semismooth Newton on the proximal residuals) ends
-    after one or two. Returns the best iterate, `solution` itself if none is better.
+    Each step solves exactly for the iterate's active set (a primal-dual active-set method, that is
+    semismooth Newton on the proximal residuals). Returns the iterate with the least residual.
     """
     best, least = solution, solution.residual(qp)
     for _ in range(STEPS):
@@ -294,10 +291,10 @@ def make_backend(name: str) -> QpBackend:
 
 
 class DaqpBackend:
-    """Solves the condensed QP; the slack never becomes a variable.
+    """Solves the condensed QP, without variables for the slack.
 
-    Every solve starts from the same empty working set, so its result depends on the QP alone and
-    not on what was solved before: runs can be repeated and resumed bit by bit.
+    Every solve starts from an empty working set, so its result depends on the QP alone: runs can be
+    repeated and resumed bit by bit.
     """
 
     def __init__(self) -> None:
@@ -374,10 +371,9 @@ ATTEMPTS: dict[str, list[dict[str, Any]]] = {
 
 
 class QpsolversBackend:
-    """Builds `qpsolvers.Problem` anew for each solve.
+    """Builds `qpsolvers.Problem` anew for each solve, and polishes the solution.
 
-    Its solutions are polished, so that interior-point solvers, asked for what they can reach, give
-    multipliers of 1e5 to the same digits as active-set ones.
+    So interior-point solvers give multipliers of 1e5 to the same digits as active-set ones.
     """
 
     def __init__(self, solver: str) -> None:

@@ -44,10 +44,9 @@ def symmetric_matrix(packed: Vector, dimension: int) -> Vector:
 class ThetaBlock:
     """A named part of θ, by its `shape` a scalar (), a vector (d,) or a symmetric matrix (d, d).
 
-    A symmetric matrix is packed as its upper triangle row by row, each entry once. `scale` is the
-    typical size of a change worth making, by packed entry in the block's own units, `meaning` a few
-    words, and `labels` name the entries where they have names of their own. `least` are the
-    smallest values that entries may have where there are such.
+    A symmetric matrix is packed as its upper triangle row by row. `scale` is the typical size of a
+    change, by packed entry in the block's own units, `meaning` a few words, `labels` the entries'
+    own names, `least` their smallest values, where there are such.
     """
 
     name: str
@@ -154,9 +153,9 @@ class ThetaBlocks:
 
         `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
         predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.
-        Scales are shares of the problem's `Units`, ρ of states and actions, κ of cost. A Hessian's
-        is κ/ρ_iρ_j, a gradient's 0.1 κ/ρ, a bound's ρ/100, those of the slack weights κ/ρ and
-        1000 κ/ρ². Raises ModelError on a parameter that the model lacks.
+        Scales are made of the problem's `Units` ρ and κ: a Hessian's is κ/ρ_iρ_j, a gradient's
+        0.1 κ/ρ, a bound's ρ/100, those of the slack weights κ/ρ and 1000 κ/ρ². Raises ModelError on
+        a parameter that the model lacks.
         """
         units = problem.units
         kappa, states = units.cost, units.state
@@ -327,8 +326,8 @@ class Parameters(Shown):
     def load(cls, path: str | Path, problem: Problem) -> Parameters:
         """Read θ for a problem; the file says which optional blocks it has.
 
-        Raises ParameterError where the file is missing, is no TOML, has another schema, lacks or
-        adds a key or a block, or where its values do not match its hash.
+        Raises ParameterError where the file is missing or no TOML, has another schema, key or
+        block, or values that do not match its hash.
         """
         document = read_toml(path, f"parameters file '{path}'", ParameterError)
         file = validated(_File, document, f"parameters file '{path}'", ParameterError)

@@ -51,7 +51,7 @@ def ratio(numerator: Array, denominator: Array) -> Estimate:
 
 
 def bootstrapped(numerator: Array, denominator: Array) -> Interval:
-    """BCa bootstrap interval of `ratio`, resampling seeds: for costs of which few seeds have most.
+    """BCa bootstrap interval of `ratio`, resampling seeds, for skewed costs.
 
     None for one seed, for more than `RESAMPLED`, and where a value is not finite.
     """
@@ -119,8 +119,8 @@ def _each(numerator: Array, denominator: Array | float) -> Array:
 def interquartile_mean(values: Array, axis: int = -1) -> Any:
     """Mean of the middle half of R values along an axis, (R,) -> scalar.
 
-    Quarters of R that are no whole numbers count with their share of an entry, so that one to four
-    runs have one too. Source: Agarwal et al., Deep RL at the Edge of the Statistical Precipice.
+    Entries at a quarter of R count with their share. Source: Agarwal et al., Deep RL at the Edge of
+    the Statistical Precipice.
     """
     ordered = np.sort(values, axis=axis)
     count = ordered.shape[axis]
@@ -166,8 +166,7 @@ def td_error_mean(
     """Root mean square TD error over the updates of the `window` samples up to each row, (K,).
 
     `samples` (K,) is where a row of a training's log ends, `td_error` (K,) its root mean square
-    over its `updates` (K,); rows without updates count for nothing. The first rows average over
-    what there is; NaN where there is none.
+    over its `updates` (K,). The first rows average over fewer samples; NaN without an update.
     """
     counts = np.where(np.isfinite(td_error), updates, 0.0)
     squares = np.where(counts > 0, td_error, 0.0) ** 2 * counts
@@ -185,8 +184,7 @@ def shown(
 ) -> str:
     """`value [low, high]` for tables, scaled; `value` alone where there is no interval.
 
-    Rounded so that the value keeps `digits` significant digits and the interval's half width two:
-    what two controllers differ by stays readable, whatever the size of J.
+    The value keeps `digits` significant digits and the interval's half width two.
     """
     value *= scale
     if ends is None:

@@ -45,11 +45,10 @@ class ActorCriticConfiguration(Configuration):
 class ActorCritic(Algorithm):
     """Actor-critic: descends J along ∇J = E[∇π ∇πᵀ] w (paper.tex, eq. pg_update and pg_solution).
 
-    θ stays as it is for a batch. Then LSTDV fits the smooth part W of V = penalty + W, and LSTDQ
-    the weights w of the advantage A(s, a) = (a − π(s) − bias)ᵀ ∇π(s)ᵀ w. `bias` is the mean that
-    saturation gives to the exploration. The known penalty is moved to the next state, r = ℓ +
-    γ·penalty(s₊), so that the critic meets no kink. Its discount γ is 1, that of the mean cost, the
-    benchmark's yardstick.
+    θ stays for a batch. Then LSTDV fits the smooth part W of V = penalty + W, and LSTDQ the weights
+    w of the advantage A(s, a) = (a − π(s) − bias)ᵀ ∇π(s)ᵀ w. `bias` is the exploration's mean under
+    saturation. The known penalty is moved to the next state, r = ℓ + γ·penalty(s₊), so that the
+    critic meets no kink. Its discount γ is 1, that of the mean cost.
     """
 
     Configuration = ActorCriticConfiguration
@@ -119,7 +118,7 @@ class ActorCritic(Algorithm):
         floor = settings.ridge * float(fisher.trace()) / gradient.size
         metric = fisher + (floor + np.finfo(float).tiny) * np.eye(gradient.size)
         fit = policy_gradient_fit(gradient, settings.step_size, metric)
-        # A step that the policy does not feel has no length here, and is none to take.
+        # A step without effect on the policy has no length here, and is not taken.
         if not fit.minimiser @ fisher @ fit.minimiser > 0:
             fit = fit.shrunk(0.0)
         # From the one radius to the other by equal ratios.
@@ -156,9 +155,8 @@ class AdvantageRegression:
     """LSTDQ for the weights w (n_θ,) of the compatible advantage A = ψᵀw, given LSTDV's TD errors.
 
     The policy is greedy in s₊, where A vanishes, so LSTDQ with V held is a regression of the TD
-    errors on ψ. Earlier batches count too, each `forgetting` times as much as the next one: θ
-    moves little from batch to batch, and the gradient's noise is what limits learning. `ridge` is
-    relative to the mean of the information's diagonal.
+    errors on ψ. Each earlier batch counts `forgetting` times as much as the next one, which lowers
+    the gradient's noise. `ridge` is relative to the mean of the information's diagonal.
     """
 
     KEPT = ("information", "moment")

@@ -38,16 +38,13 @@ class Segment(NamedTuple):
 class BackOffSearch:
     """Finds the κ of least cost for the active bounds x_l + κσ and x_u − κσ.
 
-    σ is the standard deviation of the model's one-step prediction error in each state, so that κ
-    has no unit; a bound is active where it binds in the QP (dV/dx_l or dV/dx_u ≠ 0) now and then.
-    Each has a line search of three rounds (docs/method.md). That of the bound which binds most
-    often at κ = 0 has the first round, which shows what others there are, and, with those in place,
-    the last two. No true bound is loosened. Of back-offs whose estimates differ by less than
-    `PLATEAU` the smallest is taken. Where the estimate falls up to the end of what the samples
-    speak for, the best back-off that was run is taken, and the next round is about it; `refused`
-    says so of the latest round.
-
-    Raises ConfigurationError on a budget that is too small to see anything.
+    σ is the standard deviation of the model's one-step prediction error in each state; a bound is
+    active where it binds in the QP (dV/dx_l or dV/dx_u ≠ 0) in `BINDING` of the samples. Each has a
+    line search of three rounds (docs/method.md). The bound that binds most often at κ = 0 has the
+    first round, which finds the others, and the last two. No true bound is loosened. Of back-offs
+    whose estimates differ by less than `PLATEAU` the smallest is taken. Where the estimate falls to
+    the end of its range, the best back-off that was run is taken, and the next round is about it;
+    `refused` says so of the latest round. Raises ConfigurationError on a budget that is too small.
     """
 
     KEPT = (

@@ -1,9 +1,8 @@
 """What a practitioner would do, from plant data: back-off, an offset, parameters of the model.
 
-In operation (`BackOff`, `OffsetFree`, `Identified`) the plant goes on as it is, and offset and
-parameters are followed to the end of the run. On a simulator (`…Simulator`) an estimate comes
-first and a `BackOffSearch` after it, whose stretches begin with the plant put back and meet the
-same noise.
+In operation (`BackOff`, `OffsetFree`, `Identified`) offset and parameters are estimated to the end
+of the run. On a simulator (`…Simulator`) a `BackOffSearch` follows the estimate; the plant is reset
+before each of its stretches, on the same noise.
 """
 
 from __future__ import annotations
@@ -85,12 +84,11 @@ class IdentifiedConfiguration(GreedyConfiguration):
 
 
 class BackOff(Algorithm):
-    """One number κ a bound that binds, found by a line search: the engineer's first remedy.
+    """One number κ a bound that binds, found by a line search (`BackOffSearch`).
 
-    From any start (`--start`), all else of θ stays; see `BackOffSearch`. A subclass has an estimate
-    instead in operation, and before the search on a simulator: it says how it `learn`s from a
-    transition and how it `conclude`s. `theta` is that of the estimate, or has the best back-off
-    found so far, whatever is being tried.
+    All else of θ stays. A subclass has an estimate, in operation in place of the search, on a
+    simulator before it: it says how it `learn`s from a transition and how it `conclude`s. `theta`
+    is that of the estimate, or has the best back-off found so far.
     """
 
     Configuration: ClassVar[type[Configuration]] = GreedyConfiguration
@@ -130,7 +128,7 @@ class BackOff(Algorithm):
         return search.seed if self.asks_for == "simulator" else None
 
     def failed(self, cost: float) -> Update | None:
-        """Take a sample at which the controller failed: it counts, and says nothing."""
+        """Count a sample at which the controller failed."""
         return self.observe(None)
 
     def observe(self, transition: Transition | None) -> Update | None:
@@ -181,8 +179,8 @@ class Estimate(BackOff):
     def backed_off(self, parameters: Parameters, errors: Matrix) -> Parameters:
         """θ in operation, its bounds set back by the greatest of its prediction errors (K, n).
 
-        None of these would have led from within the bounds of θ to beyond the scenario's. Bounds
-        that would cross stay as they are.
+        None of these would have led from within θ's bounds to beyond the scenario's. Bounds that
+        would cross stay.
         """
         if self.asks_for == "simulator" or not self.configuration.back_off:
             return parameters
@@ -247,9 +245,8 @@ class Identified(Estimate):
     """p̂ = argmin Σ ‖(s₊ − f(s, a; p))/σ‖², the prediction-error method, carried in θ's block p.
 
     σ is the standard deviation of the errors at the start's parameters. Then the cost is tuned at
-    the fitted model's optimal steady state and the bounds are backed off, by the greatest of the
-    fitted model's errors: what a practitioner does who knows which parameters of the plant have
-    drifted. In operation he does so every eight hours.
+    the fitted model's optimal steady state, and the bounds are backed off by the greatest of the
+    fitted model's errors. In operation this is done every eight hours.
     """
 
     Configuration = IdentifiedConfiguration

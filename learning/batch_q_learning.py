@@ -45,9 +45,8 @@ class BatchQLearning(ValueRule):
 
         min_d Σ (δ − ∇Qᵀ(d − d_now))²/r + (d − m)ᵀΛ(d − m),  then Λ ← Λ + GᵀG/r, m ← d
 
-    This is done `relinearisations` times a batch, linearised anew where the last step led: the
-    iterated filter (Gauss–Newton on the posterior). The first batch gives noise, widths and c_f as
-    well.
+    This is done `relinearisations` times a batch, each at the θ of the last step: the iterated
+    filter (Gauss–Newton on the posterior). The first batch also gives noise, widths and c_f.
     """
 
     Configuration = BatchQLearningConfiguration
@@ -155,8 +154,8 @@ def _newton(information: Matrix, slope: Vector) -> Fit:
 class Replayed:
     """K transitions at one θ: `action_value` Q(s, a), `target` ℓ + γV(s₊), both (K,).
 
-    `rows` says which ones of the buffer they are; `gradient` ∇Q, (K, n_θ), is in θ itself.
-    Transitions whose QP failed at this θ are left out; `failures` counts them.
+    `rows` are their indices in the buffer; `gradient` ∇Q (K, n_θ) is unscaled. Transitions whose QP
+    failed at this θ are left out; `failures` counts them.
     """
 
     rows: NDArray[np.int64]
@@ -167,12 +166,11 @@ class Replayed:
 
 
 class ReplayBuffer:
-    """Up to `capacity` transitions, each with the linearisation points that belong to it.
+    """Up to `capacity` transitions, each with its linearisation points.
 
-    Under real-time iterations V and Q depend on the guess at which the QP is linearised, so a
-    replay linearises where the plant's loop did, with the model and cost of the controller's θ.
-    What the loop or a replay has solved at this very θ is not solved again where the controller is
-    `memoryless`: values are NaN where nothing is known.
+    V and Q of a real-time iteration depend on the linearisation point, so a replay uses that of the
+    loop, with the model and cost of the controller's θ. Values solved at the same θ are kept where
+    the controller is `memoryless`; NaN stands for unknown ones.
     """
 
     KEPT = ("_count", "_columns", "_theta", "_action_value", "_next_value", "_gradient")
@@ -241,7 +239,7 @@ class ReplayBuffer:
         self._theta = theta
 
     def _solve(self, rows: NDArray[np.int64]) -> None:
-        """Solve for what is not known of these rows, in time's order; a failing QP leaves NaN."""
+        """Solve for unknown values of these rows, in time's order; a failing QP leaves NaN."""
         # V(s₊) of one transition is Q of the next: a successor shares the linearisation, and where
         # it was greedy the solution too.
         controller, columns = self._controller, self._columns

@@ -1,7 +1,7 @@
 """Checkpoints: one file, whole or absent, checked on reading, without pickle.
 
-The file is an NPZ archive of plain arrays; its entry `about` is JSON (schema version, what the run
-is, every number that is no array). The archive's own checksums say whether it is damaged.
+The file is an NPZ archive of plain arrays; its entry `about` is JSON: schema version, the run, and
+the numbers that are no arrays. The archive's checksums detect damage.
 """
 
 from __future__ import annotations
@@ -96,11 +96,11 @@ def group(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
 
 
 def arrays_of(state: Any) -> dict[str, Array]:
-    """What an object must keep, as arrays by name.
+    """The state of an object as arrays by name.
 
-    These are the attributes that its class names in `KEPT`, or a dataclass's fields: arrays,
-    numbers and lists of arrays; tables of arrays and objects of this kind, whose names stand after
-    the attribute's; None is left out.
+    It is made of the attributes that its class names in `KEPT`, or of a dataclass's fields: arrays,
+    numbers and lists of arrays; tables of arrays and objects of this kind, whose names follow the
+    attribute's; None is left out.
     """
     found: dict[str, Array] = {}
     for name in _kept(state):
@@ -116,8 +116,8 @@ def arrays_of(state: Any) -> dict[str, Array]:
 def take_up(state: Any, arrays: Mapping[str, Array]) -> None:
     """Restore an object's arrays from `arrays_of`; numbers keep their type.
 
-    In the order of `KEPT`; what is None now stays so; a part that can `restore` does. Raises
-    KeyError where one is missing, TypeError or ValueError where it has another form.
+    In the order of `KEPT`; None stays None; a part with a method `restore` uses it. Raises KeyError
+    where one is missing, TypeError or ValueError where it has another form.
     """
     for name in _kept(state):
         present = getattr(state, name)

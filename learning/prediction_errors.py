@@ -1,4 +1,4 @@
-"""What the plant does beside the controller's model: one-step prediction errors, and their use."""
+"""One-step prediction errors of the controller's model, and the penalty that they make likely."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ SLOWEST = 1000.0
 class OneStepModel:
     """f(s, a), the next state that the controller's own nominal model predicts, (n,).
 
-    `predict` and `errors` are for many samples at once, and for the model parameters and the
-    offset c_f of θ. Raises ModelError where the scenario names no model.
+    `predict` and `errors` take many samples, and the model parameters and c_f of θ. Raises
+    ModelError where the scenario names no model.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -107,8 +107,7 @@ def expected_penalties(
 ) -> Matrix:
     """Penalty of each state's lower and upper bound, (n, 2, K), a mean over f + h e of all errors.
 
-    `predictions` f and `scales` h are (K, n), h one if not given. The penalty is a sum over states
-    and bounds, so sums over the errors beyond a bound do.
+    `predictions` f and `scales` h are (K, n), h one if not given.
     """
     costs = np.zeros((predictions.shape[1], 2, len(predictions)))
     for i, predicted in enumerate(predictions.T):
@@ -124,9 +123,8 @@ def expected_penalties(
 class PredictionErrors:
     """The last `capacity` errors e = s₊ − f(s, a), and the mean penalty that they make likely.
 
-    The realised penalty p(s₊) is a rare spike; its expectation given (s, a), taken over what the
-    plant did lately, mean_i p(f(s, a) + e_i), is smooth in s and a. It asks for plant data alone
-    and is right under a wrong model too, since the errors carry what the model lacks.
+    The realised penalty p(s₊) is a rare spike; its expectation mean_i p(f(s, a) + e_i) is smooth in
+    s and a. It needs plant data alone, and the errors carry what the model lacks.
     """
 
     KEPT = ("_errors", "_count")

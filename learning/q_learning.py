@@ -184,15 +184,15 @@ class QLearning(ValueRule):
 
     `td` and `fit` step on each sample's δ = ℓ + γV_θ(s₊) − Q_θ(s, a) (paper.tex, eq. Qlearning).
 
-    `kalman` is an extended Kalman filter for Q with the target held, and the next penalty by its
+    `kalman` is an extended Kalman filter for Q with the target held and the next penalty in
     expectation: θ ~ N(θ₀, diag(σ²)) with the widths of `learning.step`. One TD error measures ∇Qᵀd
     with variance r (`KalmanRegression`):
 
         δ = ℓ + p(s) + γ[V_θ(s₊) − p(s₊) + mean_i p(f(s, a) + e_i)] − Q_θ(s, a)
 
     with f the controller's nominal model and e_i its latest prediction errors. Every `step_every`
-    samples d goes into θ under the constraints on θ, in the metric P⁻¹. The first `prior_samples`
-    leave θ as it is, but for c_f, which becomes the mean of e (docs/method.md).
+    samples θ moves by d under its constraints, in the metric P⁻¹. The first `prior_samples` move
+    only c_f, which becomes the mean of e (docs/method.md).
     """
 
     Configuration = QLearningConfiguration
@@ -280,9 +280,8 @@ class KalmanRegression:
         K = P∇Q/(r + ∇QᵀP∇Q),  d ← d + K·clip(δ − ∇Qᵀd),  P ← P − K∇QᵀP
 
     Without clip and with r constant this is the ridge regression min Σ(δ−∇Qᵀd)²/r + ‖d‖². The
-    innovation is cut at ±`clip`·√r; r follows the mean square of the innovations with a memory of
-    `memory` samples. `drift` is added to P's diagonal at each sample. A step `take`n has no entry
-    beyond ±`largest`.
+    innovation is clipped at ±`clip`·√r; r follows its mean square with a memory of `memory`
+    samples. `drift` is added to P's diagonal at each sample. A step has no entry beyond ±`largest`.
     """
 
     mean: Vector
@@ -315,9 +314,9 @@ class KalmanRegression:
         return innovation
 
     def take(self) -> Fit:
-        """The step d, which starts from zero again, in the metric P⁻¹ for constraints on it.
+        """The step d in the metric P⁻¹; d then starts from zero again.
 
-        A share α of a d that is too long is taken, and the same share of what P has lost since.
+        Of a step that is too long only a share is taken, and that share of P's decrease.
         """
         longest = float(np.abs(self.mean).max())
         if longest > self.largest:
@@ -334,11 +333,10 @@ class KalmanRegression:
 class AverageCost:
     """δ = ℓ + γV(s₊) − Q(s, a), and at γ = 1 δ = ℓ − g + V(s₊) − Q(s, a), with g learned.
 
-    At γ = 1 the constant c_lambda cancels out of δ: its step, which takes up the mean of δ, goes to
-    g, and c_lambda stays. With a `memory` g is no part of the fit, and each sample takes
-    g ← g + δ/memory: differential Q-learning after Wan, Naik and Sutton (2021).
-
-    `position` and `scale` are those of c_lambda in θ; `start` the first guess of g.
+    At γ = 1 the constant c_lambda cancels out of δ: its step goes to g, and c_lambda stays. With a
+    `memory` g is no part of the fit, and each sample takes g ← g + δ/memory: differential
+    Q-learning after Wan, Naik and Sutton (2021). `position` and `scale` are those of c_lambda in
+    θ; `start` is the first guess of g.
     """
 
     KEPT = ("mean_cost",)
@@ -352,7 +350,7 @@ class AverageCost:
         self._memory = memory if discount == 1.0 else 0
 
     def follow(self, td_error: float) -> None:
-        """Take a sample's δ into g, where the fit does not have it."""
+        """Move g by a sample's δ, where it is no part of the fit."""
         if self._memory:
             self.mean_cost += td_error / self._memory
 
@@ -365,7 +363,7 @@ class AverageCost:
         return kept
 
     def target(self, cost: Values, next_value: Values) -> Values:
-        """What Q(s, a) is fitted to, of one sample or of several, (K,)."""
+        """Target of Q(s, a), of one sample or of several, (K,)."""
         return cost - self.mean_cost + self.discount * next_value
 
     def take(self, fit: Fit) -> Fit:

@@ -1,9 +1,8 @@
 """A step of θ: the fit that a rule proposes, the constraints on θ, and the prior's coordinates.
 
-Every rule proposes min_d dᵀMd − 2bᵀd in scaled coordinates d = (θ̄ − θ) / scale (`Fit`). Its free
-minimiser is all that most steps need; M is built only where a constraint asks for it.
-`ConstrainedStep` moves the controller's θ by it. `prior_deviation` says how far each entry of θ may
-be from where it starts, without units of any plant.
+Every rule proposes min_d dᵀMd − 2bᵀd in scaled coordinates d = (θ̄ − θ) / scale (`Fit`); M is built
+only where a constraint needs it. `ConstrainedStep` moves the controller's θ by it.
+`prior_deviation` says how far each entry of θ may be from its start, without units of any plant.
 """
 
 from __future__ import annotations
@@ -42,9 +41,8 @@ GRADIENT = 0.3
 class Fit:
     """The problem min_d dᵀMd − 2bᵀd.
 
-    `gradient` is b (n,), `minimiser` M⁻¹b (n,), `metric()` M (n, n). `reach(d)` says how far a
-    step goes, as a multiple of the cap or trust region that the fit keeps: a step that a constraint
-    on θ corrects must still have at most 1.
+    `gradient` is b (n,), `minimiser` M⁻¹b (n,), `metric()` M (n, n). `reach(d)` is the length of a
+    step as a multiple of the fit's cap or trust region: at most 1, after corrections too.
     """
 
     gradient: Vector
@@ -103,10 +101,10 @@ def policy_gradient_fit(gradient: Vector, step_size: float, metric: Matrix) -> F
 
 
 class Outcome(NamedTuple):
-    """What a step has led to: the `smallest` eigenvalue of B_l and B_Vf after it.
+    """Result of a step: the `smallest` eigenvalue of B_l and B_Vf after it.
 
-    `corrected` says that the free step would have violated the constraint, `refused` that no
-    admissible step was found and θ stays.
+    `corrected`: the free step would have violated the constraint; `refused`: no admissible step was
+    found and θ stays.
     """
 
     smallest: float
@@ -186,9 +184,9 @@ def clip_eigenvalues(blocks: ThetaBlocks, theta: Vector, smallest: float) -> Vec
 class ConstrainedStep:
     """Moves a controller's θ by a fit under every constraint on θ.
 
-    `scale` (n_θ,) are the coordinates of the fits, the layout's if not given. The least eigenvalue
-    that the Hessians may have is the configuration's, or half of the start's where that is less: an
-    economically tuned cost is flat. Raises DivergenceError on a step that is not finite.
+    `scale` (n_θ,) are the coordinates of the fits, the layout's if not given. The Hessians' least
+    eigenvalue is the configuration's, or half of the start's where that is less. Raises
+    DivergenceError on a step that is not finite.
     """
 
     def __init__(
@@ -201,7 +199,7 @@ class ConstrainedStep:
         self._least = {block.name: np.array(block.least) for block in self.blocks if block.least}
 
     def proposal(self, fit: Fit) -> tuple[Vector, Outcome]:
-        """The new θ that a fit leads to, and what it has led to; the controller stays as it is.
+        """The new θ of a fit, and its outcome; the controller's θ stays.
 
         A step that definiteness corrects beyond the fit's cap or trust region is scaled back: the θ
         with definite Hessians are a convex set. Raises DivergenceError on a step not finite.
@@ -213,7 +211,7 @@ class ConstrainedStep:
         new = new.copy()
         for name, minimum in self._least.items():
             where = self.blocks.slices[name]
-            # What exactness (linear) and convexity ask of learned slack weights.
+            # Least slack weights: exact (linear) and convex (quadratic).
             new[where] = np.maximum(new[where], minimum)
         reach = 0.0 if fit.reach is None else fit.reach((new - theta) / self.scale)
         if reach > 1.0:
@@ -226,7 +224,7 @@ class ConstrainedStep:
         return new, outcome
 
     def take(self, fit: Fit, td_error: float) -> Update:
-        """Set the controller's θ to the fit's proposal and say what happened."""
+        """Set the controller's θ to the fit's proposal; the update."""
         old = self._controller.theta
         new, outcome = self.proposal(fit)
         self._controller.theta = new
@@ -234,10 +232,7 @@ class ConstrainedStep:
         return Update(td_error, size, *outcome)
 
     def move(self, theta: Vector, td_error: float = float("nan")) -> Update:
-        """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), and say so.
-
-        Nearest in the scaled coordinates.
-        """
+        """Set the controller's θ to the admissible one nearest to `theta` (n_θ,), scaled."""
         step = (theta - self._controller.theta) / self.scale
         return self.take(Fit(step, step, lambda: np.eye(step.size)), td_error)
 
@@ -269,10 +264,10 @@ def prior_deviation(
 ) -> Vector:
     """Standard deviation of each entry of θ about its start, (n_θ,).
 
-    With B a Hessian of the start, D = diag(B)^½ and κ = max_i B_ii σ_i² what the dearest typical
-    move costs, entries of B get `width`·D_i D_j and gradients `width`·D_i √κ (docs/method.md).
-    `state_deviation` and `error_deviation` (n,), `action_deviation` (m,) are σ of s, e and the
-    exploration, `level` the size of c_lambda.
+    With B a Hessian of the start, D = diag(B)^½ and κ = max_i B_ii σ_i² the cost of the dearest
+    typical move, entries of B get `width`·D_i D_j and gradients `width`·D_i √κ (docs/method.md).
+    `state_deviation`, `error_deviation` (n,) and `action_deviation` (m,) are σ of s, e and the
+    exploration, `level` is the size of c_lambda.
     """
     move = np.concatenate([np.maximum(state_deviation, error_deviation), action_deviation])
     stage, terminal = _root_diagonal(start["B_l"]), _root_diagonal(start["B_Vf"])

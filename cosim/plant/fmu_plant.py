@@ -284,8 +284,7 @@ _HEADER = struct.Struct("<q32s")
 class Snapshot:
     """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
 
-    Its memory belongs to the FMU and is handed to a later snapshot when this one is dropped: what
-    an FMU allocates leaks until freed.
+    Its memory belongs to the FMU, which frees none: a later snapshot reuses it.
     """
 
     __slots__ = ("handle", "k", "plant")
@@ -304,16 +303,14 @@ class FmuPlant:
 
     At sample k, time k·h, the action is written, and ℓ(x_k, u_k, d_k) and d_k are read. Then the
     FMU steps by the sampling time h, at once or by `plant.communication_step`, and x_{k+1} is
-    read. Use it as a context manager, or call `close`.
-    An FMU is native code: name only files that you trust.
-
-    Raises PlantError if the FMU is missing, corrupt, has no co-simulation binary for this
-    platform or lacks a variable that the scenario names; CapabilityError when a capability that
-    the FMU lacks is asked for, not before.
+    read. Use it as a context manager, or call `close`. An FMU is native code: name only files that
+    you trust.
 
     `scenario` is a `Scenario` or what `Scenario.load` takes; `fmu`, a shipped one's name or a path,
-    takes the place of the scenario's. `intermediate` is called with time [s] and states (n,) after
-    each internal step of an FMI 3.0 FMU that provides these values, and by no other.
+    replaces the scenario's. `intermediate` is called with time [s] and states (n,) after each
+    internal step of an FMI 3.0 FMU that provides these values. Raises PlantError if the FMU is
+    missing, corrupt, has no co-simulation binary for this platform or lacks a variable that the
+    scenario names; CapabilityError once a capability that the FMU lacks is used.
     """
 
     @known_keywords
@@ -379,8 +376,7 @@ class FmuPlant:
     def reset(self, seed: int, initial_state: Sequence[float] | Array | None = None) -> Array:
         """Start again at k = 0 with the disturbances of a seed in [0, 2⁶⁴); return the state (n,).
 
-        `initial_state` (n,) replaces the scenario's for this episode. Every start value is
-        written anew, so that nothing of an earlier episode remains.
+        `initial_state` (n,) replaces the scenario's for this episode. Every start value is written.
         """
         fmi = self._instance
         for place, word in seed_words(seed, self._seeds):
@@ -431,7 +427,7 @@ class FmuPlant:
     def drive(self, loop: CompiledLoop, table: Array) -> Array:
         """Take the next samples in a compiled loop, a row of `table` each; return the state (n,).
 
-        It does what as many calls of `step` do; raises PlantError, then needs a reset.
+        As many calls of `step` give the same. Raises PlantError, then needs a reset.
         """
         fmi = self._instance
         if self._k < 0:

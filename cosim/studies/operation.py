@@ -67,10 +67,10 @@ def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dic
     """Take the samples of a run on its plant; rows of `LIFE` and θ after each of the `marks`.
 
     Also the status, the processor time in s by mark, and the plant samples taken. `J` is the mean
-    cost of all samples so far; since the first change of θ (since the start, where θ rests)
-    `violating` is the share of violating samples and `dearest` the largest mean cost of `WINDOW`
-    samples in a row; `dearer` and `excess` compare with θ as it starts (`dearer_than`). A run that
-    diverges keeps its θ, and costs without bound from there on.
+    cost of all samples so far; since the first change of θ (the start, where θ rests) `violating`
+    is the share of violating samples and `dearest` the largest mean cost of `WINDOW` samples in a
+    row; `dearer` and `excess` compare with θ at the start (`dearer_than`). The cost of a diverged
+    run is infinite.
     """
     cost, violating = np.full(run.samples, np.inf), np.ones(run.samples, dtype=bool)
     rows: list[LogRow] = []
@@ -125,9 +125,9 @@ def dearest(cost: Array) -> float:
 def dearer_than(before: Array, cost: Array) -> tuple[float, float]:
     """Number of shifts that are dearer than `before`, and the largest excess of a shift's mean.
 
-    Costs (K,) of the same noise, in shifts of `SHIFT` samples; NaN where there is none. A shift is
-    dearer where the excess of its `PARTS` is above zero by Student's t; the chance that any is
-    called so by noise alone is `LEVEL` (Bonferroni).
+    Costs (K,) of the same noise, in shifts of `SHIFT` samples; NaN without a shift. A shift is
+    dearer where the excess of its `PARTS` is above zero by a one-sided t test at `LEVEL`
+    (Bonferroni over the shifts).
     """
     shifts = len(cost) // SHIFT
     if not shifts:

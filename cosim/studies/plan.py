@@ -34,10 +34,9 @@ SEQUENCES = (list, tuple, set, frozenset)
 class Study:
     """Cases × scenarios × training seeds, and the noise that they are compared on.
 
-    `load` reads a study file, `from_dict` takes the same document; `cosim.study` runs it.
-    `folder` is where its relative paths start and where its `module:Class` names are looked up,
-    too; `file` is its file as it was given. Raises StudyError, ScenarioError and what `learning`
-    raises of an algorithm.
+    `load` reads a study file, `from_dict` takes the same document; `cosim.study` runs it. Relative
+    paths and `module:Class` names are looked up from `folder`; `file` is its file as given. Raises
+    StudyError, ScenarioError and what `learning` raises of an algorithm.
     """
 
     def __init__(self, table: StudyTable, folder: Path, file: str | None = None) -> None:
@@ -172,7 +171,7 @@ class Study:
 
     @cached_property
     def references(self) -> list[Case]:
-        """Controllers that regret needs but the study lacks: naive, optimal."""
+        """Controllers for regret and gap that the study lacks: naive, optimal."""
         given = {case.controller for case in self.cases}
         wanted: dict[str, list[str]] = {}
         for name, scenario in self.scenarios.items():
@@ -270,7 +269,7 @@ class Study:
 
 @dataclass(frozen=True)
 class Plan:
-    """The runs of a study, those first that the others are compared with, then seed by seed."""
+    """The runs of a study: controllers first, then seed by seed."""
 
     definition: Study
     runs: list[Run]
@@ -283,7 +282,7 @@ class Plan:
 
 
 def plan(study: Study) -> Plan:
-    """All that a study has to do; every mistake in it is raised here, before the work."""
+    """The runs of a study; every mistake in it is raised here, before the work."""
     plants = {}
     for name, described in study.scenarios.items():
         with FmuPlant(described) as plant:

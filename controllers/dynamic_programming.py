@@ -608,7 +608,7 @@ def begin(operator: BellmanOperator, grid: Grid, actions: Array, share: float = 
 
 
 def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int) -> Optimum:
-    """Improve the policy once and bound what is left to gain.
+    """Improve the policy once and bound the remaining gain.
 
     Each state has a local search from its present action or from a better one of `scan_points`
     actions per dimension over the box; `lower` is a bound if that finds the global minimum.

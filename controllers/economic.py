@@ -199,7 +199,7 @@ class Convexification:
 
 
 def rotation(A: Array, B: Array, delta_P: Array) -> Array:
-    """𝓗(δP) = [A B]ᵀ δP [A B] − [I 0]ᵀ δP [I 0]: what the storage ½xᵀδPx adds to a stage."""
+    """𝓗(δP) = [A B]ᵀ δP [A B] − [I 0]ᵀ δP [I 0]: the storage ½xᵀδPx as a stage cost."""
     dynamics = np.hstack([A, B])
     rotated: Array = dynamics.T @ delta_P @ dynamics
     rotated[: len(A), : len(A)] -= delta_P
@@ -394,7 +394,7 @@ def linear_model(problem: Problem) -> tuple[Array, Array]:
 
 
 def _rounded(block: Array) -> Array:
-    """Entries to six digits, 0 below 1e-9 of the largest: a solver's last bits choose nothing."""
+    """Entries to six digits, 0 below 1e-9 of the largest, without a solver's last bits."""
     least = 1e-9 * float(np.abs(block).max(initial=0.0))
     kept = [float(f"{x:.6g}") if abs(x) > least else 0.0 for x in block.flat]
     return np.array(kept).reshape(block.shape)

@@ -1,4 +1,4 @@
-"""The evaporator as the controller knows it: the physics of the paper, nominal disturbances."""
+"""The controller's model of the evaporator: the paper's physics, nominal disturbances."""
 
 from __future__ import annotations
 

@@ -29,9 +29,9 @@ class StackedFunction:
     `inputs[name]` are flat float64 arrays in CasADi's column-major order: write the inputs, call,
     read the results by `part`. A call allocates nothing. All results share one flat array, `stack`,
     so that one copy keeps them all. The inputs follow each other in one array but for the `shared`
-    ones, which are read from somebody else's memory, such as another function's output. Own inputs
+    ones, which are read from other memory, such as another function's output. Own inputs
     and results are one array, `memory`: a given one, or one with `room` behind them for more, by
-    name and size; `places` says by name where all of it stands. The expressions are scalar graphs
+    name and size; `places` are slices of it by name. The expressions are scalar graphs
     (SX) or, where stages repeat, graphs of calls (MX).
     """
 
@@ -84,7 +84,7 @@ class StackedFunction:
             self.places[key] = slice(first + part.start, first + part.stop)
 
     def __call__(self) -> None:
-        """Evaluate with what stands in `inputs`, into `stack`."""
+        """Evaluate at `inputs`, into `stack`."""
         self._evaluate()
 
     def finite(self) -> bool:
@@ -109,7 +109,7 @@ _TIES = (
 
 
 def c_source(functions: Sequence[ca.Function]) -> str:
-    """C99 source of the functions, which need nothing but the mathematical library.
+    """C99 source of the functions; it needs the mathematical library alone.
 
     Each becomes `int NAME(const double** arg, double** res, long long* iw, double* w, int mem)`,
     with `NAME_work` for the sizes of its work vectors. Compiled without contraction of products
@@ -130,7 +130,7 @@ CHOICES = ("auto", "never", "now")
 INTERPRETED, COMPILED = "interpreted", "compiled"
 FLAGS = ("-O3", "-ffp-contract=off", "-fPIC", "-shared")
 LONG = 1000
-"""Samples from which a run is worth a compiled controller; what is compiled is kept."""
+"""Least samples of a run for which a controller is compiled; libraries are kept."""
 PATIENCE = 120.0
 """Seconds that a compiler may take."""
 

@@ -1,4 +1,4 @@
-"""What a control course would try first: a linear state feedback, and PI loops.
+"""Two baselines of a control course: a linear state feedback, and PI loops.
 
 Both hold the reference steady state and know the nominal model alone. Neither keeps a distance from
 a bound: that is asked for by the scenario's `reference_state`.
@@ -29,10 +29,10 @@ class Lqr:
         self.gain = -local_feedback(*linear_model(problem), H, np.zeros((0, len(H)))).gain
 
     def reset(self) -> None:
-        """Nothing is remembered."""
+        """Do nothing: the law has no memory."""
 
     def prepare(self) -> None:
-        """Nothing can be prepared."""
+        """Do nothing."""
 
     def feedback(self, s: Array, a: Array | None = None) -> Decision:
         """Action (m,) at the state s (n,), `a` (m,) where it is given."""

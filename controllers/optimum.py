@@ -189,7 +189,7 @@ class OptimalPolicy:
         """Do nothing: the policy has no memory."""
 
     def prepare(self) -> None:
-        """Do nothing: all was prepared when the problem was solved."""
+        """Do nothing."""
 
     def feedback(self, s: ArrayLike, a: ArrayLike | None = None) -> Decision:
         """π*(s) and V*(s), or Q*(s, a) with `a`; s (n,), a (m,); `clamped` outside the grid.
@@ -300,7 +300,7 @@ class Fouling:
 
     @property
     def plants(self) -> list[Mapping[str, float | None]]:
-        """Plant parameters of a condenser that stays as it is at each node."""
+        """Plant parameters of a condenser that stays at each node."""
         return [{self.parameter: value, **dict.fromkeys(FOULING)} for value in self.nodes]
 
     def present(self, time: float) -> dict[str, float]:

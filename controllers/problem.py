@@ -72,7 +72,7 @@ class Units:
         dearest = float(found[:n].max())
         curved = float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max())
         sizes = (dearest, curved, abs(cost))
-        # What rounding leaves of a zero is none.
+        # A size below rounding counts as zero.
         least = np.finfo(np.float64).eps ** 0.5 * max(sizes)
         powers = (float(10.0 ** (np.floor(_power(size)) + 1)) for size in sizes if size > least)
         unit = next(powers, 1.0)

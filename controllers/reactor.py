@@ -1,4 +1,4 @@
-"""The reactor as the controller knows it: mass and heat balance, nominal feed, clean jacket."""
+"""The controller's model of the reactor: mass and heat balance, nominal feed, clean jacket."""
 
 from __future__ import annotations
 

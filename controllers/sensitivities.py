@@ -87,7 +87,7 @@ def _parameter_gradient(
 def sensitivities(
     problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
-    """Gradient of the value in θ, and what makes its derivatives along the KKT adjoints.
+    """Gradient of the value in θ, and a maker of its derivatives along the KKT adjoints.
 
     The first maps a solution (xi, v, t, lam, chi), the linearisation points x, u and theta to
     `gradient` (n_θ). The second takes the longest to make and few ask for it. It maps that, the

@@ -1,4 +1,4 @@
-"""The quadruple tank of Johansson (2000) as the controller knows it."""
+"""The controller's model of the quadruple tank of Johansson (2000)."""
 
 from __future__ import annotations
 

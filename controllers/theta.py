@@ -149,7 +149,7 @@ class ThetaBlocks:
         slack_weights: bool = False,
         model_parameters: tuple[str, ...] = (),
     ) -> ThetaBlocks:
-        """Blocks of the paper's θ for a problem (paper.tex, Simulations), and what is added to it.
+        """Blocks of the paper's θ for a problem (paper.tex, Simulations), and optional ones.
 
         `slack_weights` adds the linear and quadratic slack weights w_sigma and W_sigma of the
         predicted stages 1…N; `model_parameters` adds a block p of physical parameters by name.

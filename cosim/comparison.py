@@ -136,7 +136,7 @@ class Comparison:
         return min((*steps, *([] if self.status is None else [self.status])), default=None)
 
     def lines(self) -> list[str]:
-        """What differs, in words: the first difference, then names, units and order."""
+        """The differences in words: the first one, then names, units and order."""
         text = []
         if (step := self.first) is not None:
             at = f" (time {self.times[step]:g} s)" if len(self.times) > step else ""

@@ -159,7 +159,7 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
 
 
 def _named(controller: Controller, name: str) -> Controller:
-    """Let tables and recordings call the controller what the user called it."""
+    """Name the controller as the user did, for tables and recordings."""
     with suppress(AttributeError):
         setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
     return controller
@@ -177,7 +177,7 @@ _brought: dict[str, set[str]] = {}
 _sources: dict[str, tuple[Any, str]] = {}
 """Users' modules with the hash of their source as it was when they were loaded."""
 _looked_at: dict[str, object] = {}
-"""Modules of whatever origin, by name, whose source need not be looked at again."""
+"""Modules by name whose source has been looked at."""
 
 
 def depends_on(scenario: Scenario, *parts: Any) -> dict[str, str]:
@@ -200,7 +200,7 @@ def depends_on(scenario: Scenario, *parts: Any) -> dict[str, str]:
 
 
 def changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Names of what differs between two answers of `depends_on`."""
+    """Names whose hashes differ between two answers of `depends_on`."""
     return sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
 
 

@@ -16,7 +16,7 @@ Document = TypeVar("Document", bound=BaseModel)
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# What pydantic calls otherwise than TOML does.
+# Other words than pydantic's, which are not TOML's.
 _EXPECTED = {"tuple_type": "must be a list"} | dict.fromkeys(
     ("dict_type", "model_type", "model_attributes_type"), "must be a table"
 )
@@ -39,7 +39,7 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
 
 def instead(word: str, known: Iterable[str]) -> str:
-    """What there is in place of an unknown word, the closest first."""
+    """Text with the words that are known in place of an unknown one, the closest first."""
     known = list(known)
     return f"{suggestion(word, known)}; there are {', '.join(known)}"
 

@@ -113,7 +113,7 @@ class Compiler:
 
     @property
     def version(self) -> str:
-        """What it says of itself, one line."""
+        """Its version, one line."""
         with temporary_folder("cosim-") as folder:  # Zig leaves a file where it is called
             result = subprocess.run(
                 [*self.command, "--version"], cwd=folder, capture_output=True, text=True, check=True

@@ -1,4 +1,4 @@
-"""What an FMU says of itself, and whether it is right: fmpy's validation, its variables, a run."""
+"""The description of an FMU, and its check: fmpy's validation, its variables, a run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def description_of(fmu: Path) -> ModelDescription:
 
 
 def information(fmu: Path, description: ModelDescription | None = None) -> dict[str, Any]:
-    """What the FMU file `fmu` says of itself; raises FmuError when it is missing or is no FMU.
+    """The description of the file `fmu`; raises FmuError when it is missing or is no FMU.
 
     ``flags`` are the capability flags that each interface states, by its name in words;
     ``platforms`` are the folders under ``binaries/`` with what their libraries are made for by
@@ -85,7 +85,7 @@ class NotOfferedError(FmuError):
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found: `status` is "passed", "failed" or "not offered"."""
+    """Result of a check: `status` is "passed", "failed" or "not offered"."""
 
     subject: str
     status: str

@@ -20,7 +20,7 @@ FmiVersion = Literal[2, 3]
 
 
 class Kind(StrEnum):
-    """What a variable is to an importer."""
+    """Role of a variable."""
 
     INDEPENDENT = "independent"
     INPUT = "input"
@@ -389,11 +389,11 @@ _UNKNOWNS = (
     ("InitialUnknown", "InitialUnknowns", (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT),
      initial_dependencies),
 )  # fmt: skip
-"""FMI 3.0's element of an unknown, FMI 2.0's around them, which they are, what they depend on."""
+"""FMI 3.0's element of an unknown, FMI 2.0's around them, their kinds, their dependencies."""
 
 
 def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, list[Attributes]]]:
-    """The unknowns of ModelStructure, group by group, and what they depend on."""
+    """The unknowns of ModelStructure by group, with their dependencies."""
     number = _numbering(version, model)
     shown = {model.by_name[variable.name].name for variable in model.exported(version)}
 

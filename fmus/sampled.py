@@ -36,7 +36,7 @@ class SampledSystem:
     terminal: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check what the model description and the C header rely on."""
+        """Check that names are unique in FMI and in C."""
         variables = self.model.variables
         for names in ([v.name for v in variables], [v.identifier for v in variables]):
             if twice := next((name for name in names if names.count(name) > 1), None):

@@ -97,7 +97,7 @@ class Strategy:
 
     @classmethod
     def of(cls, configuration: Configuration, scenario: Scenario) -> Strategy:
-        """What the hyperparameters say; ConfigurationError on a wrong number of deviations."""
+        """From hyperparameters; ConfigurationError on a wrong number of deviations."""
         lower, upper = scenario.action_lower, scenario.action_upper
         deviation = configuration.exploration_share * (upper - lower)
         if configuration.exploration_deviation is not None:
@@ -114,7 +114,7 @@ class Strategy:
 
     def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
         """Exploring action (m,) in place of the policy's `action`; None: greedy."""
-        # Drawn in every sample, so that paired runs stay in step whatever the probability.
+        # Drawn in every sample, so that runs of any probability stay paired.
         draw, e = rng.random(), rng.standard_normal(self.lower.size)
         if draw >= self.probability:
             return None
@@ -186,7 +186,7 @@ class Algorithm:
         return None
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """What a checkpoint must keep besides θ."""
+        """State for a checkpoint, without θ."""
         return arrays_of(self)
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
@@ -432,7 +432,7 @@ class TrainingLoop:
             self.renew()
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """JSON-ready values and arrays from which `restore` goes on; the plant's are the run's."""
+        """State for `restore`, without the plant's: JSON-ready values, and arrays."""
         arrays = {"s": self.s, "applied": self._applied, **_stored("point", self._point)}
         if self._marked is not None:
             content = self._asked("mark").serialise(self._marked[0])

@@ -49,7 +49,7 @@ class GreedyConfiguration(Configuration):
         return super().for_scenario(scenario).model_copy(update=own)
 
     def without_part(self) -> Mapping[str, str]:
-        """What is of exploration and of steps."""
+        """Hyperparameters of exploration and steps."""
         explored = [name for name in type(self).model_fields if name.startswith("exploration_")]
         stepped = ["smallest_eigenvalue"]
         return dict.fromkeys([*explored, *stepped], "a rule that tries θ, not actions")
@@ -319,7 +319,7 @@ class IdentifiedSimulator(Identified):
 
 
 class Held(Algorithm):
-    """θ as it starts, all the time: what learning in operation is compared with."""
+    """θ stays at its start: the baseline of learning in operation."""
 
     Configuration = GreedyConfiguration
     explores = False

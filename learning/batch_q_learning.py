@@ -102,7 +102,7 @@ class BatchQLearning(ValueRule):
             failures += replayed.failures
             if not len(replayed.rows):
                 break
-            # The next penalty's expectation stands in its place.
+            # The next penalty is replaced by its expectation.
             corrections = self._average_cost.discount * self._batch["corrections"][replayed.rows]
             td_error = replayed.target - replayed.action_value + corrections
             if not np.isfinite(td_error).all():

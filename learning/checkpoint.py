@@ -91,7 +91,7 @@ def prefixed(prefix: str, arrays: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def group(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
-    """What `prefixed` gave, found among others."""
+    """The arrays with a prefix, without it."""
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 

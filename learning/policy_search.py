@@ -155,7 +155,7 @@ class PolicySearch(Algorithm):
         self._told.append(np.column_stack([population, costs]))
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Take back what `state` gave, and ask and tell all of it again."""
+        """Restore what `state` returned, by asking and telling all of it again."""
         super().restore(state)
         self._search, told, self._told = self._new_search(), self._told, []
         for generation in told:

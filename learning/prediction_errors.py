@@ -78,7 +78,7 @@ def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
 
 
 class SortedErrors:
-    """Errors (M, n) sorted state by state, for means of what lies beyond a threshold."""
+    """Errors (M, n) sorted state by state, for means beyond a threshold."""
 
     def __init__(self, errors: Matrix) -> None:
         self._sorted = np.sort(errors, axis=0)

@@ -122,7 +122,7 @@ class QLearningConfiguration(ValueConfiguration):
         return self.mean_cost_memory if self.rule == "kalman" else 0.0
 
     def without_part(self) -> Mapping[str, str]:
-        """What belongs to other rules than the chosen one."""
+        """Hyperparameters of other rules than the chosen one."""
         if self.rule == "kalman":
             names = ["step_size", "scaled"]
         else:
@@ -133,7 +133,7 @@ class QLearningConfiguration(ValueConfiguration):
 
 
 class ValueRule(Algorithm):
-    """What Q-learning has online and in batches: prediction errors, a mean cost, coordinates."""
+    """Common part of online and batch Q-learning: prediction errors, a mean cost, coordinates."""
 
     # The scale first: it makes the mean cost that is taken up after it.
     KEPT: ClassVar[tuple[str, ...]] = ("scale", "_average_cost", "_errors")

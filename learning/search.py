@@ -367,7 +367,7 @@ class SearchPlan:
         blocks = max(int(self.FINAL * self._samples / comparison.block / self.FINALISTS), 1)
         last = len(self._past) - 1
         order = dict.fromkeys([0, last, last // 2, *range(last - 1, 0, -1)])
-        # The best of many moves is partly luck, and a round too short for what is rare.
+        # The best of many moves is partly luck, and a round too short for rare events.
         incumbent = comparison.incumbent.theta
         rivals = [self._past[k] for k in order if not np.array_equal(self._past[k], incumbent)]
         try:
@@ -583,7 +583,7 @@ class SearchConfiguration(Configuration):
 
 
 class EpisodeData:
-    """What `done` of a request's `length` samples gave; `deviation` (m,) is the exploration's σ."""
+    """Data of a request's `length` samples; `deviation` (m,) is the exploration's σ."""
 
     KEPT = (
         *("done", "length", "_stage_cost", "_penalty", "_rows", "_candidates", "_metric"),
@@ -623,7 +623,7 @@ class EpisodeData:
         self.done += 1
 
     def result(self, model: OneStepModel) -> Result:
-        """What came of the episode, its predictions by the controller's own `model`."""
+        """The result, with predictions by the controller's own `model`."""
         n, width = model.states, model.states + len(self._deviation)
         rows = np.array(self._rows[-LATEST:] if self._learns else self._rows).reshape(-1, width + n)
         states = rows[:, :n]

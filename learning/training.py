@@ -137,7 +137,7 @@ def prepare(
             raise ConfigurationError(f"training has no option '{name}'{suggestion(name, OPTIONS)}")
     if not isinstance(settings, Configuration):
         settings = found.Configuration.from_dict(dict(settings or {}))
-    # What is not given of log, evaluation and checkpoint is near its default and fits the others.
+    # Intervals that are not given are near their defaults and fit the others.
     given = {name: value for name in EVERY if (value := options.get(name)) is not None}
     together = gcd(*(given[name] for name in EVERY[1:] if name in given))
     most = TrainingRun.log_every
@@ -534,11 +534,11 @@ def train(
     ----------
     algorithm : a registered name (`learning.algorithm.algorithms`) or `module:Class`.
     scenario : a scenario, a preset's name or a TOML file.
-    samples : plant samples; None is what the algorithm says, else 50 000.
+    samples : plant samples; None: the algorithm's budget, else 50 000.
     seed : seed of noise and exploration.
     start : where θ starts: naive, tuned, commissioned, cautious or a parameters file.
     settings : hyperparameters by name; the algorithm's Configuration documents them.
-    controller … rest_after : what the options of `cosim train` of these names say.
+    controller … rest_after : options of `cosim train` of these names.
     out : folder that the run's checkpoints are kept in; None keeps none. `Training.save` writes
         the rest.
     resume : go on from the checkpoint in `out`.
@@ -654,7 +654,7 @@ class _Session:
         return "finished"
 
     def row(self, number: int, judge: Judge | None) -> LogRow:
-        """A line of the log: what happened since the last one, with an evaluation by a judge."""
+        """A line of the log since the last one, with an evaluation by a judge."""
         answer, counts = self.loop.parameters, asdict(self.loop.counts)
         figures = dict.fromkeys(COLUMNS, float("nan")) | self.totals.means() | counts
         del figures["number"]

@@ -52,7 +52,7 @@ class Core:
 def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton") -> Core:
     """Write the C of an RTI-NMPC: deterministic, without allocation, C99.
 
-    It does what `RtiNmpc` does with the backend `daqp`, whose part a solver of its own takes; the
+    It computes as `RtiNmpc` does with the backend `daqp`, by a QP solver of its own; the
     parameters θ stay an input. Raises ControllerError where `hessian` is not `gauss-newton` or
     `exact`, or the horizon is too long for a thread's stack.
     """
@@ -94,7 +94,7 @@ def controller_sources(
 
 
 def stack_needed(problem: Problem, functions: Mapping[str, StackedFunction]) -> int:
-    """Bytes of stack of a sample, at least what compilers make of it.
+    """Upper bound of a sample's stack in bytes.
 
     CasADi's work vectors and the QP solver's arrays share their place; gcc and clang add 4 to 18 %
     and up to 4 kB.

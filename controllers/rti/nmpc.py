@@ -86,7 +86,7 @@ class Functions:
 
 @dataclass(eq=False)
 class Prepared:
-    """What the preparation phase fixed, kept for read-outs after the next one has begun.
+    """Data of a preparation phase, kept for read-outs after the next one has begun.
 
     `memory` is a copy of the preparation's, `parameters` the θ; `spectrum` says what convexified
     the Hessians, None for Gauss–Newton; `functions` are the maker's, `engine` its compiled code.
@@ -419,7 +419,7 @@ class RtiNmpc:
 
     name = "rti"
     memoryless = True
-    """A feedback depends on nothing but θ, the point at which it was prepared, s and a."""
+    """A feedback depends on θ, its point of linearisation, s and a alone."""
 
     @known_keywords
     def __init__(

@@ -239,7 +239,7 @@ def _gathered(source: ca.MX, positions: NDArray[np.int64]) -> ca.MX:
 
 
 def _hessian_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
-    """Where H's entries, (Nm, Nm), stand in the rows of all stages; its upper triangle mirrors."""
+    """Positions of H's entries, (Nm, Nm), in the rows of all stages; its upper triangle mirrors."""
     first, second = np.indices((horizon * m, horizon * m))
     (k, a), (j, b) = (np.divmod(pick(first, second), m) for pick in (np.maximum, np.minimum))
     column: NDArray[np.int64] = k * (horizon * m + n + 1) + (k - j) * m + b
@@ -247,7 +247,7 @@ def _hessian_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
 
 
 def _response_positions(n: int, m: int, horizon: int) -> NDArray[np.int64]:
-    """Where Γ's entries, (Nn, Nm), stand in the responses of ξ_1 … ξ_N; −1 above its diagonal."""
+    """Positions of Γ's entries, (Nn, Nm), in the responses of ξ_1 … ξ_N; −1 above its diagonal."""
     first, second = np.indices((horizon * n, horizon * m))
     (k, i), (j, b) = np.divmod(first, n), np.divmod(second, m)
     column = k * (horizon * m + n + 1) + (k - j) * m + b
@@ -426,7 +426,7 @@ class Unlifted:
 
 
 Lift = Spectrum | Unlifted
-"""What P did to the blocks of an exact Hessian."""
+"""How P changed the blocks of an exact Hessian."""
 
 
 class GaussNewton:

@@ -142,7 +142,7 @@ def write_fmu(
     version: FmiVersion,
     every_platform: bool,
 ) -> Path:
-    """Write the FMU with a record of what it was made from."""
+    """Write the FMU with a record of its scenario and θ."""
     record = {
         "scenario": scenario.to_dict(),
         "scenario_hash": scenario.hash,

@@ -154,7 +154,7 @@ def show(summary: dict[str, Any], output: cli.Output) -> None:
 
 
 def _interval(estimate: dict[str, Any] | None, scale: float = 1.0) -> str:
-    """An estimate of a summary with its interval; nothing where it is undefined."""
+    """An estimate of a summary with its interval; empty where it is undefined."""
     from cosim.statistics import shown
 
     if estimate is None or not isfinite(estimate["value"]):

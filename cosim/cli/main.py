@@ -1,4 +1,4 @@
-"""The application, its commands, and what becomes of an error."""
+"""The application, its commands, and the handling of errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from cosim.files import protect
 from cosim.processes import Finished, Interrupted, Terminated, command_process, unwound
 
 OUTPUTS = ("--out", "-o", "--png", "--ssp", "--record")
-"""Options whose value names what a command writes."""
+"""Options whose value is an output path."""
 
 COURSE = ("log_every", "evaluate_every", "checkpoint_every", "divergence", "resume")
 PANELS = {
@@ -186,7 +186,7 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Make both standard streams writable whatever the caller left of them.
+    """Make both standard streams writable, closed ones too.
 
     A character that a stream's encoding lacks is written as its escape; a closed stream swallows
     what it is given.
@@ -211,7 +211,7 @@ def _run() -> None:
         print("; ".join(["interrupted" if stopped else "terminated", *notes]), file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED if stopped else EXIT_TERMINATED)
     except BaseException as error:
-        # Libraries raise what they like over it, and the cross compiler has a word of its own.
+        # Libraries raise other errors over it, and the cross compiler has its own word for it.
         if re.search("Too many open files|FdQuota", "".join(traceback.format_exception(error))):
             _fail("too few files may be open at a time: raise the limit, by ulimit -n 1024 say")
         if isinstance(error, MemoryError):

@@ -21,7 +21,7 @@ NEXT = {
     ],
     "study": ["cosim study run NAME.toml --out NAME-run"],
 }
-"""Commands that use what was written, from its folder."""
+"""Commands to run next, from the files' folder."""
 
 
 def new(

@@ -132,7 +132,7 @@ def _parts(widths: Sequence[int], room: int) -> list[list[int]]:
 
 
 def _is_number(cell: str) -> bool:
-    """Whether a cell begins with a number, or says nothing."""
+    """Whether a cell begins with a number, or is empty."""
     try:
         float(cell.split(maxsplit=1)[0].strip("()[],"))
     except (IndexError, ValueError):

@@ -72,7 +72,7 @@ def simulate(
                 "timing": trajectory.timing_summary() | {"functions": functions_of(law)},
             }
         if not record:
-            # A recording that another run left would stand beside this one's signals.
+            # A recording of another run must not stay beside this run's signals.
             (folder / "run.rrd").unlink(missing_ok=True)
         trajectory.write_csv(folder / "trajectory.csv")
         trajectory.write_timing_csv(folder / "timing.csv")

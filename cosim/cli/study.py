@@ -133,7 +133,7 @@ def report(
 
 
 def _summary(found: StudyResults) -> dict[str, Any]:
-    """The study as a JSON document; `timing` is what timing.csv says of each run."""
+    """The study as a JSON document; `timing` is timing.csv by run."""
     from cosim.studies.store import TIMING, read_table
 
     timing = read_table(found.folder / TIMING, types={"run": str})

@@ -14,7 +14,7 @@ FILES = (
     "checkpoint.npz", "learning.csv", "learning.gif", "learning.png", "parameters.toml",
     "summary.json", "training.rrd",
 )  # fmt: skip
-"""What a training leaves in its folder; each belongs to the same run."""
+"""Files of a training; all in a folder belong to one run."""
 
 
 def train(

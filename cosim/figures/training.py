@@ -61,7 +61,7 @@ def training_figure(
     order = sorted((n for n in norms if norms[n].any()), key=lambda n: -float(norms[n][-1]))
     panels = ["regret %" if best is not None else "J per sample"]
     panels += ["greedy: violating samples %"] * _measured(log, "greedy_violating_share", 1)
-    # A single TD error says nothing of a course.
+    # A single TD error makes no curve.
     panels += ["TD error (r.m.s.)"] * _measured(log, "td_error", 2)
     panels += ["change of θ, by its scale"] * bool(order)
     columns = len(panels) if len(panels) < 4 else 2

@@ -34,7 +34,7 @@ from cosim.scenario import Scenario
 FRAME = 350
 """Milliseconds of an animation's frame."""
 Run = Any
-"""A `cosim.trajectory.Trajectory`, which draws itself with what is here."""
+"""A `cosim.trajectory.Trajectory`, which imports this module."""
 
 
 def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[Run] = ()) -> Figure:

@@ -1,4 +1,4 @@
-"""A scenario for somebody's FMU, drafted from its model description, to be read and corrected."""
+"""A draft of a scenario for a foreign FMU, from its model description."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _number(stated: str | None, otherwise: float) -> float:
 
 
 def _limits(variable: Any, value: float) -> tuple[float, float]:
-    """Range of an input: what the FMU states, else as much again about its start value."""
+    """Range of an input: the FMU's, else its start value ± its magnitude."""
     reach = abs(value) or 1.0
     return _number(variable.min, value - reach), _number(variable.max, value + reach)
 
@@ -256,7 +256,7 @@ def _mapping(
 DIFFERENCE = 1e-5
 """Finite differences, as a share of a variable's scale."""
 TIGHT, LOOSE = 1e-10, 1e-6
-"""Residuals, as shares of the scales: where the search stops, and what it may end with."""
+"""Residuals, as shares of the scales, at which a search stops, and that it may end with."""
 PATIENCE = 5000
 """Samples to wait for a plant without a settable initial state to settle."""
 

@@ -138,7 +138,7 @@ def _describe(path: Path, folder: Path) -> Any:
             f"FMU '{path}' has an invalid model description: {problems[0]}"
             + (f" ({len(problems) - 1} more)" if len(problems) > 1 else "")
         ) from None
-    # fmpy raises bare Exception and whatever lxml does on text that is not XML.
+    # fmpy raises bare Exception, and lxml's errors on text that is not XML.
     except Exception as error:
         raise PlantError(f"FMU '{path}' has an unreadable model description: {error}") from None
     if description.fmiVersion[:2] not in ("2.", "3."):
@@ -169,7 +169,7 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
 
 def _holds(folder: Path, archive: zipfile.ZipFile) -> bool:
     """Whether every file of the archive is in the folder with the very same bytes."""
-    # Of entries with one name the last is what unpacking leaves.
+    # Of entries with one name unpacking leaves the last.
     entries = {entry.filename: entry for entry in archive.infolist() if not entry.is_dir()}
     try:
         return all(
@@ -241,11 +241,11 @@ class Place(NamedTuple):
 
 
 Intermediate = Callable[[float, NDArray[np.float64]], None]
-"""Is told of the time [s] and the states (n,) at each internal step of an FMU."""
+"""Called with the time [s] and the states (n,) at each internal step of an FMU."""
 
 
 class Wiring(NamedTuple):
-    """Places of what a plant exchanges with its FMU; `starts` with the value at every reset."""
+    """Places of the variables that a plant exchanges with its FMU; `starts` with their values."""
 
     inputs: Sequence[Place]
     outputs: Sequence[Place]
@@ -273,7 +273,7 @@ class Native(ctypes.Structure):
 
 
 NOT_FINITE = 5
-"""What failed in a compiled loop: an output or state is not finite; below it a call of FMI."""
+"""Fault of a compiled loop: an output or state is not finite; lower numbers: a call of FMI."""
 
 
 class Instance(ABC):
@@ -289,7 +289,7 @@ class Instance(ABC):
     setters: ClassVar[dict[str, tuple[str, Any]]]
     """By the type of a variable that can be set, the setter's name and the type of its values."""
     _state: ClassVar[str]
-    """What FMI calls a saved state."""
+    """FMI's name of a saved state."""
     _deserialise: ClassVar[str]
     _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
     """The calls that initialise, with their arguments after the instance."""
@@ -461,7 +461,7 @@ class Instance(ABC):
         )
 
     def fail_native(self, fault: int, status: int) -> None:
-        """Raise PlantError for what failed in a compiled loop."""
+        """Raise PlantError for the fault of a compiled loop."""
         names = (f"Set{self.real}", f"Get{self.real}", "DoStep", "DoStep")
         if fault == len(names):
             self.messages.append("the FMU ended the step early")
@@ -503,7 +503,7 @@ class Instance(ABC):
         )
 
     def fail(self, function: str, status: int) -> NoReturn:
-        """Raise PlantError for a failed call, with what the FMU logged about it."""
+        """Raise PlantError for a failed call, with the FMU's log messages."""
         self.fatal |= status == FATAL
         label = _STATUS.get(status, f"status {status}, which FMI does not have")
         raise PlantError(
@@ -640,7 +640,7 @@ class Fmi3Instance(Instance):
         return slave
 
     def _intermediate_update(self) -> dict[str, Any]:
-        """The arguments that ask for the states at each internal step; none if they are not had."""
+        """Arguments that ask for the states at each internal step; {} if the FMU has none."""
         if self._wiring.intermediate is None or not self._interface.providesIntermediateUpdate:
             return {}
         # fmpy does not read the attribute, an xs:boolean.

@@ -1,4 +1,4 @@
-"""The plant as the closed loop sees it: an FMU wired as a scenario says; reset, step, restore."""
+"""The plant of the closed loop: an FMU wired by a scenario; reset, step, restore."""
 
 from __future__ import annotations
 

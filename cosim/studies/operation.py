@@ -1,4 +1,4 @@
-"""Learning in operation: θ at given times, and what the samples of a run have cost until then."""
+"""Learning in operation: θ at given times, and the cost of a run's samples until then."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LIFE = [
 
 
 def plant_at(scenario: Scenario, time: float) -> Scenario:
-    """The scenario of a plant that stays as it is at a time in s."""
+    """The scenario with its plant frozen at a time in s."""
     law = change_of(scenario)
     if isinstance(law, Fouling):
         return scenario.replace(
@@ -54,7 +54,7 @@ class StoppedPolicy(QuasiStaticPolicy):
 
 
 def optimum_at(scenario: Scenario, sample: int) -> Controller:
-    """The optimal policy of the plant as it is at a sample."""
+    """The optimal policy of the plant frozen at a sample."""
     if not isinstance(change_of(scenario), Fouling):
         return build_controller("optimal", plant_at(scenario, sample * scenario.sampling_time))
     moving = QuasiStaticPolicy.from_scenario(scenario)

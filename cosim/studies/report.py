@@ -119,7 +119,7 @@ def aggregate_table(aggregate: pd.DataFrame) -> Rows:
 
 
 def case_table(cases: Mapping[str, Mapping[str, Any]]) -> Rows:
-    """Header and rows of what each case runs."""
+    """Header and rows of the cases."""
     return ("case", "algorithm or controller", "samples", "start", "NMPC", "settings"), [
         [
             name, case["target"], str(case["samples"] or ""), case["start"], case["nmpc"],
@@ -147,7 +147,7 @@ def paper_table(
     """Title, header and rows: gains of each trained case's median run on every scenario.
 
     `indicator` maps case, scenario and name to values (R, S) of runs on noise seeds. The paper's
-    two gains imply J(b)/J(a) = (1 − 0.21)/(1 − 0.15) = 0.93, whatever was learnt.
+    two gains imply J(b)/J(a) = (1 − 0.21)/(1 − 0.15) = 0.93.
     """
     rows = []
     for scenario in scenarios:

@@ -274,7 +274,7 @@ class StudyResults(Shown):
         }
 
     def _single(self, case: str, scenario: str) -> bool:
-        """Whether a case has one training only: nothing is known of its spread."""
+        """Whether a case has one training only, so that its spread is unknown."""
         return bool(self.cases[case]["trained"]) and len(self.indicator(case, scenario)) < 2
 
     def _pairs(self, case: str, other: str, scenario: str) -> tuple[Array, Array]:

@@ -247,7 +247,7 @@ def study(
     planned: Plan | None = None,
     figures: bool = True,
 ) -> StudyResults:
-    """Train and evaluate what `out` does not yet hold of a study, and write its tables there.
+    """Do the runs of a study that `out` lacks, and write its tables there.
 
     Raises StudyError and what scenarios and algorithms raise before any work is done;
     FailedRunsError after all other runs are done and written.
@@ -259,7 +259,7 @@ def study(
     scheduler : address of a Dask scheduler, used in place of `jobs`.
     progress : a `Report`, called after every work item, and with a line for each run that ends or
         fails; True draws a bar.
-    planned : what `plan` returned, if it is known.
+    planned : the study's plan, if it is known.
     figures : whether the study's trajectories and logs are drawn.
     """
     if isinstance(source, Mapping):

@@ -92,7 +92,7 @@ def _converted(texts: pd.Series[str], kind: Any) -> Any:
 
 
 def to_csv(frame: pd.DataFrame) -> str:
-    """A frame as CSV; floats read back to the same bits, what is undefined is empty."""
+    """A frame as CSV; floats read back to the same bits, NaN is empty."""
     return str(frame.to_csv(index=False, lineterminator="\n"))
 
 
@@ -153,7 +153,7 @@ class RunStore:
         return about
 
     def _begin(self) -> None:
-        """Delete what the run has left, file by file, and mark the folder as its own."""
+        """Delete the run's files and begin a new run.json."""
         for path in self.folder.glob("*"):
             if _ours(path):
                 path.unlink()
@@ -261,7 +261,7 @@ class RunStore:
 
     @property
     def finished(self) -> bool:
-        """Whether all that the plan asks of the run is there."""
+        """Whether the run is complete."""
         trained = self.run.training is None or bool(self.status)
         return trained and not any(self.missing(file) for file in self.run.noise)
 

@@ -27,9 +27,9 @@ from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
 WORK = ".work"
-"""Folder within the folder: what long studies have finished."""
+"""Folder within the folder, of the runs of studies."""
 UNCOMPARED = ["status", "residual"]
-"""Words, and what is of the size of rounding."""
+"""Columns without a tolerance: words, and values of the size of rounding."""
 LARGEST = 4_000_000
 """Bytes of a stored table, at most: a diff of it must be readable."""
 SUFFIXES = (".csv", ".toml", ".md", ".svg", ".png")
@@ -123,7 +123,7 @@ def compared_tables(folder: Path) -> dict[str, list[str]]:
 def differences(
     name: str, stored: Path, now: Path, tolerances: Mapping[str, Tolerance]
 ) -> list[str]:
-    """What differs between a stored study and the same computed now, in words; [] if nothing.
+    """Differences of a stored study from the same computed now, in words.
 
     Trajectories come first: they name the signal in which a difference begins. Raises ResultsError
     where a stored table is missing or damaged, or a signal has no tolerance.

@@ -257,7 +257,7 @@ class Scenario(Shown, Table):
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     """`schema` in the file: 1."""
     name: Name
-    """What tables and figures call the scenario; it does not count in its hash."""
+    """Its name in tables and figures, which does not count in its hash."""
     description: str = ""
     """A line for readers."""
     sampling_time: Positive
@@ -428,7 +428,7 @@ class Scenario(Shown, Table):
         )
 
     def saturate(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the actuators make of actions (…, m): the nearest within their bounds."""
+        """Actions (…, m) clipped to the actuators' bounds."""
         return np.minimum(np.maximum(action, self.action_lower), self.action_upper)
 
 

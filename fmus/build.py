@@ -275,7 +275,7 @@ def _model(description: bytes) -> tuple[str, str]:
     return version, identifier
 
 
-# Of the evaporator's sources what serves any model: FMI's faces, and what they are made of.
+# Those of the evaporator's sources that serve any model: FMI's functions and their parts.
 _FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
 _WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
 _GENERATED = ("variables.h", "buildDescription.xml")

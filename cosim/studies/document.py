@@ -82,7 +82,7 @@ class CaseTable(Table):
     """
 
     name: Name | None = None
-    """What tables call it; a controller's own name, if it is left out."""
+    """Its name in tables; by default the controller's own."""
     algorithm: Source | None = None
     """A registered algorithm, or `module:Class`."""
     controller: Source | list[Source] | None = None
@@ -92,7 +92,7 @@ class CaseTable(Table):
     start: Source | list[Source] = "naive"
     """θ at the start: `naive`, `tuned`, `commissioned`, `cautious` or a parameters file."""
     nmpc: Literal["rti", "converged"] | list[Literal["rti", "converged"]] = "rti"
-    """What carries θ."""
+    """NMPC that carries θ: real-time iteration or converged."""
     settings: dict[str, Any] = {}
     """The algorithm's hyperparameters."""
     training: dict[str, Any] = {}
@@ -102,7 +102,7 @@ class CaseTable(Table):
     training_seeds: SeedsTable | None = None
     """Its own training seeds, in place of the study's."""
     group: Name | None = None
-    """Which panel of the figures shows it; the algorithm's name, if left out."""
+    """Panel of the figures that shows it; by default the algorithm's name."""
     title: str = ""
     """A few words for readers."""
     against: Source | None = None
@@ -133,7 +133,7 @@ class TrajectoryTable(Table):
     """A table `[[trajectory]]`: one run of each case on the same noise, kept sample by sample."""
 
     name: Name
-    """What files and figures call it."""
+    """Its name in files and figures."""
     seed: Seed = 1
     """Noise seed."""
     steps: Count = 240
@@ -143,7 +143,7 @@ class TrajectoryTable(Table):
     scenarios: list[Source] | None = None
     """Those of the study's scenarios that it is of; all, if left out."""
     figures: list[Literal["trajectory", "overlay", "density", "phase"]] = []
-    """What is drawn of the runs."""
+    """Kinds of figures of the runs."""
 
     @property
     def file(self) -> str:
@@ -157,7 +157,7 @@ class StudyTable(Table):
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     """`schema` in the file: 1."""
     name: Name
-    """What tables and messages call the study."""
+    """The study's name in tables and messages."""
     title: str = ""
     """Heading of the report; the name, if left out."""
     description: str = ""
@@ -165,7 +165,7 @@ class StudyTable(Table):
     scenarios: Annotated[list[Source], Field(min_length=1)]
     """Presets, scenario files, or names of the file's own `[[scenario]]` tables."""
     scenario: list[dict[str, Any]] = []
-    """Scenarios as they stand in their own files, `extends` and all."""
+    """Scenarios with the content of scenario files, `extends` included."""
     training_seeds: SeedsTable = SeedsTable()
     """Table `[training_seeds]`: those of every case that has none of its own."""
     evaluation: EvaluationTable = EvaluationTable()

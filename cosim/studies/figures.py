@@ -33,7 +33,7 @@ from cosim.studies.work import Run, safe
 from cosim.trajectory import Trajectory, read_csv
 
 BANDED = 6
-"""Curves of a panel, at most, that have bands: more bands cannot be told apart."""
+"""Largest number of curves with bands in a panel: more cannot be told apart."""
 Policy = Callable[[Array], Array]
 TRAJECTORIES, LOGS, KEPT = "trajectories", "logs", "parameters"
 PREFIX = "theta "

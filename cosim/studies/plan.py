@@ -139,7 +139,7 @@ class Study:
             )
 
     def _file(self, source: str) -> str:
-        """A file's path as seen from the study's folder; every other name as it is."""
+        """A relative path from the study's folder; other names unchanged."""
         is_file = source.endswith(".toml") and not Path(source).is_absolute()
         return str(self.folder / source) if is_file else source
 

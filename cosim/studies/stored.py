@@ -1,4 +1,4 @@
-"""A folder of stored studies: NAME.toml says what was measured, NAME/ holds it."""
+"""A folder of stored studies: NAME.toml is the study, NAME/ its results."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def chosen(known: Mapping[str, StudyTable], names: list[str]) -> list[str]:
 def store(folder: Path, name: str, out: Path) -> list[str]:
     """Replace a study's stored files; returns those that were too large.
 
-    Left out: the runs' own folders, whatever a clock said, and tables of more than `LARGEST` bytes.
+    Left out: the runs' own folders, times, and tables of more than `LARGEST` bytes.
     """
     target = folder / name
     fresh = folder / WORK / f"{name}.fresh"

@@ -53,7 +53,6 @@ class SteadyState:
         return np.linalg.eigvalsh(self.hessian).astype(np.float64)
 
     def __str__(self) -> str:
-        """Point, cost and active bounds, in one line."""
         return (
             f"optimal steady state: x = {_short(self.x)}, u = {_short(self.u)}, "
             f"cost {self.cost:.6g}, active: {', '.join(self.active) or 'no bound'}"
@@ -285,7 +284,6 @@ class EconomicTuning:
         return float(np.abs(self.tuned.gain - self.economic.gain).max())
 
     def __str__(self) -> str:
-        """The certificate in six lines."""
         steady, convex = self.steady_state, self.convexification
         active = ", ".join(
             f"{name} (multiplier {multiplier:.4g})"

@@ -162,7 +162,6 @@ class Problem:
     substeps: int = 2
 
     def __post_init__(self) -> None:
-        """Freeze the arrays and check every size and sign once."""
         for name in VECTORS:
             size = self.n_actions if "action" in name else self.n_states
             object.__setattr__(self, name, _frozen(name, getattr(self, name), size))

@@ -196,8 +196,6 @@ class ThetaBlocks:
 
 
 class _File(Table):
-    """A parameters file."""
-
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     hash: str | None = None
     theta: dict[str, Any]
@@ -215,7 +213,6 @@ class Parameters(Shown):
     theta: Vector
 
     def __post_init__(self) -> None:
-        """Keep a read-only copy of a valid vector."""
         theta = np.array(self.theta, dtype=np.float64)
         if theta.shape != (self.blocks.size,):
             raise ParameterError(f"θ has shape {theta.shape}; it must have ({self.blocks.size},)")

@@ -360,11 +360,9 @@ class _Recorded:
         self._k = -1
 
     def reset(self) -> None:
-        """Begin with the first sample."""
         self._k = -1
 
     def prepare(self) -> None:
-        """Go on to the next sample."""
         self._k += 1
 
     def feedback(self, s: Array, a: object = None) -> Decision:

@@ -51,7 +51,6 @@ class Shown:
         return f"{type(self).__name__}({facts})"
 
     def _repr_html_(self) -> str:
-        """The facts as a table."""
         rows = "".join(
             f'<tr><th style="text-align:left">{escape(key)}</th>'
             f'<td style="text-align:left">{escape(short(value))}</td></tr>'
@@ -68,7 +67,6 @@ class Result(Shown):
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
-        """The facts as a table, and the figure."""
         buffer = io.BytesIO()
         self.figure().savefig(buffer, format="png", dpi=100)
         source = f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"

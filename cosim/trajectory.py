@@ -211,7 +211,6 @@ class Trajectory(Result):
     controller: str = ""
 
     def __post_init__(self) -> None:
-        """Check that every signal is there and has one value per sample."""
         kinds = [kind for kind in SIGNALS if not kind.clock]
         expected = (name for kind in kinds for name in kind.names(self.scenario))
         if missing := [name for name in expected if name not in self.signals]:

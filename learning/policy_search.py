@@ -115,7 +115,6 @@ class PolicySearch(Algorithm):
         )
 
     def _begin_generation(self) -> None:
-        """Ask for a population, and for its noise."""
         self._population, self._costs = self._ask(), []
         self._noise = int(self.rng.integers(2**63))
 

@@ -295,7 +295,6 @@ class KalmanRegression:
     """P at the last step."""
 
     def __post_init__(self) -> None:
-        """No step has been taken yet."""
         self.before = self.covariance.copy()
 
     def update(self, td_error: float, gradient: Vector) -> float:

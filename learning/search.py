@@ -376,7 +376,6 @@ class SearchPlan:
             return
 
     def _rounds(self) -> Plan:
-        """Rounds until the samples are used up."""
         comparison = self.comparison
         back_off, weights, reach = 1.0, -1.0, np.full(self.DIRECTIONS, 0.5)
         bounds = [0.5] * self._states

@@ -83,7 +83,6 @@ class TrainingRun:
     rest_after: int | None = None
 
     def __post_init__(self) -> None:
-        """Complete the configuration and check the counts."""
         completed = self.configuration.for_scenario(self.scenario)
         object.__setattr__(self, "configuration", completed)
         for name, least in LEAST.items():

@@ -262,7 +262,6 @@ class RtiSolution:
         return by_theta.copy(), by_state.copy()
 
     def _write_solution(self, function: StackedFunction) -> None:
-        """Give a read-out function the solution and the point of linearisation."""
         inputs, prepared = function.inputs, self.prepared
         places = prepared.functions.readout.places
         for name in SOLUTION:

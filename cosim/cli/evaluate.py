@@ -88,7 +88,6 @@ def evaluate(
 
 
 def _judge(scenario: Scenario, trajectories: Path, folder: Path, output: cli.Output) -> None:
-    """Judge recorded runs: judged.csv and summary.json in `folder`, a table of means."""
     from cosim.evaluation import judge
     from cosim.files import write_atomically
     from cosim.statistics import mean, regret, shown

@@ -516,7 +516,6 @@ class FmuPlant:
         self.close()
 
     def __del__(self) -> None:
-        """Free the instance if the plant was not closed."""
         if getattr(self, "_fmi", None) is not None:
             self.close()
 

@@ -283,7 +283,6 @@ def _is_logged(plan: Plan, run: Run) -> bool:
 
 
 def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
-    """Names and figures of the tables `[[trajectory]]`, then of the logs."""
     for name, scenario in plan.definition.scenarios.items():
         for table in plan.definition.table.trajectory:
             runs = [

@@ -356,7 +356,6 @@ def _trajectories(
 
 
 def _check_names(study: Study) -> None:
-    """Raise StudyError if the study names an unknown case."""
     names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]
     asked = [(f"trajectory '{t.name}'", t.cases or [], names) for t in study.table.trajectory]
@@ -372,7 +371,6 @@ def _check_names(study: Study) -> None:
 
 
 def _is_sequence(annotation: Any) -> bool:
-    """Whether a type is a sequence, or may be one."""
     if get_origin(annotation) in SEQUENCES or annotation in SEQUENCES:
         return True
     return any(_is_sequence(part) for part in get_args(annotation) if part is not Ellipsis)

@@ -371,7 +371,6 @@ class StudyResults(Shown):
         return {"name": self.name, **counts, "folder": self.folder}
 
     def _repr_html_(self) -> str:
-        """Tables of all scenarios, for notebooks."""
         tables = {name: self.lines(name, SHORT) for name in self.scenarios}
         return "".join(
             f"<h4>{escape(name)}</h4>" + pd.DataFrame(rows, columns=list(head)).to_html(index=False)

@@ -303,7 +303,6 @@ def frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:
 
 
 def _tables(store: RunStore) -> list[pd.DataFrame]:
-    """State, evaluation and curves of a finished run."""
     run, about = store.run, store.about
     key = {"scenario": run.key.scenario, "case": run.key.case, "training_seed": run.key.seed}
     state: dict[str, Any] = {"status": store.status or EVALUATED}

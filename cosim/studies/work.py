@@ -135,7 +135,6 @@ class RunKey:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse names that lead out of the study's folder."""
         for name in (self.scenario, self.case):
             if not name.strip(". ") or "/" in name or "\\" in name:
                 raise StudyError(
@@ -150,7 +149,6 @@ class RunKey:
         return Path(RUNS, *parts, *([] if self.seed is None else [str(self.seed)]))
 
     def __str__(self) -> str:
-        """As messages name it."""
         seed = "" if self.seed is None else f", seed {self.seed}"
         return f"{self.case} on {self.scenario}{seed}"
 

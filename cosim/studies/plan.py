@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from math import gcd
 from pathlib import Path
 from typing import Any, Self, TypeVar, get_args, get_origin
 
@@ -17,7 +16,7 @@ from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
 from cosim.scenario import Scenario, resolved
 from cosim.studies.document import DEFAULT, CaseTable, StudyTable, TrajectoryTable, read
-from cosim.studies.store import EVALUATION, GREEDY, ONLINE, check_folders, greedy_file
+from cosim.studies.store import EVALUATION, GREEDY, check_folders, greedy_file, online_file
 from cosim.studies.work import Case, Noise, Run, RunKey, TrainingTask
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
@@ -320,9 +319,9 @@ def plan(study: Study) -> Plan:
         noise |= {greedy_file(mark): at_mark._replace(mark=mark) for mark in marks}
         kept = _trajectories(study, case, name, seed)
         noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in kept}
-        if training is None and case.name == study.optima.get(name) and (ends := study.marks(name)):
-            seeds = {seed for case in cases for seed in case.training_seeds}
-            noise[ONLINE] = Noise(tuple(sorted(seeds)), ends[-1], block=gcd(*ends))
+        seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
+        if training is None and seeds:
+            noise |= {online_file(mark): Noise(seeds, mark) for mark in marks}
         key = RunKey(name, case.name, seed)
         found = Run(key, case, scenario, case.controller, training, facts, noise, kept, marks)
         runs.append(found)

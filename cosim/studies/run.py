@@ -105,7 +105,7 @@ class Runner:
         for file, noise in run.noise.items():
             missing = noise._replace(seeds=store.missing(file))
             self._done[name] += noise.samples - missing.samples
-            size = 1 if noise.block else max(1, ITEM // (noise.burn_in + noise.steps))
+            size = max(1, ITEM // (noise.burn_in + noise.steps))
             theta: tuple[float, ...] = ()
             if noise.mark and missing.seeds and run.training is not None:
                 theta = operation.theta_at(store.log, noise.mark)

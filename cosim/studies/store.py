@@ -1,7 +1,7 @@
 """The folder of a run's results.
 
     OUT/runs/SCENARIO/CASE/SEED/   run.json  checkpoint.npz | learning.csv parameters.toml
-                                   evaluation.csv  greedy.csv  online.csv
+                                   evaluation.csv  greedy.csv  greedy-*.csv  online-*.csv
                                    trajectory-*.csv  timing.csv
 
 Only the process that runs the study writes tables; a worker writes the checkpoint of its training,
@@ -17,7 +17,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from cosim.errors import StudyError
@@ -26,18 +25,17 @@ from cosim.plugins import changed
 from cosim.studies.operation import LIFE
 from cosim.studies.work import CHECKPOINT, Figures, Measured, Run, RunKey, Trained
 
-EVALUATION, GREEDY, ONLINE = "evaluation.csv", "greedy.csv", "online.csv"
+EVALUATION, GREEDY = "evaluation.csv", "greedy.csv"
 RUN = "run.json"
 TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
 FAILURE, TIMING = "failure.txt", "timing.csv"
 EVALUATED = "evaluated"
-OURS = (CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, ONLINE, TIMING)
-PATTERNS = ("trajectory-*.csv", "greedy-*.csv")
+OURS = (CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, TIMING)
+PATTERNS = ("trajectory-*.csv", "greedy-*.csv", "online*.csv")
 INDICATORS = (
     "J", "economic_cost", "mean_violation", "violating_share", "input_effort", "failures",
 )  # fmt: skip
 KEY = ["seed", "steps", "burn_in"]
-BLOCKS = ["seed", "steps", "block"]
 WHERE = ["scenario", "case"]
 KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]
@@ -52,6 +50,11 @@ PAUSE = 20
 def greedy_file(mark: int) -> str:
     """File of a run's greedy evaluation of θ after `mark` samples of operation."""
     return f"greedy-{mark}.csv"
+
+
+def online_file(mark: int) -> str:
+    """File of the optimum's first `mark` samples on the noise of the training seeds."""
+    return f"online-{mark}.csv"
 
 
 def check_folders(runs: list[Run]) -> None:
@@ -207,15 +210,13 @@ class RunStore:
 
     def _read(self, file: str) -> dict[int, Figures]:
         noise = self.run.noise[EVALUATION if file == TIMING else file]
-        key, columns = (BLOCKS, ["J"]) if noise.block else (KEY, INDICATORS)
         if not (self.folder / file).is_file():
             return {}
-        wanted = () if file == TIMING else (*key, *columns)
-        rows = read_table(self.folder / file, wanted, dict.fromkeys(key, int)).set_index("seed")
-        rows = rows[(rows.steps == noise.steps) & (rows[key[2]] == (noise.block or noise.burn_in))]
-        rows = rows.drop(columns=key[1:])
-        rows = rows.groupby("seed").agg(list) if noise.block else rows[~rows.index.duplicated()]
-        found: dict[int, Figures] = rows.to_dict("index")
+        wanted = () if file == TIMING else (*KEY, *INDICATORS)
+        rows = read_table(self.folder / file, wanted, dict.fromkeys(KEY, int)).set_index("seed")
+        rows = rows[(rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)]
+        rows = rows.drop(columns=KEY[1:])
+        found: dict[int, Figures] = rows[~rows.index.duplicated()].to_dict("index")
         return found
 
     def measured(self, file: str) -> pd.DataFrame:
@@ -250,13 +251,10 @@ class RunStore:
     def _write(self, file: str) -> None:
         rows = pd.DataFrame.from_dict(self._known[file], "index").sort_index()
         noise = self.run.noise[EVALUATION if file == TIMING else file]
-        if noise.block:
-            rows = rows.explode("J").astype(float)
-        elif file != TIMING:
+        if file != TIMING:
             rows = rows[list(INDICATORS)]
-        key = BLOCKS if noise.block else KEY
-        for place, value in enumerate((rows.index, noise.steps, noise.block or noise.burn_in)):
-            rows.insert(place, key[place], value)
+        for place, value in enumerate((rows.index, noise.steps, noise.burn_in)):
+            rows.insert(place, KEY[place], value)
         write_atomically(self.folder / file, to_csv(rows))
 
     @property
@@ -335,16 +333,13 @@ def lives(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
         if run.training is not None:
             rows = read_table(store.folder / LOG, types={"samples": int})
             alive.append(rows.assign(**names, training_seed=key.seed))
-        elif ONLINE in run.noise:
-            for seed, blocks in sorted(store.indicators(ONLINE).items()):
-                ends = run.noise[ONLINE].block * np.arange(1, len(blocks["J"]) + 1)
-                so_far = pd.Series(blocks["J"]).expanding().mean()
-                rows = pd.DataFrame({"samples": ends, "J": so_far})
-                rows = rows[rows.samples.isin(run.marks)]
-                alive.append(rows.assign(**names, training_seed=seed))
+        elif online_file(run.marks[0]) in run.noise:
+            found = {mark: store.measured(online_file(mark))[["J"]] for mark in run.marks}
+            rows = pd.concat(found, names=["samples", "training_seed"]).reset_index()
+            alive.append(rows.sort_values(["training_seed", "samples"]).assign(**names))
     tables = []
-    for found, columns in ((alive, LIVES), (greedy, [*KEYS, "samples", "seed", "J"])):
-        table = pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=columns)
+    for parts, columns in ((alive, LIVES), (greedy, [*KEYS, "samples", "seed", "J"])):
+        table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
         tables.append(table.reindex(columns=columns).astype({"training_seed": "Int64"}))
     return tables[0], tables[1]
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 RUNS, CHECKPOINT = "runs", "checkpoint.npz"
 Figures = dict[str, Any]
 Measured = dict[int, tuple[Figures, Figures]]
-"""By noise seed the indicators, or the mean cost of each block as `J`, and the times."""
+"""Indicators and times by noise seed."""
 
 
 @dataclass(frozen=True)
@@ -98,14 +98,13 @@ class TrainingTask:
 class Noise(NamedTuple):
     """Noise that a controller is measured on: `steps` samples on each seed, after `burn_in`.
 
-    Kept are indicators; with `block` mean costs over so many samples; with `whole` every sample.
-    A policy of a run in operation is that of the sample `mark`.
+    Kept are indicators, or with `whole` every sample. A policy of a run in operation is that of the
+    sample `mark`.
     """
 
     seeds: tuple[int, ...]
     steps: int
     burn_in: int = 0
-    block: int = 0
     whole: bool = False
     mark: int = 0
 
@@ -290,7 +289,7 @@ def _train(run_: Run, folder: Path | None) -> Trained:
 
 
 def _simulate(item: Item) -> Measured | str:
-    run, (seeds, steps, burn_in, block, whole, mark) = item.run, item.noise
+    run, (seeds, steps, burn_in, whole, mark) = item.run, item.noise
     scenario, factory = run.scenario, run.controller
     if mark:
         from cosim.studies.operation import optimum_at, plant_at  # noqa: PLC0415
@@ -309,11 +308,6 @@ def _simulate(item: Item) -> Measured | str:
     with FmuPlant(scenario) as plant:
         if whole:
             return simulate(plant, controller, steps, seeds[0]).to_csv()
-        if block:
-            found = simulate(plant, controller, steps, seeds[0], residuals=False)
-            cost = found["stage_cost"] + found["penalty"]
-            firsts = range(0, steps, block)
-            return {seeds[0]: ({"J": [float(cost[k : k + block].mean()) for k in firsts]}, {})}
         return {seed: measure(plant, controller, seed, steps, burn_in) for seed in seeds}
 
 

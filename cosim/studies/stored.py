@@ -8,10 +8,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from cosim.comparison import RunSignals, compare
 from cosim.errors import ResultsError
 from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
@@ -22,7 +22,6 @@ from cosim.studies.report import rendered
 from cosim.studies.results import ABOUT, CURVES, StudyResults
 from cosim.studies.store import EVALUATION, KEYS, TIMING, to_csv
 from cosim.studies.work import RUNS
-from cosim.trajectory import Signal
 from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
@@ -177,23 +176,19 @@ def _table_differences(
             lines.append(f"{name}: row {_row(one, lone[0])} is {text}")
     common = stored.index[stored.index.isin(now.index)]
     units = now.attrs | stored.attrs
-    a, b = (
-        RunSignals(name, {c: Signal(c, units[c], t.loc[common, c].to_numpy()) for c in t})
-        for t in (stored, now)
-    )
-    allowed = {c: _tolerance(c, units[c], tolerances) for c in stored if c in now}
-    result = compare(a, b, {signal: one.absolute for signal, one in allowed.items()})
-    for found in sorted(result.differences, key=lambda one: one.first != result.first):
-        if found.first is None:
-            continue
-        was, value = (float(run.signals[found.name].values[found.first]) for run in (a, b))
-        unit = allowed[found.name].unit.removeprefix("1")
-        lines.append(
-            f"{name}: row {_row(stored, common[found.first])}: signal {found.name} is {value!r} "
-            f"now, {was!r} stored, tolerance {found.tolerance:g} {unit}".rstrip()
-        )
-    for lost, text in ((result.only_a, "stored, not computed"), (result.only_b, "not stored")):
-        if lost:
+    found: list[tuple[int, str]] = []
+    for signal in (signal for signal in stored if signal in now):
+        allowed = _tolerance(signal, units[signal], tolerances)
+        was, value = (table.loc[common, signal].to_numpy() for table in (stored, now))
+        same = np.isclose(value, was, 0.0, allowed.absolute, equal_nan=True)
+        if not same.all():
+            k = int(same.argmin())
+            text = f"row {_row(stored, common[k])}: signal {signal} is {float(value[k])!r} now, "
+            text += f"{float(was[k])!r} stored, tolerance {allowed.absolute:g}"
+            found.append((k, f"{name}: {text} {allowed.unit.removeprefix('1')}".rstrip()))
+    lines += [text for _, text in sorted(found, key=lambda one: one[0])]
+    for one, other, text in ((stored, now, "stored, not computed"), (now, stored, "not stored")):
+        if lost := [signal for signal in one if signal not in other]:
             lines.append(f"{name}: signal {', '.join(lost)} is {text}")
     return lines
 

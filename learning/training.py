@@ -63,8 +63,7 @@ class TrainingRun:
     The `configuration` is completed by what the `scenario` states; the other fields are options of
     `cosim train`. A run has diverged, and ends, where its greedy J exceeds the larger of the naive
     θ's and the start's by more than (`divergence` − 1) of its magnitude, twice in a row or at the
-    end.
-    Raises ConfigurationError on counts that make no run.
+    end. Raises ConfigurationError on counts that make no run.
     """
 
     algorithm: str

@@ -99,7 +99,7 @@ class PlantTable(Table):
     parameters: dict[str, float | bool] = {}
     """Further start values, by variable, that each reset writes."""
     communication_step: Positive | None = None
-    """Steps in s by which the FMU goes through a sample, a divisor of the sampling time; else 1."""
+    """Communication step in s, a divisor of the sampling time; without it the sampling time."""
     changes: Annotated[tuple[ChangeTable, ...], Field(strict=False)] | None = None
     """Tables `[[plant.changes]]`: what changes in mid run, times increasing."""
     model: Annotated[str, Field(pattern=r"^[\w.]+:\w+$")] | None = None
@@ -173,7 +173,7 @@ class ControllerTable(Table):
     iterations: Annotated[int, Field(ge=1, le=100)] = 1
     """QPs a sample: 1 is the real-time iteration, more of them come near to convergence."""
     value_offset: Literal["stage-cost", "discounted"] | None = None
-    """c_λ at the start: ℓ_s (paper) or ℓ_s/(1−γ); without it left to the algorithm, ℓ_s else."""
+    """c_λ at the start: ℓ_s (paper) or ℓ_s/(1−γ). Without it algorithms choose; else it is ℓ_s."""
     reference_state: Numbers
     """x_s of the operating point, (n,)."""
     reference_action: Numbers
@@ -273,7 +273,7 @@ class Scenario(Shown, Table):
     penalty: PenaltyTable
     """Table `[penalty]`: the price of a violation."""
     exploration: ExplorationTable | None = None
-    """Table `[exploration]`: how training explores; without it that is left to the algorithm."""
+    """Table `[exploration]`: how training explores; without it the algorithm decides."""
     controller: ControllerTable
     """Table `[controller]`: what the controller is told."""
 

@@ -63,7 +63,7 @@ class Dyna(QLearning):
         return self._imagines or age < self.configuration.exploration_samples
 
     def observe(self, transition: Transition) -> Update | None:
-        """Learn from one sample of the plant, and where it is time from the model's."""
+        """Learn from one sample of the plant and, when due, from the model's."""
         update, data = super().observe(transition), self._data
         data.add(transition)
         since = data.count - data.fitted

@@ -120,7 +120,7 @@ class ModelBased(Algorithm):
         return self._data.count - self._data.era < self.configuration.exploration_samples
 
     def observe(self, transition: Transition) -> Update | None:
-        """Keep a transition; move θ where it is time."""
+        """Keep a transition; move θ when an update is due."""
         data = self._data
         data.add(transition)
         if data.model is not None and (data.count - data.fitted) % WINDOWS[0] == 0:

@@ -619,7 +619,8 @@ def document(plan: Plan) -> dict[str, Any]:
         "pictures": [],
         "made_with": dict(plan.provenance) | {"commit": report.commit()},
     }
-    if (table := definition.table.operation) is not None:
+    trains = any(case.algorithm for case in definition.cases)
+    if (table := definition.table.operation) is not None and trains:
         about["operation"] = {
             name: {
                 "sampling_time": scenario.sampling_time,

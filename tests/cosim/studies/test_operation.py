@@ -1,5 +1,6 @@
 import numpy as np
 
+from cosim import study
 from cosim.studies.operation import SHIFT, dearer_than
 
 
@@ -18,3 +19,9 @@ def test_a_run_that_diverged_is_dearer_in_each_shift_since():
     cost[SHIFT:] = np.inf
     assert dearer_than(np.ones(4 * SHIFT), cost) == (3.0, np.inf)
     assert np.isnan(dearer_than(cost[:10], cost[:10])).all()
+
+
+def test_a_study_in_operation_without_a_training_has_a_report(tmp_path):
+    document = {"schema": 1, "name": "held", "scenarios": ["paper"], "operation": {"hours": [1]}}
+    document |= {"case": [{"controller": "naive"}], "evaluation": {"seeds": 2, "steps": 10}}
+    assert study(document | {"curves": {"seeds": 2, "steps": 10}}, tmp_path).report().is_file()

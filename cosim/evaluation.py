@@ -73,18 +73,17 @@ def evaluate(
     runs too, for J*, without rows of its own unless it is named. Raises EvaluationError on a
     malformed request or failed workers, and what building or running a controller raises.
 
-    Parameters
-    ----------
-    controllers : by name a factory(scenario) -> Controller, importable where the workers run, or
-        what `cosim.plugins.build_controller` takes; or only such texts, or `NAME=…`. The
-        one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
-    seeds : the seeds, or their number S for 0 … S−1.
-    steps : samples per run, from the scenario's initial state on.
-    folder : where finished runs are kept and found again; None keeps none.
-    jobs : worker processes; 1 works in this process.
-    scheduler : address of a Dask scheduler, used in place of `jobs`.
-    progress : called as `cosim.study` does, with a line on what is done anew; True draws a bar.
-    command : the text of the column `command`.
+    Args:
+        controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
+            what `cosim.plugins.build_controller` takes; or only such texts, or `NAME=…`. The
+            one named `naive`, else the first, is the gains' reference; `optimal` gives J*.
+        seeds: the seeds, or their number S for 0 … S−1.
+        steps: samples per run, from the scenario's initial state on.
+        folder: where finished runs are kept and found again; None keeps none.
+        jobs: worker processes; 1 works in this process.
+        scheduler: address of a Dask scheduler, used in place of `jobs`.
+        progress: called as `cosim.study` does, with a line on what is done anew; True draws a bar.
+        command: the text of the column `command`.
     """
     scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     numbers = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)

@@ -1,7 +1,7 @@
 """The search: a simulator decides which θ is kept, with or without a learning rule.
 
 `SearchPlan` decides what to try next. It is a generator that yields requests (`Learn`, `Settle`,
-`Trial`), is sent results (`Learned`, `Block`), and knows no plant, controller or rule. `Search`
+`Trial`), is sent results (`Learned`, `Stretch`), and knows no plant, controller or rule. `Search`
 carries the requests out as an algorithm.
 """
 
@@ -47,7 +47,7 @@ RULE_DEFAULTS = {
 CANDIDATES = 3
 """θ of a phase of learning that are compared, at equal distances in samples."""
 SENSITIVITIES = 100
-"""Largest number of policy Jacobians in the metric of a block."""
+"""Largest number of policy Jacobians in the metric of a stretch."""
 LATEST = 1000
 """Samples of a phase of learning whose prediction errors are kept."""
 ROUNDING = 1e-9
@@ -67,7 +67,7 @@ class Learn(NamedTuple):
 
 
 class Settle(NamedTuple):
-    """Run θ (n_θ,) greedily for a block, then take a snapshot of the plant.
+    """Run θ (n_θ,) greedily for a stretch, then take a snapshot of the plant.
 
     The plant is reset before, where `episode` gives the seed of its noise.
     """
@@ -77,7 +77,7 @@ class Settle(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """Run θ (n_θ,) greedily for a block, from the snapshot (`begins`) or on from the last block.
+    """Run θ (n_θ,) greedily for a stretch, from the snapshot (`begins`) or on from the last one.
 
     The snapshot includes the noise to come. `sensitive` asks for dπ/dθ.
     """
@@ -99,7 +99,7 @@ class Learned(NamedTuple):
     error_deviation: Vector
 
 
-class Block(NamedTuple):
+class Stretch(NamedTuple):
     """Result of `Settle` and `Trial`: mean `stage_cost` and `penalty` per sample.
 
     `predictions` f(s, a) (K, n); `errors` s₊ − f(s, a) (K, n); `metric` E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ)
@@ -116,7 +116,7 @@ class Block(NamedTuple):
 
 
 Request = Learn | Settle | Trial
-Result = Learned | Block
+Result = Learned | Stretch
 Plan = Generator[Request, Result, None]
 Step = Generator[Request, Result, bool]
 
@@ -127,7 +127,7 @@ class Spent(Exception):
 
 @dataclass
 class Candidate:
-    """A θ with the mean costs of its blocks: `realised`, and `expected` with pooled errors."""
+    """A θ with the mean costs of its stretches: `realised`, and `expected` with pooled errors."""
 
     theta: Vector
     realised: list[float] = field(default_factory=list)
@@ -135,7 +135,7 @@ class Candidate:
 
     @property
     def costs(self) -> Vector:
-        """The larger of both readings, block by block.
+        """The larger of both readings, stretch by stretch.
 
         The realised penalty is rare spikes. The expected one is too large where the errors depend
         on the state, by 10 to 20 a sample near the best back-off of `paper`.
@@ -149,7 +149,7 @@ class PairedComparison:
     All comparisons of a round begin at one snapshot, with the same noise to come. The `incumbent`
     has won a comparison, or is the start. Candidates are compared with `base`: the incumbent, or
     the centre of a line search that has not won yet. `scenario` gives bounds and penalty,
-    `samples` the budget; a comparison has up to `blocks` blocks of `block` samples.
+    `samples` the budget; a comparison has up to `stretches` stretches of `stretch` samples.
     """
 
     KEPT = ("_errors", "pooled")
@@ -157,16 +157,16 @@ class PairedComparison:
     """Prediction errors kept for expected penalties, whose tail counts."""
 
     def __init__(
-        self, scenario: Scenario, start: Parameters, samples: int, *, block: int, blocks: int
+        self, scenario: Scenario, start: Parameters, samples: int, *, stretch: int, stretches: int
     ) -> None:
         self._penalty = scenario.state_penalty
         self._parameters, self._start = start.blocks, start.theta
-        self.block, self.blocks = block, blocks
+        self.stretch, self.stretches = stretch, stretches
         self.least = 0.5 * max(smallest_eigenvalue(start.blocks, start.theta), 0.0)
         """Least eigenvalue that the Hessians of a candidate may have."""
         self.spent, self.limit = 0, samples
         self.expected = float("nan")
-        """Penalty expected of the latest block."""
+        """Penalty expected of the latest stretch."""
         self._errors: Matrix = np.zeros((0, scenario.state_lower.size))
         self.pooled = self._errors
         self.incumbent = Candidate(start.theta)
@@ -174,12 +174,12 @@ class PairedComparison:
 
     @property
     def pooled(self) -> Matrix:
-        """The prediction errors that the penalties of this round's blocks are expected with."""
+        """The prediction errors that the penalties of this round's stretches are expected with."""
         return self._pooled
 
     @pooled.setter
     def pooled(self, errors: Matrix) -> None:
-        # Sorted once a round: a block only looks up.
+        # Sorted once a round: a stretch only looks up.
         self._pooled, self._pool = errors, SortedErrors(errors)
 
     def accept(self, candidate: Candidate) -> None:
@@ -197,39 +197,39 @@ class PairedComparison:
         self._errors = np.concatenate([self._errors, errors])[-self.MEMORY :]
 
     def run(self, candidate: Candidate) -> Generator[Request, Result, None]:
-        """One more block of a candidate, always on from its last one."""
-        self.spend(self.block)
-        block = yield Trial(candidate.theta, begins=not candidate.realised)
-        assert isinstance(block, Block)
-        self.expected = self._expected(block)
-        candidate.realised.append(block.stage_cost + block.penalty)
-        candidate.expected.append(block.stage_cost + self.expected)
-        self.remember(block.errors)
+        """One more stretch of a candidate, always on from its last one."""
+        self.spend(self.stretch)
+        stretch = yield Trial(candidate.theta, begins=not candidate.realised)
+        assert isinstance(stretch, Stretch)
+        self.expected = self._expected(stretch)
+        candidate.realised.append(stretch.stage_cost + stretch.penalty)
+        candidate.expected.append(stretch.stage_cost + self.expected)
+        self.remember(stretch.errors)
 
-    def _expected(self, block: Block) -> float:
-        """Expected penalty of a block; the realised one where there is no pool yet."""
-        if block.expected is not None:
-            return block.expected
-        if len(block.predictions) and len(self._pool):
-            found = expected_penalties(self._penalty, block.predictions, self._pool)
+    def _expected(self, stretch: Stretch) -> float:
+        """Expected penalty of a stretch; the realised one where there is no pool yet."""
+        if stretch.expected is not None:
+            return stretch.expected
+        if len(stretch.predictions) and len(self._pool):
+            found = expected_penalties(self._penalty, stretch.predictions, self._pool)
             return float(found.mean(axis=-1).cumsum()[-1])
-        return block.penalty
+        return stretch.penalty
 
-    def renew(self, blocks: int, episode: int | None = None) -> Generator[Request, Result, None]:
+    def renew(self, stretches: int, episode: int | None = None) -> Generator[Request, Result, None]:
         """Run the incumbent on new noise: on from where the plant is, or in a new episode."""
-        self.spend(self.block)
+        self.spend(self.stretch)
         yield Settle(self.incumbent.theta, episode)
         # One pool for the whole round, so that all θ are judged alike.
         self.pooled = self._errors
         self.base = self.incumbent = Candidate(self.incumbent.theta)
-        for _ in range(blocks):
+        for _ in range(stretches):
             yield from self.run(self.incumbent)
 
     def compare(self, theta: Vector, *, patient: bool = False) -> Step:
         """Whether θ takes the base's place: cheaper on the same noise by a standard error.
 
-        Stops once θ's summed cost exceeds the base's; with `patient`, once the remaining blocks can
-        no longer make up for it. A winner has run all blocks, since slow states show effects late.
+        Stops once θ's summed cost exceeds the base's; with `patient`, once the stretches left
+        cannot make up for it. A winner has run all stretches, since slow states show effects late.
         """
         costs = self.base.costs
         patience = _patience(costs) if patient else 0.0
@@ -244,7 +244,7 @@ class PairedComparison:
     def screen(
         self, theta: Vector, costs: Vector, patience: float = 0.0
     ) -> Generator[Request, Result, Candidate | None]:
-        """θ with its first blocks if it is never dearer on them, else None."""
+        """θ with its first stretches if it is never dearer on them, else None."""
         admissible = self.admissible(theta)
         if admissible is None:
             return None
@@ -256,21 +256,21 @@ class PairedComparison:
         return candidate
 
     def final(
-        self, rivals: list[Vector], blocks: int, episode: int
+        self, rivals: list[Vector], stretches: int, episode: int
     ) -> Generator[Request, Result, None]:
         """Make the cheapest of the incumbent and its rivals (n_θ,) the incumbent.
 
-        Each runs over `blocks` blocks of a new episode. A rival is given up once its remaining
-        blocks can no longer make up for its loss. The start is left only for a θ that is cheaper
+        Each runs over `stretches` stretches of a new episode. A rival is given up once its other
+        stretches can no longer make up for its loss. The start is left only for a θ that is cheaper
         by a standard error: the best of many is partly luck.
         """
-        yield from self.renew(blocks, episode)
+        yield from self.renew(stretches, episode)
         costs = self.incumbent.costs
-        patience = _patience(costs) if blocks > 1 else np.inf
+        patience = _patience(costs) if stretches > 1 else np.inf
         finalists = [self.incumbent]
         for theta in rivals:
             rival = Candidate(theta)
-            while len(rival.realised) < blocks:
+            while len(rival.realised) < stretches:
                 yield from self.run(rival)
                 if (rival.costs - costs[: len(rival.realised)]).sum() >= patience:
                     break
@@ -301,14 +301,14 @@ class PairedComparison:
 
 
 def cheaper(difference: Vector) -> bool:
-    """Whether costs that differ so, block by block, are lower by a standard error."""
-    blocks = len(difference)
-    error = float(difference.std(ddof=1)) / blocks**0.5 if blocks > 1 else 0.0
+    """Whether costs that differ so, stretch by stretch, are lower by a standard error."""
+    stretches = len(difference)
+    error = float(difference.std(ddof=1)) / stretches**0.5 if stretches > 1 else 0.0
     return float(difference.mean()) + error < 0.0
 
 
 def _patience(costs: Vector) -> float:
-    """Loss of a candidate, summed over its blocks, that the blocks' own spread still explains."""
+    """Loss of a candidate, summed over its stretches, that their own spread still explains."""
     return float(costs.std()) * len(costs)
 
 
@@ -320,15 +320,14 @@ class SearchPlan:
     in the phases of learning, which then only measure the coordinates of the line searches
     (`prior_deviation`).
 
-    `scenario` gives bounds and penalty, `action_deviation` (m,) the exploration's σ, `samples` the
-    budget, `block` the samples of a block, `blocks` those of a comparison, `phase` the samples of
-    a phase.
+    `scenario` gives bounds and penalty; `action_deviation` (m,) is the exploration's σ, `samples`
+    the budget. A comparison has `stretches` stretches of `stretch` samples, a phase has `phase`.
     """
 
     FINAL = 0.25
     """Share of the samples for the last comparison."""
     FINALISTS = 3.2
-    """Runs over all blocks of the last comparison that its samples suffice for."""
+    """Runs over all stretches of the last comparison that its samples suffice for."""
     DIRECTIONS = 4
     CAP = 1.5
     """Longest first step of a line search, in the prior's standard deviations."""
@@ -342,17 +341,19 @@ class SearchPlan:
         seed: int,
         *,
         phase: int,
-        block: int,
-        blocks: int,
+        stretch: int,
+        stretches: int,
     ) -> None:
         self._start, self._states = start, scenario.state_lower.size
         self._action_deviation, self._samples = action_deviation, samples
         # A short run has short phases and comparisons.
         self._phase = min(phase, max(samples // 8, 1))
-        block = min(block, max(samples // 100, 1))
+        stretch = min(stretch, max(samples // 100, 1))
         self._rng = np.random.default_rng(seed)
-        self.comparison = PairedComparison(scenario, start, samples, block=block, blocks=blocks)
-        self._longer = 2 * blocks
+        self.comparison = PairedComparison(
+            scenario, start, samples, stretch=stretch, stretches=stretches
+        )
+        self._longer = 2 * stretches
         self._scale: Vector = np.ones(start.theta.size)
         self._past = [start.theta]
 
@@ -364,14 +365,14 @@ class SearchPlan:
             yield from self._rounds()
         except Spent:
             comparison.limit = self._samples
-        blocks = max(int(self.FINAL * self._samples / comparison.block / self.FINALISTS), 1)
+        stretches = max(int(self.FINAL * self._samples / comparison.stretch / self.FINALISTS), 1)
         last = len(self._past) - 1
         order = dict.fromkeys([0, last, last // 2, *range(last - 1, 0, -1)])
         # The best of many moves is partly luck, and a round too short for rare events.
         incumbent = comparison.incumbent.theta
         rivals = [self._past[k] for k in order if not np.array_equal(self._past[k], incumbent)]
         try:
-            yield from comparison.final(rivals, blocks, int(self._rng.integers(2**31)))
+            yield from comparison.final(rivals, stretches, int(self._rng.integers(2**31)))
         except Spent:
             return
 
@@ -385,7 +386,7 @@ class SearchPlan:
             # At the end too few samples may be left for learning, not for a search.
             enough = (
                 comparison.limit - comparison.spent
-                >= self._phase + comparison.blocks * comparison.block
+                >= self._phase + comparison.stretches * comparison.stretch
             )
             if enough and rest == 0:
                 better = yield from self._learn(width, goes_on=better and not rescaled)
@@ -395,7 +396,7 @@ class SearchPlan:
                 better = False
                 yield from self._renew()
             if not better:
-                comparison.blocks = self._longer
+                comparison.stretches = self._longer
             rest = max(rest - 1, 0)
             back_off = yield from self._along(self._tightening(), min(back_off, 1.0))
             unscaled = comparison.incumbent
@@ -419,7 +420,7 @@ class SearchPlan:
     def _renew(self) -> Plan:
         """Run the incumbent on new noise, and compare its predecessor with it once more."""
         comparison, past = self.comparison, self._past[-1]
-        yield from comparison.renew(comparison.blocks)
+        yield from comparison.renew(comparison.stretches)
         if not np.array_equal(past, comparison.incumbent.theta):
             yield from comparison.compare(past, patient=True)
 
@@ -455,7 +456,7 @@ class SearchPlan:
         longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
         origin, quarter = comparison.base.theta, max(len(comparison.base.realised) // 4, 1)
         for sign in (1.0, -1.0):
-            # Steps that win over a quarter of the blocks are doubled; the longest runs all of them.
+            # Steps that win over a quarter of the stretches are doubled; the longest runs all.
             step, best, costs = sign * min(reach, longest), 0.0, comparison.base.costs[:quarter]
             while abs(step) <= 4.0 * longest:
                 found = yield from comparison.screen(
@@ -482,10 +483,10 @@ class SearchPlan:
     def _directions(self, *, turned: bool) -> Generator[Request, Result, Matrix]:
         """Directions in scaled θ that change the policy by the exploration's σ, (n_θ, K)."""
         comparison = self.comparison
-        comparison.spend(comparison.block)
-        block = yield Trial(comparison.base.theta, True, sensitive=True)
-        assert isinstance(block, Block) and block.metric is not None
-        values, vectors = np.linalg.eigh(block.metric * np.outer(self._scale, self._scale))
+        comparison.spend(comparison.stretch)
+        stretch = yield Trial(comparison.base.theta, True, sensitive=True)
+        assert isinstance(stretch, Stretch) and stretch.metric is not None
+        values, vectors = np.linalg.eigh(stretch.metric * np.outer(self._scale, self._scale))
         values, vectors = values[::-1][: self.DIRECTIONS], vectors[:, ::-1][:, : self.DIRECTIONS]
         directions = vectors / np.sqrt(np.maximum(values, 1e-12))
         if turned:
@@ -535,7 +536,7 @@ class SearchConfiguration(Configuration):
     rule: Literal["none", "q-learning", "batch-q-learning", "actor-critic"] = Field(
         "none",
         description="what learns in the phases between the comparisons; none: θ rests in them, and "
-        "they last blocks × block samples",
+        "they last stretches × stretch samples",
     )
     rule_settings: dict[str, Any] = Field(
         {}, description="the rule's own settings, as rule_settings = {prior_width = 0.1}"
@@ -546,8 +547,8 @@ class SearchConfiguration(Configuration):
         "policy gradient alone finds no way out of a start that violates its bounds",
     )
     phase: Count = Field(2500, description="samples of learning between comparisons")
-    block: Count = Field(100, description="samples of a block of a comparison")
-    blocks: Count = Field(8, description="blocks of a comparison that is not decided before")
+    stretch: Count = Field(100, description="samples of a stretch of a comparison")
+    stretches: Count = Field(8, description="stretches of a comparison that is not decided before")
 
     def rule_configuration(self, name: str) -> Any:
         """Settings of a rule in the search: those that they share, and the rule's own."""
@@ -631,7 +632,7 @@ class EpisodeData:
         if not self._learns:
             metric = self._metric / max(self._jacobians, 1) if self._sensitive else None
             count = self.length
-            return Block(
+            return Stretch(
                 self._stage_cost / count, self._penalty / count, predictions, errors, metric
             )
         candidates = np.array(self._candidates).reshape(-1, len(self._metric))
@@ -661,16 +662,16 @@ class Search(Algorithm):
         self._rule = self._make_rule(self.samples, 1.0)
         self._deviation = np.broadcast_to(self.strategy.deviation, scenario.action_lower.shape)
         self._model = OneStepModel(scenario)
-        block, blocks = settings.block, settings.blocks
+        stretch, stretches = settings.stretch, settings.stretches
         search = SearchPlan(
             scenario,
             self.controller.parameters,
             self._deviation,
             self.samples,
             seed,
-            phase=blocks * block if self._rule is None else settings.phase,
-            block=block,
-            blocks=blocks,
+            phase=stretches * stretch if self._rule is None else settings.phase,
+            stretch=stretch,
+            stretches=stretches,
         )
         self._comparison, self._plan = search.comparison, search.plan()
         self._results: list[Result] = []
@@ -719,7 +720,7 @@ class Search(Algorithm):
         request, controller = self._request, self.controller
         controller.theta = self.theta if request is None else request.theta
         learns = isinstance(request, Learn)
-        length = request.samples if isinstance(request, Learn) else self._comparison.block
+        length = request.samples if isinstance(request, Learn) else self._comparison.stretch
         self._episode = EpisodeData(request, length, self._deviation, controller.theta.size)
         if isinstance(request, Learn) and not request.goes_on:
             self._rule = self._make_rule(request.samples, request.width)
@@ -765,7 +766,7 @@ class Search(Algorithm):
         except StopIteration:
             self._request = None
         none = np.zeros((0, self._model.states))
-        if isinstance(result, Block):
+        if isinstance(result, Stretch):
             expected = self._comparison.expected
             result = result._replace(predictions=none, expected=expected)
         self._results.append(result._replace(errors=none))
@@ -786,6 +787,6 @@ class Search(Algorithm):
             kept: dict[str, Any] = group(state, f"result {k} ")
             for name in kept.keys() & {"stage_cost", "penalty", "expected"}:
                 kept[name] = float(kept[name])
-            self._advance(Learned(**kept) if "candidates" in kept else Block(**kept))
+            self._advance(Learned(**kept) if "candidates" in kept else Stretch(**kept))
         self.controller.theta = theta
         super().restore(state)

@@ -60,10 +60,13 @@ LEAST = {"seed": 0} | dict.fromkeys(
 class TrainingRun:
     """What identifies a training run; only an identical one can resume a checkpoint.
 
-    The `configuration` is completed by what the `scenario` states; the other fields are options of
-    `cosim train`. A run has diverged, and ends, where its greedy J exceeds the larger of the naive
-    θ's and the start's by more than (`divergence` − 1) of its magnitude, twice in a row or at the
-    end. Raises ConfigurationError on counts that make no run.
+    The `configuration` is completed by what the `scenario` states. `controller`, `rti` or
+    `converged`, carries θ. A row of the log comes every `log_every` samples, a greedy evaluation of
+    θ every `evaluate_every`, on `evaluation_seeds` held-out seeds of `evaluation_steps` samples, a
+    checkpoint every `checkpoint_every`. After `rest_after` samples θ stays and nothing explores. A
+    run has diverged, and ends, where its greedy J exceeds the larger of the naive θ's and the
+    start's by more than (`divergence` − 1) of its magnitude, twice in a row or at the end. Raises
+    ConfigurationError on counts that make no run.
     """
 
     algorithm: str
@@ -105,7 +108,7 @@ class TrainingRun:
         return values
 
     def starting_parameters(self) -> Parameters:
-        """θ where the run starts; the errors are those of `starting_parameters` below."""
+        """θ where the run starts; raises what the function `starting_parameters` raises."""
         problem = Problem.from_scenario(self.scenario)
         if self.start not in ("commissioned", "cautious"):
             return starting_parameters(problem, self.configuration, self.start)
@@ -525,23 +528,20 @@ def train(
     """Train a controller's θ on a scenario's plant; J* is that of its stored optimum, if any.
 
     Raises AlgorithmLookupError, ConfigurationError, ScenarioError, PlantError, CheckpointError,
-    each in one line, before the work where it can be known before; PrivilegeError where an
-    algorithm asks more of the plant than it states.
+    each in one line, before the work where that is possible; PrivilegeError where an algorithm asks
+    more of the plant than it states. The arguments that are not below are `TrainingRun`'s fields.
 
-    Parameters
-    ----------
-    algorithm : a registered name (`learning.algorithm.algorithms`) or `module:Class`.
-    scenario : a scenario, a preset's name or a TOML file.
-    samples : plant samples; None: the algorithm's budget, else 50 000.
-    seed : seed of noise and exploration.
-    start : where θ starts: naive, tuned, commissioned, cautious or a parameters file.
-    settings : hyperparameters by name; the algorithm's Configuration documents them.
-    controller … rest_after : options of `cosim train` of these names.
-    out : folder that the run's checkpoints are kept in; None keeps none. `Training.save` writes
-        the rest.
-    resume : go on from the checkpoint in `out`.
-    progress : called with the samples done and the last row of the log, or a `Tracker`; True draws
-        a bar.
+    Args:
+        algorithm: a registered name (`learning.algorithm.algorithms`) or `module:Class`.
+        scenario: a scenario, a preset's name or a TOML file.
+        samples: plant samples; None: the algorithm's budget, else 50 000.
+        seed: seed of noise and exploration.
+        start: where θ starts: naive, tuned, commissioned, cautious or a parameters file.
+        settings: hyperparameters by name; the algorithm's Configuration documents them.
+        out: folder of the run's checkpoints; None keeps none. `Training.save` writes the rest.
+        resume: go on from the checkpoint in `out`.
+        progress: a function of the samples done and the log's last row, or a `Tracker`; True draws
+            a bar.
     """
     given = locals() | {"start": str(start)}
     if not isinstance(scenario, Scenario):

@@ -252,15 +252,14 @@ def study(
     Raises StudyError and what scenarios and algorithms raise before any work is done;
     FailedRunsError after all other runs are done and written.
 
-    Parameters
-    ----------
-    source : a study, its file, or the same document as a mapping.
-    jobs : worker processes; 1 works in this process. No byte of a table depends on it.
-    scheduler : address of a Dask scheduler, used in place of `jobs`.
-    progress : a `Report`, called after every work item, and with a line for each run that ends or
-        fails; True draws a bar.
-    planned : the study's plan, if it is known.
-    figures : whether the study's trajectories and logs are drawn.
+    Args:
+        source: a study, its file, or the same document as a mapping.
+        jobs: worker processes; 1 works in this process. No byte of a table depends on it.
+        scheduler: address of a Dask scheduler, used in place of `jobs`.
+        progress: a `Report`, called after every work item, and with a line for each run that ends;
+            True draws a bar.
+        planned: the study's plan, if it is known.
+        figures: whether the study's trajectories and logs are drawn.
     """
     if isinstance(source, Mapping):
         source = Study.from_dict(source)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from controllers.theta import Parameters
-from learning.search import Block, Learn, Learned, PairedComparison, SearchPlan, Settle, Trial
+from learning.search import Learn, Learned, PairedComparison, SearchPlan, Settle, Stretch, Trial
 
-BLOCKS = 8
+STRETCHES = 8
 
 
 def drive(plan, answer):
@@ -22,11 +22,11 @@ def drive(plan, answer):
 
 
 class Plant:
-    """Answers with the block costs of each θ, known by the value of c_lambda; counts blocks."""
+    """Answers with the costs of each θ, known by the value of c_lambda; counts stretches."""
 
     def __init__(self, start, costs):
         self.where = start.blocks.slices["c_lambda"]
-        self.costs, self.episodes, self.run, self.block = costs, [], {}, 0
+        self.costs, self.episodes, self.run, self.stretch = costs, [], {}, 0
 
     def drive(self, plan):
         return drive(plan, self.answer)
@@ -37,10 +37,10 @@ class Plant:
             self.episodes.append(request.episode)
             cost = 0.0
         else:
-            self.block = 0 if request.begins else self.block + 1
-            cost = self.costs[name][self.block]
+            self.stretch = 0 if request.begins else self.stretch + 1
+            cost = self.costs[name][self.stretch]
             self.run[name] = self.run.get(name, 0) + 1
-        return Block(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
+        return Stretch(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
 
 
 @pytest.fixture
@@ -54,26 +54,26 @@ def rival(start):
 
 
 def comparison(scenario, start, samples=10_000):
-    return PairedComparison(scenario, start, samples, block=100, blocks=BLOCKS)
+    return PairedComparison(scenario, start, samples, stretch=100, stretches=STRETCHES)
 
 
 def settled(scenario, start, costs):
     plant, made = Plant(start, costs), comparison(scenario, start)
-    plant.drive(made.renew(BLOCKS))
+    plant.drive(made.renew(STRETCHES))
     return plant, made
 
 
-def test_a_winner_has_run_all_blocks(scenario, start, rival):
-    noise = np.arange(BLOCKS) * 5.0
+def test_a_winner_has_run_all_stretches(scenario, start, rival):
+    noise = np.arange(STRETCHES) * 5.0
     plant, made = settled(scenario, start, {1.0: 100.0 + noise, 2.0: 99.0 + noise})
     assert plant.drive(made.compare(rival))
     assert np.array_equal(made.incumbent.theta, rival)
-    assert plant.run[2.0] == BLOCKS
-    assert made.spent == 100 * (1 + 2 * BLOCKS)
+    assert plant.run[2.0] == STRETCHES
+    assert made.spent == 100 * (1 + 2 * STRETCHES)
 
 
 def test_a_loser_is_given_up_at_once(scenario, start, rival):
-    plant, made = settled(scenario, start, {1.0: [100.0] * BLOCKS, 2.0: [101.0] + [0.0] * 7})
+    plant, made = settled(scenario, start, {1.0: [100.0] * STRETCHES, 2.0: [101.0] + [0.0] * 7})
     assert not plant.drive(made.compare(rival))
     assert np.array_equal(made.incumbent.theta, start.theta)
     assert plant.run[2.0] == 1
@@ -81,7 +81,7 @@ def test_a_loser_is_given_up_at_once(scenario, start, rival):
 
 def test_patience_lets_a_rival_mend_what_it_was_left_with(scenario, start, rival):
     """As a θ must that begins where another one let a slow state drift to."""
-    drifting, mending = 100.0 + 10.0 * np.arange(BLOCKS), 110.0 - 5.0 * np.arange(BLOCKS)
+    drifting, mending = 100.0 + 10.0 * np.arange(STRETCHES), 110.0 - 5.0 * np.arange(STRETCHES)
     plant, made = settled(scenario, start, {1.0: drifting, 2.0: mending})
     assert not plant.drive(made.compare(rival))
     assert plant.drive(made.compare(rival, patient=True))
@@ -89,9 +89,9 @@ def test_patience_lets_a_rival_mend_what_it_was_left_with(scenario, start, rival
 
 def test_the_final_leaves_the_cheapest_and_begins_anew(scenario, start, rival):
     third = start.replace({"c_lambda": 3.0}).theta
-    costs = {1.0: 100.0 + np.arange(BLOCKS), 2.0: [1e6] * BLOCKS, 3.0: [99.0] * BLOCKS}
+    costs = {1.0: 100.0 + np.arange(STRETCHES), 2.0: [1e6] * STRETCHES, 3.0: [99.0] * STRETCHES}
     plant, made = Plant(start, costs), comparison(scenario, start)
-    plant.drive(made.final([rival, third], BLOCKS, 17))
+    plant.drive(made.final([rival, third], STRETCHES, 17))
     assert plant.episodes == [17]
     assert np.array_equal(made.incumbent.theta, third)
     assert plant.run[2.0] == 1, "given up where it cannot win any more"
@@ -110,10 +110,10 @@ def test_a_theta_that_no_controller_takes_is_not_tried(scenario, start, block, v
 def test_the_final_leaves_the_start_only_for_what_is_cheaper_by_a_standard_error(
     scenario, start, rival
 ):
-    lucky = np.where(np.arange(BLOCKS) == 0, -2.0, 0.25)
-    for gain, leaves in ((lucky, False), (np.full(BLOCKS, -1.0), True)):
-        plant, made = settled(scenario, start, {1.0: [100.0] * BLOCKS, 2.0: 100.0 + gain})
-        plant.drive(made.final([rival], BLOCKS, 17))
+    lucky = np.where(np.arange(STRETCHES) == 0, -2.0, 0.25)
+    for gain, leaves in ((lucky, False), (np.full(STRETCHES, -1.0), True)):
+        plant, made = settled(scenario, start, {1.0: [100.0] * STRETCHES, 2.0: 100.0 + gain})
+        plant.drive(made.final([rival], STRETCHES, 17))
         assert np.array_equal(made.incumbent.theta, rival if leaves else start.theta)
 
 
@@ -134,7 +134,7 @@ class Bowl:
 
     def answer(self, request):
         cost = 0.0 if isinstance(request, Settle) else self.cost(request.theta)
-        return Block(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
+        return Stretch(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
 
     def drive(self, plan):
         return drive(plan, self.answer)
@@ -148,8 +148,8 @@ def far(problem):
 
 @pytest.fixture
 def lines(scenario, far):
-    deviation = np.array([10.0, 10.0])
-    return SearchPlan(scenario, far, deviation, 100_000, 0, phase=800, block=100, blocks=BLOCKS)
+    sizes = {"phase": 800, "stretch": 100, "stretches": STRETCHES}
+    return SearchPlan(scenario, far, np.array([10.0, 10.0]), 100_000, 0, **sizes)
 
 
 def minimiser(parameters):
@@ -162,7 +162,7 @@ def test_the_inputs_weights_are_found_each_with_its_own_back_off(lines, far):
     plant = Bowl(far, 1e-2)
     same = lines._weighted(0.1)
     assert plant.cost(same) > plant.cost(far.theta)
-    plant.drive(comparison.renew(BLOCKS))
+    plant.drive(comparison.renew(STRETCHES))
     assert plant.drive(lines._rescale(-1.0)) == -1.0
     found = far.with_theta(comparison.incumbent.theta)
     assert np.diag(found["B_l"]) == pytest.approx([1.0, 1.0, 1e-2, 1e-2])
@@ -177,7 +177,7 @@ SAMPLES = 20_000
 def search(scenario, problem, samples=SAMPLES):
     start = Parameters.naive(problem, value_offset=6e5)
     return SearchPlan(
-        scenario, start, np.array([10.0, 10.0]), samples, 7, phase=1000, block=100, blocks=8
+        scenario, start, np.array([10.0, 10.0]), samples, 7, phase=1000, stretch=100, stretches=8
     )
 
 
@@ -209,19 +209,19 @@ class Quadratic:
             self.rounds += 1
             self.draws = np.random.default_rng(self.rounds).normal(size=1000)
         elif request.begins:
-            self.block = 0
+            self.stretch = 0
         metric = None
         if isinstance(request, Trial):
             self.tried.append(request.theta)
-            self.block += 1
+            self.stretch += 1
             if request.sensitive:
                 jacobian = np.zeros((2, request.theta.size))
                 where = self.blocks.slices["b_l"]
                 jacobian[0, where.stop - 2] = jacobian[1, where.stop - 1] = -0.05
                 metric = jacobian.T @ jacobian
-        draw = self.noise * self.draws[getattr(self, "block", 0)]
+        draw = self.noise * self.draws[getattr(self, "stretch", 0)]
         far = np.full((100, 2), 60.0)
-        return Block(self.cost(request.theta) + draw, 0.0, far, np.zeros((100, 2)), metric)
+        return Stretch(self.cost(request.theta) + draw, 0.0, far, np.zeros((100, 2)), metric)
 
 
 def run(search, plant):

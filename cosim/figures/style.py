@@ -6,7 +6,7 @@ import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from colorsys import hls_to_rgb, rgb_to_hls
 from contextlib import contextmanager
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -111,13 +111,16 @@ class Look(NamedTuple):
     line: Any
 
 
-def palette(names: Sequence[str]) -> dict[str, Look]:
+def palette(names: Sequence[str], scenarios: Iterable[str] = ()) -> dict[str, Look]:
     """A look for each controller or case, in the order given.
 
     Cases of one rule, `rule(start=naive)`, `search+rule` and `rule-simulator`, share a colour and
-    differ in their line style. Known rules have colours of their own, the same in all sets.
+    differ in their line style; so do `case-SCENARIO` of several `scenarios`. Known rules have
+    colours of their own, the same in all sets.
     """
     head_of = {name: name.partition("(")[0].removeprefix("search+") for name in names}
+    for name, scenario in product(names, scenarios):
+        head_of[name] = head_of[name].removesuffix(f"-{scenario}")
     for name, head in head_of.items():
         rules = [known for known in _KNOWN if f"{head}-".startswith(f"{known}-")]
         head_of[name] = max(rules, key=len, default=head.removesuffix("-simulator"))

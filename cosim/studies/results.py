@@ -431,7 +431,7 @@ class StudyResults(Shown):
 
     @property
     def _looks(self) -> dict[str, Look]:
-        return palette(list(self.cases))
+        return palette(list(self.cases), self.scenarios)
 
     def _regret(self, scenario: str) -> Figure | None:
         if self.reference("optimum", scenario) is None:

@@ -176,9 +176,8 @@ SAMPLES = 20_000
 
 def search(scenario, problem, samples=SAMPLES):
     start = Parameters.naive(problem, value_offset=6e5)
-    return SearchPlan(
-        scenario, start, np.array([10.0, 10.0]), samples, 7, phase=1000, stretch=100, stretches=8
-    )
+    sizes = {"phase": 1000, "stretch": 100, "stretches": 8}
+    return SearchPlan(scenario, start, np.array([10.0, 10.0]), samples, 7, **sizes)
 
 
 class Quadratic:

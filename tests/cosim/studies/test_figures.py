@@ -66,6 +66,11 @@ def test_a_dark_ground_hides_no_controller():
     assert [lit(look.color) for look in looks] == ["#7f7f7f", "#0072B2", "#c8c8c8", "#523ace"]
 
 
+def test_one_controller_has_one_colour_on_all_scenarios():
+    looks = palette(["two-fouled(two-fouled)", "two-jump(two-jump)", "q"], ["fouled", "jump"])
+    assert len({look.color for look in looks.values()}) == 2
+
+
 def test_increments_are_of_each_block_since_its_first_row():
     log = pd.DataFrame({"samples": [0, 1], "theta b[0]": [1.0, 3.0], "theta b[1]": [2.0, 2.0]})
     assert increments(log)["b"].tolist() == [[0.0, 0.0], [2.0, 0.0]]

@@ -190,8 +190,8 @@ def _check(controllers: Mapping[str, Factory | str], seeds: Sequence[int], steps
 class Evaluation(Result):
     """Indicators of controllers × seeds on common random numbers.
 
-    `columns` and `timing` hold, by controller, what was measured: a frame with a row for each
-    seed. `parameters` are each controller's hash; `facts` are the columns that do not vary.
+    `columns` and `timing` hold the measurements by controller: a frame with a row for each seed.
+    `parameters` are each controller's hash; `facts` are the columns that do not vary.
     """
 
     controllers: Sequence[str]

@@ -178,7 +178,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
-    """Document of a TOML file; `origin` is what messages call it.
+    """Document of a TOML file; `origin` is its name in messages.
 
     Raises `error` where there is no such regular file, or where it is not UTF-8 or not TOML.
     """

@@ -1,4 +1,4 @@
-"""What the closed loop asks of a plant, a controller and a recorder."""
+"""Protocols of the closed loop: a plant, a controller and a recorder."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Plant(Protocol):
 
 
 class Solution(Protocol):
-    """What a controller returns from `feedback`."""
+    """The result of a controller's `feedback`."""
 
     @property
     def action(self) -> Array:
@@ -102,7 +102,7 @@ class Controller(Protocol):
         """Forget every earlier sample."""
 
     def prepare(self) -> None:
-        """Do what needs no measurement, e.g. shift and linearise."""
+        """Do the work that needs no measurement, e.g. shift and linearise."""
 
     def feedback(self, s: Array, a: Array | None = None) -> Solution:
         """Solve for the measured state s (n,), with the first action fixed to a (m,) if given."""

@@ -1,4 +1,4 @@
-"""What results can do: a line at a prompt, a table, a page and a picture; tables as text."""
+"""Results as a line at a prompt, a table, a page and a picture; tables as text."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def short(value: object) -> str:
 
 
 class Shown:
-    """What shows its facts: a line at a prompt, a table in a notebook."""
+    """An object that shows its facts: a line at a prompt, a table in a notebook."""
 
     def _facts(self) -> Mapping[str, object]:
-        """What is shown of it, by label."""
+        """The facts to show, by label."""
         return {}
 
     def __repr__(self) -> str:
@@ -60,7 +60,7 @@ class Shown:
 
 
 class Result(Shown):
-    """What was measured, with its figure."""
+    """A measured result, with its figure."""
 
     def figure(self) -> Figure:
         """The figure of the result."""

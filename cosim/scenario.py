@@ -43,7 +43,8 @@ class Table(BaseModel):
 class MappingTable(Table):
     """FMU variables that a reset writes; each is optional.
 
-    What is left out is not written: without `seed`, for instance, the FMU draws its own noise.
+    A variable that is left out is not written: without `seed`, for instance, the FMU draws its own
+    noise.
     """
 
     initial_state: Names = ()
@@ -158,7 +159,7 @@ class ExplorationTable(Table):
 
 
 class ControllerTable(Table):
-    """What the controller is told."""
+    """The controller's model, solver and operating point."""
 
     model: Annotated[str, Field(pattern=r"^[\w.]+:\w+$")] | None = None
     """Its model of the plant, `module:factory`; not needed by controllers that have none."""
@@ -455,7 +456,7 @@ RANDOM = re.compile(r"random-(0|[1-9]\d{0,8})")
 
 
 def random_plant(seed: int) -> dict[str, Any]:
-    """What a plant with random errors changes in `paper`; its controller is told nothing of it.
+    """The changes of `paper` that make a plant with random errors, unknown to its controller.
 
     Drawn in this order, uniformly unless stated, and rounded to four digits: sampling time 30, 60
     or 120 s; UA2 and C by −20 … +30 %; F3 and Cp by ±5 %, both latent heats by ±3 %; the nominal
@@ -518,7 +519,7 @@ def read(source: str | Path, seen: tuple[str, ...] = ()) -> tuple[dict[str, Any]
 def resolved(
     document: Mapping[str, Any], origin: str, folder: Path, seen: tuple[str, ...] = ()
 ) -> dict[str, Any]:
-    """The document with what it `extends`, its paths made absolute as seen from `folder`.
+    """The document with all that it `extends`, its paths made absolute as seen from `folder`.
 
     `seen` are the files that led here. Raises ScenarioError.
     """

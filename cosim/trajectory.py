@@ -62,7 +62,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class SignalKind:
-    """A declared signal: its `name`, what it is `of`, its `unit`.
+    """A declared signal: its `name`, its source `of`, its `unit`.
 
     `of` is an attribute of a `Sample`, or a function of other signals. A `vector` has a signal for
     each variable that the scenario's plant names under `name`, in the variable's unit. `group` is

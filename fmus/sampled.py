@@ -19,12 +19,12 @@ _SAMPLES = 100
 class SampledSystem:
     """A function of inputs and parameters that is evaluated once a `sampling_time` [s].
 
-    `name` and `description` are for people, `identifier` is the model's C identifier. `signals` are
-    real variables, or Boolean inputs: the inputs, then the outputs, then the tunable parameters;
-    every output depends on every input and parameter. `sources` are C headers by name, of which
-    ``core.h`` defines what ``sampled_sources/model_state.h`` lists; the arrays it is given and
-    fills are ordered like the signals. `terminal` is its model's. Raises BuildError on names that
-    are taken twice.
+    `name` and `description` are for readers, `identifier` is the model's C identifier. `signals`
+    are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
+    parameters; every output depends on every input and parameter. `sources` are C headers by name,
+    of which ``core.h`` defines the functions that ``sampled_sources/model_state.h`` lists; their
+    arrays are ordered like the signals. `terminal` is that of `FmuModel`. Raises BuildError on
+    names that are taken twice.
     """
 
     name: str

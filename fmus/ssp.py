@@ -27,9 +27,9 @@ def write_ssp(
     """Write a loop of two FMUs (System Structure and Parameterization); the bytes repeat.
 
     It is SSP 1.0 where both are FMI 2.0, else SSP 2.0, which has FMI 3.0's types. The controller is
-    stepped first. `states`, and what else it measures, go from the plant to it, `actions` back, by
-    their names in both and with their units; `starts` are the plant's start values with their FMI
-    types. Raises BuildError where an FMU has no co-simulation.
+    stepped first. `states`, and the disturbances that it measures, go from the plant to it,
+    `actions` back, by their names in both and with their units; `starts` are the plant's start
+    values with their FMI types. Raises BuildError where an FMU has no co-simulation.
     """
     members: dict[str, bytes] = {}
     components = []

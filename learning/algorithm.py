@@ -1,7 +1,7 @@
-"""A learning rule, what it asks for, and its loop: plant, controller and rule, by the sample.
+"""A learning rule, its requests to the plant, and the loop of plant, controller and rule.
 
 An own rule inherits `Algorithm`, is given a `Transition` and returns an `Update`. `TrainingLoop`
-draws the exploration and carries out what an update asks of the plant.
+draws the exploration and carries out an update's requests to the plant.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Strategy:
 
     @classmethod
     def of(cls, configuration: Configuration, scenario: Scenario) -> Strategy:
-        """From hyperparameters; ConfigurationError on a wrong number of deviations."""
+        """The strategy of a configuration; ConfigurationError on a wrong number of deviations."""
         lower, upper = scenario.action_lower, scenario.action_upper
         deviation = configuration.exploration_share * (upper - lower)
         if configuration.exploration_deviation is not None:

@@ -1,4 +1,4 @@
-"""What a practitioner would do, from plant data: back-off, an offset, parameters of the model.
+"""The practitioner's methods, from plant data: back-off, offset, parameters of the model.
 
 In operation (`BackOff`, `OffsetFree`, `Identified`) offset and parameters are estimated to the end
 of the run. On a simulator (`…Simulator`) a `BackOffSearch` follows the estimate; the plant is reset

@@ -1,6 +1,6 @@
 """The θ that an engineer has on the first day: tuned, and backed off for a guessed noise.
 
-No sample of the plant goes into it, and nothing that the controller's own model does not say.
+It comes from the controller's own model alone, without a sample of the plant.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def back_off(start: Parameters, scenario: Scenario) -> Parameters:
 
     The disturbances are normal about their nominal values with the deviation `GUESS`, new in each
     sample; `BackOffSearch` moves every bound that binds. Without a nominal disturbance there is no
-    noise to guess, and θ stays. What a process has found once it does not search again.
+    noise to guess, and θ stays. A process searches once for each scenario and start.
     """
     key = (scenario.hash, start.hash)
     if key not in _found:
@@ -56,10 +56,10 @@ def back_off(start: Parameters, scenario: Scenario) -> Parameters:
 
 
 def spare(start: Parameters, scenario: Scenario) -> Parameters:
-    """`start` with each bound that binds in none of such samples set back by `SPARE`.
+    """`start` with each bound that never binds in such a simulation set back by `SPARE`.
 
-    By half of the way to the state that came closest to it, where that is less: it costs nothing on
-    the model, and meets a plant whose states lie elsewhere.
+    Where half of the distance to the nearest state of the simulation is less, it is that half. It
+    costs nothing on the model, and is a reserve for a plant whose states lie elsewhere.
     """
     controller, sample = nmpc(scenario, start), _simulation(scenario)
     noise, s = np.random.default_rng(0), scenario.initial_state

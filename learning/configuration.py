@@ -27,10 +27,9 @@ ExplorationShare = Annotated[
 class Configuration(BaseModel):
     """Hyperparameters that every algorithm has; an algorithm adds its own in a subclass.
 
-    What a scenario states of exploration and c_lambda's start takes the place of an algorithm's
-    defaults, but not of what the user set (`for_scenario`). A field's description is its
-    documentation (`documentation`). Scaled coordinates are θ / blocks.scale, so that one step size
-    fits all entries.
+    A scenario's exploration and first c_lambda replace an algorithm's defaults, but no value that
+    the user set (`for_scenario`). A field's description is its documentation (`documentation`).
+    Scaled coordinates are θ / blocks.scale, so that one step size fits all entries.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -51,13 +50,13 @@ class Configuration(BaseModel):
     )
     exploration: Literal["additive", "literal", "none"] = Field(
         "additive",
-        description="a = sat(π+e), a = sat(e), or always a = π; this and what follows: unless the "
-        "scenario has a table [exploration]",
+        description="a = sat(π+e), a = sat(e), or always a = π; a scenario's table [exploration] "
+        "replaces the defaults of all four exploration settings",
     )
     exploration_probability: ExplorationProbability = 1.0
     exploration_share: ExplorationShare = 1 / 60
     exploration_deviation: tuple[NonNegative, ...] | None = Field(
-        None, description="the same in the units of u, one or one per action, in place of the share"
+        None, description="in place of the share: σ of e in the units of u, one or one per action"
     )
 
     @classmethod

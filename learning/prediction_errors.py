@@ -13,7 +13,7 @@ from cosim.protocols import Matrix, Vector
 from cosim.scenario import Penalty, Scenario
 
 SLOWEST = 1000.0
-"""Samples of the slowest time constant that is believed: of a state that integrates, say."""
+"""Cap of the slowest time constant in samples; that of an integrating state is infinite."""
 
 
 class OneStepModel:
@@ -121,10 +121,10 @@ def expected_penalties(
 
 
 class PredictionErrors:
-    """The last `capacity` errors e = s₊ − f(s, a), and the mean penalty that they make likely.
+    """The last `capacity` errors e = s₊ − f(s, a), and the mean penalty expected from them.
 
     The realised penalty p(s₊) is a rare spike; its expectation mean_i p(f(s, a) + e_i) is smooth in
-    s and a. It needs plant data alone, and the errors carry what the model lacks.
+    s and a. It needs plant data alone, and the errors include those of the model.
     """
 
     KEPT = ("_errors", "_count")

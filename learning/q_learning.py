@@ -39,8 +39,8 @@ class ValueConfiguration(Configuration):
         None,
         gt=0,
         le=1,
-        description="of the TD error; if not given 1, that is the mean cost, which no sampling "
-        "time alters, and for the rules td and fit the scenario's",
+        description="discount of the TD error; if not given, 1 (the mean cost, which no sampling "
+        "time alters), and the scenario's for the rules td and fit",
     )
     prior_width: Positive = Field(
         0.15, description="how far θ may be from its start, as a share of the start's cost"
@@ -98,8 +98,8 @@ class QLearningConfiguration(ValueConfiguration):
     )
     mean_cost_memory: NonNegative = Field(
         1.625,
-        description="slowest time constants of the nominal model over which the mean cost follows "
-        "δ; 0: θ's fit has it",
+        description="time over which the mean cost follows δ, in slowest time constants of the "
+        "nominal model; 0: the mean cost is fitted with θ",
     )
     parameter_drift: NonNegative = Field(
         0.0,

@@ -57,7 +57,7 @@ ROUNDING = 1e-9
 class Learn(NamedTuple):
     """Let the rule learn from θ (n_θ,) for some samples.
 
-    It `goes_on` with what it knows, or is new, its prior or trust region times `width`.
+    It `goes_on` with its data, or starts anew with its prior or trust region times `width`.
     """
 
     theta: Vector

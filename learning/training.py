@@ -58,7 +58,7 @@ LEAST = {"seed": 0} | dict.fromkeys(
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """What identifies a training run; only an identical one can resume a checkpoint.
+    """The identity of a training run; only an identical one can resume a checkpoint.
 
     The `configuration` is completed by what the `scenario` states. `controller`, `rti` or
     `converged`, carries θ. A row of the log comes every `log_every` samples, a greedy evaluation of

@@ -88,9 +88,9 @@ class Functions:
 class Prepared:
     """Data of a preparation phase, kept for read-outs after the next one has begun.
 
-    `memory` is a copy of the preparation's, `parameters` the θ; `spectrum` says what convexified
-    the Hessians, None for Gauss–Newton; `functions` are the maker's, `engine` its compiled code.
-    Where that goes stage by stage nothing is condensed until somebody asks for the QP.
+    `memory` is a copy of the preparation's memory, `parameters` are θ. `spectrum` is the lift that
+    convexified the Hessians, None for Gauss–Newton. `functions` and `engine` are the controller's.
+    An engine that solves stage by stage condenses the QP only when it is asked for.
     """
 
     memory: Vector
@@ -408,8 +408,8 @@ class RtiNmpc:
 
     With `iterations` above 1 a feedback solves that many QPs, each linearised at the solution of
     the last, full steps at the measured state: many end at `ConvergedNmpc`. Value, policy and
-    derivatives are then those of the last QP at its own point of linearisation; what `prepare`
-    prepared stays for the sample's other feedbacks, so that Q(s, π(s)) = V(s), and for replay.
+    derivatives are then those of the last QP at its own point of linearisation; the QP of `prepare`
+    stays for the sample's other feedbacks, so that Q(s, π(s)) = V(s), and replay.
 
     `hessian` is `gauss-newton` or `exact`, `backend` `daqp`, `proxqp`, `qpsolvers:SOLVER`
     or a function that makes a `QpBackend`; `functions` says whether a sample is `interpreted` or
@@ -624,8 +624,8 @@ class RtiNmpc:
         """Feedback phase: V(s) and π(s), or Q(s, a) where `a` is given.
 
         s (n,) and a (m,) in the units of the model; an enforced action replaces the bounds of the
-        first control. The solution becomes what the next `prepare` shifts. Raises QpError where s
-        is not finite or the QP is not solved; ControllerError on wrong shapes.
+        first control. The next `prepare` shifts this solution. Raises QpError where s is not finite
+        or the QP is not solved; ControllerError on wrong shapes.
         """
         solution = self._solve(s, a)
         self._pending = solution

@@ -1,4 +1,4 @@
-"""`cosim fmu`: what is in an FMU, whether it is right, and the build of ours."""
+"""`cosim fmu`: the contents of an FMU, its check, and the build of the shipped ones."""
 
 from __future__ import annotations
 

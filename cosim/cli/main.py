@@ -174,8 +174,8 @@ def options(
 def main() -> None:
     """Run the command line.
 
-    Bad input ends in one line on standard error and exit code 2, what nobody foresaw in one line,
-    a report with the traceback and exit code 70.
+    Bad input ends in one line on standard error and exit code 2, an unforeseen error in one line, a
+    report with the traceback and exit code 70.
     """
     # Passes of the collector over modules and CasADi's expressions are a fifth of a short run.
     gc.set_threshold(50_000)
@@ -188,8 +188,8 @@ def main() -> None:
 def _open_streams() -> None:
     """Make both standard streams writable, closed ones too.
 
-    A character that a stream's encoding lacks is written as its escape; a closed stream swallows
-    what it is given.
+    A character that a stream's encoding lacks is written as its escape; a closed stream drops its
+    text.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)

@@ -120,7 +120,7 @@ def report(
 ) -> None:
     """Draw a study: report.html, one page that needs nothing else, report.md and figures/.
 
-    A study that is not finished, or a stored one, is reported with what it has.
+    Of an unfinished study the finished runs are reported; a stored study may be reported, too.
     """
     with cli.output(json) as out_:
         from cosim.studies.results import StudyResults

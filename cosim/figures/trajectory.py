@@ -139,7 +139,7 @@ def overlay_figure(runs: Mapping[str, Run]) -> Figure:
 def animation(start: str, first: Run, name: str, runs: Mapping[str, Run], path: str | Path) -> Path:
     """Write a GIF: a frame for each of `runs`, by title, drawn over the `first` on the same axes.
 
-    `start` and `name` are what the legend calls the first and the others. Raises FigureError on
+    `start` and `name` are the legend's names of the first and the others. Raises FigureError on
     another suffix, OSError where the file cannot be written.
     """
     if Path(path).suffix != ".gif":

@@ -43,8 +43,8 @@ def draft_scenario(
 ) -> str:
     """Text of a scenario file for an FMU, as it will stand at `target`, remarks first.
 
-    What is not given is guessed; `state` and `action` are where the search for the steady state
-    begins. Raises PlantError, which says what to give, where nothing can be guessed.
+    Roles that are not given are guessed; `state` and `action` are where the search for the steady
+    state begins. Raises PlantError, which says what to give, where nothing can be guessed.
     """
     archive = unpack(fmu)
     for refusal in refusals(archive):

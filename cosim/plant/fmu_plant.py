@@ -498,7 +498,7 @@ class FmuPlant:
         return self._free_handles.pop()
 
     def recycle(self, handle: ctypes.c_void_p) -> None:
-        """Keep a dropped snapshot's memory for the next one."""
+        """Keep a dropped snapshot's memory for the next one; each snapshot calls this."""
         self._free_handles.append(handle)
 
     def close(self) -> None:

@@ -246,7 +246,7 @@ penalty of violating the state bounds (red lines).
 
 
 class Plot(NamedTuple):
-    """A view of what has ended: its title, and of each signal its channel, rows and values."""
+    """A view of an ended run: its title, and each signal's channel, rows and values."""
 
     title: str
     signals: Sequence[tuple[Channel, list[rr.TimeColumn], Array]]

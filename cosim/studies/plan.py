@@ -35,7 +35,7 @@ class Study:
 
     `load` reads a study file, `from_dict` takes the same document; `cosim.study` runs it. Relative
     paths and `module:Class` names are looked up from `folder`; `file` is its file as given. Raises
-    StudyError, ScenarioError and what `learning` raises of an algorithm.
+    StudyError, ScenarioError and, of an algorithm, LearningError.
     """
 
     def __init__(self, table: StudyTable, folder: Path, file: str | None = None) -> None:

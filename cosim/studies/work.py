@@ -1,4 +1,4 @@
-"""The work of a study: runs, what they are measured on, and how a worker does a part of one.
+"""The work of a study: runs, the noise that they are measured on, and a worker's part of a run.
 
 An evaluation's worker imports only this: learning, pandas and SciPy take longer than many samples.
 """
@@ -157,8 +157,8 @@ class Run:
     """One run: a controller, or a training and its θ.
 
     `controller` is what `cosim.plugins.build_controller` takes, or a factory(scenario); None for a
-    training. `noise` is what it is measured on, by the file that keeps the results; `trajectories`
-    are those that it is in; `marks` the samples of operation at which θ, or the optimum, is judged.
+    training. `noise` is that of its evaluations, by the file of the results; `trajectories` are
+    those to keep of it; `marks` the samples of operation at which θ, or the optimum, is judged.
     """
 
     key: RunKey

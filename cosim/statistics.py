@@ -96,7 +96,7 @@ def regrets(cost: Array, optimum: Array | float) -> Array:
 
 
 def regret_terms(cost: Array, optimum: Array) -> Array:
-    """Contribution (S,) of each seed or block to `regret`, their mean."""
+    """Contribution (S,) of each seed or stretch to `regret`, their mean."""
     return (cost - optimum) / abs(np.mean(optimum))
 
 

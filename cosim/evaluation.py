@@ -16,11 +16,10 @@ from cosim.errors import EvaluationError, StudyError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
-from cosim.progress import told
 from cosim.protocols import Array, Controller, Decision
 from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
-from cosim.simulation import indicators, measure, simulate
+from cosim.simulation import indicators, measure, simulate, told
 from cosim.statistics import (
     bootstrapped,
     gain,

@@ -1,16 +1,16 @@
-"""The closed loop of a plant and a controller, and its indicators."""
+"""The closed loop of a plant and a controller, its indicators, and its progress."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from threading import RLock
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from cosim.errors import CosimError
-from cosim.progress import told
 from cosim.protocols import (
     Array,
     CompiledLoop,
@@ -315,3 +315,35 @@ def input_effort(actions: Array, lower: Array, upper: Array) -> float:
     if len(actions) < 2:
         return 0.0
     return float(np.mean(np.sum(np.abs(np.diff(actions, axis=0)) / (upper - lower), axis=1)))
+
+
+@contextmanager
+def told(
+    progress: Callable[..., None] | bool,
+    label: str,
+    total: int,
+    read: Callable[..., tuple[int, str]] = lambda done, remark="", *_: (done, remark),
+) -> Iterator[Callable[..., None]]:
+    """Yield the callback of an argument `progress`: itself, a bar, or a no-op.
+
+    True stands for a bar of `total` samples: `read` turns what the function is called with into
+    the number done and a remark.
+    """
+    if callable(progress) or not progress:
+        yield progress or (lambda *news: None)
+        return
+    from tqdm.auto import tqdm  # noqa: PLC0415, only where a bar is drawn
+
+    # No thread that watches the bar, and no lock between processes: one process draws it.
+    tqdm.monitor_interval = 0
+    tqdm.set_lock(RLock())
+    form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{remaining}{postfix}]"
+    looks = {"bar_format": form, "unit_scale": True, "miniters": 1, "dynamic_ncols": True}
+    with tqdm(total=total, desc=label, **looks) as bar:
+
+        def update(*news: object) -> None:
+            done, remark = read(*news)
+            bar.set_postfix_str(remark, refresh=False)
+            bar.update(done - bar.n)
+
+        yield update

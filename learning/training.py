@@ -25,11 +25,10 @@ from cosim.errors import CapabilityError, PlantError
 from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, depends_on
-from cosim.progress import told
 from cosim.protocols import Array, Controller, Plant
 from cosim.result import Result, csv_text
 from cosim.scenario import Scenario
-from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds
+from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds, told
 from cosim.statistics import gap_closed, regret, shown
 from cosim.validation import known_keywords, suggestion
 from learning import checkpoint

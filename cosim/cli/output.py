@@ -173,7 +173,7 @@ def resumable(
 @contextmanager
 def followed(out: Output, label: str, samples: int) -> Iterator[Callable[[int, str, str], None]]:
     """The `progress` of resumable work on so many samples: a bar, and a line for each event."""
-    from cosim.progress import told
+    from cosim.simulation import told
 
     with resumable(), told(out.live, label, samples) as bar:
 

@@ -20,7 +20,7 @@ import loky
 from cosim.errors import EvaluationError, FailedRunsError
 from cosim.files import write_atomically
 from cosim.processes import out_of_reach_of_ctrl_c
-from cosim.progress import told
+from cosim.simulation import told
 from cosim.studies import operation
 from cosim.studies.plan import Plan, Study, plan
 from cosim.studies.results import StudyResults

@@ -88,7 +88,7 @@ class StackedFunction:
         self._evaluate()
 
     def finite(self) -> bool:
-        """Whether all results are."""
+        """Whether all results are finite."""
         return bool(np.isfinite(self.stack).all())
 
     def part(self, name: str, memory: Vector | None = None) -> Vector:

@@ -293,7 +293,7 @@ class Fouling:
 
     @property
     def nodes(self) -> list[float]:
-        """The parameter's values whose optima the reference is made of, increasing."""
+        """Increasing values of the parameter at which the reference has an optimum."""
         fouled = self.clean * (self.floor + (1 - self.floor) * np.exp(-self.rate * self.period))
         values: list[float] = np.linspace(fouled, self.clean, NODES).round(6).tolist()
         return values
@@ -343,7 +343,7 @@ class Jumps:
         return dict(self.plants[int(self.position(time))])
 
     def position(self, time: ArrayLike) -> Vector:
-        """Which of the plants is there at times in s."""
+        """Index of the plant at times in s."""
         return np.asarray(np.searchsorted(self.starts, time, side="right") - 1, dtype=np.float64)
 
     def quadrature(self) -> tuple[Vector, Vector]:

@@ -33,7 +33,7 @@ ACTIVE = 1e-6
 
 @dataclass(frozen=True)
 class Units:
-    """Units `state` ρ_x (n,) and `action` ρ_u (m,), of cost κ, and `dearest` max_i μ_i ρ_i.
+    """The units `state` ρ_x (n,), `action` ρ_u (m,), `cost` κ; and `dearest`, max_i μ_i ρ_i.
 
     μ are the multipliers of the state bounds at the reference; κ is the power of ten above
     `dearest`, so that slack weights κ/ρ_x are exact. Where no bound is active, `dearest` is 0 and
@@ -201,7 +201,7 @@ class Problem:
         )
 
     def symbolic_penalty(self, s: ca.SX) -> ca.SX:
-        """The same as a CasADi expression of a state (n,)."""
+        """The penalty of the true bounds as a CasADi expression of a state (n,)."""
         violation = ca.fmax(ca.fmax(self.state_lower - s, s - self.state_upper), 0)
         return ca.dot(self.penalty_linear, violation) + ca.dot(self.penalty_quadratic, violation**2)
 

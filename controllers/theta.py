@@ -244,7 +244,7 @@ class Parameters(Shown):
         return Parameters(self.blocks, theta)
 
     def placed_in(self, other: Parameters) -> Parameters:
-        """`other`, which has all of this θ's blocks, with its values; a longer p keeps its end."""
+        """`other`, which has this θ's blocks, with this θ's values; a longer p keeps its end."""
         values = {block.name: self[block.name] for block in self.blocks}
         if "p" in values:
             values["p"] = np.concatenate([values["p"], other["p"][values["p"].size :]])

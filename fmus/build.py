@@ -1,4 +1,4 @@
-"""C sources and a model description made an FMU: compilers, archives that repeat."""
+"""The build of an FMU from C sources and a model description: compilers, equal archives."""
 
 from __future__ import annotations
 

@@ -133,14 +133,14 @@ def build_plant(
     version: FmiVersion = 2,
     every_platform: bool = False,
 ) -> Path:
-    """Compile a plant's equations into the FMU `target`, with everything that a good FMU offers.
+    """Compile a plant's equations into the FMU `target`; returns its path.
 
     `equations` is a C header that includes ``variables.h`` and defines ``static void
     evaluate(double v[N_VARIABLES])``: from the states, inputs, disturbances and parameters in `v`,
     each at its value reference ``VR_name``, it sets the outputs and the states' derivatives per
     second. FMI 2.0 or 3.0, co-simulation and model exchange; snapshots and their serialisation;
     draws that are a function of seed and sample; fourth-order Runge–Kutta steps of at most 1 s.
-    Raises BuildError where there is no compiler or it complains.
+    Raises BuildError where there is no compiler or it refuses the equations.
     """
     own = {name: (SOURCES / name).read_bytes() for name in _SHARED} | files_of("plant_sources")
     own["equations.h"] = equations.encode() if isinstance(equations, str) else equations

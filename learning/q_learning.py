@@ -146,7 +146,7 @@ class ValueRule(Algorithm):
 
     @property
     def scale(self) -> Vector:
-        """The coordinates of the steps, (n_θ,)."""
+        """Scale of each entry of θ in the steps' coordinates, (n_θ,)."""
         return self._step.scale
 
     @scale.setter

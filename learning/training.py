@@ -230,7 +230,7 @@ DAMAGED = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, 
 class LogRow(dict[str, float]):
     """A line of the log: figures by column, NaN where not measured, and the `parameters` then.
 
-    The entries of θ have names in the CSV alone.
+    Only the CSV names the entries of θ.
     """
 
     __slots__ = ("parameters",)
@@ -436,8 +436,8 @@ class Training(Result):
     def animate(self, path: str | Path, steps: int = 200) -> Path:
         """Write a GIF of the closed loop with θ as it was learnt, over that of the start.
 
-        At most `FRAMES` rows of the log, on noise that no training met. Raises FigureError, or
-        OSError where the file cannot be written.
+        A frame for each of at most 40 rows of the log, on noise that no training met. Raises
+        FigureError, or OSError where the file cannot be written.
         """
         from cosim.figures.trajectory import animation  # noqa: PLC0415 - matplotlib
 
@@ -491,7 +491,7 @@ class Training(Result):
 
 
 class Tracker(Protocol):
-    """Follows a training as the `progress` of `train`, which may be the second method alone."""
+    """An object that follows a training as `progress` of `train`; a function will do, too."""
 
     def start(self, run: TrainingRun) -> None:
         """Take note of the run, before its first sample."""

@@ -158,7 +158,7 @@ class RtiSolution:
 
     @property
     def unshifted(self) -> LinearisationPoint:
-        """The solution as it is, as a point of linearisation for the same sample."""
+        """The solution, not shifted, as a point of linearisation for the same sample."""
         return LinearisationPoint(
             self.predicted_states[:-1], self.predicted_actions, self.costates[1:]
         )
@@ -202,7 +202,7 @@ class RtiSolution:
     def weakly_active(self) -> bool:
         """Whether a limit is about to change its activity, so that derivatives are one-sided.
 
-        So it is too where an eigenvalue of the exact Hessian is about to be lifted.
+        The same holds where an eigenvalue of the exact Hessian is about to be lifted.
         """
         spectrum = self.prepared.spectrum
         lifting = spectrum is not None and spectrum.undecided()
@@ -472,11 +472,12 @@ class RtiNmpc:
         self.reset()
 
     def compile(self, samples: int = LONG) -> None:
-        """Compile if a run of `samples` is worth it; to be called before the first sample.
+        """Compile for a run of `samples`, if it is long enough; call this before the first sample.
 
-        COSIM_COMPILE says `never`, or `now` for any number. Without a compiler, for the exact
-        Hessian and for backends other than `daqp` CasADi's interpreter stays. Both give the same to
-        rounding and to DAQP's accuracy (`tests/controllers/rti/test_engine.py` holds the bounds).
+        COSIM_COMPILE=never forbids it, `now` compiles for any number. Without a compiler, for the
+        exact Hessian and for backends other than `daqp` CasADi's interpreter stays. Both give the
+        same to rounding and to DAQP's accuracy (`tests/controllers/rti/test_engine.py` holds the
+        bounds).
         """
         if not self._compilable or (samples < LONG and switch() != "now"):
             return

@@ -147,7 +147,7 @@ def library(sources: Mapping[str, str | bytes], entry: Sequence[str]) -> Path | 
     if switch() == "never" or compiler is None:
         return None
     files = {name: s.encode() if isinstance(s, str) else s for name, s in sources.items()}
-    # It tells a compiler from others, and machines of unlike processors.
+    # The identity of the compiler and of the processor's architecture.
     status = Path(compiler).resolve().stat()
     identity = f"{compiler} {status.st_size} {status.st_mtime_ns} {platform.machine()}"
     content = hashlib.sha256("\0".join((identity, *FLAGS, *entry)).encode())

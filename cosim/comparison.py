@@ -16,7 +16,7 @@ from cosim.scenario import Scenario
 from cosim.trajectory import Signal, clocked, read_signals
 from cosim.validation import instead
 
-# Itself an error, of the size of rounding: no share of it is a tolerance.
+# The residual is itself a rounding error: a share of it is no tolerance.
 _ERROR = "residual"
 
 

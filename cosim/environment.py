@@ -46,7 +46,7 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         self.render_mode = render_mode
         self._plant = FmuPlant(scenario)
         limits = self.scenario.action_lower.copy(), self.scenario.action_upper.copy()
-        # As wide as the FMU says its states can be.
+        # The FMU's own ranges of its states.
         self.observation_space = Box(*self._plant.state_range, dtype=np.float64)
         self.action_space = Box(*limits, dtype=np.float64)
         self._states: deque[Array] = deque(maxlen=SHOWN + 1)
@@ -93,7 +93,7 @@ class PlantEnv(gymnasium.Env[Array, Array]):
         """Draw the last samples as an RGB image (height, width, 3); None without a render mode."""
         if self.render_mode is None:
             return None
-        # Matplotlib is for those who look.
+        # Import Matplotlib only where a picture is asked for.
         from cosim.figures.trajectory import episode_image  # noqa: PLC0415
 
         first = self._plant.k - len(self._actions)

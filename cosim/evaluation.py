@@ -285,7 +285,7 @@ class Evaluation(Result):
         clock = pd.concat({name: self.timing[name] for name in self.controllers})
         clock = clock.rename_axis(["controller", "seed"]).reset_index()
         for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock.round(3))):
-            # Rows as they are written: their text takes ten times the memory of their numbers.
+            # Write row by row: the text of all takes ten times the memory of the numbers.
             with replacing(folder / name) as path:
                 frame.to_csv(path, index=False, lineterminator="\n")
 

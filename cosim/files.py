@@ -97,7 +97,7 @@ def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:
     import filelock  # noqa: PLC0415
 
     try:
-        # All may write it who may write the folder: no user's lock is to outlive its process.
+        # Whoever may write the folder may write its lock, so that no lock outlives its process.
         return filelock.FileLock(path, timeout, 0o666, fallback_to_soft=False).acquire()
     except OSError as error:
         if not error.filename and error.strerror:  # not from opening it, and no Timeout

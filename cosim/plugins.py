@@ -125,7 +125,7 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     if name in known:
         return _made(name, known[name], scenario)
     if name.endswith(".toml"):
-        # By name: `cosim` itself imports no controller here.
+        # Import it by its name: `cosim` itself imports no controller here.
         read = load_plugin("controllers.factories:from_file", "θ", ControllerLookupError)
         return _named(read(scenario, name), Path(name).stem)
     if ":" in name:
@@ -169,7 +169,7 @@ def _named(controller: Controller, name: str) -> Controller:
 
 DISTRIBUTIONS = ("rti-cosim", "casadi", "daqp", "fmpy", "numpy", "proxsuite", "scipy")
 SUFFIXES = (".py", ".toml", ".fmu", ".npz")
-# Nothing that these files hold bears on a number.
+# These files do not affect any stored number.
 ASIDE = {"cli", "figures", "recording", "__pycache__", "report.py", "figures.py"}
 
 _brought: dict[str, set[str]] = {}

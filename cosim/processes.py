@@ -220,7 +220,7 @@ def release() -> list[Path]:
     folders = list(_held)
     while _held:
         folder, held = _held.popitem()
-        # Removed while it is held: whoever opens it meanwhile makes another one.
+        # Remove it while it is held: another process then makes another file.
         for name in (HOLDER, LOCK):
             with suppress(OSError):
                 (folder / name).unlink()
@@ -294,7 +294,7 @@ def watch(suspect: str) -> None:
     folders = release()  # for the process that does the work
     with temporary_folder("cosim-") as temporary:
         mark = temporary / "finished"
-        # With this process's import path: a folder of the user's may have the name of a package.
+        # Pass on the import path: a folder of the user's may have the name of a package.
         program = (
             f"import sys; sys.path[:] = {sys.path}; from cosim import cli, processes; "
             f"processes.run_watched(cli.main, {os.getpid()}, {str(mark)!r})"

@@ -78,7 +78,7 @@ def simulate(
     drives = recorder is None and hasattr(type(plant), "drive")
     drives = drives and getattr(plant, "drivable", False)
     if drives and hasattr(type(controller), "compiled_loop"):
-        # Their own, not a wrapper's.
+        # The classes' own methods, not a wrapper's.
         loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
     with told(progress, plant.scenario.name, steps) as tell:
         if loop is not None:

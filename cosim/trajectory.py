@@ -129,7 +129,7 @@ class SignalColumns:
         read = {kind: kind.of for kind in SIGNALS if isinstance(kind.of, str)}
         scalars = {k: of for k, of in read.items() if not k.vector and of not in unwanted}
         vectors = {kind: of for kind, of in read.items() if kind.vector}
-        # Of all scalars, and of all vectors, one call a sample.
+        # One call a sample reads all scalars, one all vectors.
         self._scalars, self._vectors = attrgetter(*scalars.values()), attrgetter(*vectors.values())
         self._derived = {k.name: k.of for k in SIGNALS if not isinstance(k.of, str)}
         self._rows: list[list[float]] = []

@@ -16,7 +16,7 @@ Document = TypeVar("Document", bound=BaseModel)
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Other words than pydantic's, which are not TOML's.
+# In place of pydantic's messages, whose words are not TOML's.
 _EXPECTED = {"tuple_type": "must be a list"} | dict.fromkeys(
     ("dict_type", "model_type", "model_attributes_type"), "must be a table"
 )

@@ -80,7 +80,7 @@ COMPILER_FLAGS = (
     "-fPIC",
     "-fno-ident",
     "-fvisibility=hidden",
-    # A library's functions have FMI's own names, whatever prefix the sources define.
+    # The functions of a library have FMI's own names, without the sources' prefix.
     "-DFMI2_OVERRIDE_FUNCTION_PREFIX",
     "-DFMI3_OVERRIDE_FUNCTION_PREFIX",
 )
@@ -275,7 +275,7 @@ def _model(description: bytes) -> tuple[str, str]:
     return version, identifier
 
 
-# Those of the evaporator's sources that serve any model: FMI's functions and their parts.
+# The evaporator's sources that serve any model: FMI's functions and their parts.
 _FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
 _WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
 _GENERATED = ("variables.h", "buildDescription.xml")

@@ -15,7 +15,7 @@ from pathlib import Path
 from fmus.build import PACKAGE, RESOURCES, SOURCES, assemble, files_of, sources_of
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable, read_variables, render, unit
 
-# Those of the evaporator's sources that serve any plant; the others are its own or generated.
+# The evaporator's sources that serve any plant; the others are its own or generated.
 _SHARED = (
     "disturbance.h", "elementary.h", "events.h", "model_state.h", "philox.h", "sampled.h", "seed.h",
     "simulation.h",

@@ -59,7 +59,7 @@ class ActorCritic(Algorithm):
         super().__init__(*arguments)
         settings, scenario = self.configuration, self.scenario
         self._step = ConstrainedStep(self.controller, settings)
-        # Actions count in the exploration's standard deviations.
+        # Actions are in units of the exploration's standard deviation.
         self._unit = np.broadcast_to(self.strategy.deviation, scenario.action_lower.shape)
         size, n, m = self._step.scale.size, scenario.state_lower.size, scenario.action_lower.size
         rows = settings.batch_size
@@ -121,7 +121,7 @@ class ActorCritic(Algorithm):
         # A step without effect on the policy has no length here, and is not taken.
         if not fit.minimiser @ fisher @ fit.minimiser > 0:
             fit = fit.shrunk(0.0)
-        # From the one radius to the other by equal ratios.
+        # The radius changes from the first to the last by equal ratios.
         share = min(number / self.samples, 1.0)
         radius = settings.radius * (settings.radius_end / settings.radius) ** share
         fit = fit.within(radius, lambda d: max(float(d @ fisher @ d), 0.0) ** 0.5)

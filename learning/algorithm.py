@@ -114,7 +114,7 @@ class Strategy:
 
     def __call__(self, action: Vector, rng: np.random.Generator) -> Vector | None:
         """Exploring action (m,) in place of the policy's `action`; None: greedy."""
-        # Drawn in every sample, so that runs of any probability stay paired.
+        # Draw in every sample, so that runs of any probability stay paired.
         draw, e = rng.random(), rng.standard_normal(self.lower.size)
         if draw >= self.probability:
             return None

@@ -169,7 +169,7 @@ class BackOffSearch:
     def _segments(self, number: int) -> list[Segment]:
         bound, phase = self._schedule[number]
         share, offsets = PHASES[phase]
-        # The first round knows of one bound; the others share what it leaves.
+        # The first round is about one bound; later rounds share the samples that it leaves.
         left = 13 / sum(PHASES[later][0] for _, later in self._schedule[1:]) if number else 1.0
         steps = int(self._budget * left * share / (SEGMENTS * len(offsets)))
         steps = max(steps, self._settling + 1)

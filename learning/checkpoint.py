@@ -67,7 +67,7 @@ def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
         )
     found: dict[str, Any] = about["run"]
     if run is not None:
-        # Both sides through JSON, where tuples are lists.
+        # Compare both as JSON, where tuples are lists.
         there, here = _flat(found), _flat(json.loads(json.dumps(dict(run))))
         for key in sorted(there.keys() | here.keys()):
             if there.get(key) != here.get(key):

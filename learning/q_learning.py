@@ -135,7 +135,7 @@ class QLearningConfiguration(ValueConfiguration):
 class ValueRule(Algorithm):
     """Common part of online and batch Q-learning: prediction errors, a mean cost, coordinates."""
 
-    # The scale first: it makes the mean cost that is taken up after it.
+    # The scale comes first: setting it makes the mean cost, which is restored after it.
     KEPT: ClassVar[tuple[str, ...]] = ("scale", "_average_cost", "_errors")
 
     def __init__(self, *arguments: Any) -> None:

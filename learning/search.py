@@ -179,7 +179,7 @@ class PairedComparison:
 
     @pooled.setter
     def pooled(self, errors: Matrix) -> None:
-        # Sorted once a round: a stretch only looks up.
+        # Sort once a round: a stretch only looks values up.
         self._pooled, self._pool = errors, SortedErrors(errors)
 
     def accept(self, candidate: Candidate) -> None:

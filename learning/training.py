@@ -319,7 +319,7 @@ class Judge:
         if optimum is not None:
             self._optimal_cost = self._costs(optimum)["J"]
             self.baselines["optimal"] = float(self._optimal_cost.mean())
-        # A cost may be negative, a profit say: the margin counts in its magnitude.
+        # A cost may be negative (a profit): the margin is a share of its magnitude.
         worst = max(self.baselines["naive"], self.start_J)
         self.limit = worst + (run.divergence - 1) * abs(worst)
         """Greedy J above which a run has diverged."""

@@ -332,7 +332,7 @@ class Engine:
             "POLICY": functions.policy(),
         }
         problem = functions.problem
-        # From there on no preset's sample is slower so; the evaporator's is not from 12 stages on.
+        # From this horizon on no preset is slower stage by stage; the evaporator from 12 stages on.
         stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
         stagewise = stagewise or stack_needed(problem, named) > STACK_LIMIT
         if stagewise:
@@ -363,7 +363,7 @@ class Engine:
 
     def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
         """Copies of dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
-        # In another workspace: the next feedback needs what the preparation factorised.
+        # Use another workspace: the next feedback needs the preparation's factors.
         given = (ctypes.c_void_p(array.ctypes.data) for array in (before, after))
         if self._policy(*given, self._other, self._jacobians_at):
             return None
@@ -574,7 +574,7 @@ class RtiNmpc:
         problem, stages = self.problem, np.arange(1, self.problem.horizon + 1)
         discounts = np.repeat(problem.discount**stages, problem.reference_state.size)
         memory, places = self._prepare.memory, self._prepare.places
-        # New views: a backend sees by them that the weights are others.
+        # Make new views: a backend recognises new weights by them.
         self._qp.w, self._qp.W = memory[places["w"]], memory[places["W"]]
         self._qp.w[:] = discounts * np.tile(w, stages.size)
         self._qp.W[:] = discounts * np.tile(W, stages.size)

@@ -159,7 +159,7 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
         return folder
     with lock(cache / f"{sha256}.lock", 60):
         if not _holds(folder, archive):
-            # What runs from a damaged folder keeps its open files.
+            # A process that runs from a damaged folder keeps its open files.
             shutil.rmtree(folder, ignore_errors=True)
             with temporary_folder(".partial-", cache) as partial:
                 archive.extractall(partial)
@@ -169,7 +169,7 @@ def place(archive: zipfile.ZipFile, sha256: str) -> Path:
 
 def _holds(folder: Path, archive: zipfile.ZipFile) -> bool:
     """Whether every file of the archive is in the folder with the very same bytes."""
-    # Of entries with one name unpacking leaves the last.
+    # Unpacking leaves the last of entries with one name.
     entries = {entry.filename: entry for entry in archive.infolist() if not entry.is_dir()}
     try:
         return all(
@@ -444,7 +444,7 @@ class Instance(ABC):
     def native(self) -> Native:
         """The instance's functions and buffers for compiled code, which calls them directly."""
         buffers = (self.inputs, self.outputs, self.states)
-        # Kept: compiled code has but their addresses.
+        # Keep them: compiled code has only their addresses.
         self._references = [
             self._arguments([place.reference for place in places], buffer)[1]
             for places, buffer in zip(self._places, buffers, strict=True)

@@ -163,7 +163,7 @@ class Wirer:
         starts = []
         for field, (names, values) in fields.items():
             listed = [names] if isinstance(names, str) else names or ()
-            # Either may be left out; the scenario has seen to it that they fit.
+            # Either may be left out; the scenario has checked that they fit.
             for name, value in zip(listed, values, strict=False):
                 starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
         for name, value in scenario.plant.parameters.items():

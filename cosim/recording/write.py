@@ -177,7 +177,7 @@ class RerunRecorder:
             return
         moments, *states = np.array(self._within).T
         self._within.clear()
-        # The end of a sample is its own.
+        # A state at the end of a sample counts to that sample.
         rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
         for channel, values in zip(self._fine, states, strict=True):
             stream.send([channel.see(values)], rows, values)

@@ -292,7 +292,7 @@ def plan(study: Study) -> Plan:
         scenario = study.scenarios[name]
         training = None if seed is None else study.training(case, name, seed)
         if (case.name, name) not in depends:
-            # A mistake shows here.
+            # Raise here what a wrong case would raise in its run.
             if ":" in (case.controller or ""):
                 build_controller(case.target, scenario)
             if training is not None:

@@ -194,7 +194,7 @@ def _on_cluster(address: str, items: list[Item]) -> Iterator[tuple[Item, Outcome
     level = logging.root.manager.disable
     logging.disable()  # the exception says what went wrong, once
     try:
-        # Asked first: a client made for an address where nobody answers can hang when it ends.
+        # Ask the address first: a client made where nobody answers can hang when it ends.
         if asyncio.run(_identity(dask, address)).get("type") != "Scheduler":
             raise OSError("what answers is no scheduler")
         client = dask.Client(address, timeout=f"{ANSWER_SECONDS} s", set_as_default=False)

@@ -178,7 +178,7 @@ def main() -> None:
     report with the traceback and exit code 70.
     """
     # Passes of the collector over modules and CasADi's expressions are a fifth of a short run.
-    gc.set_threshold(50_000)
+    gc.set_threshold(100_000)
     atexit.register(gc.freeze)
     _open_streams()
     with command_process():

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -52,6 +53,7 @@ def test_every_installed_importer_takes_the_fmu(exported):
 
 def test_its_variables_have_the_plants_names_and_units_and_theta_is_tunable(exported):
     description = fmpy.read_model_description(str(exported[0]))
+    assert description.generationTool == f"rti-cosim {version('rti-cosim')}"
     found = {v.name: v for v in description.modelVariables}
     assert [found[name].causality for name in ("X2", "P2", "P100", "F200")] == [
         "input", "input", "output", "output",
@@ -119,9 +121,7 @@ def test_both_ends_of_a_connection_have_the_plants_unit(exported):
 
 def master(*words):
     """The lines that a script prints which runs an SSP."""
-    command = [sys.executable, *map(str, words)]
-    result = subprocess.run(command, capture_output=True, text=True, check=True)
-    return result.stdout.split()
+    return subprocess.check_output([sys.executable, *map(str, words)], text=True).split()
 
 
 def rows_by(name, ssp, step, samples):

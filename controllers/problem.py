@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from controllers.errors import ModelError, OptimumError
 from controllers.model import Model
 from controllers.qp import FIXED, MEANING, SETTINGS
-from cosim.plugins import blamed, load_plugin
+from cosim.plugins import exception_line, load_plugin
 from cosim.protocols import Matrix, Vector
 from cosim.scenario import Penalty, Scenario
 
@@ -250,7 +250,7 @@ def load_model(name: str | None) -> Model:
     try:
         model = factory()
     except (Exception, SystemExit) as error:  # a user's module may raise anything
-        raise ModelError(f"model '{name}' cannot be made: {blamed(error)}") from error
+        raise ModelError(f"model '{name}' cannot be made: {exception_line(error)}") from error
     if not isinstance(model, Model):
         raise ModelError(f"model '{name}' returned {type(model).__name__}, not a controllers.Model")
     return model

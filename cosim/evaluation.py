@@ -19,7 +19,7 @@ from cosim.plugins import build_controller, code_hash, depends_on, parameters_ha
 from cosim.protocols import Array, Controller, Decision
 from cosim.result import Result, markdown_table
 from cosim.scenario import Scenario
-from cosim.simulation import indicators, measure, simulate, told
+from cosim.simulation import indicators, measure, reporting, simulate
 from cosim.statistics import (
     bootstrapped,
     gain,
@@ -122,7 +122,7 @@ def evaluate(
     check_folders(runs)
 
     total = sum(run.samples for run in runs)
-    bar = told(progress, scenario.name, total)
+    bar = reporting(progress, scenario.name, total)
     with temporary_folder("cosim-evaluation-") as own, bar as tell:
         runner = Runner(runs, Path(folder or own), (Path.cwd(),), lambda *at: tell(*at[:2], ""))
         for line in runner.remarks:

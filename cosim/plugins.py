@@ -99,11 +99,11 @@ def load_plugin(target: str, what: str, error: type[Exception]) -> Any:
             found = getattr(found, part)
     # A module may raise anything while it is imported, and one that is a script may even exit.
     except (Exception, SystemExit) as cause:
-        raise error(f"{what} cannot be imported: {blamed(cause)}") from cause
+        raise error(f"{what} cannot be imported: {exception_line(cause)}") from cause
     return found
 
 
-def blamed(cause: BaseException) -> str:
+def exception_line(cause: BaseException) -> str:
     """The exception, its file and its line, as one line of text."""
     said = str(cause) if isinstance(cause, ImportError) else f"{type(cause).__name__}: {cause}"
     frames = [
@@ -147,7 +147,7 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
         packages = {base.__module__.partition(".")[0] for base in type(error).__mro__}
         if target == name and not packages & set(OURS):  # the words of ours say enough
             raise ControllerLookupError(
-                f"the factory of controller '{name}' failed: {blamed(error)}"
+                f"the factory of controller '{name}' failed: {exception_line(error)}"
             ) from error
         raise
     if not isinstance(controller, Controller):

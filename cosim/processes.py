@@ -95,7 +95,7 @@ def _raise(number: int, _: FrameType | None) -> None:
 
 
 @contextmanager
-def out_of_reach_of_ctrl_c() -> Iterator[None]:
+def without_interrupts() -> Iterator[None]:
     """Block Ctrl-C for the workers that are started here, and for their threads and children.
 
     On Windows nothing is done.
@@ -233,7 +233,7 @@ _stdout: list[int] = []
 
 
 @contextmanager
-def output_turned_aside() -> Iterator[int | None]:
+def redirected_output() -> Iterator[int | None]:
     """Redirect standard output, of native code too, to standard error; yields the true descriptor.
 
     It is None where standard output is not this process's own, as in a test runner.

@@ -80,7 +80,7 @@ def simulate(
     if drives and hasattr(type(controller), "compiled_loop"):
         # The classes' own methods, not a wrapper's.
         loop = controller.compiled_loop(plant.scenario)  # type: ignore[attr-defined]
-    with told(progress, plant.scenario.name, steps) as tell:
+    with reporting(progress, plant.scenario.name, steps) as tell:
         if loop is not None:
             run.compiled(loop, tell)
         elif recorder is None:
@@ -318,7 +318,7 @@ def input_effort(actions: Array, lower: Array, upper: Array) -> float:
 
 
 @contextmanager
-def told(
+def reporting(
     progress: Callable[..., None] | bool,
     label: str,
     total: int,

@@ -28,7 +28,7 @@ from cosim.plugins import build_controller, depends_on
 from cosim.protocols import Array, Controller, Plant
 from cosim.result import Result, csv_text
 from cosim.scenario import Scenario
-from cosim.simulation import functions_of, indicators_of, simulate, spawn_seeds, told
+from cosim.simulation import functions_of, indicators_of, reporting, simulate, spawn_seeds
 from cosim.statistics import gap_closed, regret, shown
 from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
@@ -583,7 +583,7 @@ def run_training(
         else:
             session.checkpoint()
         judge = Judge(run, evaluation_plant, session.start, best)
-        with told(progress, run.algorithm, run.samples, _Remark()) as tell:
+        with reporting(progress, run.algorithm, run.samples, _Remark()) as tell:
             status = session.run_to_the_end(judge, tell)
         parameters = session.loop.parameters
         training = Training(

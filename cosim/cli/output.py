@@ -15,7 +15,7 @@ import typer
 
 from cosim.errors import CosimError
 from cosim.files import write_atomically
-from cosim.processes import Terminated, hold, output_turned_aside, release, watch
+from cosim.processes import Terminated, hold, redirected_output, release, watch
 
 if TYPE_CHECKING:
     from cosim.scenario import Scenario
@@ -148,7 +148,7 @@ def output(as_json: bool) -> Iterator[Output]:
     is native code that may print.
     """
     result = Output(as_json)
-    with output_turned_aside() if as_json else nullcontext(None) as result._stdout:
+    with redirected_output() if as_json else nullcontext(None) as result._stdout:
         try:
             yield result
         finally:
@@ -173,9 +173,9 @@ def resumable(
 @contextmanager
 def followed(out: Output, label: str, samples: int) -> Iterator[Callable[[int, str, str], None]]:
     """The `progress` of resumable work on so many samples: a bar, and a line for each event."""
-    from cosim.simulation import told
+    from cosim.simulation import reporting
 
-    with resumable(), told(out.live, label, samples) as bar:
+    with resumable(), reporting(out.live, label, samples) as bar:
 
         def report(samples: int, runs: str, line: str) -> None:
             bar(samples, runs)

@@ -87,7 +87,7 @@ def read_recording(path: str | Path) -> Recording:
     return Recording(signals, samples, time, units, properties, status, intermediate)
 
 
-def telling_moment(path: str | Path) -> float | None:
+def worst_moment(path: str | Path) -> float | None:
     """Time in s (training: sample) of the worst violation, or of the end; None if unreadable."""
     try:
         recording = read_recording(path)

@@ -18,7 +18,7 @@ from rerun.experimental import ViewerClient
 from cosim.errors import RecordingError
 from cosim.files import replacing
 from cosim.processes import child_process
-from cosim.recording.read import SAMPLE, TIME, telling_moment
+from cosim.recording.read import SAMPLE, TIME, worst_moment
 
 LOOPBACK = "127.0.0.1"
 _NOWHERE = f"http://{LOOPBACK}:9"
@@ -60,7 +60,7 @@ def render(
         raise RecordingError(f"the time of the cursor (--at) must be finite, not {at}")
     path = _existing(path)
     if at is None:
-        at = telling_moment(path)
+        at = worst_moment(path)
     deadline = time.monotonic() + timeout
     try:
         with replacing(png) as target:

@@ -19,8 +19,8 @@ import loky
 
 from cosim.errors import EvaluationError, FailedRunsError
 from cosim.files import write_atomically
-from cosim.processes import out_of_reach_of_ctrl_c
-from cosim.simulation import told
+from cosim.processes import without_interrupts
+from cosim.simulation import reporting
 from cosim.studies import operation
 from cosim.studies.plan import Plan, Study, plan
 from cosim.studies.results import StudyResults
@@ -170,7 +170,7 @@ def _outcomes(
         min(jobs, len(items)), initializer=begin, initargs=(os.getpid(),), env=one_thread
     )
     try:
-        with out_of_reach_of_ctrl_c():
+        with without_interrupts():
             ended = [workers.submit(perform, item) for item in items]
         for future in loky.as_completed(ended):
             yield future.result()
@@ -266,7 +266,7 @@ def study(
     definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     planned = planned or plan(definition)
-    with told(progress, definition.name, planned.samples) as report:
+    with reporting(progress, definition.name, planned.samples) as report:
         runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
         for line in runner.remarks:
             report(0, "", line)

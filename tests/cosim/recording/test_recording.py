@@ -20,7 +20,7 @@ from cosim.recording import (
     record_training,
     summarise,
 )
-from cosim.recording.read import telling_moment
+from cosim.recording.read import worst_moment
 from cosim.recording.write import drawable
 from cosim.trajectory import Signal, read_csv
 from tests.helpers.blocks import random_block
@@ -119,7 +119,7 @@ def test_a_training_comes_back_as_its_log_and_the_change_of_each_block(tmp_path,
         assert np.array_equal(recording.signals[name], values, equal_nan=True)
     assert recording.samples.tolist() == [20, 40, 60]
     assert recording.properties["seed"] == "9"
-    assert telling_moment(path) == 60
+    assert worst_moment(path) == 60
 
 
 def run(name, **signals):
@@ -168,7 +168,7 @@ def test_what_is_no_recording_of_ours_is_refused(tmp_path, make):
     make(tmp_path / "x.rrd")
     with pytest.raises(RecordingError, match=r"x\.rrd"):
         read_recording(tmp_path / "x.rrd")
-    assert telling_moment(tmp_path / "x.rrd") is None
+    assert worst_moment(tmp_path / "x.rrd") is None
 
 
 def test_states_within_the_samples_of_an_fmi3_plant_are_recorded(paper, tmp_path):

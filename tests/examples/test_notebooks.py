@@ -4,6 +4,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parents[2] / "examples" / "notebooks"
 SMALLER = {"4000": "1000", "2000": "1000", "steps=300": "steps=20"}
@@ -29,12 +30,11 @@ def test_a_notebook_is_stored_with_its_pictures(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_a_notebook_runs_cell_by_cell(name, tmp_path):
-    from nbclient import NotebookClient
-
+def test_a_notebook_runs_cell_by_cell(name, tmp_path, monkeypatch):
+    # Python 3.13.0 warns when ipykernel starts.
+    monkeypatch.setenv("PYTHONWARNINGS", "error,ignore:There is no current event loop")
     notebook = read(name)
     for cell in code(notebook):
         for size, smaller in SMALLER.items():
             cell.source = cell.source.replace(size, smaller)
-    folder = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources=folder).execute()
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()

@@ -77,8 +77,7 @@ def test_increments_are_of_each_block_since_its_first_row():
 
 
 def test_a_cases_settings_are_set_after_its_name():
-    shown = shown_case("q-learning(start=naive prior_width=0.3)")
-    assert shown == "q-learning, naive, prior width 0.3"
+    assert shown_case("q(start=naive prior_width=0.3)") == "q, naive, prior width 0.3"
     assert shown_case("two-fouled(tuned-two-fouled)") == "two-fouled"
 
 

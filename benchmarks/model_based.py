@@ -26,7 +26,9 @@ from learning.training import begin, prepare
 
 PARTS = {
     "parameters": (empirical_model, "PARAMETER_DEVIATION", 1e-6),  # W alone is fitted
-    "slopes": (empirical_model, "SLOPE_DEVIATION", 1e-6),  # c and offsets alone
+    "slopes": (empirical_model, "SLOPE_DEVIATIONS", (1e-6,)),  # c and offsets alone
+    "evidence": (empirical_model, "SLOPE_DEVIATIONS", (0.1,)),  # the widest prior of slopes
+    "rounds": (empirical_model, "ROUNDS", 2),  # two Gauss-Newton steps in place of six
     "scale": (empirical_model, "FLOOR", 1e3),  # h is constant
     "doubt": (model_based, "DOUBT", 0.0),  # the least promised cost, not the smallest back-off
     "tail": (model_based, "TAIL", 0.0),

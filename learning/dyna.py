@@ -111,9 +111,9 @@ class ModelPlant(PlantInOperation):
         def step(a: Array) -> Step:
             nonlocal present
             inputs, penalty = np.concatenate([present, a]), scenario.state_penalty(present.tolist())
-            y, G, h = (part[0] for part in model.features(inputs[None]))
+            y, h = (part.full()[:, 0] for part in model.features.mean(present, a, c))
             residual = model.residuals[rng.integers(len(model.residuals))]
-            outcome = y + G @ c + W @ np.append(1.0, inputs) + h * residual
+            outcome = y + W @ np.append(1.0, inputs) + h * residual
             present = outcome[:-1]
             return Step(present, float(outcome[-1]), penalty, np.zeros(0))
 

@@ -1,11 +1,11 @@
 """A model of a plant from its own operation: what the controller's nominal model lacks.
 
-(s₊, ℓ) = y(s, a) + G(s, a) c + W (1, s, a) + h(s, a) r, where y is nominal model and economic cost.
-G has the derivatives of y in each parameter and nominal disturbance, times its value. h is the size
-of the error that disturbances in proportion to their values would make. c, one coefficient a
-parameter for all outputs, and W are estimated by Bayesian generalised least squares from
-transitions; the residuals r are kept and drawn anew. It knows no parameter of the plant and no law
-of its disturbances.
+(s₊, ℓ) = y(s, a; c) + W (1, s, a) + h(s, a) r. y is the nominal model with its economic cost, whose
+parameters and nominal disturbances are c times their value larger. h is the size of the error that
+disturbances in proportion to their values would make. c and W are estimated from transitions by
+Bayesian generalised least squares, in Gauss-Newton steps since y is not linear in c; the width of
+the prior of W's slopes is the one of greatest evidence (MacKay 1992). The residuals r are kept and
+drawn anew. The model knows no parameter of the plant and no law of its disturbances.
 """
 
 from __future__ import annotations
@@ -36,14 +36,16 @@ from learning.checkpoint import group, take_up
 
 PARAMETER_DEVIATION = 0.15
 """Prior standard deviation of a parameter's error, as a share of its value."""
-SLOPE_DEVIATION = 0.1
-"""That of W's slopes, in standard deviations of the error over one of the input."""
+MOST = 0.5
+"""Largest such error."""
+SLOPE_DEVIATIONS = (0.1, 0.01, 0.001)
+"""Those of W's slopes to choose from, in standard deviations of the error over one of the input."""
 FLOOR = 0.1
 """Least h, as a share of its value at the reference."""
 EXACT = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
-ROUNDS = 2
-"""Fits, each with the residuals' covariance of the one before."""
+ROUNDS = 4
+"""Fits, each about the parameters and with the residuals' covariance of the one before."""
 ALARM = 1e-7
 """Probability below which the mean error since the last fit speaks of another plant."""
 WINDOWS = (15, 60, 240, 960)
@@ -55,35 +57,39 @@ POOL = 480
 
 
 class Features:
-    """y (K,), G (K, p) and h (K,) of a problem's nominal model; K = n + 1, the cost is last."""
+    """The nominal model as a function of its parameters' errors c (p,), for K = n + 1 outputs.
+
+    `mean` is y (K,) and h (K,) of (s, a, c), a CasADi function; h is that of c = 0. The cost is the
+    last output.
+    """
 
     def __init__(self, problem: Problem) -> None:
         model = problem.model
         x, u, d, p = model.symbols()
         step = discretise(model, problem.sampling_time, problem.substeps)(x, u, d, p)
         outputs = ca.vertcat(step, economic_cost(model)(x, u, d, p))
-        disturbance, parameters = ca.DM(model.nominal_disturbance), ca.DM(model.nominal_parameters)
-        by_disturbance = ca.jacobian(outputs, d) @ ca.diag(disturbance)
-        by_parameter = ca.jacobian(outputs, p) @ ca.diag(parameters)
+        nominal = ca.DM([*model.nominal_parameters, *model.nominal_disturbance])
+        c = ca.SX.sym("c", nominal.numel())
+        (y,) = ca.substitute([outputs], [ca.vertcat(p, d)], [nominal * (1 + c)])
+        G = ca.jacobian(y, c)
+        by_disturbance = ca.substitute(G[:, p.numel() :], c, ca.DM.zeros(c.shape))
         size = ca.sqrt(ca.sum2(by_disturbance**2))
-        y, by_both, size = ca.substitute(
-            [outputs, ca.horzcat(by_parameter, by_disturbance), size],
-            [d, p],
-            [disturbance, parameters],
-        )
         at = ca.Function("size", [x, u], [size])
         reference = at(problem.reference_state, problem.reference_action).full()[:, 0]
         sizes = zip(ca.vertsplit(size), reference, strict=True)
         h = ca.vertcat(*(ca.fmax(own, FLOOR * at) if at > 0 else 1.0 for own, at in sizes))
-        results = [ca.densify(part) for part in (y, by_both, h)]
-        self.function = ca.Function("nominal", [x, u], results, ["x", "u"], ["y", "G", "h"])
-        self.outputs, self.count = by_both.shape
+        given, names = [x, u, c], ["x", "u", "c"]
+        y, G, h = (ca.densify(part) for part in (y, G, h))
+        self.mean = ca.Function("nominal", given, [y, h], names, ["y", "h"])
+        self._function = ca.Function("features", given, [y, G, h], names, ["y", "G", "h"])
+        self.outputs, self.count = G.shape
         self.inputs = problem.n_states + problem.n_actions
 
-    def __call__(self, inputs: Array) -> tuple[Array, Array, Array]:
-        """y (M, K), G (M, K, p) and h (M, K) at M inputs (s, a), (M, n+m)."""
+    def __call__(self, inputs: Array, c: Array) -> tuple[Array, Array, Array]:
+        """y (M, K), its derivative by c, G (M, K, p), and h (M, K) at inputs (s, a), (M, n+m)."""
         n = self.outputs - 1
-        y, G, h = (part.full() for part in self.function(inputs[:, :n].T, inputs[:, n:].T))
+        results = self._function(inputs[:, :n].T, inputs[:, n:].T, c)
+        y, G, h = (part.full() for part in results)
         stacked = G.T.reshape(len(inputs), self.count, self.outputs)
         return y.T, stacked.transpose(0, 2, 1), h.T
 
@@ -115,43 +121,42 @@ class EmpiricalModel:
         """
         centre, unit = inputs.mean(axis=0), inputs.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
-        y, G, h = features(inputs)
-        target = (outputs - y) / h
-        design = _design(G, (inputs - centre) / unit) / h[:, :, None]
-        older = np.empty((0, features.outputs)) if pool is None else pool
+        standardised, p = (inputs - centre) / unit, features.count
+        y, G, h = features(inputs, c := np.zeros(p))
         deviation = (outputs - y).std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
-        slopes = np.full(features.inputs, SLOPE_DEVIATION)
-        prior = np.concatenate(
-            [
-                np.full(features.count, PARAMETER_DEVIATION),
-                np.outer(deviation, np.append(1.0, slopes)).reshape(-1),
-            ]
-        )
-        residuals = target - target.mean(axis=0)
+        parameters, ones = np.full(p, PARAMETER_DEVIATION), np.ones(features.inputs)
+        priors = [
+            np.append(parameters, np.outer(deviation, np.append(1.0, slopes * ones)))
+            for slopes in SLOPE_DEVIATIONS
+        ]
+        older = np.empty((0, features.outputs)) if pool is None else pool
+        residuals = (outputs - y) / h
+        residuals = residuals - residuals.mean(axis=0)
         least = EXACT**2 * ((y / h) ** 2).mean(axis=0)
         for _ in range(ROUNDS):
             known = np.concatenate([residuals, older])
             noise = known.T @ known / len(known)
             variance = np.diag(noise)
             noise = noise + np.diag(np.maximum(least - variance, 1e-9 * variance))
-            whiten = np.linalg.inv(np.linalg.cholesky(noise))
-            rows = (whiten @ design).reshape(-1, design.shape[2]) * prior
-            precision = rows.T @ rows + np.eye(prior.size)
-            covariance = np.linalg.inv(precision) * np.outer(prior, prior)
-            mean = covariance @ (rows.T @ (target @ whiten.T).reshape(-1) / prior)
-            residuals = target - design @ mean
+            design = _design(G, standardised) / h[:, :, None]
+            target = (outputs - y + G @ c) / h
+            mean, covariance = _posterior(design, target, noise, priors)
+            c = mean[:p] = mean[:p].clip(-MOST, MOST)
+            y, G, _ = features(inputs, c)
+            residuals = (outputs - y) / h - design[:, :, p:] @ mean[p:]
         residuals = np.concatenate([residuals - residuals.mean(axis=0), older])
         return cls(features, centre, unit, mean, covariance, residuals)
 
     def predict(self, inputs: Array) -> tuple[Array, Array, Array]:
         """Predictions of (s₊, ℓ) without r, h (M, K), and their derivative by `mean` over h."""
-        y, G, h = self.features(inputs)
+        p = self.features.count
+        y, G, h = self.features(inputs, self.mean[:p])
         design = _design(G, (inputs - self.centre) / self.unit) / h[:, :, None]
-        return y + h * (design @ self.mean), h, design
+        return y + h * (design[:, :, p:] @ self.mean[p:]), h, design
 
     def cost_row(self, inputs: Array) -> Array:
         """Derivative of the mean cost at inputs (M, n+m) by `mean`."""
-        _, G, _ = self.features(inputs)
+        _, G, _ = self.features(inputs, self.mean[: self.features.count])
         row: Array = _design(G, (inputs - self.centre) / self.unit)[:, -1].mean(axis=0)
         return row
 
@@ -184,6 +189,8 @@ class PlantData:
         # A ring of transitions (s, a, s₊, ℓ), and the residuals from before the last change.
         self._rows = np.zeros((memory, features.inputs + features.outputs))
         self._pool = np.zeros((0, features.outputs))
+        # Of each `WINDOWS[0]` samples since the fit what `errors` says of them.
+        self._judged: list[tuple[Array, Array, Array, Array]] = []
 
     def add(self, transition: Transition) -> None:
         """Keep a transition in place of the oldest one."""
@@ -210,7 +217,7 @@ class PlantData:
             inputs, outputs = self.present
         pool = self._pool[: max(POOL - len(inputs), 0)]
         self.model = model = EmpiricalModel.fit(self.features, inputs, outputs, pool)
-        self.fitted = self.count
+        self.fitted, self._judged = self.count, []
         return model
 
     def _outdated(self, inputs: Array, outputs: Array) -> int:
@@ -231,11 +238,21 @@ class PlantData:
         return older if losses[0] - losses[1] > EVIDENCE else 0
 
     def errors(self) -> tuple[Array, Array, Array, Array]:
-        """Predictions, h, errors over h and designs of the latest samples since the fit."""
+        """Predictions, h, errors over h and designs of the samples since the fit.
+
+        Of the latest `WINDOWS[-1]` of them at most; a last part below `WINDOWS[0]` is left out.
+        """
         assert self.model is not None
-        inputs, outputs = self.latest(min(self.count - self.fitted, WINDOWS[-1]))
-        predicted, h, designs = self.model.predict(inputs)
-        return predicted, h, (outputs - predicted) / h, designs
+        block, judged = WINDOWS[0], self._judged
+        since = self.count - self.fitted
+        inputs, outputs = self.latest(since - block * len(judged))
+        for first in range(0, len(inputs) - block + 1, block):
+            at = slice(first, first + block)
+            predicted, h, designs = self.model.predict(inputs[at])
+            judged.append((predicted, h, (outputs[at] - predicted) / h, designs))
+        parts = zip(*judged[-WINDOWS[-1] // block :], strict=True)
+        predicted, h, errors, designs = (np.concatenate(part) for part in parts)
+        return predicted, h, errors, designs
 
     def changed(self, errors: Array, designs: Array, alarm: float = ALARM) -> bool:
         """Whether the mean of the latest `errors` (T, K) is improbable, with their designs.
@@ -270,10 +287,9 @@ class Rollout:
     def __init__(self, problem: Problem, parameters: Parameters, features: Features) -> None:
         self._problem, self._features = problem, features
         self._controller = RtiNmpc(problem, parameters)
-        function = features.function
+        function = features.mean
         sizes = {
             "K": features.outputs,
-            "FEATURES": features.count,
             "NOMINAL_ARG": function.sz_arg(),
             "NOMINAL_RES": function.sz_res(),
             "NOMINAL_W": function.sz_w(),
@@ -329,9 +345,9 @@ class Rollout:
                 except Exception as error:
                     recover(controller, error)
                 inputs[step] = np.concatenate([s, a])
-                y, G, size = self._features(inputs[step][None])
-                predicted[step] = y[0] + G[0] @ c + W @ np.append(1.0, inputs[step])
-                h[step] = size[0]
+                y, size = self._features.mean(s, a, c)
+                predicted[step] = y.full()[:, 0] + W @ np.append(1.0, inputs[step])
+                h[step] = size.full()[:, 0]
                 s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
         return inputs, predicted, h
 
@@ -346,3 +362,21 @@ def _design(G: Array, standardised: Array) -> Array:
     for i in range(K):
         design[:, i, p + i * q : p + (i + 1) * q] = inputs
     return design
+
+
+def _posterior(
+    design: Array, target: Array, noise: Array, priors: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Mean and covariance of the coefficients, with the prior deviations of greatest evidence."""
+    whiten = np.linalg.inv(np.linalg.cholesky(noise))
+    rows = (whiten @ design).reshape(-1, design.shape[2])
+    gram, moment = rows.T @ rows, rows.T @ (target @ whiten.T).reshape(-1)
+    found = []
+    for prior in priors:
+        precision = gram * np.outer(prior, prior) + np.eye(prior.size)
+        covariance = np.linalg.inv(precision) * np.outer(prior, prior)
+        mean = covariance @ moment
+        evidence = (moment @ mean - np.linalg.slogdet(precision).logabsdet) / 2
+        found.append((float(evidence), mean, covariance))
+    _, mean, covariance = max(found, key=lambda item: item[0])
+    return mean, covariance

@@ -1,7 +1,7 @@
 /* The RTI-NMPC in closed loop with an empirical model: `learning.empirical_model.Rollout`, compiled.
  *
- * `sizes.h` has K (states and cost), FEATURES of the model, and the work space of `nominal`, CasADi's
- * code for y(s, a), G(s, a) and h(s, a). The controller is the package's own C (`core.h`).
+ * `sizes.h` has K (states and cost) and the work space of `nominal`, CasADi's code for y(s, a; c) and
+ * h(s, a). The controller is the package's own C (`core.h`).
  */
 #include "core.h"
 
@@ -13,7 +13,7 @@ int nominal(const double **arguments, double **results, long long int *iw, doubl
 
 /* From a state `start`, `steps` samples, of which each meets the residual that `picks` names. `c` and
  * `W`, a row (1, s, a) an output, are the model's coefficients. Results, a row a sample: `inputs`
- * (s, a), `predicted` y + G c + W (1, s, a), and h. The samples before one whose state is not finite
+ * (s, a), `predicted` y(s, a; c) + W (1, s, a), and h. The samples before one whose state is not finite
  * are returned as their number, else `steps`. */
 int rollout(const double theta[], const double start[], const double c[], const double W[],
             const double residuals[], const int32_t picks[], int steps, double *inputs,
@@ -22,18 +22,17 @@ int rollout(const double theta[], const double start[], const double c[], const 
     core_reset(&state);
     memcpy(inputs, start, N_X * sizeof *start);
     for (int step = 0; step < steps; step++, inputs += N_IN, predicted += K, h += K) {
-        double G[K * FEATURES + 1], w[NOMINAL_W + 1];
+        double w[NOMINAL_W + 1];
         if (!all_finite(inputs, N_X)) return step;
         core_act(&state, inputs, 0, theta);
         core_commit(&state);
         memcpy(inputs + N_X, state.applied, sizeof state.applied);
-        const double *arguments[NOMINAL_ARG] = {inputs, inputs + N_X};
-        double *results[NOMINAL_RES] = {predicted, G, h};
+        const double *arguments[NOMINAL_ARG] = {inputs, inputs + N_X, c};
+        double *results[NOMINAL_RES] = {predicted, h};
         long long int iw[NOMINAL_IW + 1];
         nominal(arguments, results, iw, w, 0);
         for (int i = 0; i < K; i++) {
             predicted[i] += W[i * (N_IN + 1)];
-            for (int j = 0; j < FEATURES; j++) predicted[i] += G[j * K + i] * c[j];
             for (int j = 0; j < N_IN; j++) predicted[i] += W[i * (N_IN + 1) + 1 + j] * inputs[j];
         }
         if (step + 1 < steps)

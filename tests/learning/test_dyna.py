@@ -14,7 +14,7 @@ from tests.helpers.training import killed_and_resumed, make_run
 def test_the_model_plays_the_plant_that_it_was_fitted_to(scenario, rng):
     features = Features(Problem.from_scenario(scenario))
     inputs = rng.normal([27.0, 60.0, 220.0, 230.0], [2.0, 6.0, 20.0, 20.0], (500, 4))
-    y, _, h = features(inputs)
+    y, _, h = features(inputs, np.zeros(features.count))
     noise = rng.uniform(-0.1, 0.1, y.shape)
     model = EmpiricalModel.fit(features, inputs, 1.02 * y + h * noise)
     plant = ModelPlant(scenario, model, np.array([24.0, 60.0]), rng)

@@ -27,9 +27,9 @@ def base(scenario):
 def plant_data(features, rng, count, error, offset=0.0):
     """Inputs about the steady state and outputs of a plant whose parameter errors are `error`."""
     inputs = rng.normal([27.0, 60.0, 220.0, 230.0], [2.0, 6.0, 20.0, 20.0], (count, 4))
-    y, G, h = features(inputs)
+    y, _, h = features(inputs, error)
     noise = rng.uniform(-0.1, 0.1, y.shape)
-    return inputs, y + G @ error + h * (noise + offset)
+    return inputs, y + h * (noise + offset)
 
 
 @pytest.fixture
@@ -43,18 +43,18 @@ def test_the_fit_predicts_a_plant_with_another_parameter(features, rng):
     error = rng.normal(scale=0.1, size=features.count)
     model = EmpiricalModel.fit(features, *plant_data(features, rng, 4000, error))
     inputs, outputs = plant_data(features, rng, 4000, error)
-    y, G, h = features(inputs)
+    (nominal, _, h), true = features(inputs, np.zeros(features.count)), features(inputs, error)[0]
     c, W = model.coefficients
-    predicted = y + G @ c + np.column_stack([np.ones(4000), inputs]) @ W.T
-    wrong = np.abs((predicted - y - G @ error) / h)
+    predicted = features(inputs, c)[0] + np.column_stack([np.ones(4000), inputs]) @ W.T
+    wrong = np.abs((predicted - true) / h)
     assert wrong.max() < 0.03
-    assert np.abs((y - outputs) / h).mean() > 5 * wrong.mean()
+    assert np.abs((nominal - outputs) / h).mean() > 5 * wrong.mean()
     assert np.allclose(model.residuals.std(axis=0), 0.1 / np.sqrt(3), rtol=0.05)
 
 
 def test_what_the_nominal_model_knows_exactly_says_nothing_of_its_parameters(features, rng):
     inputs, outputs = plant_data(features, rng, 400, np.zeros(features.count))
-    outputs[:, -1] = features(inputs)[0][:, -1] * (1 + 1e-9 * rng.normal(size=400))
+    outputs[:, -1] = features(inputs, np.zeros(features.count))[0][:, -1] * (1 + 1e-9 * rng.normal(size=400))
     model = EmpiricalModel.fit(features, inputs, outputs)
     assert np.abs(model.coefficients[0]).max() < 0.1
 
@@ -65,11 +65,24 @@ def test_the_deviation_of_the_mean_cost_is_what_the_fits_scatter(features, rng):
     for _ in range(12):
         error = rng.normal(scale=0.15, size=features.count)
         model = EmpiricalModel.fit(features, *plant_data(features, rng, 200, error))
-        row = model.cost_row(at)
-        true = (features(at)[1][:, -1] @ error).mean()
-        costs.append(row @ model.mean - true)
+        row, true = model.cost_row(at), features(at, error)[0]
+        costs.append((model.predict(at)[0] - true)[:, -1].mean())
         deviations.append(np.sqrt(row @ model.covariance @ row))
     assert 0.4 < np.std(costs) / np.mean(deviations) < 1.6
+
+
+def test_an_error_that_no_parameter_makes_is_fitted_too(features, rng):
+    def plant(count):
+        inputs, outputs = plant_data(features, rng, count, np.zeros(features.count))
+        outputs[:, 0] += 0.2 * (inputs[:, 0] - 27.0) - 0.02 * (inputs[:, 2] - 220.0)
+        return inputs, outputs
+
+    model = EmpiricalModel.fit(features, *plant(4000))
+    inputs, outputs = plant(4000)
+    predicted, h, _ = model.predict(inputs)
+    error = (outputs - predicted) / h
+    assert np.allclose(error.std(axis=0), 0.1 / np.sqrt(3), rtol=0.05)
+    assert np.abs(error.mean(axis=0)).max() < 0.01
 
 
 @pytest.mark.slow  # compiles the controller
@@ -155,7 +168,7 @@ def filled(rule, inputs, outputs, model):
     """The rule's data with these samples, all since the fit of the model."""
     data = rule._data
     data._rows[: len(inputs)] = np.column_stack([inputs, outputs])
-    data.count, data.era, data.model = len(inputs), 0, model
+    data.count, data.era, data.model, data._judged = len(inputs), 0, model, []
     return data
 
 

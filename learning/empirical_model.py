@@ -44,8 +44,9 @@ FLOOR = 0.1
 """Least h, as a share of its value at the reference."""
 EXACT = 1e-6
 """Least deviation of an output, as a share of its size: two integrators differ by as much."""
-ROUNDS = 4
-"""Fits, each about the parameters and with the residuals' covariance of the one before."""
+ROUNDS, ENOUGH = 6, 2000
+"""Fits, each about the parameters and with the residuals' covariance of the one before, and samples
+of which all but the last take no more than twice as many."""
 ALARM = 1e-7
 """Probability below which the mean error since the last fit speaks of another plant."""
 WINDOWS = (15, 60, 240, 960)
@@ -121,29 +122,30 @@ class EmpiricalModel:
         """
         centre, unit = inputs.mean(axis=0), inputs.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
-        standardised, p = (inputs - centre) / unit, features.count
-        y, G, h = features(inputs, c := np.zeros(p))
-        deviation = (outputs - y).std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
+        thinned, p = max(len(inputs) // ENOUGH, 1), features.count
+        y, _, h = features(inputs[::thinned], c := np.zeros(p))
+        deviation = (outputs[::thinned] - y).std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
         parameters, ones = np.full(p, PARAMETER_DEVIATION), np.ones(features.inputs)
         priors = [
             np.append(parameters, np.outer(deviation, np.append(1.0, slopes * ones)))
             for slopes in SLOPE_DEVIATIONS
         ]
         older = np.empty((0, features.outputs)) if pool is None else pool
-        residuals = (outputs - y) / h
+        residuals = (outputs[::thinned] - y) / h
         residuals = residuals - residuals.mean(axis=0)
         least = EXACT**2 * ((y / h) ** 2).mean(axis=0)
-        for _ in range(ROUNDS):
+        for step in (*[thinned] * (ROUNDS - 1), 1):
+            some, given = inputs[::step], outputs[::step]
+            y, G, h = features(some, c)
             known = np.concatenate([residuals, older])
             noise = known.T @ known / len(known)
             variance = np.diag(noise)
             noise = noise + np.diag(np.maximum(least - variance, 1e-9 * variance))
-            design = _design(G, standardised) / h[:, :, None]
-            target = (outputs - y + G @ c) / h
-            mean, covariance = _posterior(design, target, noise, priors)
+            design = _design(G, (some - centre) / unit) / h[:, :, None]
+            mean, covariance = _posterior(design, (given - y + G @ c) / h, noise, priors)
             c = mean[:p] = mean[:p].clip(-MOST, MOST)
-            y, G, _ = features(inputs, c)
-            residuals = (outputs - y) / h - design[:, :, p:] @ mean[p:]
+            y, _, _ = features(some, c)
+            residuals = (given - y) / h - design[:, :, p:] @ mean[p:]
         residuals = np.concatenate([residuals - residuals.mean(axis=0), older])
         return cls(features, centre, unit, mean, covariance, residuals)
 

@@ -125,9 +125,9 @@ class EmpiricalModel:
         thinned, p = max(len(inputs) // ENOUGH, 1), features.count
         y, _, h = features(inputs[::thinned], c := np.zeros(p))
         deviation = (outputs[::thinned] - y).std(axis=0) + 1e-9 * np.abs(y).mean(axis=0)
-        parameters, ones = np.full(p, PARAMETER_DEVIATION), np.ones(features.inputs)
+        parameters = np.full(p, PARAMETER_DEVIATION)
         priors = [
-            np.append(parameters, np.outer(deviation, np.append(1.0, slopes * ones)))
+            np.append(parameters, np.outer(deviation, [1.0] + [slopes] * features.inputs))
             for slopes in SLOPE_DEVIATIONS
         ]
         older = np.empty((0, features.outputs)) if pool is None else pool

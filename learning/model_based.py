@@ -146,20 +146,6 @@ class ModelBased(Algorithm):
             if changed:
                 return
 
-    def _least(self, inputs: Array) -> Array:
-        """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
-
-        A present one shrinks little beyond the state that came closest to its bound: what lies
-        behind it the model only extrapolates. Of few samples none shrinks.
-        """
-        present, problem = self.back_off, self._problem
-        if len(inputs) < CAUTION:
-            return present
-        states = inputs[:, : problem.n_states]
-        rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
-        least: Array = np.clip(SHRINKS * rooms.min(axis=0), 0.0, present)
-        return least
-
     def _update(self) -> Update:
         data = self._data
         model = data.fit()
@@ -168,14 +154,17 @@ class ModelBased(Algorithm):
         self._due = data.count + min(interval, self.configuration.longest_interval)
         latest, _ = data.latest(RECENT)
         spare, rng = self.configuration.spare, self.rng
-        search = BackOffs(self._problem, self._rollout, self._base, model, latest, spare, rng)
-        found = search.best(self.back_off, self._least(inputs))
         present = self.controller.parameters
+        base = self._base.replace({"c_f": model.lack(inputs[-RECENT:])})
+        more = base["c_f"] - present["c_f"]
+        kept = np.maximum(self.back_off + np.concatenate([more, -more]), 0.0)
+        search = BackOffs(self._problem, self._rollout, base, model, latest, spare, rng)
+        found = search.best(kept, _least(self._problem, kept, inputs))
         new = search.theta(found)
         search.draw(FINE)
-        promise, kept = search.promises([new, present.theta])
-        better = search.excess(promise, kept) <= 0
-        self._limits = (promise if better else kept).limits
+        promise, held = search.promises([new, present.theta])
+        better = search.excess(promise, held) <= 0
+        self._limits = (promise if better else held).limits
         if not np.isfinite(self._limits).all():
             self._due = min(self._due, data.count + WINDOWS[-2])
         if better:
@@ -363,6 +352,20 @@ def _with(delta: Array, bounds: Sequence[int], values: Sequence[float]) -> Array
     changed = delta.copy()
     changed[list(bounds)] = values
     return changed
+
+
+def _least(problem: Problem, present: Array, inputs: Array) -> Array:
+    """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
+
+    A present one shrinks little beyond the state that came closest to its bound: what lies behind
+    it the model only extrapolates. Of few samples none shrinks.
+    """
+    if len(inputs) < CAUTION:
+        return present
+    states = inputs[:, : problem.n_states]
+    rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
+    least: Array = np.clip(SHRINKS * rooms.min(axis=0), 0.0, present)
+    return least
 
 
 def _tuned(problem: Problem, start: Parameters) -> Parameters:

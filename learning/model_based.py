@@ -1,10 +1,11 @@
 """`model-based`: θ searched on a model of the plant that its own operation has taught.
 
-The cost is tuned on the nominal model; what is searched are the back-offs of the state bounds. A θ
-costs what the empirical model promises: the mean stage cost of one long rollout and the expectation
-of the penalty over all errors of prediction. Of back-offs between which the model cannot tell the
-smallest is taken, but where a bound does not bind, which costs nothing: there it is a spare one,
-against a plant that changes.
+The cost is tuned on the nominal model, and c_f is what this lacks on average on the plant, as in
+offset-free control. What is searched are the back-offs of the state bounds. A θ costs what the
+empirical model promises: the mean stage cost of one long rollout and the expectation of the penalty
+over all errors of prediction. Of back-offs between which the model cannot tell the smallest is
+taken, but where a bound does not bind, which costs nothing: there it is a spare one, against a
+plant that changes.
 """
 
 from __future__ import annotations
@@ -146,6 +147,20 @@ class ModelBased(Algorithm):
             if changed:
                 return
 
+    def _least(self, present: Array, inputs: Array) -> Array:
+        """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
+
+        A present one shrinks little beyond the state that came closest to its bound: what lies
+        behind it the model only extrapolates. Of few samples none shrinks.
+        """
+        problem = self._problem
+        if len(inputs) < CAUTION:
+            return present
+        states = inputs[:, : problem.n_states]
+        rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
+        least: Array = np.clip(SHRINKS * rooms.min(axis=0), 0.0, present)
+        return least
+
     def _update(self) -> Update:
         data = self._data
         model = data.fit()
@@ -159,7 +174,7 @@ class ModelBased(Algorithm):
         more = base["c_f"] - present["c_f"]
         kept = np.maximum(self.back_off + np.concatenate([more, -more]), 0.0)
         search = BackOffs(self._problem, self._rollout, base, model, latest, spare, rng)
-        found = search.best(kept, _least(self._problem, kept, inputs))
+        found = search.best(kept, self._least(kept, inputs))
         new = search.theta(found)
         search.draw(FINE)
         promise, held = search.promises([new, present.theta])
@@ -352,20 +367,6 @@ def _with(delta: Array, bounds: Sequence[int], values: Sequence[float]) -> Array
     changed = delta.copy()
     changed[list(bounds)] = values
     return changed
-
-
-def _least(problem: Problem, present: Array, inputs: Array) -> Array:
-    """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
-
-    A present one shrinks little beyond the state that came closest to its bound: what lies behind
-    it the model only extrapolates. Of few samples none shrinks.
-    """
-    if len(inputs) < CAUTION:
-        return present
-    states = inputs[:, : problem.n_states]
-    rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
-    least: Array = np.clip(SHRINKS * rooms.min(axis=0), 0.0, present)
-    return least
 
 
 def _tuned(problem: Problem, start: Parameters) -> Parameters:

@@ -53,9 +53,8 @@ def test_the_fit_predicts_a_plant_with_another_parameter(features, rng):
 
 def test_what_the_nominal_model_knows_exactly_says_nothing_of_its_parameters(features, rng):
     inputs, outputs = plant_data(features, rng, 400, np.zeros(features.count))
-    outputs[:, -1] = features(inputs, np.zeros(features.count))[0][:, -1] * (
-        1 + 1e-9 * rng.normal(size=400)
-    )
+    exact = features(inputs, np.zeros(features.count))[0][:, -1]
+    outputs[:, -1] = exact * (1 + 1e-9 * rng.normal(size=400))
     model = EmpiricalModel.fit(features, inputs, outputs)
     assert np.abs(model.coefficients[0]).max() < 0.1
 
@@ -174,8 +173,7 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(rule, features, fitte
 
 
 def test_data_from_before_a_slow_change_are_dropped(features, rng):
-    error = np.zeros(features.count)
-    parts = []
+    error, parts = np.zeros(features.count), []
     for _ in range(4):
         parts.append(plant_data(features, rng, 500, error.copy()))
         error[0] -= 0.01

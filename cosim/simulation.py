@@ -33,6 +33,7 @@ from cosim.trajectory import (
 from cosim.validation import known_keywords
 
 PART = 500
+"""Samples of a part; of more than 10⁵ samples it is longer, since a recording indexes each."""
 
 
 def spawn_seeds(seed: int) -> tuple[int, np.random.Generator]:
@@ -100,6 +101,7 @@ class _Run:
         self._plant, self._controller = plant, controller
         self._scenario: Scenario = plant.scenario
         self._seed, self._steps = seed, steps
+        self._length = min(max(PART, steps // 200), 10 * PART)
         self._columns = SignalColumns(self._scenario, steps, residuals)
         self._status: list[str] = []
         self._predicted_states: Array | None = None
@@ -143,8 +145,8 @@ class _Run:
             s = step.s
             if record is not None and solution is not None:
                 self._keep_prediction(k, solution)
-            if (k + 1) % PART == 0 or k + 1 == self._steps:
-                part = self._part(k // PART * PART, k + 1)
+            if (k + 1) % self._length == 0 or k + 1 == self._steps:
+                part = self._part(k // self._length * self._length, k + 1)
                 if record is not None:
                     record(part)
                 progress(k + 1)
@@ -209,11 +211,11 @@ class _Run:
         if states is None or actions is None:
             return
         if self._predicted_states is None or self._predicted_actions is None:
-            self._predicted_states = np.full((PART, *np.shape(states)), np.nan)
-            self._predicted_actions = np.full((PART, *np.shape(actions)), np.nan)
+            self._predicted_states = np.full((self._length, *np.shape(states)), np.nan)
+            self._predicted_actions = np.full((self._length, *np.shape(actions)), np.nan)
         try:
-            self._predicted_states[k % PART] = states
-            self._predicted_actions[k % PART] = actions
+            self._predicted_states[k % self._length] = states
+            self._predicted_actions[k % self._length] = actions
         except (TypeError, ValueError) as error:
             raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
 

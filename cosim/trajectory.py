@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from math import nan
+from math import ceil, nan
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
@@ -309,9 +309,13 @@ class Trajectory(Result):
         """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
         # np.quantile would load numpy.ma, 3 % of a short run's processor time.
         return {
-            name: {key: 1e6 * float(np.interp(q, grid, ordered)) for key, q in QUANTILES.items()}
+            name: {
+                key: 1e6
+                * float(np.interp(q * last % 1, (0, 1), ordered[[int(q * last), ceil(q * last)]]))
+                for key, q in QUANTILES.items()
+            }
             for name, values in self.timing.items()
-            for grid, ordered in [(np.linspace(0.0, 1.0, len(values)), np.sort(values))]
+            for last, ordered in [(len(values) - 1, np.sort(values))]
         }
 
     def to_csv(self) -> str:

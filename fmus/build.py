@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.resources
 import importlib.util
 import os
 import shutil
@@ -103,7 +104,7 @@ class Compiler:
     """A C compiler for one platform: the command that calls it and the flags of its linker.
 
     `runtime` is a command that compiles the platform's C library and `empty.c`, where that is to be
-    done first.
+    done first. Of its files those that our FMUs do not use come in where a symbol is missing.
     """
 
     platform: Platform
@@ -132,22 +133,46 @@ class Compiler:
         headers = Path(fmpy.__file__).parent / "c-code"
         file = name + self.platform.suffix
         with temporary_folder("cosim-") as folder:
-            for path, data in sources.items():
+            for path, data in {"empty.c": b"", **sources}.items():
                 (folder / path).write_bytes(data)
-            if self.runtime:
-                (folder / "empty.c").write_bytes(b"")
-                subprocess.run(self.runtime, cwd=folder, capture_output=True, check=False)
             units = sorted(path for path in sources if path.endswith(".c"))
             command = [
                 *self.command, *COMPILER_FLAGS, *warnings, "-isystem", str(headers),
                 *units, "-o", file, *self.linker_flags,
             ]  # fmt: skip
-            result = subprocess.run(
-                command, cwd=folder, capture_output=True, text=True, check=False
-            )
+            attempts: list[dict[str, str]] = [{}]
+            if self.runtime and os.name != "nt":  # there, links need a privilege
+                attempts.insert(0, {"ZIG_LIB_DIR": str(_lean_library(folder / "zig"))})
+            for variables in attempts:
+                for step in filter(None, (self.runtime, command)):
+                    result = subprocess.run(
+                        step, cwd=folder, env=os.environ | variables, capture_output=True,
+                        text=True, check=False,
+                    )  # fmt: skip
+                if "undefined symbol" not in result.stderr:
+                    break
             if result.returncode != 0 or result.stderr:
                 raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
             return (folder / file).read_bytes()
+
+
+def _lean_library(folder: Path) -> Path:
+    """Fill `folder` with links to Zig's library, less what our FMUs do not use of Windows' part.
+
+    Those are three quarters of its C files, and most of the time of a first build.
+    """
+    own = Path(str(importlib.resources.files("ziglang"))) / "lib"
+    mingw = own / "libc" / "mingw"
+    parts = {path.parent for path in mingw.glob("*/*.c")} - {mingw / "crt", mingw / "math"}
+    opened = (own, own / "libc", mingw, *parts)
+    for source in opened:
+        target = folder / source.relative_to(own)
+        target.mkdir()
+        for path in set(source.iterdir()).difference(opened):
+            used = source not in parts or path.suffix not in (".c", ".S")
+            used = used or path.name == "dllmain.c" or path.name.startswith("ucrt_")
+            (target / path.name).symlink_to(path if used else os.devnull)
+    return folder
 
 
 def local_compiler() -> Compiler:

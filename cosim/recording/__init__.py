@@ -2,7 +2,7 @@
 
 from cosim.recording.read import Recording, read_recording, summarise
 from cosim.recording.viewer import open_viewer, render
-from cosim.recording.write import RerunRecorder, record_overlay, record_training
+from cosim.recording.write import RerunRecorder, record_overlay, record_training, spare_pandas
 
 __all__ = [
     "Recording",
@@ -12,5 +12,6 @@ __all__ = [
     "record_overlay",
     "record_training",
     "render",
+    "spare_pandas",
     "summarise",
 ]

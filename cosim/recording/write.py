@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import secrets
+import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple, NoReturn, Self
 
 import numpy as np
+import pyarrow
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -243,6 +245,24 @@ penalty of violating the state bounds (red lines).
 
 **Predictions**: line +i is the QP's prediction, made at the cursor, of the sample i later.
 """
+
+
+def spare_pandas() -> None:
+    """Let pyarrow go without pandas in this process, unless something has imported it.
+
+    pyarrow would import it, 46 MB and an eighth of a second, to see that a list is no series.
+    """
+
+    class Missing:
+        @staticmethod
+        def find_spec(name: str, *_: object) -> None:
+            if name == "pandas":
+                raise ModuleNotFoundError(name)
+
+    if "pandas" not in sys.modules:
+        sys.meta_path.insert(0, Missing)
+        pyarrow.array([0.0])  # pyarrow looks once
+        sys.meta_path.remove(Missing)
 
 
 class Plot(NamedTuple):

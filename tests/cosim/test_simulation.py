@@ -103,8 +103,7 @@ class Predicting(Proportional):
 
 
 def test_a_recorder_gets_the_whole_run_in_parts(evaporator, paper):
-    recorder, done = Recorder(), []
-    steps = 2 * PART + 17
+    recorder, done, steps = Recorder(), [], 2 * PART + 17
     trajectory = simulate(
         evaporator, Predicting(paper), steps, seed=9, recorder=recorder, progress=done.append
     )
@@ -121,17 +120,18 @@ def test_a_recorder_gets_the_whole_run_in_parts(evaporator, paper):
         assert block.predicted_actions.shape[1:] == (3, 2)
 
 
-def test_recording_does_not_change_the_run(evaporator, paper):
-    plain = simulate(evaporator, Predicting(paper), 600, seed=9)
-    assert same(plain, simulate(evaporator, Predicting(paper), 600, seed=9, recorder=Recorder()))
+def test_recording_does_not_change_the_run_nor_do_longer_parts(evaporator, paper, monkeypatch):
+    plain, recorder = simulate(evaporator, Predicting(paper), 600, seed=9), Recorder()
+    monkeypatch.setattr("cosim.simulation.PART", 2)
+    assert same(plain, simulate(evaporator, Predicting(paper), 600, seed=9, recorder=recorder))
+    assert [first for first, *_ in recorder.blocks] == [*range(0, 600, 600 // 200)]
 
 
 def test_the_recorder_is_closed_when_the_run_fails(evaporator, paper):
     recorder = Recorder(fail_at=PART)
     with pytest.raises(OSError, match="disk full"):
         simulate(evaporator, Proportional(paper), 2 * PART, seed=0, recorder=recorder)
-    assert recorder.calls[-1] == ("close",)
-    assert len(recorder.blocks) == 1
+    assert (recorder.calls[-1], len(recorder.blocks)) == (("close",), 1)
 
 
 def test_input_effort_is_the_share_of_the_range_moved_per_sample():

@@ -13,14 +13,12 @@ from tests.helpers.platforms import MARKS as CROSS
 
 pytestmark = needs_compiler
 EQUATIONS = """
-#ifndef EQUATIONS_H
-#define EQUATIONS_H
+#pragma once
 #include "variables.h"
 static void evaluate(double v[N_VARIABLES]) {
     v[VR_der_x] = v[VR_gain] * v[VR_u] - v[VR_x];
     v[VR_y] = 2.0 * v[VR_x];
 }
-#endif
 """
 
 
@@ -65,10 +63,11 @@ FOREIGN = Path(__file__).parents[1] / "helpers" / "foreign"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A plant of C and XML by hand."""
+    """A plant of C and XML by hand, which uses more of the C library than ours."""
     own = tmp_path / "own"
     own.mkdir()
-    (own / "tank.c").write_bytes((FOREIGN / "tank.c").read_bytes())
+    more = "#include <dirent.h>\nint more(DIR *folder) { return closedir(folder); }\n"
+    (own / "tank.c").write_text(more + (FOREIGN / "tank.c").read_text())
     (own / "modelDescription.xml").write_bytes((FOREIGN / "tank.xml").read_bytes())
     return own
 

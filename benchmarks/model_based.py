@@ -36,6 +36,11 @@ PARTS = {
     "reach": (model_based, "REACH", 1e9),  # a rollout is lost by its cost alone
     "promise": (model_based, "BROKEN", 1e9),  # no promise is ever broken
     "dropping": (empirical_model, "EVIDENCE", np.inf),  # the fit uses all data
+    "offset": (
+        empirical_model.EmpiricalModel,
+        "lack",
+        lambda model, inputs: inputs[0, : model.features.outputs - 1] * 0.0,
+    ),
     "nothing": (model_based, "CAUTION", model_based.CAUTION),
 }
 SEEDS, STEPS, BURN = range(700_000, 700_005), 1300, 300

@@ -156,6 +156,12 @@ class EmpiricalModel:
         design = _design(G, (inputs - self.centre) / self.unit) / h[:, :, None]
         return y + h * (design[:, :, p:] @ self.mean[p:]), h, design
 
+    def lack(self, inputs: Array) -> Array:
+        """What the nominal model's predictions of s₊ lack on average at inputs (M, n+m), (n,)."""
+        y, _, _ = self.features(inputs, np.zeros(self.features.count))
+        mean: Array = (self.predict(inputs)[0] - y)[:, :-1].mean(axis=0)
+        return mean
+
     def cost_row(self, inputs: Array) -> Array:
         """Derivative of the mean cost at inputs (M, n+m) by `mean`."""
         _, G, _ = self.features(inputs, self.mean[: self.features.count])

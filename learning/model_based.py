@@ -1,10 +1,11 @@
 """`model-based`: θ searched on a model of the plant that its own operation has taught.
 
-The cost is tuned on the nominal model; what is searched are the back-offs of the state bounds. A θ
-costs what the empirical model promises: the mean stage cost of one long rollout and the expectation
-of the penalty over all errors of prediction. Of back-offs between which the model cannot tell the
-smallest is taken, but where a bound does not bind, which costs nothing: there it is a spare one,
-against a plant that changes.
+The cost is tuned on the nominal model, and c_f is what this lacks on average on the plant, as in
+offset-free control. What is searched are the back-offs of the state bounds. A θ costs what the
+empirical model promises: the mean stage cost of one long rollout and the expectation of the penalty
+over all errors of prediction. Of back-offs between which the model cannot tell the smallest is
+taken, but where a bound does not bind, which costs nothing: there it is a spare one, against a
+plant that changes.
 """
 
 from __future__ import annotations
@@ -146,13 +147,13 @@ class ModelBased(Algorithm):
             if changed:
                 return
 
-    def _least(self, inputs: Array) -> Array:
+    def _least(self, present: Array, inputs: Array) -> Array:
         """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
 
         A present one shrinks little beyond the state that came closest to its bound: what lies
         behind it the model only extrapolates. Of few samples none shrinks.
         """
-        present, problem = self.back_off, self._problem
+        problem = self._problem
         if len(inputs) < CAUTION:
             return present
         states = inputs[:, : problem.n_states]
@@ -168,14 +169,19 @@ class ModelBased(Algorithm):
         self._due = data.count + min(interval, self.configuration.longest_interval)
         latest, _ = data.latest(RECENT)
         spare, rng = self.configuration.spare, self.rng
-        search = BackOffs(self._problem, self._rollout, self._base, model, latest, spare, rng)
-        found = search.best(self.back_off, self._least(inputs))
         present = self.controller.parameters
+        base = self._base.replace({"c_f": present["c_f"]})
+        if len(inputs) >= CAUTION:
+            base = self._base.replace({"c_f": model.lack(inputs[-RECENT:])})
+        more = base["c_f"] - present["c_f"]
+        kept = np.maximum(self.back_off + np.concatenate([more, -more]), 0.0)
+        search = BackOffs(self._problem, self._rollout, base, model, latest, spare, rng)
+        found = search.best(kept, self._least(kept, inputs))
         new = search.theta(found)
         search.draw(FINE)
-        promise, kept = search.promises([new, present.theta])
-        better = search.excess(promise, kept) <= 0
-        self._limits = (promise if better else kept).limits
+        promise, held = search.promises([new, present.theta])
+        better = search.excess(promise, held) <= 0
+        self._limits = (promise if better else held).limits
         if not np.isfinite(self._limits).all():
             self._due = min(self._due, data.count + WINDOWS[-2])
         if better:

@@ -76,6 +76,8 @@ def test_an_error_that_no_parameter_makes_is_fitted_too(features, rng):
     outputs[:, 0] += 0.2 * (inputs[:, 0] - 27.0) - 0.02 * (inputs[:, 2] - 220.0)
     model = EmpiricalModel.fit(features, inputs[:4000], outputs[:4000])
     predicted, h, _ = model.predict(inputs[4000:])
+    beyond = (outputs - features(inputs, np.zeros(features.count))[0])[:4000, :-1].mean(axis=0)
+    assert model.lack(inputs[:4000]) == pytest.approx(beyond, rel=0.05, abs=0.01)
     assert np.allclose(((outputs[4000:] - predicted) / h).std(axis=0), 0.1 / np.sqrt(3), rtol=0.05)
 
 
@@ -148,10 +150,10 @@ def rule(scenario, base, rng):
 
 
 def test_back_offs_shrink_little_further_than_the_plant_has_been(rule):
-    rule.back_off = np.array([2.0, 0.0, 0.0, 5.0])
+    present = np.array([2.0, 0.0, 0.0, 5.0])
     inputs = np.tile([26.0, 77.0, 220.0, 230.0], (200, 1))
-    assert rule._least(inputs) == pytest.approx([0.7, 0.0, 0.0, 2.1])
-    assert rule._least(inputs[:50]) == pytest.approx([2.0, 0.0, 0.0, 5.0])
+    assert rule._least(present, inputs) == pytest.approx([0.7, 0.0, 0.0, 2.1])
+    assert rule._least(present, inputs[:50]) == pytest.approx(present)
 
 
 def filled(rule, inputs, outputs, model):

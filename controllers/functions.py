@@ -8,6 +8,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import tarfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -133,34 +134,52 @@ LONG = 1000
 """Least samples of a run for which a controller is compiled; libraries are kept."""
 PATIENCE = 120.0
 """Seconds that a compiler may take."""
+BUILDS = Path(__file__).with_name("builds.tar.xz")
+"""Libraries of the presets' controllers and rollouts for five platforms, by `build_name`."""
 
 
-def library(sources: Mapping[str, str | bytes], entry: Sequence[str]) -> Path | None:
-    """Shared library of C files in the user's cache, made where it is missing.
+def library(sources: Mapping[str, str | bytes]) -> Path | None:
+    """Shared library of C files by name, in the user's cache, made where it is missing.
 
-    `sources` are the files by name, `entry` the names of those that the compiler is given; the
-    others are included by them. It is the same file for the same content, compiler and flags, it
-    appears whole, and of several processes one makes it. None without a compiler, where it fails,
+    Every `*.c` is given to the compiler, the others are included. It is the same file for the same
+    content, compiler and flags, it appears whole, and of several processes one makes it. Without a
+    compiler it is taken from `BUILDS`. None where it is not there either, where the compiler fails,
     and where COSIM_COMPILE says `never`; ControllerError on a word that it does not know.
     """
-    compiler = find_compiler()
-    if switch() == "never" or compiler is None:
+    if switch() == "never":
         return None
     files = {name: s.encode() if isinstance(s, str) else s for name, s in sources.items()}
-    # The identity of the compiler and of the processor's architecture.
-    status = Path(compiler).resolve().stat()
-    identity = f"{compiler} {status.st_size} {status.st_mtime_ns} {platform.machine()}"
-    content = hashlib.sha256("\0".join((identity, *FLAGS, *entry)).encode())
-    for name in sorted(files):
-        content.update(f"\0{name}\0{len(files[name])}\0".encode() + files[name])
+    compiler = find_compiler()
+    system = [sys.platform, platform.machine().lower()]
+    if compiler is not None:
+        status = Path(compiler).resolve().stat()
+        system += [compiler, str(status.st_size), str(status.st_mtime_ns), *FLAGS]
     try:
-        path = cache_folder("compiled") / f"{content.hexdigest()[:32]}.lib"
+        path = cache_folder("compiled") / f"{build_name(files, system)}.lib"
         if not path.is_file():
-            _compile([compiler, *FLAGS, "-o", "library", *entry, "-lm"], files, path)
+            if compiler is None:
+                _unpack(path)
+            else:
+                units = sorted(name for name in files if name.endswith(".c"))
+                _compile([compiler, *FLAGS, "-o", "library", *units, "-lm"], files, path)
         os.utime(path)
-    except (OSError, subprocess.SubprocessError):
+    except (OSError, KeyError, subprocess.SubprocessError):
         return None
     return path
+
+
+def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
+    """Name of a library by its C files and what it is built for and with."""
+    content = hashlib.sha256("\0".join(system).encode())
+    for name in sorted(files):
+        content.update(f"\0{name}\0{len(files[name])}\0".encode() + files[name])
+    return content.hexdigest()[:32]
+
+
+def _unpack(path: Path) -> None:
+    with tarfile.open(BUILDS) as builds, temporary_folder(".partial-", path.parent) as folder:
+        builds.extract(path.stem, folder, filter="data")
+        (folder / path.stem).replace(path)
 
 
 def _compile(command: Sequence[str], files: Mapping[str, bytes], path: Path) -> None:
@@ -200,5 +219,5 @@ def description() -> str:
         return f"{INTERPRETED} ({SWITCH}=never)"
     compiler = find_compiler()
     if compiler is None:
-        return f"{INTERPRETED} (no C compiler found)"
+        return f"{COMPILED} for the presets, {INTERPRETED} else (no C compiler found)"
     return f"{COMPILED} by {compiler} {' '.join(FLAGS)}, kept in {cache_folder('compiled')}"

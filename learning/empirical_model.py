@@ -306,10 +306,11 @@ class Rollout:
         sources: dict[str, str | bytes] = {
             **core(problem, parameters).sources,
             "sizes.h": "".join(f"#define {name} {value}\n" for name, value in sizes.items()),
-            "nominal.c": c_source([function]),
+            # Where a function says that it is exported, Windows exports no other.
+            "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
-        path = library(sources, ("rollout.c", "nominal.c"))
+        path = library(sources)
         self.compiled = None if path is None else ctypes.CDLL(str(path)).rollout
 
     def __call__(

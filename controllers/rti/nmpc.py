@@ -340,7 +340,7 @@ class Engine:
         sources = controller_sources(problem, blocks, "gauss-newton", named)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
-        path = library(sources, ["engine.c"])
+        path = library(sources)
         return None if path is None else cls(str(path), functions, stagewise)
 
     def prepare(self) -> int:

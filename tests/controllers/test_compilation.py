@@ -1,13 +1,19 @@
 """C files compiled into a cache: whole, once, and without an endless wait."""
 
 import ctypes
+import importlib.util
 import shutil
 import sys
+import tarfile
 
 import pytest
 
 from controllers import ControllerError, Parameters, RtiNmpc, functions
-from controllers.functions import description, library
+from controllers.factories import naive
+from controllers.functions import BUILDS, build_name, description, library
+from cosim import FmuPlant, Scenario, simulate
+from fmus import present
+from tests.helpers.builds import SYSTEMS, built, preset_sources
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.sampling import evaporator_problem
 
@@ -15,7 +21,7 @@ SOURCES = {"answer.c": '#include "answer.h"\nint answer(void) { return ANSWER; }
 
 
 def answer(value):
-    return library(SOURCES | {"answer.h": f"#define ANSWER {value}\n"}, ["answer.c"])
+    return library(SOURCES | {"answer.h": f"#define ANSWER {value}\n"})
 
 
 @pytest.fixture
@@ -37,6 +43,39 @@ def test_without_a_compiler_there_is_none_and_the_description_says_so(folder, mo
     monkeypatch.setenv("CC", "no-such-compiler")
     assert answer(42) is None
     assert "no C compiler" in description()
+
+
+def test_the_stored_builds_are_those_of_the_presets():
+    wanted = preset_sources()
+    names = {build_name(sources, system) for sources in wanted for system in SYSTEMS.values()}
+    with tarfile.open(BUILDS) as builds:
+        assert set(builds.getnames()) == names, "python -m tests.helpers.builds"
+        for name in names:
+            build = builds.extractfile(name).read()
+            assert b"engine_run\0" in build or b"rollout\0" in build
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="no cross-compiler")
+def test_a_stored_build_is_what_its_sources_give():
+    with tarfile.open(BUILDS) as builds:
+        for sources in preset_sources()[:2]:
+            name = build_name(sources, SYSTEMS[present().tuple])
+            assert builds.extractfile(name).read() == built(sources, present())
+
+
+@needs_compiler
+def test_a_stored_build_gives_the_compilers_bytes(folder, monkeypatch):
+    scenario, tables = Scenario.load("paper"), []
+    for name in (None, "no-such-compiler"):
+        if name:
+            monkeypatch.setenv("CC", name)
+        controller = naive(scenario)
+        controller.compile()
+        assert controller.functions == "compiled"
+        with FmuPlant(scenario) as plant:
+            tables.append(simulate(plant, controller, 200, seed=1).to_csv())
+    assert tables[0] == tables[1] and len(list(folder.glob("*.lib"))) == 2
 
 
 def test_a_compiler_that_fails_or_hangs_leaves_nothing(folder, monkeypatch, tmp_path):

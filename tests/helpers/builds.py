@@ -1,0 +1,78 @@
+"""Stored builds of the presets' controllers: `python -m tests.helpers.builds` makes them anew.
+
+It takes the extra `cross`; five platforms take some minutes.
+"""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from importlib.resources import files
+from unittest.mock import patch
+
+from controllers.factories import naive
+from controllers.functions import BUILDS, LONG, build_name
+from cosim.files import replacing
+from cosim.scenario import Scenario
+from fmus import PLATFORMS, Platform
+from fmus.build import cross_compiler
+from learning.empirical_model import Features, Rollout
+
+SYSTEMS = {
+    "x86_64-linux": ("linux", "x86_64"),
+    "aarch64-linux": ("linux", "aarch64"),
+    "x86_64-windows": ("win32", "amd64"),
+    "x86_64-darwin": ("darwin", "x86_64"),
+    "aarch64-darwin": ("darwin", "arm64"),
+}
+"""`sys.platform` and the machine that Python says, by platform."""
+
+
+def preset_sources() -> list[dict[str, bytes]]:
+    """C files by name of each library that a preset's controller and its rollouts need."""
+    found: list[dict[str, bytes]] = []
+
+    def keep(sources: Mapping[str, str | bytes]) -> None:
+        each = {k: s.encode() if isinstance(s, str) else s for k, s in sources.items()}
+        if each not in found:
+            found.append(each)
+
+    presets = [path.name for path in files("cosim.presets").iterdir()]
+    with (
+        patch("controllers.rti.nmpc.library", keep),
+        patch("learning.empirical_model.library", keep),
+    ):
+        for preset in sorted(name.removesuffix(".toml") for name in presets if ".toml" in name):
+            controller = naive(Scenario.load(preset))
+            controller.compile(LONG)
+            Rollout(controller.problem, controller.parameters, Features(controller.problem))
+    return found
+
+
+def built(sources: Mapping[str, bytes], platform: Platform) -> bytes:
+    """One library, optimised and with all its functions public."""
+    options = ("-w", "-O3", "-fvisibility=default")
+    return cross_compiler(platform).library(sources, "library", options)
+
+
+def main() -> None:
+    """Build all and write `BUILDS`."""
+    wanted = {
+        build_name(sources, SYSTEMS[platform.tuple]): (sources, platform)
+        for sources in preset_sources()
+        for platform in PLATFORMS
+    }
+    with ThreadPoolExecutor(2) as pool:
+        each = pool.map(lambda pair: built(*pair), wanted.values())
+        builds = dict(zip(wanted, each, strict=True))
+    with replacing(BUILDS) as partial, tarfile.open(partial, "w:xz", preset=9) as archive:
+        for name, data in builds.items():
+            entry = tarfile.TarInfo(name)
+            entry.size, entry.mode = len(data), 0o755
+            archive.addfile(entry, io.BytesIO(data))
+
+
+if __name__ == "__main__":
+    main()

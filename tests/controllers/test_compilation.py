@@ -1,19 +1,18 @@
 """C files compiled into a cache: whole, once, and without an endless wait."""
 
 import ctypes
-import importlib.util
 import shutil
 import sys
 import tarfile
 
 import pytest
 
+from benchmarks.builds import SYSTEMS, built, preset_sources
 from controllers import ControllerError, Parameters, RtiNmpc, functions
 from controllers.factories import naive
-from controllers.functions import BUILDS, build_name, description, library
+from controllers.functions import BUILDS, build_name, description, find_compiler, library
 from cosim import FmuPlant, Scenario, simulate
 from fmus import present
-from tests.helpers.builds import SYSTEMS, built, preset_sources
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.sampling import evaporator_problem
 
@@ -49,15 +48,15 @@ def test_the_stored_builds_are_those_of_the_presets():
     wanted = preset_sources()
     names = {build_name(sources, system) for sources in wanted for system in SYSTEMS.values()}
     with tarfile.open(BUILDS) as builds:
-        assert set(builds.getnames()) == names, "python -m tests.helpers.builds"
+        assert set(builds.getnames()) == names, "python -m benchmarks.builds"
         for name in names:
             build = builds.extractfile(name).read()
             assert b"engine_run\0" in build or b"rollout\0" in build
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="no cross-compiler")
 def test_a_stored_build_is_what_its_sources_give():
+    pytest.importorskip("ziglang")
     with tarfile.open(BUILDS) as builds:
         for sources in preset_sources()[:2]:
             name = build_name(sources, SYSTEMS[present().tuple])
@@ -67,9 +66,8 @@ def test_a_stored_build_is_what_its_sources_give():
 @needs_compiler
 def test_a_stored_build_gives_the_compilers_bytes(folder, monkeypatch):
     scenario, tables = Scenario.load("paper"), []
-    for name in (None, "no-such-compiler"):
-        if name:
-            monkeypatch.setenv("CC", name)
+    for name in (find_compiler(), "no-such-compiler"):
+        monkeypatch.setenv("CC", name)
         controller = naive(scenario)
         controller.compile()
         assert controller.functions == "compiled"

@@ -1,4 +1,4 @@
-"""Stored builds of the presets' controllers: `python -m tests.helpers.builds` makes them anew.
+"""Stored builds of the presets' controllers: `python -m benchmarks.builds` makes them anew.
 
 It takes the extra `cross`; five platforms take some minutes.
 """

@@ -163,7 +163,7 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
                 units = sorted(name for name in files if name.endswith(".c"))
                 _compile([compiler, *FLAGS, "-o", "library", *units, "-lm"], files, path)
         os.utime(path)
-    except (OSError, KeyError, subprocess.SubprocessError):
+    except (OSError, KeyError, tarfile.TarError, subprocess.SubprocessError):
         return None
     return path
 
@@ -178,8 +178,10 @@ def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
 
 def _unpack(path: Path) -> None:
     with tarfile.open(BUILDS) as builds, temporary_folder(".partial-", path.parent) as folder:
-        builds.extract(path.stem, folder, filter="data")
-        (folder / path.stem).replace(path)
+        build = builds.extractfile(path.stem)
+        assert build is not None, "only files are in it"
+        (folder / "library").write_bytes(build.read())
+        (folder / "library").replace(path)
 
 
 def _compile(command: Sequence[str], files: Mapping[str, bytes], path: Path) -> None:

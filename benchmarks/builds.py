@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 from unittest.mock import patch
 
-from controllers.factories import naive
+from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks
 from controllers.functions import BUILDS, LONG, build_name
 from cosim.files import replacing
 from cosim.scenario import Scenario
@@ -31,7 +31,10 @@ SYSTEMS = {
 
 
 def preset_sources() -> list[dict[str, bytes]]:
-    """C files by name of each library that a preset's controller and its rollouts need."""
+    """C files by name of each library that a preset's controller and its rollouts need.
+
+    θ has the slack's weights, as in a training, or not.
+    """
     found: list[dict[str, bytes]] = []
 
     def keep(sources: Mapping[str, str | bytes]) -> None:
@@ -45,9 +48,12 @@ def preset_sources() -> list[dict[str, bytes]]:
         patch("learning.empirical_model.library", keep),
     ):
         for preset in sorted(name.removesuffix(".toml") for name in presets if ".toml" in name):
-            controller = naive(Scenario.load(preset))
-            controller.compile(LONG)
-            Rollout(controller.problem, controller.parameters, Features(controller.problem))
+            problem = Problem.from_scenario(Scenario.load(preset))
+            for slack_weights in (False, True):
+                blocks = ThetaBlocks.of(problem, slack_weights=slack_weights)
+                parameters = Parameters.naive(problem, blocks)
+                RtiNmpc(problem, parameters).compile(LONG)
+                Rollout(problem, parameters, Features(problem))
     return found
 
 

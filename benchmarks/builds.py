@@ -9,13 +9,12 @@ import io
 import tarfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from importlib.resources import files
 from unittest.mock import patch
 
 from controllers import Parameters, Problem, RtiNmpc, ThetaBlocks
 from controllers.functions import BUILDS, LONG, build_name
 from cosim.files import replacing
-from cosim.scenario import Scenario
+from cosim.scenario import Scenario, presets
 from fmus import PLATFORMS, Platform
 from fmus.build import cross_compiler
 from learning.empirical_model import Features, Rollout
@@ -42,12 +41,11 @@ def preset_sources() -> list[dict[str, bytes]]:
         if each not in found:
             found.append(each)
 
-    presets = [path.name for path in files("cosim.presets").iterdir()]
     with (
         patch("controllers.rti.nmpc.library", keep),
         patch("learning.empirical_model.library", keep),
     ):
-        for preset in sorted(name.removesuffix(".toml") for name in presets if ".toml" in name):
+        for preset in presets():
             problem = Problem.from_scenario(Scenario.load(preset))
             for slack_weights in (False, True):
                 blocks = ThetaBlocks.of(problem, slack_weights=slack_weights)

@@ -157,11 +157,7 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
     try:
         path = cache_folder("compiled") / f"{build_name(files, system)}.lib"
         if not path.is_file():
-            if compiler is None:
-                _unpack(path)
-            else:
-                units = sorted(name for name in files if name.endswith(".c"))
-                _compile([compiler, *FLAGS, "-o", "library", *units, "-lm"], files, path)
+            _make(path, files, compiler)
         os.utime(path)
     except (OSError, KeyError, tarfile.TarError, subprocess.SubprocessError):
         return None
@@ -176,25 +172,30 @@ def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
     return content.hexdigest()[:32]
 
 
-def _unpack(path: Path) -> None:
-    with tarfile.open(BUILDS) as builds, temporary_folder(".partial-", path.parent) as folder:
-        build = builds.extractfile(path.stem)
-        assert build is not None, "only files are in it"
-        (folder / "library").write_bytes(build.read())
-        (folder / "library").replace(path)
-
-
-def _compile(command: Sequence[str], files: Mapping[str, bytes], path: Path) -> None:
+def _make(path: Path, files: Mapping[str, bytes], compiler: str | None) -> None:
     with lock(path.with_suffix(".lock"), PATIENCE):
         if path.is_file():
             return
         with temporary_folder(".partial-", path.parent) as folder:
-            for name, content in files.items():
-                (folder / name).write_bytes(content)
-            with child_process(command, folder=folder, log=subprocess.DEVNULL) as compiler:
-                if compiler.wait(PATIENCE):
-                    raise OSError("the compiler failed")
-            (folder / "library").replace(path)
+            made = folder / "library"
+            if compiler is None:
+                with tarfile.open(BUILDS) as builds:
+                    build = builds.extractfile(path.stem)
+                    assert build is not None, "only files are in it"
+                    made.write_bytes(build.read())
+            else:
+                _compile(compiler, files, folder)
+            made.replace(path)
+
+
+def _compile(compiler: str, files: Mapping[str, bytes], folder: Path) -> None:
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    units = sorted(name for name in files if name.endswith(".c"))
+    command = [compiler, *FLAGS, "-o", "library", *units, "-lm"]
+    with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
+        if child.wait(PATIENCE):
+            raise OSError("the compiler failed")
 
 
 def switch() -> str:

@@ -170,10 +170,9 @@ class ModelBased(Algorithm):
         latest, _ = data.latest(RECENT)
         spare, rng = self.configuration.spare, self.rng
         present = self.controller.parameters
-        base = self._base.replace({"c_f": present["c_f"]})
-        if len(inputs) >= CAUTION:
-            base = self._base.replace({"c_f": model.lack(inputs[-RECENT:])})
-        more = base["c_f"] - present["c_f"]
+        offset = model.lack(inputs[-RECENT:]) if len(inputs) >= CAUTION else present["c_f"]
+        base = self._base.replace({"c_f": offset})
+        more = offset - present["c_f"]
         kept = np.maximum(self.back_off + np.concatenate([more, -more]), 0.0)
         search = BackOffs(self._problem, self._rollout, base, model, latest, spare, rng)
         found = search.best(kept, self._least(kept, inputs))

@@ -332,8 +332,7 @@ class Engine:
             "POLICY": functions.policy(),
         }
         problem = functions.problem
-        # Stage by stage is faster from 12 (naive θ) or 16 stages (tuned) on for the evaporator, and
-        # from 36 (tuned) on for the tanks.
+        # A rule of thumb: where stage by stage becomes faster depends on the plant and on θ.
         stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
         stagewise = stagewise or stack_needed(problem, named) > STACK_LIMIT
         if stagewise:

@@ -49,8 +49,7 @@ def test_the_stored_builds_are_those_of_the_presets():
     names = {build_name(sources, system) for sources in wanted for system in SYSTEMS.values()}
     with tarfile.open(BUILDS) as builds:
         assert set(builds.getnames()) == names, "python -m benchmarks.builds"
-        for name in names:
-            build = builds.extractfile(name).read()
+        for build in (builds.extractfile(name).read() for name in names):
             assert b"engine_run\0" in build or b"rollout\0" in build
 
 

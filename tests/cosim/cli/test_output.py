@@ -2,6 +2,14 @@ import os
 import subprocess
 import sys
 
+from cosim.cli.output import Output
+
+
+def test_brackets_are_text(capsys):
+    Output(False).table("a[b]", ("c[red]",), [("pip install 'rti-cosim[cluster]'",)])
+    text = "".join(capsys.readouterr())
+    assert all(part in text for part in ("a[b]", "c[red]", "'rti-cosim[cluster]'"))
+
 
 def test_a_reader_who_leaves_hears_nothing():
     reading, writing = os.pipe()

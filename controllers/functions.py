@@ -109,15 +109,15 @@ _TIES = (
 )
 
 
-def c_source(functions: Sequence[ca.Function]) -> str:
+def c_source(functions: Sequence[ca.Function], name: str = "functions") -> str:
     """C99 source of the functions; it needs the mathematical library alone.
 
     Each becomes `int NAME(const double** arg, double** res, long long* iw, double* w, int mem)`,
     with `NAME_work` for the sizes of its work vectors. Compiled without contraction of products
     and sums (-ffp-contract=off) and without fast-math it gives the interpreter's bytes. The same
-    functions give the same source.
+    functions give the same source. The names of its helpers begin with `name`.
     """
-    generator = ca.CodeGenerator("functions.c")
+    generator = ca.CodeGenerator(f"{name}.c")
     for function in functions:
         generator.add(function)
     source = str(generator.dump())

@@ -10,13 +10,21 @@ from itertools import product
 from pathlib import Path
 from string import Template
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
 from controllers.functions import StackedFunction, c_source
 from controllers.problem import Problem
-from controllers.rti.preparation import Exact, embedding, make_hessian, preparation, readout
+from controllers.rti.preparation import (
+    Exact,
+    embedding,
+    make_hessian,
+    preparation,
+    readout,
+    stage_linearisation,
+)
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.scenario import Scenario
 
@@ -80,16 +88,24 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
 
 
 def controller_sources(
-    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, StackedFunction]
+    problem: Problem,
+    blocks: ThetaBlocks,
+    hessian: str,
+    functions: Mapping[str, StackedFunction],
+    *,
+    stagewise: bool = False,
 ) -> dict[str, bytes]:
-    """C files by name of a controller made of `functions`, by the prefix of their constants."""
-    stagewise = "LINEARISED" in functions  # its QP is solved stage by stage
+    """C files by name of a controller made of `functions`, by the prefix of their constants.
+
+    Its QP is condensed, or solved stage by stage.
+    """
     wanted = ("core.h", "rti.h", *SOLVERS[stagewise], "costs.h", "rotation.h", RULES[hessian])
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
-    unused = {"PREPARED", "EMBEDDED"} if stagewise else set()
-    called = [function for name, function in functions.items() if name not in unused]
-    sources["functions.h"] = _functions(called).encode()
-    sources["problem.h"] = _constants(problem, blocks, hessian, functions).encode()
+    unused = {"PREPARED", "EMBEDDED"} if stagewise else {"PREPARED"}
+    called = [each.function for name, each in functions.items() if name not in unused]
+    sources["linearise.h"] = _functions("linearise", [stage_linearisation(problem, blocks)])
+    sources["functions.h"] = _functions("functions", called)
+    sources["problem.h"] = _constants(problem, blocks, hessian, functions, stagewise).encode()
     return sources
 
 
@@ -103,20 +119,26 @@ def stack_needed(problem: Problem, functions: Mapping[str, StackedFunction]) -> 
     variables, limits = horizon * m, horizon * (m + n)
     own = sum(functions[name].memory.size for name in ("PREPARED", "READ"))
     solver = limits * (variables + limits + 10) + 2 * limits + variables * (variables + 1)
-    shared = max(solver, *(each.function.sz_w() for each in functions.values()))
+    condensing = (horizon + 5) * n * (variables + n + 1)
+    called = (each.function.sz_w() for name, each in functions.items() if name != "PREPARED")
+    shared = max(solver, condensing, *called)
     return 4000 + round(1.2 * 8 * (own + shared))
 
 
-def _functions(functions: Sequence[StackedFunction]) -> str:
+def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
     """CasADi's C with every function static and without the compiler's remarks on it."""
     own = re.compile(r"^casadi_real casadi_|^void casadi_|^casadi_int casadi_", re.MULTILINE)
-    code = c_source([function.function for function in functions])
+    code = c_source(functions, name)
     code = own.sub(lambda found: f"static {found.group()}", code)
-    return _filled("functions.h.in", code=code)
+    return _filled("functions.h.in", code=code).encode()
 
 
 def _constants(
-    problem: Problem, blocks: ThetaBlocks, hessian: str, functions: Mapping[str, StackedFunction]
+    problem: Problem,
+    blocks: ThetaBlocks,
+    hessian: str,
+    functions: Mapping[str, StackedFunction],
+    stagewise: bool,
 ) -> str:
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     gamma = problem.discount
@@ -143,8 +165,8 @@ def _constants(
         end_discount=repr(float(gamma**horizon)),
         floor=repr(Exact.FLOOR),
         rule=RULES[hessian],
-        solver=SOLVERS["LINEARISED" in functions][0],
-        stagewise=str(int("LINEARISED" in functions)),
+        solver=SOLVERS[stagewise][0],
+        stagewise=str(int(stagewise)),
         **slack,
     )
 

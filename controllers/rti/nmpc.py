@@ -27,7 +27,6 @@ from controllers.qp import (
 from controllers.rti.preparation import (
     Lift,
     embedding,
-    linearisation,
     make_hessian,
     preparation,
     qp_of,
@@ -335,9 +334,8 @@ class Engine:
         # A rule of thumb: where stage by stage becomes faster depends on the plant and on θ.
         stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
         stagewise = stagewise or stack_needed(problem, named) > STACK_LIMIT
-        if stagewise:
-            named["LINEARISED"] = linearisation(problem, blocks)
-        sources = controller_sources(problem, blocks, "gauss-newton", named)
+        rule = "gauss-newton"
+        sources = controller_sources(problem, blocks, rule, named, stagewise=stagewise)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)

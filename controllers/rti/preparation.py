@@ -186,16 +186,6 @@ def preparation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
     )
 
 
-def linearisation(problem: Problem, blocks: ThetaBlocks) -> StackedFunction:
-    """The part of `preparation` that concerns each stage alone: A, B, r from x, u and theta."""
-    horizon, theta = problem.horizon, ca.MX.sym("theta", blocks.size)
-    x, u = ca.MX.sym("x", problem.n_states, horizon), ca.MX.sym("u", problem.n_actions, horizon)
-    A, B, r = stage_linearisation(problem, blocks).map(horizon)(x, u, ca.repmat(theta, 1, horizon))
-    return StackedFunction(
-        "linearisation", {"x": x, "u": u, "theta": theta}, {"A": A, "B": B, "r": r}
-    )
-
-
 def _respond(n: int, m: int, horizon: int) -> ca.Function:
     """Responses (n, Nm + n + 1) of ξ_{k+1} from those of ξ_k: to each control, ξ_0 and offsets."""
     A, B, r = ca.SX.sym("A", n, n), ca.SX.sym("B", m, n), ca.SX.sym("r", n)

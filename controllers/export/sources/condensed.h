@@ -15,16 +15,71 @@ static Qp rti_qp(const RtiPrepared *prepared, const RtiSolved *solved) {
     return qp;
 }
 
-/* Linearise and condense. Apart, so that CasADi's work vector and the solver's may share their place on
- * a stack. */
-static QP_APART int rti_linearise(RtiPrepared *prepared) {
-    const double *arguments[PREPARED_ARG] = {prepared->x[0], prepared->u[0], prepared->L, prepared->q,
-                                             prepared->L_N,  prepared->q_N,  prepared->theta};
-    QP_SCRATCH double w[PREPARED_W + 1];
-    double *results[PREPARED_RES] = {prepared->stack};
-    long long int iw[PREPARED_IW + 1];
-    preparation(arguments, results, iw, w, 0);
-    return all_finite(prepared->stack, PREPARED_SIZE) ? QP_SOLVED : QP_NOT_FINITE;
+/* Columns of a response: to each control, to ξ_0, and to the offsets. */
+enum { CONDENSED_WIDTH = QP_N + N_X + 1 };
+typedef double CondensedRows[N_X][CONDENSED_WIDTH];
+
+/* out = Σ_l a_l rows_l with entries of a `stride` apart. */
+static void condensed_product(const double a[], int stride, CondensedRows rows, double out[]) {
+    for (int j = 0; j < CONDENSED_WIDTH; j++) out[j] = a[0] * rows[0][j];
+    for (int l = 1; l < N_X; l++)
+        for (int j = 0; j < CONDENSED_WIDTH; j++) out[j] += a[l * stride] * rows[l][j];
+}
+
+/* out = Σ_l a_l x_l + Σ_l b_l y_l, of which each sum is made before they are added. */
+static void condensed_sum(const double a[], CondensedRows x, const double b[], int stride,
+                          CondensedRows y, double out[]) {
+    double second[CONDENSED_WIDTH];
+    condensed_product(a, N_W, x, out);
+    condensed_product(b, stride, y, second);
+    for (int j = 0; j < CONDENSED_WIDTH; j++) out[j] += second[j];
+}
+
+/* Condense: with V = (v_0, …, v_{N−1}) the states are Ξ = Γ V + Φ ξ_0 + g. A sweep forward makes the
+ * responses of each ξ_k, one backward the gradients of the cost, f + F ξ_0 + H V, by costates. Apart,
+ * so that its arrays and the solver's may share their place on a stack. */
+static QP_APART int rti_assemble(RtiPrepared *prepared) {
+    enum { OFFSET = CONDENSED_WIDTH - 1 };
+    QP_SCRATCH CondensedRows response[HORIZON + 1];
+    CondensedRows costates[2];
+    double *const stack = prepared->stack, *const H = stack + PREPARED_H;
+    memset(response, 0, sizeof response);
+    for (int i = 0; i < N_X; i++) response[0][i][QP_N + i] = 1.0;
+    for (int k = 0; k < HORIZON; k++)
+        for (int i = 0; i < N_X; i++) {
+            const int r = k * N_X + i;
+            double *const row = response[k + 1][i];
+            condensed_product(stack + PREPARED_A + r * N_X, 1, response[k], row);
+            memcpy(row + k * N_U, stack + PREPARED_B + r * N_U, N_U * sizeof *row);
+            row[OFFSET] += stack[PREPARED_r + r];
+            memcpy(stack + PREPARED_Gamma + r * QP_N, row, QP_N * sizeof *row);
+            memcpy(stack + PREPARED_Phi + r * N_X, row + QP_N, N_X * sizeof *row);
+            stack[PREPARED_g + r] = row[OFFSET];
+        }
+    for (int i = 0; i < N_X; i++) {
+        condensed_product(prepared->L_N + i, N_X, response[HORIZON], costates[HORIZON % 2][i]);
+        costates[HORIZON % 2][i][OFFSET] += prepared->q_N[i];
+    }
+    for (int k = HORIZON - 1; k >= 0; k--) {
+        const double *const L = prepared->L + k * N_W * N_W, *const q = prepared->q + k * N_W;
+        const double *const A = stack + PREPARED_A + k * N_X * N_X;
+        const double *const B = stack + PREPARED_B + k * N_X * N_U;
+        double(*const next)[CONDENSED_WIDTH] = costates[(k + 1) % 2];
+        for (int a = 0; a < N_U; a++) {
+            const int r = k * N_U + a;
+            double row[CONDENSED_WIDTH];
+            condensed_sum(L + N_X + a, response[k], B + a, N_U, next, row);
+            for (int b = 0; b < N_U; b++) row[k * N_U + b] += L[(N_X + b) * N_W + N_X + a];
+            for (int j = 0; j <= r; j++) H[r * QP_N + j] = H[j * QP_N + r] = row[j];
+            memcpy(stack + PREPARED_F + r * N_X, row + QP_N, N_X * sizeof *row);
+            stack[PREPARED_f + r] = row[OFFSET] + q[N_X + a];
+        }
+        for (int i = 0; i < N_X; i++) {
+            condensed_sum(L + i, response[k], A + i, N_X, next, costates[k % 2][i]);
+            costates[k % 2][i][OFFSET] += q[i];
+        }
+    }
+    return all_finite(stack, PREPARED_SIZE) ? QP_SOLVED : QP_NOT_FINITE;
 }
 
 static int rti_load(const RtiPrepared *prepared, QpWork *work) {

@@ -77,20 +77,21 @@ static QpStatus qp_factorise(const Qp *qp, QpWork *work) {
         U[k][k] = sqrt(pivot);
         inverse[k] = 1.0 / U[k][k];
         for (int j = 0; j < k; j++) U[k][j] = qp->H[j * QP_N + k];
-        for (int l = k + 1; l < QP_N; l++)
-            for (int j = 0; j < k; j++) U[k][j] -= U[l][k] * U[l][j];
-        for (int j = 0; j < k; j++) U[k][j] *= inverse[k];
-    }
-    for (int i = 0; i < QP_N; i++) {
-        double *m = work->M[i];
-        memset(m, 0, sizeof work->M[i]);
-        m[i] = 1.0;
-        for (int k = i; k >= 0; k--) {
-            m[k] *= inverse[k];
-            for (int j = 0; j < k; j++) m[j] -= U[k][j] * m[k];
+        for (int j = 0; j < k; j++) {
+            for (int l = k + 1; l < QP_N; l++) U[k][j] -= U[l][k] * U[l][j];
+            U[k][j] *= inverse[k];
         }
+    }
+    memset(work->M, 0, sizeof work->M);
+    for (int i = 0; i < QP_N; i++) {
+        work->M[i][i] = 1.0;
         work->length[i] = i + 1;
     }
+    for (int k = QP_N - 1; k >= 0; k--) /* the rows inside: none waits for another */
+        for (int i = k; i < QP_N; i++) {
+            const double entry = work->M[i][k] *= inverse[k];
+            for (int j = 0; j < k; j++) work->M[i][j] -= U[k][j] * entry;
+        }
     return QP_SOLVED;
 }
 
@@ -100,14 +101,16 @@ static QpStatus qp_load(const Qp *qp, QpWork *work) {
     if (status != QP_SOLVED) return status;
     for (int r = 0; r < QP_ROWS; r++) {
         const double *a = qp->rows + r * QP_N;
-        double *m = work->M[QP_N + r];
         int length = QP_N;
         while (length > 0 && a[length - 1] == 0.0) length--;
         work->length[QP_N + r] = length;
-        memset(m, 0, sizeof work->M[QP_N + r]);
-        for (int j = 0; j < length; j++)
-            for (int i = 0; i <= j; i++) m[i] += a[j] * work->M[j][i];
     }
+    for (int j = 0; j < QP_N; j++)
+        for (int r = 0; r < QP_ROWS; r++) {
+            const double entry = qp->rows[r * QP_N + j];
+            if (j >= work->length[QP_N + r]) continue;
+            for (int i = 0; i <= j; i++) work->M[QP_N + r][i] += entry * work->M[j][i];
+        }
     for (int i = 0; i < QP_LIMITS; i++) {
         work->gram[i] = 0.0;
         for (int j = 0; j < work->length[i]; j++) work->gram[i] += work->M[i][j] * work->M[i][j];

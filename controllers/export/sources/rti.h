@@ -18,7 +18,7 @@ enum { RTI_SOLVED = QP_SOLVED, RTI_ILL_POSED = QP_NOT_FINITE + 1, RTI_INACCURATE
 #define RTI_RESIDUAL 1e-6
 
 /* A QP without its state. Given: the point of linearisation (states x_0 … x_{N−1}, actions, costates
- * χ_1 … χ_N) and θ. `stack` is what CasADi's `preparation` makes of it. Doubles only, in the order
+ * χ_1 … χ_N) and θ. `stack` has what `controllers.rti.preparation` makes of it. Doubles only, in the order
  * in which Python has them (`controllers.rti.nmpc`). */
 typedef struct {
     double x[HORIZON][N_X], u[HORIZON][N_U];
@@ -62,6 +62,18 @@ static int well_posed(const double theta[]) {
 
 #include QP_RULE
 
+/* A_k, B_k and r_k of all stages. Where the loop takes CasADi's code in, the compiler makes several
+ * stages at a time of it. */
+static void rti_linearise(RtiPrepared *prepared) {
+    double *const A = prepared->stack + PREPARED_A, *const B = prepared->stack + PREPARED_B;
+    for (int k = 0; k < HORIZON; k++) {
+        const double *arguments[] = {prepared->x[k], prepared->u[k], prepared->theta};
+        double *results[] = {A + k * N_X * N_X, B + k * N_X * N_U,
+                             prepared->stack + PREPARED_r + k * N_X};
+        linearise(arguments, results, 0, 0, 0);
+    }
+}
+
 /* Linearise; `rti_load` is what the QP's solver does beforehand. */
 static int rti_prepare(RtiPrepared *prepared) {
     const double *const theta = prepared->theta;
@@ -73,7 +85,8 @@ static int rti_prepare(RtiPrepared *prepared) {
     prepared->constant = stage_costs(prepared->x[0], prepared->u[0], prepared->costates[0], theta,
                                      prepared->L, prepared->q);
     terminal_cost(theta, prepared->L_N, prepared->q_N);
-    return rti_linearise(prepared);
+    rti_linearise(prepared);
+    return rti_assemble(prepared);
 }
 
 /* Of all multipliers of Q(s, a) at a kink, those that make dQ/da as small as they can: see

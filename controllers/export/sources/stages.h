@@ -380,12 +380,8 @@ static double stages_residual(const RtiPrepared *prepared, const RtiSolved *solv
     return qp_max(largest, stationarity / scale);
 }
 
-static int rti_linearise(RtiPrepared *prepared) {
-    const double *arguments[LINEARISED_ARG] = {prepared->x[0], prepared->u[0], prepared->theta};
-    double *results[LINEARISED_RES] = {prepared->stack}, w[LINEARISED_W + 1];
-    long long int iw[LINEARISED_IW + 1];
-    linearisation(arguments, results, iw, w, 0);
-    return all_finite(prepared->stack, LINEARISED_SIZE) ? QP_SOLVED : QP_NOT_FINITE;
+static int rti_assemble(const RtiPrepared *prepared) {
+    return all_finite(prepared->stack, PREPARED_H) ? QP_SOLVED : QP_NOT_FINITE;
 }
 
 /* All that does not depend on the state: whether the QP is convex, and the curvatures. */

@@ -55,6 +55,8 @@ FORETOLD, EVIDENCE = 240, 3.0
 """Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
 POOL = 480
 """Number of residuals up to which those from before a change are kept."""
+EXPORTED = "CASADI_SYMBOL_EXPORT"
+"""What CasADi's C says of a function that a library shows."""
 
 
 class Features:
@@ -82,17 +84,32 @@ class Features:
         given, names = [x, u, c], ["x", "u", "c"]
         y, G, h = (ca.densify(part) for part in (y, G, h))
         self.mean = ca.Function("nominal", given, [y, h], names, ["y", "h"])
-        self._function = ca.Function("features", given, [y, G, h], names, ["y", "G", "h"])
+        self._function = ca.Function("features", given, [y, G.T, h], names, ["y", "G", "h"])
         self.outputs, self.count = G.shape
         self.inputs = problem.n_states + problem.n_actions
+        n, K, p = problem.n_states, self.outputs, self.count
+        sizes = {"N_X": n, "N_IN": self.inputs, "K": K, "P": p}
+        path = library(
+            {
+                "sizes.h": _definitions(sizes),
+                "nominal.h": f"#define {EXPORTED} static\n" + c_source([self._function]),
+                "features.c": (files("learning") / "features.c").read_bytes(),
+            }
+        )
+        self.compiled = None if path is None else ctypes.CDLL(str(path)).features_at
 
     def __call__(self, inputs: Array, c: Array) -> tuple[Array, Array, Array]:
         """y (M, K), its derivative by c, G (M, K, p), and h (M, K) at inputs (s, a), (M, n+m)."""
-        n = self.outputs - 1
+        M, n, K = len(inputs), self.outputs - 1, self.outputs
+        if self.compiled is not None:
+            y, G, h = np.empty((M, K)), np.empty((M, K, self.count)), np.empty((M, K))
+            rows = np.ascontiguousarray(inputs)
+            where = [each.ctypes.data_as(ctypes.c_void_p) for each in (rows, c, y, G, h)]
+            self.compiled(*where[:2], ctypes.c_longlong(M), *where[2:])
+            return y, G, h
         results = self._function(inputs[:, :n].T, inputs[:, n:].T, c)
         y, G, h = (part.full() for part in results)
-        stacked = G.T.reshape(len(inputs), self.count, self.outputs)
-        return y.T, stacked.transpose(0, 2, 1), h.T
+        return y.T, G.T.reshape(M, K, self.count), h.T
 
 
 @dataclass(frozen=True)
@@ -305,9 +322,9 @@ class Rollout:
         }
         sources: dict[str, str | bytes] = {
             **core(problem, parameters).sources,
-            "sizes.h": "".join(f"#define {name} {value}\n" for name, value in sizes.items()),
+            "sizes.h": _definitions(sizes),
             # Where a function says that it is exported, Windows exports no other.
-            "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
+            "nominal.c": f"#define {EXPORTED}\n" + c_source([function]),
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
         path = library(sources)
@@ -359,6 +376,10 @@ class Rollout:
                 h[step] = size.full()[:, 0]
                 s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
         return inputs, predicted, h
+
+
+def _definitions(sizes: Mapping[str, int]) -> str:
+    return "".join(f"#define {name} {value}\n" for name, value in sizes.items())
 
 
 def _design(G: Array, standardised: Array) -> Array:

@@ -19,20 +19,11 @@ static Qp rti_qp(const RtiPrepared *prepared, const RtiSolved *solved) {
 enum { CONDENSED_WIDTH = QP_N + N_X + 1 };
 typedef double CondensedRows[N_X][CONDENSED_WIDTH];
 
-/* out = Σ_l a_l rows_l with entries of a `stride` apart. */
-static void condensed_product(const double a[], int stride, CondensedRows rows, double out[]) {
-    for (int j = 0; j < CONDENSED_WIDTH; j++) out[j] = a[0] * rows[0][j];
-    for (int l = 1; l < N_X; l++)
-        for (int j = 0; j < CONDENSED_WIDTH; j++) out[j] += a[l * stride] * rows[l][j];
-}
-
-/* out = Σ_l a_l x_l + Σ_l b_l y_l, of which each sum is made before they are added. */
-static void condensed_sum(const double a[], CondensedRows x, const double b[], int stride,
-                          CondensedRows y, double out[]) {
-    double second[CONDENSED_WIDTH];
-    condensed_product(a, N_W, x, out);
-    condensed_product(b, stride, y, second);
-    for (int j = 0; j < CONDENSED_WIDTH; j++) out[j] += second[j];
+/* Σ_l a_l x_l, column j, with entries of a `stride` apart. */
+static inline double condensed_product(const double a[], int stride, CondensedRows x, int j) {
+    double sum = a[0] * x[0][j];
+    for (int l = 1; l < N_X; l++) sum += a[l * stride] * x[l][j];
+    return sum;
 }
 
 /* Condense: with V = (v_0, …, v_{N−1}) the states are Ξ = Γ V + Φ ξ_0 + g. A sweep forward makes the
@@ -49,7 +40,8 @@ static QP_APART int rti_assemble(RtiPrepared *prepared) {
         for (int i = 0; i < N_X; i++) {
             const int r = k * N_X + i;
             double *const row = response[k + 1][i];
-            condensed_product(stack + PREPARED_A + r * N_X, 1, response[k], row);
+            for (int j = 0; j < CONDENSED_WIDTH; j++)
+                row[j] = condensed_product(stack + PREPARED_A + r * N_X, 1, response[k], j);
             memcpy(row + k * N_U, stack + PREPARED_B + r * N_U, N_U * sizeof *row);
             row[OFFSET] += stack[PREPARED_r + r];
             memcpy(stack + PREPARED_Gamma + r * QP_N, row, QP_N * sizeof *row);
@@ -57,8 +49,10 @@ static QP_APART int rti_assemble(RtiPrepared *prepared) {
             stack[PREPARED_g + r] = row[OFFSET];
         }
     for (int i = 0; i < N_X; i++) {
-        condensed_product(prepared->L_N + i, N_X, response[HORIZON], costates[HORIZON % 2][i]);
-        costates[HORIZON % 2][i][OFFSET] += prepared->q_N[i];
+        double *const row = costates[HORIZON % 2][i];
+        for (int j = 0; j < CONDENSED_WIDTH; j++)
+            row[j] = condensed_product(prepared->L_N + i, N_X, response[HORIZON], j);
+        row[OFFSET] += prepared->q_N[i];
     }
     for (int k = HORIZON - 1; k >= 0; k--) {
         const double *const L = prepared->L + k * N_W * N_W, *const q = prepared->q + k * N_W;
@@ -68,15 +62,20 @@ static QP_APART int rti_assemble(RtiPrepared *prepared) {
         for (int a = 0; a < N_U; a++) {
             const int r = k * N_U + a;
             double row[CONDENSED_WIDTH];
-            condensed_sum(L + N_X + a, response[k], B + a, N_U, next, row);
+            for (int j = 0; j < CONDENSED_WIDTH; j++)
+                row[j] = condensed_product(L + N_X + a, N_W, response[k], j) +
+                         condensed_product(B + a, N_U, next, j);
             for (int b = 0; b < N_U; b++) row[k * N_U + b] += L[(N_X + b) * N_W + N_X + a];
             for (int j = 0; j <= r; j++) H[r * QP_N + j] = H[j * QP_N + r] = row[j];
             memcpy(stack + PREPARED_F + r * N_X, row + QP_N, N_X * sizeof *row);
             stack[PREPARED_f + r] = row[OFFSET] + q[N_X + a];
         }
         for (int i = 0; i < N_X; i++) {
-            condensed_sum(L + i, response[k], A + i, N_X, next, costates[k % 2][i]);
-            costates[k % 2][i][OFFSET] += q[i];
+            double *const row = costates[k % 2][i];
+            for (int j = 0; j < CONDENSED_WIDTH; j++)
+                row[j] = condensed_product(L + i, N_W, response[k], j) +
+                         condensed_product(A + i, N_X, next, j);
+            row[OFFSET] += q[i];
         }
     }
     return all_finite(stack, PREPARED_SIZE) ? QP_SOLVED : QP_NOT_FINITE;

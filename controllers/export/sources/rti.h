@@ -62,9 +62,9 @@ static int well_posed(const double theta[]) {
 
 #include QP_RULE
 
-/* A_k, B_k and r_k of all stages. Where the loop takes CasADi's code in, the compiler makes several
- * stages at a time of it. */
-static void rti_linearise(RtiPrepared *prepared) {
+/* A_k, B_k and r_k of all stages. Apart, so that CasADi's code has one caller: the loop takes it in,
+ * and the compiler makes several stages at a time of it. */
+static QP_APART void rti_linearise(RtiPrepared *prepared) {
     double *const A = prepared->stack + PREPARED_A, *const B = prepared->stack + PREPARED_B;
     for (int k = 0; k < HORIZON; k++) {
         const double *arguments[] = {prepared->x[k], prepared->u[k], prepared->theta};

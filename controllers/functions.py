@@ -143,23 +143,24 @@ def library(sources: Mapping[str, str | bytes]) -> Path | None:
 
     Every `*.c` is given to the compiler, the others are included. It is the same file for the same
     content, compiler and flags, it appears whole, and of several processes one makes it. Without a
-    compiler it is taken from `BUILDS`. None where it is not there either, where the compiler fails,
-    and where COSIM_COMPILE says `never`; ControllerError on a word that it does not know.
+    compiler, or where it fails, it is taken from `BUILDS`. None where it is not there either, and
+    where COSIM_COMPILE says `never`; ControllerError on a word that it does not know.
     """
     if switch() == "never":
         return None
     files = {name: s.encode() if isinstance(s, str) else s for name, s in sources.items()}
     compiler = find_compiler()
     system = [sys.platform, platform.machine().lower()]
+    stored = build_name(files, system)
     if compiler is not None:
         status = Path(compiler).resolve().stat()
         system += [compiler, str(status.st_size), str(status.st_mtime_ns), *FLAGS]
     try:
         path = cache_folder("compiled") / f"{build_name(files, system)}.lib"
         if not path.is_file():
-            _make(path, files, compiler)
+            _make(path, files, compiler, stored)
         os.utime(path)
-    except (OSError, KeyError, tarfile.TarError, subprocess.SubprocessError):
+    except (OSError, KeyError, tarfile.TarError):
         return None
     return path
 
@@ -172,30 +173,30 @@ def build_name(files: Mapping[str, bytes], system: Sequence[str]) -> str:
     return content.hexdigest()[:32]
 
 
-def _make(path: Path, files: Mapping[str, bytes], compiler: str | None) -> None:
+def _make(path: Path, files: Mapping[str, bytes], compiler: str | None, stored: str) -> None:
     with lock(path.with_suffix(".lock"), PATIENCE):
         if path.is_file():
             return
         with temporary_folder(".partial-", path.parent) as folder:
             made = folder / "library"
-            if compiler is None:
+            if compiler is None or not _compiled(compiler, files, folder):
                 with tarfile.open(BUILDS) as builds:
-                    build = builds.extractfile(path.stem)
+                    build = builds.extractfile(stored)
                     assert build is not None, "only files are in it"
                     made.write_bytes(build.read())
-            else:
-                _compile(compiler, files, folder)
             made.replace(path)
 
 
-def _compile(compiler: str, files: Mapping[str, bytes], folder: Path) -> None:
+def _compiled(compiler: str, files: Mapping[str, bytes], folder: Path) -> bool:
     for name, content in files.items():
         (folder / name).write_bytes(content)
     units = sorted(name for name in files if name.endswith(".c"))
     command = [compiler, *FLAGS, "-o", "library", *units, "-lm"]
-    with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
-        if child.wait(PATIENCE):
-            raise OSError("the compiler failed")
+    try:
+        with child_process(command, folder=folder, log=subprocess.DEVNULL) as child:
+            return child.wait(PATIENCE) == 0 and (folder / "library").is_file()
+    except (OSError, subprocess.SubprocessError):
+        return False
 
 
 def switch() -> str:

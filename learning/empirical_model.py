@@ -87,11 +87,10 @@ class Features:
         self._function = ca.Function("features", given, [y, G.T, h], names, ["y", "G", "h"])
         self.outputs, self.count = G.shape
         self.inputs = problem.n_states + problem.n_actions
-        n, K, p = problem.n_states, self.outputs, self.count
-        sizes = {"N_X": n, "N_IN": self.inputs, "K": K, "P": p}
+        n, shape = problem.n_states, {"K": self.outputs, "P": self.count}
         path = library(
             {
-                "sizes.h": _definitions(sizes),
+                "sizes.h": _definitions({"N_X": n, "N_IN": self.inputs, **shape}),
                 "nominal.h": f"#define {EXPORTED} static\n" + c_source([self._function]),
                 "features.c": (files("learning") / "features.c").read_bytes(),
             }

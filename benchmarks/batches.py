@@ -15,7 +15,8 @@ def measure(scenario, steps):
     rng = np.random.default_rng(0)
     reference = controller.problem.reference_state
     states = reference + 0.02 * np.abs(reference) * rng.normal(size=(steps, reference.size))
-    thetas = controller.theta * (1 + 1e-6 * rng.normal(size=(steps, controller.theta.size)))
+    # So little apart that each row is prepared and all have the active sets of one θ.
+    thetas = controller.theta * (1 + 1e-12 * rng.normal(size=(steps, controller.theta.size)))
 
     def alone(derivatives):
         for s, theta in zip(states, thetas, strict=True):

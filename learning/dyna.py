@@ -111,9 +111,9 @@ class ModelPlant(PlantInOperation):
         def step(a: Array) -> Step:
             nonlocal present
             inputs, penalty = np.concatenate([present, a]), scenario.state_penalty(present.tolist())
-            y, h = (part.full()[:, 0] for part in model.features.mean(present, a, c))
+            y, _, h = model.features(inputs[None], c)
             residual = model.residuals[rng.integers(len(model.residuals))]
-            outcome = y + W @ np.append(1.0, inputs) + h * residual
+            outcome = y[0] + W @ np.append(1.0, inputs) + h[0] * residual
             present = outcome[:-1]
             return Step(present, float(outcome[-1]), penalty, np.zeros(0))
 

@@ -35,7 +35,8 @@ class OneStepModel:
         self._transition = ca.Function("A", [x, u], [ca.jacobian(next_state, x)])
         self._problem, self._model = problem, model
         free = ca.SX.sym("p", len(model.parameters))
-        self._parametric = ca.Function("f", [x, u, free], [step(x, u, d, free)])
+        given = {"x": x, "u": u, "p": free}
+        self._parametric = StackedFunction("f", given, {"y": step(x, u, d, free)})
 
     def __call__(self, s: Vector, a: Vector) -> Vector:
         """Prediction for state s (n,) and action a (m,)."""
@@ -59,8 +60,13 @@ class OneStepModel:
 
     def predict(self, states: Matrix, actions: Matrix, parameters: Vector) -> Matrix:
         """f(s, a), (K, n), without offset, for K states and actions and one (n_p,) for all."""
-        inputs = (np.atleast_2d(states).T, np.atleast_2d(actions).T, parameters)
-        return np.asarray(self._parametric(*inputs).full().T)
+        function, found = self._parametric, np.empty(np.atleast_2d(states).shape)
+        function.inputs["p"][:] = parameters
+        for row, s, a in zip(found, np.atleast_2d(states), np.atleast_2d(actions), strict=True):
+            function.inputs["x"][:], function.inputs["u"][:] = s, a
+            function()
+            row[:] = function.stack
+        return found
 
     def errors(
         self, states: Matrix, actions: Matrix, next_states: Matrix, theta: Parameters

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 from unittest.mock import patch
 
 from benchmarks.measuring import clock, figure
+from controllers import compile_functions
 from cosim import FmuPlant
 from learning.algorithm import load_algorithm
 from learning.training import begin, prepare
@@ -28,6 +29,7 @@ def measure(scenario, steps):
                 plant = stack.enter_context(FmuPlant(scenario))
                 with patch.dict(os.environ, COSIM_COMPILE=mode):
                     loops[mode] = begin(run, load_algorithm(name), plant)
+                    compile_functions(loops[mode].controller, run.samples)
                 take(loops[mode], SETTLING)
             for _ in range(REPETITIONS):
                 for mode, loop in loops.items():

@@ -399,13 +399,14 @@ def _posterior(
     """Mean and covariance of the coefficients, with the prior deviations of greatest evidence."""
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
     rows = (whiten @ design).reshape(-1, design.shape[2])
-    gram, moment = rows.T @ rows, rows.T @ (target @ whiten.T).reshape(-1)
+    # Some outputs are nearly exact, others noisy: the normal equations would lose the latter.
+    R = np.linalg.qr(np.column_stack([rows, (target @ whiten.T).reshape(-1)]), mode="r")
     found = []
     for prior in priors:
-        precision = gram * np.outer(prior, prior) + np.eye(prior.size)
-        covariance = np.linalg.inv(precision) * np.outer(prior, prior)
-        mean = covariance @ moment
-        evidence = (moment @ mean - np.linalg.slogdet(precision).logabsdet) / 2
-        found.append((float(evidence), mean, covariance))
+        Q, root = np.linalg.qr(np.concatenate([R[:, :-1] * prior, np.eye(prior.size)]))
+        moment = Q[: len(R)].T @ R[:, -1]
+        factor = prior[:, None] * np.linalg.inv(root)
+        evidence = moment @ moment / 2 - np.log(np.abs(np.diag(root))).sum()
+        found.append((float(evidence), factor @ moment, factor @ factor.T))
     _, mean, covariance = max(found, key=lambda item: item[0])
     return mean, covariance

@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from controllers import Problem
 from controllers.factories import tuned
+from cosim import Scenario
 from learning import model_based
 from learning.empirical_model import EmpiricalModel, Features, PlantData, Rollout
 from learning.model_based import BackOffs, ExpectedCosts, ModelBased
@@ -57,6 +59,16 @@ def test_what_the_nominal_model_knows_exactly_says_nothing_of_its_parameters(fea
     outputs[:, -1] = exact * (1 + 1e-9 * rng.normal(size=400))
     model = EmpiricalModel.fit(features, inputs, outputs)
     assert np.abs(model.coefficients[0]).max() < 0.1
+
+
+def test_exact_outputs_do_not_drown_what_noisy_ones_say(rng):
+    problem = Problem.from_scenario(Scenario.load("tanks"))
+    features = Features(problem)
+    reference = np.concatenate([problem.reference_state, problem.reference_action])
+    inputs = reference * rng.uniform(0.9, 1.1, (480, 6))
+    y, _, _ = features(inputs, rng.normal(scale=0.05, size=features.count))
+    model = EmpiricalModel.fit(features, inputs, y + rng.normal(size=y.shape) * [0.3, 0.3, 0, 0, 0])
+    assert np.abs((model.predict(inputs)[0] - y).mean(axis=0)).max() < 0.05
 
 
 def test_the_deviation_of_the_mean_cost_is_what_the_fits_scatter(features, rng):

@@ -66,9 +66,7 @@ def test_the_least_cost_of_a_known_loop_is_found(problem, scenario, start):
     assert sum(segment.steps for segment in search._plan) <= 8000
 
 
-def test_a_bound_that_binds_only_once_another_is_backed_off_is_searched_too(
-    problem, scenario, start
-):
+def test_a_bound_that_binds_once_another_is_backed_off_is_searched(problem, scenario, start):
     loop = Loop(problem, scenario, both=True)
     search = loop.run(search_of(problem, scenario, start, 10000))
     assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.02)

@@ -88,9 +88,7 @@ class Failing(RtiNmpc):
         return super().feedback(s, a)
 
 
-def test_a_failure_repeats_the_action_is_counted_and_learned_from_no_more(
-    plant, problem, parameters
-):
+def test_a_failure_repeats_the_action_and_teaches_nothing(plant, problem, parameters):
     loop, _ = interaction(plant, problem, Failing(problem, parameters), exploration_probability=0.0)
     got = [loop.next()[0] for _ in range(10)]
     assert [sample is None for sample in got] == [False] * 3 + [True] * 2 + [False] * 5

@@ -95,9 +95,7 @@ def test_an_error_that_no_parameter_makes_is_fitted_too(features, rng):
 
 @pytest.mark.slow  # compiles the controller
 @needs_compiler
-def test_the_compiled_rollout_is_the_interpreted_one(
-    problem, base, features, fitted, rng, monkeypatch
-):
+def test_both_rollouts_are_one(problem, base, features, fitted, rng, monkeypatch):
     monkeypatch.setenv("COSIM_COMPILE", "now")
     rollout = Rollout(problem, base, features)
     assert rollout.compiled is not None

@@ -99,9 +99,7 @@ def test_the_judge_sets_theta_and_evaluates_greedily(scenario, problem, paramete
     assert [found[name] for name in FIGURES] == [own[name][0] for name in FIGURES]
 
 
-def test_the_naive_controller_is_the_judges_zero_and_the_optimum_its_one(
-    scenario, problem, parameters
-):
+def test_the_naive_controller_is_the_judges_zero_the_optimum_its_one(scenario, problem, parameters):
     other = RtiNmpc(problem, parameters.replace({"x_l": np.array([26.0, 40.0])}))
     with FmuPlant(scenario) as plant:
         judged = judge(plant, parameters, optimum=other)

@@ -61,9 +61,7 @@ def test_the_program_gives_the_actions_of_the_python_controller(example):
     assert set(found[:, 2]) == {0}
 
 
-def test_a_failed_sensor_holds_the_last_action_and_the_iteration_cap_is_a_failure(
-    exported, example
-):
+def test_a_failed_sensor_holds_the_action_and_the_iteration_cap_is_a_failure(exported, example):
     first, failed, after = rows(example, [(25, 50), (np.nan, 50), (25, 50)])
     assert (failed[2], after[2]) == (3, 0)
     np.testing.assert_array_equal(failed[:2], first[:2])

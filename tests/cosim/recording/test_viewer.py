@@ -71,9 +71,7 @@ def viewers():
 
 
 @slow
-def test_without_a_graphics_driver_the_message_says_what_to_install(
-    recording, tmp_path, monkeypatch
-):
+def test_without_a_graphics_driver_there_is_no_picture(recording, tmp_path, monkeypatch):
     for variable in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
         monkeypatch.setenv(variable, "/nonexistent")
     with pytest.raises(RecordingError, match="mesa-vulkan-drivers"):

@@ -400,7 +400,8 @@ def _posterior(
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
     rows = (whiten @ design).reshape(-1, design.shape[2])
     # Some outputs are nearly exact, others noisy: the normal equations would lose the latter.
-    R = np.linalg.qr(np.column_stack([rows, (target @ whiten.T).reshape(-1)]), mode="r")
+    rows = np.column_stack([rows, (target @ whiten.T).reshape(-1)])
+    R: Array = np.asarray(np.linalg.qr(rows, mode="r"))
     found = []
     for prior in priors:
         Q, root = np.linalg.qr(np.concatenate([R[:, :-1] * prior, np.eye(prior.size)]))

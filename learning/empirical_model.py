@@ -55,8 +55,6 @@ FORETOLD, EVIDENCE = 240, 3.0
 """Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
 POOL = 480
 """Number of residuals up to which those from before a change are kept."""
-EXPORTED = "CASADI_SYMBOL_EXPORT"
-"""What CasADi's C says of a function that a library shows."""
 
 
 class Features:
@@ -91,7 +89,7 @@ class Features:
         path = library(
             {
                 "sizes.h": _definitions({"N_X": n, "N_IN": self.inputs, **shape}),
-                "nominal.h": f"#define {EXPORTED} static\n" + c_source([self._function]),
+                "nominal.h": "#define CASADI_SYMBOL_EXPORT static\n" + c_source([self._function]),
                 "features.c": (files("learning") / "features.c").read_bytes(),
             }
         )
@@ -103,8 +101,7 @@ class Features:
         if self.compiled is not None:
             y, G, h = np.empty((M, K)), np.empty((M, K, self.count)), np.empty((M, K))
             rows = np.ascontiguousarray(inputs)
-            where = [each.ctypes.data_as(ctypes.c_void_p) for each in (rows, c, y, G, h)]
-            self.compiled(*where[:2], ctypes.c_longlong(M), *where[2:])
+            self.compiled(*_pointers(rows, c), ctypes.c_longlong(M), *_pointers(y, G, h))
             return y, G, h
         results = self._function(inputs[:, :n].T, inputs[:, n:].T, c)
         y, G, h = (part.full() for part in results)
@@ -323,7 +320,7 @@ class Rollout:
             **core(problem, parameters).sources,
             "sizes.h": _definitions(sizes),
             # Where a function says that it is exported, Windows exports no other.
-            "nominal.c": f"#define {EXPORTED}\n" + c_source([function]),
+            "nominal.c": "#define CASADI_SYMBOL_EXPORT\n" + c_source([function]),
             "rollout.c": (files("learning") / "rollout.c").read_bytes(),
         }
         path = library(sources)
@@ -350,9 +347,7 @@ class Rollout:
         if self.compiled is not None:
             given = (theta, start, *model.coefficients, model.residuals, picks)
             arrays = [np.ascontiguousarray(array) for array in given]
-            where = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
-            results = [array.ctypes.data_as(ctypes.c_void_p) for array in (inputs, predicted, h)]
-            steps = self.compiled(*where, steps, *results)
+            steps = self.compiled(*_pointers(*arrays), steps, *_pointers(inputs, predicted, h))
             return inputs[:steps], predicted[:steps], h[:steps]
         problem, controller, s = self._problem, self._controller, start
         (c, W), a = model.coefficients, problem.reference_action
@@ -375,6 +370,10 @@ class Rollout:
                 h[step] = size.full()[:, 0]
                 s = (predicted[step] + h[step] * model.residuals[pick])[:-1]
         return inputs, predicted, h
+
+
+def _pointers(*arrays: NDArray[Any]) -> list[ctypes.c_void_p]:
+    return [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
 
 
 def _definitions(sizes: Mapping[str, int]) -> str:

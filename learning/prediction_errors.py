@@ -60,9 +60,10 @@ class OneStepModel:
 
     def predict(self, states: Matrix, actions: Matrix, parameters: Vector) -> Matrix:
         """f(s, a), (K, n), without offset, for K states and actions and one (n_p,) for all."""
-        function, found = self._parametric, np.empty(np.atleast_2d(states).shape)
+        states, actions = np.atleast_2d(states), np.atleast_2d(actions)
+        function, found = self._parametric, np.empty(states.shape)
         function.inputs["p"][:] = parameters
-        for row, s, a in zip(found, np.atleast_2d(states), np.atleast_2d(actions), strict=True):
+        for row, s, a in zip(found, states, actions, strict=True):
             function.inputs["x"][:], function.inputs["u"][:] = s, a
             function()
             row[:] = function.stack
@@ -137,6 +138,7 @@ class PredictionErrors:
 
     def __init__(self, scenario: Scenario, capacity: int) -> None:
         self._penalty = scenario.state_penalty
+        # A row a state: NumPy is three times as fast along the errors as along a few states.
         self._errors = np.zeros((scenario.state_lower.size, capacity))
         self._count = 0
 
@@ -152,13 +154,6 @@ class PredictionErrors:
 
     def expected_penalty(self, prediction: Vector) -> float:
         """mean_i p(f + e_i) for a prediction f (n,); NaN before the first error."""
-        if not self._count:
-            return float("nan")
-        penalty, due = self._penalty, 0.0
-        # State by state, of which each is one stretch of memory: many times faster.
-        for i, errors in enumerate(self._errors[:, : self._count]):
-            states = prediction[i] + errors
-            outside = np.maximum(penalty.lower[i] - states, states - penalty.upper[i])
-            violation = np.maximum(outside, 0.0)
-            due = due + violation * (penalty.linear[i] + penalty.quadratic[i] * violation)
-        return float(np.mean(due))
+        values = self.values
+        due = known_penalty(self._penalty, prediction + values)
+        return float(due.mean()) if len(values) else float("nan")

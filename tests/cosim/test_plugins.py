@@ -76,9 +76,7 @@ def test_an_edit_of_the_module_or_of_what_it_imports_is_said_by_name(plugin, tmp
 
 
 @pytest.mark.parametrize("form", ["{0}_kit.later", "{0}_kit"])
-def test_an_edit_of_what_a_function_imports_only_when_it_is_called_is_seen(
-    plugin, tmp_path, monkeypatch, form
-):
+def test_an_edit_of_a_late_import_is_seen(plugin, tmp_path, monkeypatch, form):
     name, _ = plugin
     monkeypatch.syspath_prepend(str(tmp_path))
     path = tmp_path / f"{name}.py"

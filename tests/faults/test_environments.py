@@ -37,10 +37,13 @@ def results(folder, command, values=None, options=(), umask=None):
     environment = os.environ | {"COSIM_CACHE": str(folder.parent / "cache")} | (values or {})
     done = subprocess.run(
         [sys.executable, *options, "-m", "cosim", *words, "--out", str(folder / "a b θ")],
-        cwd=folder, env={name: value for name, value in environment.items() if value is not GONE},
-        stdin=subprocess.DEVNULL, capture_output=True, check=False,
+        cwd=folder,
+        env={name: value for name, value in environment.items() if value is not GONE},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        check=False,
         umask=-1 if umask is None else umask,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr.decode(errors="replace")
     return [(folder / "a b θ" / name).read_bytes() for name in files]
 

@@ -373,7 +373,7 @@ class Rollout:
 
 
 def _pointers(*arrays: NDArray[Any]) -> list[ctypes.c_void_p]:
-    return [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
+    return [ctypes.c_void_p(array.ctypes.data) for array in arrays]
 
 
 def _definitions(sizes: Mapping[str, int]) -> str:

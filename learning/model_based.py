@@ -266,6 +266,7 @@ class BackOffs:
         """Take new noise for rollouts of so many samples."""
         residuals = len(self._model.residuals)
         self._picks = self._rng.integers(residuals, size=steps, dtype=np.int32)
+        self._known: dict[bytes, Promise] = {}  # on this noise, by θ
 
     def theta(self, delta: Array) -> Array:
         """θ with its bounds backed off by δ."""
@@ -275,8 +276,12 @@ class BackOffs:
 
     def promises(self, thetas: Sequence[Array]) -> list[Promise]:
         """What the model promises of each θ; infinite cost where the rollout is lost."""
-        rollouts = self._rollout(thetas, self._start, self._model, self._picks)
-        return [self._promise(*parts) for parts in rollouts]
+        new = {key: theta for theta in thetas if (key := theta.tobytes()) not in self._known}
+        rollouts = self._rollout(list(new.values()), self._start, self._model, self._picks)
+        self._known |= {
+            key: self._promise(*parts) for key, parts in zip(new, rollouts, strict=True)
+        }
+        return [self._known[theta.tobytes()] for theta in thetas]
 
     def _promise(self, *parts: Array) -> Promise:
         model = self._model
@@ -351,12 +356,11 @@ class BackOffs:
         return sorted({float(min(round(v / step) * step, self._most[i])) for v in values})
 
     def _least(self, points: Sequence[Array]) -> Array:
-        distinct = list({tuple(point): point for point in points}.values())
-        promises = self.promises([self.theta(point) for point in distinct])
+        promises = self.promises([self.theta(point) for point in points])
         least = min(promises, key=lambda promise: promise.cost)
         told = [self.excess(promise, least) <= DOUBT for promise in promises]
-        close = [point for point, like in zip(distinct, told, strict=True) if like]
-        return min(close or distinct[:1], key=lambda point: float((point / self._unit).sum()))
+        close = [point for point, like in zip(points, told, strict=True) if like]
+        return min(close or points[:1], key=lambda point: float((point / self._unit).sum()))
 
 
 def _moving_mean(costs: Array, window: int) -> Array:

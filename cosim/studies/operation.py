@@ -12,15 +12,16 @@ import pandas as pd
 from scipy.stats import ttest_1samp
 
 from controllers import compile_functions
+from controllers.factories import nmpc
 from controllers.optimum import Fouling, QuasiStaticPolicy, change_of
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
 from cosim.result import TextTable
 from cosim.scenario import VIOLATING, Scenario
+from cosim.simulation import simulate
 from cosim.statistics import paired_difference, shown
 from learning.algorithm import load_algorithm
-from learning.baselines import Held
 from learning.errors import DivergenceError
 from learning.training import LogRow, TrainingRun, begin
 
@@ -77,9 +78,10 @@ def live(run: TrainingRun, marks: Sequence[int]) -> tuple[list[LogRow], str, dic
     clock: dict[int, float] = {}
     status, first, updates = "finished", 0, 0
     with FmuPlant(run.scenario) as plant:
-        held = begin(run, Held, plant)
-        compile_functions(held.controller, run.samples)
-        before = np.array([held.advance()[0] for _ in range(run.samples)])
+        held = nmpc(run.scenario, run.starting_parameters(), run.controller)
+        compile_functions(held, run.samples)
+        signals = simulate(plant, held, run.samples, run.seed, residuals=False).signals
+        before = signals["stage_cost"].values + signals["penalty"].values
         loop, start = begin(run, load_algorithm(run.algorithm), plant), process_time()
         compile_functions(loop.controller, run.samples)
         theta, penalty = loop.controller.theta.copy(), run.scenario.state_penalty

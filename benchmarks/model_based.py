@@ -39,7 +39,7 @@ PARTS = {
     "offset": (
         empirical_model.EmpiricalModel,
         "lack",
-        lambda model, inputs: inputs[0, : model.features.outputs - 1] * 0.0,
+        lambda model, inputs, c: inputs[0, : model.features.outputs - 1] * 0.0,
     ),
     "nothing": (model_based, "CAUTION", model_based.CAUTION),
 }
@@ -65,11 +65,13 @@ def main() -> None:
     parser.add_argument("seed", type=int)
     parser.add_argument("--samples", type=int, default=960)
     parser.add_argument("--without", choices=PARTS, default="nothing")
+    parser.add_argument("--parameters", nargs="*", default=[], help="of the model, in θ")
     chosen = parser.parse_args()
     setattr(*PARTS[chosen.without])
     scenario = Scenario.load(chosen.scenario)
     options = {"seed": chosen.seed, "start": chosen.start}
-    run = prepare("model-based", scenario, chosen.samples, None, options)
+    settings = {"model_parameters": chosen.parameters}
+    run = prepare("model-based", scenario, chosen.samples, settings, options)
     best: dict[str, float] = {}
     costs: list[float] = []
     with FmuPlant(scenario) as plant:

@@ -169,9 +169,9 @@ class EmpiricalModel:
         design = _design(G, (inputs - self.centre) / self.unit) / h[:, :, None]
         return y + h * (design[:, :, p:] @ self.mean[p:]), h, design
 
-    def lack(self, inputs: Array) -> Array:
-        """What the nominal model's predictions of s₊ lack on average at inputs (M, n+m), (n,)."""
-        y, _, _ = self.features(inputs, np.zeros(self.features.count))
+    def lack(self, inputs: Array, c: Array) -> Array:
+        """What predictions of s₊ by y(s, a; c) lack on average at inputs (M, n+m), (n,)."""
+        y, _, _ = self.features(inputs, c)
         mean: Array = (self.predict(inputs)[0] - y)[:, :-1].mean(axis=0)
         return mean
 

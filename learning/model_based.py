@@ -1,11 +1,11 @@
 """`model-based`: θ searched on a model of the plant that its own operation has taught.
 
 The cost is tuned on the nominal model, and c_f is what this lacks on average on the plant, as in
-offset-free control. What is searched are the back-offs of the state bounds. A θ costs what the
-empirical model promises: the mean stage cost of one long rollout and the expectation of the penalty
-over all errors of prediction. Of back-offs between which the model cannot tell the smallest is
-taken, but where a bound does not bind, which costs nothing: there it is a spare one, against a
-plant that changes.
+offset-free control. Model parameters that θ has (`model_parameters`) are the fitted ones. What is
+searched are the back-offs of the state bounds. A θ costs what the empirical model promises: the
+mean stage cost of one long rollout and the expectation of the penalty over all errors of
+prediction. Of back-offs between which the model cannot tell the smallest is taken, but where a
+bound does not bind, which costs nothing: there it is a spare one, against a plant that changes.
 """
 
 from __future__ import annotations
@@ -105,6 +105,8 @@ class ModelBased(Algorithm):
         self._problem = problem = Problem.from_scenario(self.scenario)
         self._base = base = _tuned(problem, start)
         self._features = Features(problem)
+        labels = start.blocks.block("p").labels if "p" in start.blocks else ()
+        self._carried = problem.model.parameter_indices(labels)
         self._rollout = Rollout(problem, start, self._features)
         self._data = PlantData(self._features, settings.memory)
         backed = np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]])
@@ -161,6 +163,26 @@ class ModelBased(Algorithm):
         least: Array = np.clip(SHRINKS * rooms.min(axis=0), 0.0, present)
         return least
 
+    def _corrected(
+        self, present: Parameters, model: EmpiricalModel, inputs: Array
+    ) -> tuple[Parameters, Array]:
+        """θ before its back-offs, and what the controller's predictions of s₊ gain by it, (n,).
+
+        Its model parameters are the fitted ones, c_f is what is lacking with them on average at
+        inputs (M, n+m) of the present plant. Of few samples the present ones stay.
+        """
+        kept = {name: present[name] for name in ("p", "c_f") if name in present.blocks}
+        if len(inputs) < CAUTION:
+            return self._base.replace(kept), np.zeros_like(present["c_f"])
+        before, after = np.zeros(self._features.count), np.zeros(self._features.count)
+        if "p" in kept:
+            nominal = self._problem.model.nominal_parameters[self._carried]
+            before[self._carried] = kept["p"] / nominal - 1
+            after[self._carried] = model.mean[self._carried]
+            kept["p"] = nominal * (1 + after[self._carried])
+        kept["c_f"] = model.lack(inputs, after)
+        return self._base.replace(kept), model.lack(inputs, before) - present["c_f"]
+
     def _update(self) -> Update:
         data = self._data
         model = data.fit()
@@ -170,9 +192,7 @@ class ModelBased(Algorithm):
         latest, _ = data.latest(RECENT)
         spare, rng = self.configuration.spare, self.rng
         present = self.controller.parameters
-        offset = model.lack(inputs[-RECENT:]) if len(inputs) >= CAUTION else present["c_f"]
-        base = self._base.replace({"c_f": offset})
-        more = offset - present["c_f"]
+        base, more = self._corrected(present, model, inputs[-RECENT:])
         kept = np.maximum(self.back_off + np.concatenate([more, -more]), 0.0)
         search = BackOffs(self._problem, self._rollout, base, model, latest, spare, rng)
         found = search.best(kept, self._least(kept, inputs))

@@ -89,7 +89,8 @@ def test_an_error_that_no_parameter_makes_is_fitted_too(features, rng):
     model = EmpiricalModel.fit(features, inputs[:4000], outputs[:4000])
     predicted, h, _ = model.predict(inputs[4000:])
     beyond = (outputs - features(inputs, np.zeros(features.count))[0])[:4000, :-1].mean(axis=0)
-    assert model.lack(inputs[:4000]) == pytest.approx(beyond, rel=0.05, abs=0.01)
+    lack = model.lack(inputs[:4000], np.zeros(features.count))
+    assert lack == pytest.approx(beyond, rel=0.05, abs=0.01)
     assert np.allclose(((outputs[4000:] - predicted) / h).std(axis=0), 0.1 / np.sqrt(3), rtol=0.05)
 
 
@@ -157,6 +158,28 @@ def rule(scenario, base, rng):
     controller = SimpleNamespace(parameters=base, theta=base.theta)
     configuration = make_run("model-based", scenario).configuration
     return ModelBased(controller, scenario, configuration, 1000, None, rng)
+
+
+def test_model_parameters_of_theta_are_the_fitted_ones(scenario, features, rng):
+    run = make_run("model-based", scenario, {"model_parameters": ["M", "UA2"]}, start="tuned")
+    start = run.starting_parameters()
+    controller = SimpleNamespace(parameters=start, theta=start.theta)
+    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
+    where = rule._carried
+    error = np.zeros(features.count)
+    error[where] = -0.3, 0.1
+    inputs, outputs = plant_data(features, rng, 2000, error)
+    model = EmpiricalModel.fit(features, inputs, outputs)
+    base, gained = rule._corrected(start, model, inputs)
+    assert base["p"] == pytest.approx([14.0, 7.524], rel=0.1)  # the prior pulls to 20
+    error[where] = base["p"] / start["p"] - 1
+    own = features(inputs, error)[0][:, :-1] + base["c_f"]
+    former = features(inputs, np.zeros(features.count))[0][:, :-1]
+    assert (model.predict(inputs)[0][:, :-1] - own).mean(axis=0) == pytest.approx(0.0, abs=1e-9)
+    assert gained == pytest.approx((own - former).mean(axis=0))
+    few, none = rule._corrected(start, model, inputs[:50])
+    assert np.array_equal(few["p"], start["p"])
+    assert not none.any()
 
 
 def test_back_offs_shrink_little_further_than_the_plant_has_been(rule):

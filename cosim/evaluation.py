@@ -31,16 +31,22 @@ from cosim.statistics import (
     regret,
     regrets,
 )
-from cosim.studies.plan import NAIVE
-from cosim.studies.run import Report, Runner
-from cosim.studies.store import EVALUATION, TIMING, check_folders, to_csv
-from cosim.studies.work import Case, Noise, Run, RunKey
+from cosim.studies.run import (
+    EVALUATION,
+    TIMING,
+    Noise,
+    Report,
+    Run,
+    RunKey,
+    Runner,
+    to_csv,
+)
 from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OPTIMAL = "optimal"
+NAIVE, OPTIMAL = "naive", "optimal"
 Factory = Callable[[Scenario], Controller]
 
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
@@ -117,10 +123,7 @@ def evaluate(
             key = RunKey(scenario.name, name)
         except StudyError as error:
             raise EvaluationError(str(error)) from None
-        case = Case(name, (scenario.name,), "")
-        runs.append(Run(key, case, scenario, item, None, depends, noise))
-    check_folders(runs)
-
+        runs.append(Run(key, scenario, item, None, depends, noise))
     total = sum(run.samples for run in runs)
     bar = reporting(progress, scenario.name, total)
     with temporary_folder("cosim-evaluation-") as own, bar as tell:
@@ -132,10 +135,7 @@ def evaluate(
             raise failure.error()
         stores = dict(zip(named, runner.stores.values(), strict=True))
         columns, timing = (
-            {
-                name: pd.DataFrame.from_dict(store.indicators(file), "index").reindex(numbers)
-                for name, store in stores.items()
-            }
+            {name: store.measured(file) for name, store in stores.items()}
             for file in (EVALUATION, TIMING)
         )
     return Evaluation(wanted, numbers, columns, timing, parameters, facts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -15,19 +15,57 @@ from cosim.errors import StudyError
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
 from cosim.scenario import Scenario, resolved
-from cosim.studies.document import DEFAULT, CaseTable, StudyTable, TrajectoryTable, read
-from cosim.studies.store import EVALUATION, GREEDY, check_folders, greedy_file, online_file
-from cosim.studies.work import Case, Noise, Run, RunKey, TrainingTask
+from cosim.studies.document import DEFAULT, CaseTable, StudyTable, read
+from cosim.studies.run import (
+    EVALUATION,
+    GREEDY,
+    LOG,
+    PARAMETERS,
+    Noise,
+    Run,
+    RunKey,
+    TrainingTask,
+    safe,
+)
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.training import HELD_OUT
 
 BASELINES, NAIVE = "baselines", "naive"
+TRAJECTORIES, LOGS = "trajectories", "logs"
+"""Folders of what a study keeps of its runs."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
 T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One point of a grid: a controller, or an algorithm with one set of settings.
+
+    `scenarios` are names; `training_seeds` is empty for a controller. `group` is the panel of the
+    figures that shows it; `against` the case that its paired difference is taken from.
+    """
+
+    name: str
+    scenarios: tuple[str, ...]
+    group: str
+    controller: str | None = None
+    algorithm: str | None = None
+    samples: int = 0
+    start: str = ""
+    nmpc: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+    training_seeds: tuple[int, ...] = ()
+    against: str | None = None
+
+    @property
+    def target(self) -> str:
+        """The algorithm or the controller."""
+        return self.algorithm or self.controller or ""
 
 
 class Study:
@@ -316,17 +354,27 @@ def plan(study: Study) -> Plan:
         if training is None and any(case.algorithm for case in cases):
             noise[GREEDY] = study.held_out(name)
         at_mark = study.held_out(name)._replace(burn_in=own.burn_in)
-        noise |= {greedy_file(mark): at_mark._replace(mark=mark) for mark in marks}
-        kept = _trajectories(study, case, name, seed)
-        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in kept}
+        noise |= {f"greedy-{mark}.csv": at_mark._replace(mark=mark) for mark in marks}
+        first = seed in (None, *case.training_seeds[:1])  # only its files are kept
+        tables = [
+            table
+            for table in study.table.trajectory
+            if first
+            and case.name in (table.cases or [case.name])
+            and name in (table.scenarios or [name])
+        ]
+        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in tables}
+        where, stem = safe(name), safe(case.name)
+        kept = {t.file: f"{TRAJECTORIES}/{t.name}/{where}/{stem}.csv" for t in tables}
+        if first and case.name in study.table.logs:
+            kept[LOG] = f"{LOGS}/{where}-{stem}.csv"
+            kept[PARAMETERS] = f"parameters/{where}-{stem}.toml"
         seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
-        if training is None and seeds:
-            noise |= {online_file(mark): Noise(seeds, mark) for mark in marks}
+        if training is None and seeds:  # the optimum, on the noise of the training seeds
+            noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
         key = RunKey(name, case.name, seed)
-        found = Run(key, case, scenario, case.controller, training, facts, noise, kept, marks)
-        runs.append(found)
+        runs.append(Run(key, scenario, case.controller, training, facts, noise, kept, marks))
     _check_names(study)
-    check_folders(runs)
     about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
 
@@ -339,19 +387,6 @@ def _order(study: Study) -> Iterator[tuple[Case, str, int | None]]:
             for case in study.all_cases:
                 if seed in (case.training_seeds or (None,)) and scenario in case.scenarios:
                     yield case, scenario, seed
-
-
-def _trajectories(
-    study: Study, case: Case, scenario: str, seed: int | None
-) -> tuple[TrajectoryTable, ...]:
-    """Trajectories that include a run; of trainings, only the first seed's."""
-    if case.training_seeds and seed != case.training_seeds[0]:
-        return ()
-    return tuple(
-        table
-        for table in study.table.trajectory
-        if case.name in (table.cases or [case.name]) and scenario in (table.scenarios or [scenario])
-    )
 
 
 def _check_names(study: Study) -> None:

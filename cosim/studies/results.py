@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -14,11 +14,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cosim.errors import StudyError
+from cosim.errors import FailedRunsError, StudyError
 from cosim.figures.style import FLOOR, Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
+from cosim.simulation import reporting
 from cosim.statistics import (
     Estimate,
     Interval,
@@ -29,27 +30,32 @@ from cosim.statistics import (
     regrets,
     two_way,
 )
-from cosim.studies import figures, operation, report, store
-from cosim.studies.plan import BASELINES, NAIVE, Plan
+from cosim.studies import figures, operation, report
+from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
 from cosim.studies.report import COLUMNS, SHORT
-from cosim.studies.store import (
-    CURVE,
+from cosim.studies.run import (
     EVALUATION,
     GREEDY,
     INDICATORS,
-    KEYS,
-    STATE,
+    LOG,
     TIMING,
-    WHERE,
+    Report,
+    Runner,
+    RunStore,
     read_table,
+    safe,
     to_csv,
 )
-from cosim.studies.work import safe
-from cosim.validation import instead
+from cosim.validation import instead, known_keywords
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
 OPERATION = "operation.csv"
+WHERE = ["scenario", "case"]
+KEYS = [*WHERE, "training_seed"]
+STATE = [*KEYS, "status", "samples", "plant_samples"]
+LIVES = [*KEYS, "samples", *operation.LIFE]
+CURVE = ["samples", "J", "greedy_J", "td_error"]
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -112,25 +118,29 @@ class StudyResults(Shown):
 
     @classmethod
     def written(
-        cls, plan: Plan, out: Path, stores: Collection[store.RunStore], *, draw: bool = True
+        cls, planned: Plan, out: Path, stores: Iterable[RunStore], *, draw: bool = True
     ) -> StudyResults:
         """Write the tables and kept files of a plan's finished runs, study.json last.
 
         `draw` draws the kept trajectories and logs, too.
         """
-        runs = _finished(plan, stores)
-        found = cls(out, document(plan), *store.frames(runs))
-        figures.keep(plan, out)
-        drawn = figures.draw(plan, out) if draw else []
+        runs = _finished(planned, stores)
+        found = cls(out, document(planned), *_frames(runs))
+        for run in planned.runs:
+            for name, target in run.kept.items():
+                if (source := out / run.key.folder / name).is_file():
+                    (out / target).parent.mkdir(parents=True, exist_ok=True)
+                    write_atomically(out / target, source.read_bytes())
+        drawn = figures.draw(planned, out) if draw else []
         tables = {
             EVALUATION: found.evaluation,
             CURVES: found.curves,
             RUNS: found.runs,
             SUMMARY: found.summary,
-            TIMING: store.timing(stores),
+            TIMING: _timing(stores),
         }
         if found.about.get("operation"):
-            tables[OPERATION], tables[GREEDY] = store.lives(runs)
+            tables[OPERATION], tables[GREEDY] = _lives(runs)
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
@@ -479,7 +489,7 @@ class StudyResults(Shown):
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
-        lives = lives.reindex(columns=store.LIVES)  # an older table lacks the latest ones
+        lives = lives.reindex(columns=LIVES)  # an older table lacks the latest ones
         greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
         return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
@@ -571,17 +581,83 @@ def _columns(name: str, value: float, interval: Interval) -> dict[str, float]:
     return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
-def _finished(plan: Plan, stores: Iterable[store.RunStore]) -> list[store.RunStore]:
+def _finished(planned: Plan, stores: Iterable[RunStore]) -> list[RunStore]:
     """The runs that are finished, by scenario, case and training seed, in the study's order."""
-    cases = [case.name for case in plan.definition.all_cases]
-    scenarios = list(plan.definition.scenarios)
+    cases = [case.name for case in planned.definition.all_cases]
+    scenarios = list(planned.definition.scenarios)
 
-    def place(one: store.RunStore) -> tuple[int, int, int]:
+    def place(one: RunStore) -> tuple[int, int, int]:
         key = one.run.key
         seed = -1 if key.seed is None else key.seed
         return scenarios.index(key.scenario), cases.index(key.case), seed
 
-    return sorted((one for one in stores if one.finished), key=place)
+    return sorted((one for one in stores if one.sealed), key=place)
+
+
+def _stacked(parts: Iterable[pd.DataFrame], columns: list[str]) -> pd.DataFrame:
+    """The tables one below the other, with these columns."""
+    parts = [part for part in parts if len(part)]
+    table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+    return table.reindex(columns=columns).astype({"training_seed": "Int64"})
+
+
+def _frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:
+    """State, evaluation and curves of finished runs."""
+    states, evaluations, curves = [], [], []
+    for store in stores:
+        run, about = store.run, store.about
+        key = dict(zip(KEYS, (run.key.scenario, run.key.case, run.key.seed), strict=True))
+        counts = {name: int(about.get(name, 0)) for name in ("samples", "plant_samples")}
+        states.append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
+        rows = store.measured(EVALUATION).rename_axis("seed").reset_index()
+        evaluations.append(rows.assign(**key, steps=run.noise[EVALUATION].steps))
+        if run.training is not None:
+            curves.append(read_table(store.folder / LOG).assign(**key))
+        elif GREEDY in run.noise:
+            greedy_J = float(store.measured(GREEDY).J.mean())
+            curves.append(pd.DataFrame([key | {"greedy_J": greedy_J}]))
+    curve = _stacked(curves, [*KEYS, *CURVE])
+    return [
+        _stacked(states, STATE),
+        _stacked(evaluations, [*KEYS, "seed", "steps", *INDICATORS]),
+        curve.astype({"samples": "Int64"} | dict.fromkeys(CURVE[1:], float)),
+    ]
+
+
+def _lives(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows of the lives, by run and mark, and of the greedy evaluations, by noise seed, too.
+
+    The optimum has a life on the noise of every training seed, of which J is known.
+    """
+    alive, greedy = [], []
+    for store in stores:
+        run, key = store.run, store.run.key
+        names, online = {"scenario": key.scenario, "case": key.case}, []
+        for file, noise in run.noise.items():
+            if noise.mark:
+                rows = store.measured(file).rename_axis("seed").reset_index()
+                greedy.append(rows.assign(**names, training_seed=key.seed, samples=noise.mark))
+            elif file.startswith("online-"):
+                rows = store.measured(file)[["J"]].rename_axis("training_seed").reset_index()
+                online.append(rows.assign(**names, samples=noise.steps))
+        if run.marks and run.training is not None:
+            rows = read_table(store.folder / LOG, types={"samples": int})
+            alive.append(rows.assign(**names, training_seed=key.seed))
+        elif online:
+            alive.append(pd.concat(online).sort_values(["training_seed", "samples"]))
+    return _stacked(alive, LIVES), _stacked(greedy, [*KEYS, "samples", "seed", "J"])
+
+
+def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
+    """Seconds that each run's training took; in operation the processor's up to each mark, too."""
+    rows = []
+    for store in stores:
+        clock = store.about.get("timing", {})
+        seconds = {str(store.run.key): clock.get("wall_seconds", 0.0)}
+        marks = clock.get("processor_seconds", {})
+        seconds |= {f"{store.run.key}, sample {mark}": value for mark, value in marks.items()}
+        rows += [{"run": name, "training_seconds": float(value)} for name, value in seconds.items()]
+    return pd.DataFrame(rows, columns=["run", "training_seconds"])
 
 
 def document(plan: Plan) -> dict[str, Any]:
@@ -633,3 +709,47 @@ def document(plan: Plan) -> dict[str, Any]:
         }
     found: dict[str, Any] = json.loads(json.dumps(about))
     return found
+
+
+@known_keywords
+def study(
+    source: Study | str | Path | Mapping[str, Any],
+    out: str | Path,
+    *,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: Report | bool = False,
+    planned: Plan | None = None,
+    figures: bool = True,
+) -> StudyResults:
+    """Do the runs of a study that `out` lacks, and write its tables there.
+
+    Raises StudyError and what scenarios and algorithms raise before any work is done;
+    FailedRunsError after all other runs are done and written.
+
+    Args:
+        source: a study, its file, or the same document as a mapping.
+        jobs: worker processes; 1 works in this process. No byte of a table depends on it.
+        scheduler: address of a Dask scheduler, used in place of `jobs`.
+        progress: a `Report`, called after every work item, and with a line for each run that ends;
+            True draws a bar.
+        planned: the study's plan, if it is known.
+        figures: whether the study's trajectories and logs are drawn.
+    """
+    if isinstance(source, Mapping):
+        source = Study.from_dict(source)
+    definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    planned = planned or plan(definition)
+    with reporting(progress, definition.name, planned.samples) as report:
+        runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
+        for line in runner.remarks:
+            report(0, "", line)
+        runner.run(jobs, scheduler)
+    stores = runner.stores.values()
+    results = StudyResults.written(planned, folder, stores, draw=figures)
+    if runner.failures:
+        name, failure = next(iter(runner.failures.items()))
+        others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""
+        raise FailedRunsError(f"{name}: {failure.message}{others}; run again to try anew")
+    return results

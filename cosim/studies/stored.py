@@ -17,11 +17,10 @@ from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
-from cosim.studies.figures import LOGS, TRAJECTORIES
+from cosim.studies.plan import LOGS, TRAJECTORIES
 from cosim.studies.report import rendered
-from cosim.studies.results import ABOUT, CURVES, StudyResults
-from cosim.studies.store import EVALUATION, KEYS, TIMING, to_csv
-from cosim.studies.work import RUNS
+from cosim.studies.results import ABOUT, CURVES, KEYS, StudyResults
+from cosim.studies.run import EVALUATION, RUNS, TIMING, to_csv
 from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8

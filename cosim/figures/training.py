@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, FuncFormatter
+from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
 from cosim.figures.style import (
     DASHED,
@@ -21,7 +21,6 @@ from cosim.figures.style import (
     figure,
     label_ends,
     palette,
-    percent,
     plain,
     samples_axis,
     symbol,
@@ -124,7 +123,7 @@ def _course(axes: Axes, samples: Array, values: Array, color: str, least: float)
     """A line from 0 to `least` or more, logarithmic where it spans decades."""
     axes.plot(samples, values, marker="." if len(values) < POINTS else "", color=color, **_LINE)
     low, top = float(values.min()), max(float(values.max()), least)
-    short = EngFormatter(sep="") if top >= 1e3 else FuncFormatter(percent)
+    short = EngFormatter(sep="") if top >= 1e3 else FormatStrFormatter("%g")
     axes.yaxis.set_major_formatter(short)
     if 0 < DECADES * low < top:
         axes.set_yscale("log")
@@ -141,7 +140,7 @@ def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) ->
     top = max(float(norm.max()) for norm in moved.values())
     if top > DECADES:
         axes.set_yscale("symlog", linthresh=1.0)
-        axes.yaxis.set_major_formatter(FuncFormatter(percent))
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.set_ylim(0.0, 1.05 * top)
     return labels
 

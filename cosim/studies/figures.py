@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, FormatStrFormatter, LogLocator, NullFormatter
 
 from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, FLOOR, Dots, EndLabel, Look, palette, shown_case
@@ -175,7 +175,7 @@ def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Lo
         axes.set_xscale("log")
         axes.set_xlim(axis[0], axis[-1])
         axes.set_ylim(-0.02, 1.02)
-        axes.xaxis.set_major_formatter(FuncFormatter(style.percent))
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
         axes.set_xlabel("regret % at most")
         axes.set_ylabel("share of runs")
         drawn.legend(loc="outside right upper", handlelength=2.4)

@@ -48,7 +48,7 @@ def evaluation_figure(
         left, right = drawn.subplots(1, 2, width_ratios=(1.0, 1.05))
         _rows(left, controllers, looks, optimal)
         _pareto(right, controllers, looks)
-        drawn.suptitle(plain(title), fontsize=8.5)
+        drawn.suptitle(plain(title))
     return drawn
 
 

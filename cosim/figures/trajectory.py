@@ -53,7 +53,9 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
     held, costs = scenario.plant.disturbances, {"stage_cost": REFERENCE, "penalty": BOUND}
     left, right = [*scenario.limits], [*held, *costs]
     rows = int(np.lcm(len(left), len(right)))
-    cells = [[names[row * len(names) // rows] for names in (left, right)] for row in range(rows)]
+    cells: Any = [
+        [names[row * len(names) // rows] for names in (left, right)] for row in range(rows)
+    ]
     references = np.append(scenario.reference_state, scenario.reference_action)
     failed = trajectory["failed"] > 0
     with figure(max(1.05 * max(len(left), len(right) * 0.8), 2.4) + 0.5) as drawn:
@@ -93,8 +95,7 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
         drawn.suptitle(
             f"{shown_case(who)} on {plain(scenario.name)}{seed}:   "
             f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
-            f"violating {100 * summary['violating_share']:.1f} % of samples",
-            fontsize=8.5,
+            f"violating {100 * summary['violating_share']:.1f} % of samples"
         )
     return drawn
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from controllers.optimum import stored_optimum
-from cosim.errors import EvaluationError, StudyError
+from cosim.errors import EvaluationError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
@@ -76,7 +76,8 @@ def evaluate(
 
     On a seed all controllers meet the same disturbances (common random numbers). A stored optimum
     runs too, for J*, without rows of its own unless it is named. Raises EvaluationError on a
-    malformed request or failed workers, and what building or running a controller raises.
+    malformed request or failed workers, StudyError on a name that no folder can have, and what
+    building or running a controller raises.
 
     Args:
         controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
@@ -119,11 +120,7 @@ def evaluate(
             "controller": item if isinstance(item, str) else _qualified(item),
             "parameters": parameters[name],
         }
-        try:
-            key = RunKey(scenario.name, name)
-        except StudyError as error:
-            raise EvaluationError(str(error)) from None
-        runs.append(Run(key, scenario, item, None, depends, noise))
+        runs.append(Run(RunKey(scenario.name, name), scenario, item, None, depends, noise))
     total = sum(run.samples for run in runs)
     bar = reporting(progress, scenario.name, total)
     with temporary_folder("cosim-evaluation-") as own, bar as tell:
@@ -213,19 +210,14 @@ class Evaluation(Result):
         return OPTIMAL if OPTIMAL in self.columns else None
 
     @property
-    def naive(self) -> str | None:
-        """Name of the reference controller of the closed gap, or None."""
-        return NAIVE if NAIVE in self.controllers else None
-
-    @property
     def reference(self) -> str:
         """Name of the controller that gains are measured against."""
-        return self.naive or self.controllers[0]
+        return NAIVE if NAIVE in self.controllers else self.controllers[0]
 
     @property
     def optimal(self) -> Array:
         """J of the optimum over the seeds, (S,), NaN where it is not known."""
-        return self._cost(self.optimum)
+        return self._cost(OPTIMAL)
 
     def column(self, controller: str, name: str) -> Array:
         """An indicator of a controller over the seeds, (S,); raises EvaluationError on others."""
@@ -235,14 +227,14 @@ class Evaluation(Result):
         found: Array = self.columns[controller][name].to_numpy()
         return found
 
-    def _cost(self, controller: str | None) -> Array:
-        if controller is None:
-            return np.full(len(self.seeds), np.nan)
-        return self.column(controller, "J")
+    def _cost(self, controller: str) -> Array:
+        """J over the seeds, (S,), NaN of a controller that was not evaluated."""
+        there = controller in self.columns
+        return self.column(controller, "J") if there else np.full(len(self.seeds), np.nan)
 
     def to_pandas(self) -> pd.DataFrame:
         """A row for each controller, as given, and seed; NaN where an indicator is undefined."""
-        naive, frames = self._cost(self.naive), []
+        naive, frames = self._cost(NAIVE), []
         for name in self.controllers:
             cost = self.column(name, "J")
             frame = self.columns[name].assign(
@@ -276,7 +268,7 @@ class Evaluation(Result):
         """Means over the seeds by controller, as a Markdown table; a regret of 1 is 100 %."""
         names = ["J", "regret", "economic_cost", "violating_share", "failures"]
         means = self.to_pandas().groupby("controller", sort=False)[names].mean()
-        rows = [[str(row[0]), *(f"{value:.6g}" for value in row[1:])] for row in means.itertuples()]
+        rows = means.map("{:.6g}".format).reset_index().to_numpy().tolist()
         return markdown_table(("controller", *names), rows)
 
     def write(self, folder: Path) -> None:
@@ -322,11 +314,11 @@ class Evaluation(Result):
             "parameters_hash": self.parameters[name],
             "intervals": estimates,
         }
-        cost, naive = self._cost(name), self._cost(self.naive)
+        cost, naive = self._cost(name), self._cost(NAIVE)
         if self.optimum is not None:
             resampled = bootstrapped(cost - self.optimal, magnitude(self.optimal))
             document["regret"] = regret(cost, self.optimal)._asdict() | {"bootstrap": resampled}
-        if self.optimum is not None and self.naive is not None:
+        if self.optimum is not None and NAIVE in self.controllers:
             document["gap_closed"] = gap_closed(cost, naive, self.optimal)._asdict()
         return document
 

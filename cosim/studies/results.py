@@ -22,7 +22,6 @@ from cosim.result import Shown, TextTable, markdown_table
 from cosim.simulation import reporting
 from cosim.statistics import (
     Estimate,
-    Interval,
     gap_closed,
     over_runs,
     paired_difference,
@@ -56,6 +55,8 @@ KEYS = [*WHERE, "training_seed"]
 STATE = [*KEYS, "status", "samples", "plant_samples"]
 LIVES = [*KEYS, "samples", *operation.LIFE]
 CURVE = ["samples", "J", "greedy_J", "td_error"]
+SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios")
+"""What study.json says of a case as it is."""
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -223,15 +224,12 @@ class StudyResults(Shown):
         for (scenario, case), state in self.state.groupby(WHERE, sort=False):
             own = self._arrays[scenario, case]
             for run, known in enumerate(state.to_dict("records")):
-                found = self.regret(case, scenario, [run])
-                cost = float(own["J"][run].mean())
-                row = known | _columns("regret", found.value, found.interval)
-                row["J"] = cost if np.isfinite(cost) else np.inf
+                row = known | _columns("regret", self.regret(case, scenario, [run]))
+                row |= {name: float(own[name][run].mean()) for name in ("J", *MEANS)}
+                row["J"] = row["J"] if np.isfinite(row["J"]) else np.inf
                 row["gap_closed"] = self.gap_closed(case, scenario, [run]).value
-                row |= {name: float(own[name][run].mean()) for name in MEANS}
                 rows.append(row | {"failures": int(own["failures"][run].sum())})
-        frame = pd.DataFrame(rows, columns=RUN_COLUMNS)
-        return frame.astype({"training_seed": "Int64"})
+        return pd.DataFrame(rows, columns=RUN_COLUMNS).astype({"training_seed": "Int64"})
 
     @cached_property
     def summary(self) -> pd.DataFrame:
@@ -241,9 +239,8 @@ class StudyResults(Shown):
         """
         rows: list[dict[str, Any]] = []
         for scenario in self.scenarios:
-            known = [
-                self._summary(case, scenario) for case in self.cases if len(self.of(case, scenario))
-            ]
+            cases = [case for case in self.cases if len(self.indicator(case, scenario))]
+            known = [self._summary(case, scenario) for case in cases]
             rows += self._ranked(scenario, sorted(known, key=lambda row: float(row["J_median"])))
         return pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
 
@@ -255,12 +252,12 @@ class StudyResults(Shown):
         median = self.regret(case, scenario, list(middle))
         spread = over_runs([values[order]]) if len(runs) > 1 else Estimate(values[0])
         best, other = self.reference("optimum", scenario), self.cases[case].get("against")
-        wide: Interval = None
-        found: tuple[float, Interval, float] = (np.nan, None, np.nan)
+        wide, difference, p = None, Estimate(np.nan), np.nan
         if best is not None and not self._single(case, scenario):
             wide = two_way(own["J"], best)
         if best is not None and other is not None and len(self.indicator(other, scenario)):
-            found = paired_difference(*self._pairs(case, other, scenario), best)
+            value, ends, p = paired_difference(*self._pairs(case, other, scenario), best)
+            difference = Estimate(value, ends)
         return {
             "scenario": scenario,
             "case": case,
@@ -268,19 +265,19 @@ class StudyResults(Shown):
             "plant_samples": runs.plant_samples.max(),
             "finished": int((~runs.status.str.startswith("diverged")).sum()),
             "runs": len(runs),
-            **_columns("regret_median", median.value, median.interval),
+            **_columns("regret_median", median),
             "regret_worst": float(values[order[-1]]),
-            **_columns("regret_iqm", spread.value, spread.interval),
+            **_columns("regret_iqm", spread),
             "J_median": float(np.median(cost)),
             "J_worst": float(cost[order[-1]]),
             "J_iqm": over_runs([cost[order]]).value,
             "gap_closed_median": self.gap_closed(case, scenario, list(middle)).value,
             **{name: float(np.median(runs[name])) for name in MEANS},
             "failures": int(own["failures"].sum()),
-            **_columns("regret_wide", np.nan, wide),
+            **_columns("regret_wide", Estimate(np.nan, wide)),
             "against": other,
-            **_columns("difference", *found[:2]),
-            "difference_p": found[2],
+            **_columns("difference", difference),
+            "difference_p": p,
         }
 
     def _single(self, case: str, scenario: str) -> bool:
@@ -342,7 +339,7 @@ class StudyResults(Shown):
             spread, everything = over_runs(strata), np.concatenate(strata)
             row = {"case": case, "scenarios": len(strata), "runs": len(everything)}
             row |= {"regret_median": np.median(everything), "regret_worst": everything.max()}
-            rows.append(row | _columns("regret_iqm", spread.value, spread.interval))
+            rows.append(row | _columns("regret_iqm", spread))
         rows.sort(key=lambda row: float(row["regret_iqm"]))
         return pd.DataFrame(rows, columns=AGGREGATE_COLUMNS)
 
@@ -576,9 +573,9 @@ class StudyResults(Shown):
         )
 
 
-def _columns(name: str, value: float, interval: Interval) -> dict[str, float]:
-    low, high = interval or (np.nan, np.nan)
-    return {name: value, f"{name}_low": low, f"{name}_high": high}
+def _columns(name: str, found: Estimate) -> dict[str, float]:
+    low, high = found.interval or (np.nan, np.nan)
+    return {name: found.value, f"{name}_low": low, f"{name}_high": high}
 
 
 def _finished(planned: Plan, stores: Iterable[RunStore]) -> list[RunStore]:
@@ -673,15 +670,10 @@ def document(plan: Plan) -> dict[str, Any]:
         "scenarios": scenarios,
         "cases": [
             {
-                "name": case.name,
-                "group": case.group,
+                **{name: getattr(case, name) for name in SAME},
+                "start": definition.relative(case.start),
                 "target": definition.relative(case.target),
                 "trained": case.algorithm is not None,
-                "samples": case.samples,
-                "start": definition.relative(case.start),
-                "nmpc": case.nmpc,
-                "settings": dict(case.settings),
-                "scenarios": list(case.scenarios),
                 "against": definition.counterpart(case),
             }
             for case in definition.all_cases

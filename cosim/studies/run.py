@@ -227,19 +227,16 @@ class Run:
 # A worker's part of a run
 
 
-@dataclass(frozen=True)
-class Trained:
-    """A training at its end: `status` is `finished` or `diverged: …`, `log` learning.csv,
-    `parameters` θ as text, `plant_samples` all that the plant gave for it; `clock` the processor
-    time in s up to each mark of operation."""
+class Trained(NamedTuple):
+    """A training at its end: learning.csv and θ as texts, and what run.json says of it.
 
-    samples: int
-    status: str
+    That is its `status`, `finished` or `diverged: …`, its `samples`, `plant_samples`, all that the
+    plant gave for it, and `timing`: seconds, of operation also the processor's up to each mark.
+    """
+
     log: str
     parameters: str
-    plant_samples: int
-    wall_seconds: float
-    clock: Mapping[int, float] = field(default_factory=dict)
+    about: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -317,24 +314,22 @@ def _train(run_: Run, folder: Path | None) -> Trained:
 
     assert run_.training is not None
     run, marks, begin = run_.training.prepare(), run_.marks, time.perf_counter()
+    clock: Mapping[int, float] = {}
     if marks:
-        lived, status, clock, taken = operation.live(run, marks)
-        log, theta = to_csv(lived), lived[-1].parameters.to_toml()
-        return Trained(marks[-1], status, log, theta, taken, time.perf_counter() - begin, clock)
-    with temporary_folder("cosim-training-") as own:
-        out = folder or own
-        result = run_training(run, out, resume=(out / CHECKPOINT).is_file())
-    rows = result.rows
-    # The log of a study starts with θ at the start, from which its increments are counted.
-    start = dict.fromkeys(rows[0] if rows else COLUMNS, float("nan")) | {"samples": 0.0}
-    return Trained(
-        int(rows[-1]["samples"]) if rows else 0,
-        result.status,
-        to_csv([LogRow(start, result.start), *rows]),
-        result.parameters.to_toml(),
-        result.plant_samples,
-        time.perf_counter() - begin,
-    )
+        rows, status, clock, taken = operation.live(run, marks)
+        samples, theta = marks[-1], rows[-1].parameters
+    else:
+        with temporary_folder("cosim-training-") as own:
+            out = folder or own
+            result = run_training(run, out, resume=(out / CHECKPOINT).is_file())
+        status, taken, theta = result.status, result.plant_samples, result.parameters
+        samples = int(result.rows[-1]["samples"]) if result.rows else 0
+        # The log of a study starts with θ at the start, from which its increments are counted.
+        start = dict.fromkeys(result.rows[0] if result.rows else COLUMNS, float("nan"))
+        rows = [LogRow(start | {"samples": 0.0}, result.start), *result.rows]
+    seconds = {"wall_seconds": time.perf_counter() - begin, "processor_seconds": clock}
+    about = {"status": status, "samples": samples, "plant_samples": taken, "timing": seconds}
+    return Trained(to_csv(rows), theta.to_toml(), about)
 
 
 def _simulate(item: Item) -> Measured | str:
@@ -452,23 +447,20 @@ class RunStore:
 
     def indicators(self, file: str) -> dict[int, Figures]:
         """Content of a file by noise seed, of runs as long as the plan's; {} of a damaged one."""
-        if file not in self._known:
+        path, noise = self.folder / file, self._noise(file)
+        if file in self._known:
+            return self._known[file]
+        found = self._known[file] = {}
+        if path.is_file():
+            wanted = () if file == TIMING else (*KEY, *INDICATORS)
             try:
-                self._known[file] = self._read(file)
+                rows = read_table(path, wanted, dict.fromkeys(KEY, int)).set_index("seed")
             except StudyError:
-                self.remarks.append(f"'{self.folder / file}' is damaged; made anew")
-                self._known[file] = {}
-        return self._known[file]
-
-    def _read(self, file: str) -> dict[int, Figures]:
-        noise = self._noise(file)
-        if not (self.folder / file).is_file():
-            return {}
-        wanted = () if file == TIMING else (*KEY, *INDICATORS)
-        rows = read_table(self.folder / file, wanted, dict.fromkeys(KEY, int)).set_index("seed")
-        rows = rows[(rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)]
-        rows = rows.drop(columns=KEY[1:])
-        found: dict[int, Figures] = rows[~rows.index.duplicated()].to_dict("index")
+                self.remarks.append(f"'{path}' is damaged; made anew")
+                return found
+            rows = rows[(rows.steps == noise.steps) & (rows.burn_in == noise.burn_in)]
+            rows = rows[~rows.index.duplicated()].drop(columns=KEY[1:])
+            found |= rows.to_dict("index")
         return found
 
     def _noise(self, file: str) -> Noise:
@@ -518,17 +510,11 @@ class RunStore:
         if isinstance(outcome, str):
             write_atomically(self.folder / item.file, outcome)
         elif isinstance(outcome, Trained):
-            self.done = outcome.samples
+            self.done = outcome.about["samples"]
             write_atomically(self.folder / LOG, outcome.log)
             write_atomically(self.folder / PARAMETERS, outcome.parameters)
-            clock = {"wall_seconds": outcome.wall_seconds, "processor_seconds": outcome.clock}
-            self._note(
-                status=outcome.status,
-                samples=outcome.samples,
-                plant_samples=outcome.plant_samples,
-                timing=clock,
-                files={name: _digest(self.folder / name) for name in TRAINED},
-            )
+            files = {name: _digest(self.folder / name) for name in TRAINED}
+            self._note(**outcome.about, files=files)
             (self.folder / CHECKPOINT).unlink(missing_ok=True)
         else:
             parts = [(item.file, 0), *([(TIMING, 1)] if item.file == EVALUATION else [])]
@@ -646,7 +632,7 @@ class Runner:
             return
         store.take(item, outcome)
         if isinstance(outcome, Trained):
-            line = "" if outcome.status == "finished" else f"{name}: {outcome.status}"
+            line = "" if store.status == "finished" else f"{name}: {store.status}"
         else:
             store.seal()
         if store.sealed:

@@ -136,25 +136,19 @@ class Study:
     def _expanded(self, table: CaseTable) -> Iterator[Case]:
         """The points of a case's grid."""
         scenarios = tuple(self.scenarios if table.scenarios is None else table.scenarios)
-        if unknown := [name for name in scenarios if name not in self.scenarios]:
-            raise StudyError(
-                f"case '{table.name}': '{unknown[0]}' is none of the study's scenarios"
-                f"{instead(unknown[0], self.scenarios)}"
-            )
+        _check_known(scenarios, self.scenarios, f"case '{table.name}'", "scenario")
         if table.algorithm is None:
-            given = table.controller or ""
-            for source in given if isinstance(given, list) else [given]:
+            sources = table.controller or ""
+            for source in sources if isinstance(sources, list) else [sources]:
                 own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
-                name = f"{table.name}({own})" if table.name and given[1:] else table.name or own
+                name = f"{table.name}({own})" if table.name and sources[1:] else table.name or own
                 group, file = table.group or BASELINES, self._file(source)
                 yield Case(name, scenarios, group, controller=file, against=table.against)
             return
-        axes: dict[str, list[Any]] = {}
-        for key in ("samples", "start", "nmpc"):
-            value = getattr(table, key)
-            axes[key] = value if isinstance(value, list) else [value]
-        for key, value in table.settings.items():
-            axes[key] = _axis(table.algorithm, key, value)
+        given = {"samples": table.samples, "start": table.start, "nmpc": table.nmpc}
+        axes: dict[str, list[Any]]
+        axes = {k: v if isinstance(v, list) else [v] for k, v in given.items()}
+        axes |= {k: _axis(table.algorithm, k, v) for k, v in table.settings.items()}
         if empty := [key for key, values in axes.items() if not values]:
             raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
         varied = [key for key, values in axes.items() if len(values) > 1]
@@ -264,11 +258,7 @@ class Study:
     def _of(self, value: T | dict[str, T], scenario: str, field: str) -> T:
         if not isinstance(value, dict):
             return value
-        names = [*self.scenarios, DEFAULT]
-        if unknown := [name for name in value if name not in names]:
-            raise StudyError(
-                f"{field}: '{unknown[0]}' is no scenario of the study{instead(unknown[0], names)}"
-            )
+        _check_known(value, [*self.scenarios, DEFAULT], field, "scenario")
         number = value.get(scenario, value.get(DEFAULT))
         if number is None:
             raise StudyError(f"{field}: has no number for '{scenario}', and no '{DEFAULT}'")
@@ -392,16 +382,19 @@ def _order(study: Study) -> Iterator[tuple[Case, str, int | None]]:
 def _check_names(study: Study) -> None:
     names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]
-    asked = [(f"trajectory '{t.name}'", t.cases or [], names) for t in study.table.trajectory]
-    asked.append(("logs", study.table.logs, trained))
+    for table in study.table.trajectory:
+        _check_known(table.cases or (), names, f"trajectory '{table.name}'", "case")
+    _check_known(study.table.logs, trained, "logs", "case")
     if (operation := study.table.operation) is not None:
-        asked.append(("operation.drawn", operation.drawn, trained))
-    for where, wanted, known in asked:
-        for name in wanted:
-            if name not in known:
-                raise StudyError(f"{where}: there is no case '{name}'{instead(name, known)}")
+        _check_known(operation.drawn, trained, "operation.drawn", "case")
     for case in study.cases:
         study.counterpart(case)
+
+
+def _check_known(words: Iterable[str], known: Iterable[str], where: str, kind: str) -> None:
+    for word in words:
+        if word not in known:
+            raise StudyError(f"{where}: there is no {kind} '{word}'{instead(word, known)}")
 
 
 def _is_sequence(annotation: Any) -> bool:

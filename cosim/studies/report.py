@@ -26,14 +26,31 @@ PAGE, TABLES, FOLDER = "report.html", "report.md", "figures"
 Rows = tuple[Sequence[str], list[list[str]]]
 """Header and rows of texts."""
 
-COLUMNS = {
-    "case": "case", "rank": "rank", "samples": "plant samples", "finished": "finished",
-    "regret": "regret %, median [95 %]", "worst": "worst", "iqm": "IQM [95 %]",
-    "J": "J, median", "J-worst": "J, worst", "gap": "gap closed %", "economic": "economic cost",
-    "violation": "violation", "violating": "violating %", "against": "against",
-    "difference": "difference % [95 %]", "p": "p",
-}  # fmt: skip
-"""Headers of the columns of a scenario's table, by the names that options take."""
+COLUMNS: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
+    "case": ("case", lambda row: row["case"]),
+    "rank": ("rank", lambda row: str(row["rank"])),
+    "samples": ("plant samples", lambda row: str(row["plant_samples"] or "")),
+    "finished": (
+        "finished",
+        lambda row: f"{row['finished']}/{row['runs']}" if row["samples"] else "",
+    ),
+    "regret": (
+        "regret %, median [95 %]",
+        lambda row: _percent(row, "regret_median", "regret_wide"),
+    ),
+    "worst": ("worst", lambda row: _percent(row, "regret_worst") if row["runs"] > 1 else ""),
+    "iqm": ("IQM [95 %]", lambda row: _percent(row, "regret_iqm") if row["runs"] > 1 else ""),
+    "J": ("J, median", lambda row: _number(row["J_median"])),
+    "J-worst": ("J, worst", lambda row: _number(row["J_worst"]) if row["runs"] > 1 else ""),
+    "gap": ("gap closed %", lambda row: _percent(row, "gap_closed_median", digits=4)),
+    "economic": ("economic cost", lambda row: _number(row["economic_cost"])),
+    "violation": ("violation", lambda row: f"{row['mean_violation']:.5f}"),
+    "violating": ("violating %", lambda row: f"{100 * row['violating_share']:.2f}"),
+    "against": ("against", lambda row: row["against"] if isinstance(row["against"], str) else ""),
+    "difference": ("difference % [95 %]", lambda row: _percent(row, "difference")),
+    "p": ("p", lambda row: "" if np.isnan(row["difference_p"]) else f"{row['difference_p']:.3f}"),
+}
+"""Columns of a scenario's table by the names that options take: header, text of a summary's row."""
 SHORT = ("case", "rank", "regret", "worst", "finished")
 """Columns that fit a terminal of 80 characters."""
 
@@ -75,35 +92,12 @@ def rendered(template: str, **context: Any) -> str:
     return environment.get_template(template).render(context)
 
 
-def texts(row: Mapping[str, Any]) -> dict[str, str]:
-    """Texts of a row of a study's summary by the keys of `COLUMNS`."""
-    several, p, gap = row["runs"] > 1, row["difference_p"], row["gap_closed_median"]
-    return {
-        "case": row["case"],
-        "rank": str(row["rank"]),
-        "samples": str(row["plant_samples"] or ""),
-        "finished": f"{row['finished']}/{row['runs']}" if row["samples"] else "",
-        "regret": _percent(row, "regret_median", "regret_wide"),
-        "worst": _percent(row, "regret_worst") if several else "",
-        "iqm": _percent(row, "regret_iqm") if several else "",
-        "J": _number(row["J_median"]),
-        "J-worst": _number(row["J_worst"]) if several else "",
-        "gap": "" if np.isnan(gap) else shown(gap, None, 100.0, 4),
-        "economic": _number(row["economic_cost"]),
-        "violation": f"{row['mean_violation']:.5f}",
-        "violating": f"{100 * row['violating_share']:.2f}",
-        "against": row["against"] if isinstance(row["against"], str) else "",
-        "difference": _percent(row, "difference"),
-        "p": "" if np.isnan(p) else f"{p:.3f}",
-    }
-
-
-def _percent(row: Mapping[str, Any], name: str, ends: str = "") -> str:
+def _percent(row: Mapping[str, Any], name: str, ends: str = "", digits: int = 3) -> str:
     """A share in per cent with its interval, if any; empty if undefined."""
     low, high = (float(row.get(f"{ends or name}_{end}", np.nan)) for end in ("low", "high"))
     if np.isnan(row[name]):
         return ""
-    return shown(float(row[name]), None if np.isnan(low) else (low, high), 100.0, 3)
+    return shown(float(row[name]), None if np.isnan(low) else (low, high), 100.0, digits)
 
 
 def _number(value: float) -> str:

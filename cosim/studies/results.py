@@ -361,10 +361,9 @@ class StudyResults(Shown):
         for name in columns:
             if name not in COLUMNS:
                 raise StudyError(f"a table has no column '{name}'{instead(name, COLUMNS)}")
-        own = self.summary[self.summary.scenario == scenario]
-        texts = [report.texts(row) for row in own.to_dict("records")]
-        header = [COLUMNS[name] for name in columns]
-        return header, [[row[name] for name in columns] for row in texts]
+        own = self.summary[self.summary.scenario == scenario].to_dict("records")
+        header = [COLUMNS[name][0] for name in columns]
+        return header, [[COLUMNS[name][1](row) for name in columns] for row in own]
 
     def table(self, scenario: str | None = None) -> str:
         """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
@@ -459,30 +458,25 @@ class StudyResults(Shown):
         own = self.curves[self.curves.scenario == scenario]
         levels = own[own.training_seed.isna()].set_index("case").greedy_J
         trained = own[own.training_seed.notna()]
-        if not (trained.dropna(subset="greedy_J").groupby(KEYS).size() > 1).any():
+        greedy = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J
+        drawn = trained[~trained.case.isin(self.baselines)].groupby("case", sort=False)
+        if not (greedy.size() > 1).any() or not len(drawn):
             return None
-        best = float(levels.get(self.about["optimum"].get(scenario), np.nan))
-        known = np.isfinite(best)
-        curves = {
-            str(case): figures.learning_curve(rows, best if known else None)
-            for case, rows in trained.groupby("case", sort=False)
-            if case not in self.baselines
-        }
-        if not curves:
-            return None
-        ends = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J.last()
-        ends = ends.groupby("case").median()
         first, optimum = (self.about[kind].get(scenario) for kind in ("naive", "optimum"))
-        marks = {
-            name: float(level)
-            for name, level in pd.concat([levels, ends]).items()
-            if name in self.baselines and np.isfinite(level) and name != optimum
+        best = float(levels.get(optimum, np.nan))
+        known = bool(np.isfinite(best))
+        curves = {
+            str(case): figures.learning_curve(rows, best if known else None) for case, rows in drawn
         }
+        marks = pd.concat([levels, greedy.last().groupby("case").median()])
+        marks = marks[marks.index.isin(self.baselines) & np.isfinite(marks)].drop(
+            optimum, errors="ignore"
+        )
         # Naive stays: it is where the curves begin.
-        chosen = sorted(marks, key=lambda name: (name != first, marks[name]))[:LEVELS]
-        shown = (lambda level: float(100 * regrets(np.array(level), best))) if known else float
-        drawn = {name: shown(marks[name]) for name in chosen}
-        return figures.curves_figure(curves, drawn, self._looks, relative=bool(known))
+        chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
+        shown = 100 * regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
+        levels = dict(zip(chosen, map(float, shown), strict=True))
+        return figures.curves_figure(curves, levels, self._looks, relative=known)
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})

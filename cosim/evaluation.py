@@ -234,20 +234,18 @@ class Evaluation(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """A row for each controller, as given, and seed; NaN where an indicator is undefined."""
-        naive, frames = self._cost(NAIVE), []
-        for name in self.controllers:
-            cost = self.column(name, "J")
-            frame = self.columns[name].assign(
-                **self.facts,
-                controller=name,
-                seed=self.seeds,
-                parameters_hash=self.parameters[name],
-                regret=regrets(cost, self.optimal),
-                gap_closed=gaps_closed(cost, naive, self.optimal),
-                gain_in_J=gains(cost, self._cost(self.reference)),
-            )
-            frames.append(frame[COLUMNS].astype({"failures": int}))
-        return pd.concat(frames, ignore_index=True)
+        frame = self._rows(self.columns).assign(**self.facts)
+        cost, names = frame.J.to_numpy(), (NAIVE, OPTIMAL, self.reference)
+        naive, optimal, reference = (np.tile(self._cost(n), len(self.controllers)) for n in names)
+        frame["parameters_hash"] = frame.controller.map(self.parameters)
+        frame["regret"] = regrets(cost, optimal)
+        frame["gap_closed"] = gaps_closed(cost, naive, optimal)
+        frame["gain_in_J"] = gains(cost, reference)
+        return frame[COLUMNS].astype({"failures": int})
+
+    def _rows(self, frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+        rows = pd.concat({name: frames[name] for name in self.controllers})
+        return rows.rename_axis(["controller", "seed"]).reset_index()
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
@@ -274,9 +272,8 @@ class Evaluation(Result):
     def write(self, folder: Path) -> None:
         """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""
         self.plot(folder / "evaluation.png")
-        clock = pd.concat({name: self.timing[name] for name in self.controllers})
-        clock = clock.rename_axis(["controller", "seed"]).reset_index()
-        for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock.round(3))):
+        clock = self._rows(self.timing).round(3)
+        for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock)):
             # Write row by row: the text of all takes ten times the memory of the numbers.
             with replacing(folder / name) as path:
                 frame.to_csv(path, index=False, lineterminator="\n")

@@ -125,10 +125,16 @@ def summarise(path: str | Path) -> dict[str, Any]:
     }
 
 
+def existing(path: str | Path) -> Path:
+    """The path; raises RecordingError where there is no such file."""
+    if not Path(path).is_file():
+        raise RecordingError(f"there is no recording {path}")
+    return Path(path)
+
+
 def _chunks(path: Path) -> list[Chunk]:
     try:
-        if not path.is_file():
-            raise RecordingError(f"there is no recording {path}")
+        existing(path)
         with warnings.catch_warnings():
             # A file without its end is reported below, once.
             warnings.simplefilter("ignore", RerunWarning)

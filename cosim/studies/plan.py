@@ -316,7 +316,14 @@ def plan(study: Study) -> Plan:
             plants[name] = {"scenario": described.hash, "fmu": plant.fmu_sha256}
     depends: dict[tuple[str, str], dict[str, str]] = {}
     runs = []
-    for case, name, seed in _order(study):
+    # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
+    met = sorted({seed for case in study.cases for seed in case.training_seeds})
+    order = [
+        (seed, name, case)
+        for seed, name, case in product((None, *met), study.scenarios, study.all_cases)
+        if seed in (case.training_seeds or (None,)) and name in case.scenarios
+    ]
+    for seed, name, case in order:
         scenario = study.scenarios[name]
         training = None if seed is None else study.training(case, name, seed)
         if (case.name, name) not in depends:
@@ -367,16 +374,6 @@ def plan(study: Study) -> Plan:
     _check_names(study)
     about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
-
-
-def _order(study: Study) -> Iterator[tuple[Case, str, int | None]]:
-    """Controllers first, then seed after seed: stopped early, every case has fewer seeds."""
-    seeds = {seed for case in study.cases for seed in case.training_seeds}
-    for seed in (None, *sorted(seeds)):
-        for scenario in study.scenarios:
-            for case in study.all_cases:
-                if seed in (case.training_seeds or (None,)) and scenario in case.scenarios:
-                    yield case, scenario, seed
 
 
 def _check_names(study: Study) -> None:

@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-from cosim.files import write_atomically
 from cosim.protocols import Array
 from cosim.result import TextTable, markdown_table
 from cosim.statistics import gain, shown
@@ -58,22 +57,6 @@ PAPER = {"naive": 21.0, "tuned": 15.0}
 """Gain of the paper's RL-tuned RTI-NMPC over (a) and (b), in per cent."""
 NEAR = 3.0
 """Per cent within which a gain agrees with the paper's, which are approximate."""
-
-
-def write(page: Mapping[str, Any], folder: Path, study: Path) -> Path:
-    """Write report.html and report.md of a page's `sections` into a folder; returns the page.
-
-    A section has a title and may have a note, tables and names of figures, which are in `figures`
-    of `folder`, or of the study's own folder.
-    """
-
-    def figure(name: str) -> dict[str, str]:
-        paths = (where / FOLDER / f"{name}.svg" for where in (folder, study))
-        return image(next(path for path in paths if path.is_file()))
-
-    for name in (TABLES, PAGE):
-        write_atomically(folder / name, rendered(name, **page, picture=figure))
-    return folder / PAGE
 
 
 def rendered(template: str, **context: Any) -> str:

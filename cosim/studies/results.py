@@ -521,11 +521,22 @@ class StudyResults(Shown):
     def report(self, folder: Path | None = None) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
         target = self.folder if folder is None else folder
-        drawn = self.draw(target / report.FOLDER)
-        return report.write(self._page(drawn), target, self.folder)
+        page, folders = self._page(self.draw(target / report.FOLDER)), (target, self.folder)
+
+        def picture(name: str) -> dict[str, str]:
+            paths = (where / report.FOLDER / f"{name}.svg" for where in folders)
+            return report.image(next(path for path in paths if path.is_file()))
+
+        for name in (report.TABLES, report.PAGE):
+            text = report.rendered(name, **page, picture=picture)
+            write_atomically(target / name, text)
+        return target / report.PAGE
 
     def _page(self, drawn: Mapping[str, list[str]]) -> dict[str, Any]:
-        """The report's sections, for its templates."""
+        """The report, for its templates.
+
+        A section has a title and may have a note, tables, and names of figures in `figures`.
+        """
         sections: list[dict[str, Any]] = []
         for scenario in self.scenarios:
             table = ("", *self.lines(scenario))

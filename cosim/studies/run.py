@@ -55,7 +55,7 @@ RUNS, RUN, CHECKPOINT = "runs", "run.json", "checkpoint.npz"
 TRAINED = LOG, PARAMETERS = "learning.csv", "parameters.toml"
 EVALUATION, GREEDY = "evaluation.csv", "greedy.csv"
 FAILURE, TIMING = "failure.txt", "timing.csv"
-OURS_BY_NAME = (
+WRITTEN = (
     CHECKPOINT, LOG, PARAMETERS, EVALUATION, GREEDY, FAILURE, TIMING,
     "trajectory-*.csv", "greedy-*.csv", "online*.csv",
 )  # fmt: skip
@@ -432,7 +432,7 @@ class RunStore:
     def _files(self) -> list[Path]:
         """Files of the folder that a run of a study writes, run.json apart."""
         found = sorted(self.folder.glob("*"))
-        return [path for path in found if any(map(path.match, OURS_BY_NAME))]
+        return [path for path in found if any(map(path.match, WRITTEN))]
 
     def _note(self, **values: Any) -> None:
         """Write values to run.json."""

@@ -180,17 +180,16 @@ class StudyResults(Shown):
 
     @cached_property
     def _arrays(self) -> dict[tuple[str, str], dict[str, Array]]:
-        """Seeds, steps and indicators (R, S) by scenario and case."""
+        """Indicators (R, S) by scenario and case."""
         found: dict[tuple[str, str], dict[str, Array]] = {}
         rows = self.state[KEYS].merge(self.evaluation, on=KEYS, how="left")
-        for where, runs in self.state.groupby(WHERE, sort=False):
-            own = rows[(rows.scenario == where[0]) & (rows.case == where[1])]
-            if own.seed.isna().any() or len(own) % len(runs):
+        counts = self.state.groupby(WHERE).size()
+        for where, own in rows.groupby(WHERE, sort=False):
+            if own.seed.isna().any() or len(own) % counts[where]:
                 raise StudyError(f"the tables in '{self.folder}' are damaged: {where}")
-            found[where] = {
-                name: own[name].to_numpy(dtype=np.float64).reshape(len(runs), -1)
-                for name in ("seed", "steps", *INDICATORS)
-            }
+            values = own[[*INDICATORS]].to_numpy(dtype=np.float64).T
+            arrays = np.ascontiguousarray(values).reshape(len(values), counts[where], -1)
+            found[where] = dict(zip(INDICATORS, arrays, strict=True))
         return found
 
     def indicator(self, case: str, scenario: str, name: str = "J") -> Array:

@@ -128,7 +128,10 @@ class StudyResults(Shown):
 
         `draw` draws the kept trajectories and logs, too.
         """
-        runs = _finished(planned, stores)
+        cases = [case.name for case in planned.definition.all_cases]
+        places = {key: i for i, key in enumerate(product(planned.definition.scenarios, cases))}
+        runs = [store for store in stores if store.sealed]  # by training seed
+        runs.sort(key=lambda store: places[store.run.key.scenario, store.run.key.case])
         found = cls(out, document(planned), *_frames(runs))
         for run in planned.runs:
             for name, target in run.kept.items():
@@ -614,19 +617,6 @@ class StudyResults(Shown):
 def _columns(name: str, found: Estimate) -> dict[str, float]:
     low, high = found.interval or (np.nan, np.nan)
     return {name: found.value, f"{name}_low": low, f"{name}_high": high}
-
-
-def _finished(planned: Plan, stores: Iterable[RunStore]) -> list[RunStore]:
-    """The runs that are finished, by scenario, case and training seed, in the study's order."""
-    cases = [case.name for case in planned.definition.all_cases]
-    scenarios = list(planned.definition.scenarios)
-
-    def place(one: RunStore) -> tuple[int, int, int]:
-        key = one.run.key
-        seed = -1 if key.seed is None else key.seed
-        return scenarios.index(key.scenario), cases.index(key.case), seed
-
-    return sorted((one for one in stores if one.sealed), key=place)
 
 
 def _stacked(parts: Iterable[pd.DataFrame], columns: list[str]) -> pd.DataFrame:

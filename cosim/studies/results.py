@@ -503,9 +503,8 @@ class StudyResults(Shown):
             str(case): figures.learning_curve(rows, best if known else None) for case, rows in drawn
         }
         marks = pd.concat([levels, greedy.last().groupby("case").median()])
-        marks = marks[marks.index.isin(self.baselines) & np.isfinite(marks)].drop(
-            optimum, errors="ignore"
-        )
+        marks = marks[marks.index.isin(self.baselines) & (marks.index != optimum)]
+        marks = marks[np.isfinite(marks)]
         # Naive stays: it is where the curves begin.
         chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
         level = 100 * regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]

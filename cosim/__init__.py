@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cosim.simulation import simulate as simulate
     from cosim.studies.plan import Study as Study
     from cosim.studies.results import StudyResults as StudyResults
-    from cosim.studies.run import study as study
+    from cosim.studies.results import study as study
     from cosim.trajectory import Trajectory as Trajectory
     from learning.training import Training as Training
     from learning.training import train as train
@@ -37,7 +37,7 @@ _HOMES = {
     "Trajectory": "cosim.trajectory",
     "build_controller": "cosim.plugins",
     "evaluate": "cosim.evaluation",
-    "study": "cosim.studies.run",
+    "study": "cosim.studies.results",
     "simulate": "cosim.simulation",
     "train": "learning.training",
 }

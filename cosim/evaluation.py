@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from controllers.optimum import stored_optimum
-from cosim.errors import EvaluationError, StudyError
+from cosim.errors import EvaluationError
 from cosim.files import replacing, temporary_folder
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, parameters_hash, versions
@@ -31,16 +31,22 @@ from cosim.statistics import (
     regret,
     regrets,
 )
-from cosim.studies.plan import NAIVE
-from cosim.studies.run import Report, Runner
-from cosim.studies.store import EVALUATION, TIMING, check_folders, to_csv
-from cosim.studies.work import Case, Noise, Run, RunKey
+from cosim.studies.run import (
+    EVALUATION,
+    TIMING,
+    Noise,
+    Report,
+    Run,
+    RunKey,
+    Runner,
+    to_csv,
+)
 from cosim.validation import instead, known_keywords
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-OPTIMAL = "optimal"
+NAIVE, OPTIMAL = "naive", "optimal"
 Factory = Callable[[Scenario], Controller]
 
 MEANS = ("economic_cost", "mean_violation", "violating_share", "J", "input_effort")
@@ -70,7 +76,8 @@ def evaluate(
 
     On a seed all controllers meet the same disturbances (common random numbers). A stored optimum
     runs too, for J*, without rows of its own unless it is named. Raises EvaluationError on a
-    malformed request or failed workers, and what building or running a controller raises.
+    malformed request or failed workers, StudyError on a name that no folder can have, and what
+    building or running a controller raises.
 
     Args:
         controllers: by name a factory(scenario) -> Controller, importable where the workers run, or
@@ -113,14 +120,7 @@ def evaluate(
             "controller": item if isinstance(item, str) else _qualified(item),
             "parameters": parameters[name],
         }
-        try:
-            key = RunKey(scenario.name, name)
-        except StudyError as error:
-            raise EvaluationError(str(error)) from None
-        case = Case(name, (scenario.name,), "")
-        runs.append(Run(key, case, scenario, item, None, depends, noise))
-    check_folders(runs)
-
+        runs.append(Run(RunKey(scenario.name, name), scenario, item, None, depends, noise))
     total = sum(run.samples for run in runs)
     bar = reporting(progress, scenario.name, total)
     with temporary_folder("cosim-evaluation-") as own, bar as tell:
@@ -132,10 +132,7 @@ def evaluate(
             raise failure.error()
         stores = dict(zip(named, runner.stores.values(), strict=True))
         columns, timing = (
-            {
-                name: pd.DataFrame.from_dict(store.indicators(file), "index").reindex(numbers)
-                for name, store in stores.items()
-            }
+            {name: store.measured(file) for name, store in stores.items()}
             for file in (EVALUATION, TIMING)
         )
     return Evaluation(wanted, numbers, columns, timing, parameters, facts)
@@ -213,19 +210,14 @@ class Evaluation(Result):
         return OPTIMAL if OPTIMAL in self.columns else None
 
     @property
-    def naive(self) -> str | None:
-        """Name of the reference controller of the closed gap, or None."""
-        return NAIVE if NAIVE in self.controllers else None
-
-    @property
     def reference(self) -> str:
         """Name of the controller that gains are measured against."""
-        return self.naive or self.controllers[0]
+        return NAIVE if NAIVE in self.controllers else self.controllers[0]
 
     @property
     def optimal(self) -> Array:
         """J of the optimum over the seeds, (S,), NaN where it is not known."""
-        return self._cost(self.optimum)
+        return self._cost(OPTIMAL)
 
     def column(self, controller: str, name: str) -> Array:
         """An indicator of a controller over the seeds, (S,); raises EvaluationError on others."""
@@ -235,27 +227,25 @@ class Evaluation(Result):
         found: Array = self.columns[controller][name].to_numpy()
         return found
 
-    def _cost(self, controller: str | None) -> Array:
-        if controller is None:
-            return np.full(len(self.seeds), np.nan)
-        return self.column(controller, "J")
+    def _cost(self, controller: str) -> Array:
+        """J over the seeds, (S,), NaN of a controller that was not evaluated."""
+        there = controller in self.columns
+        return self.column(controller, "J") if there else np.full(len(self.seeds), np.nan)
 
     def to_pandas(self) -> pd.DataFrame:
         """A row for each controller, as given, and seed; NaN where an indicator is undefined."""
-        naive, frames = self._cost(self.naive), []
-        for name in self.controllers:
-            cost = self.column(name, "J")
-            frame = self.columns[name].assign(
-                **self.facts,
-                controller=name,
-                seed=self.seeds,
-                parameters_hash=self.parameters[name],
-                regret=regrets(cost, self.optimal),
-                gap_closed=gaps_closed(cost, naive, self.optimal),
-                gain_in_J=gains(cost, self._cost(self.reference)),
-            )
-            frames.append(frame[COLUMNS].astype({"failures": int}))
-        return pd.concat(frames, ignore_index=True)
+        frame = self._rows(self.columns).assign(**self.facts)
+        cost, names = frame.J.to_numpy(), (NAIVE, OPTIMAL, self.reference)
+        naive, optimal, reference = (np.tile(self._cost(n), len(self.controllers)) for n in names)
+        frame["parameters_hash"] = frame.controller.map(self.parameters)
+        frame["regret"] = regrets(cost, optimal)
+        frame["gap_closed"] = gaps_closed(cost, naive, optimal)
+        frame["gain_in_J"] = gains(cost, reference)
+        return frame[COLUMNS].astype({"failures": int})
+
+    def _rows(self, frames: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+        rows = pd.concat({name: frames[name] for name in self.controllers})
+        return rows.rename_axis(["controller", "seed"]).reset_index()
 
     def to_csv(self) -> str:
         """The table as CSV; floats read back to the same bits, undefined ones are empty."""
@@ -276,15 +266,14 @@ class Evaluation(Result):
         """Means over the seeds by controller, as a Markdown table; a regret of 1 is 100 %."""
         names = ["J", "regret", "economic_cost", "violating_share", "failures"]
         means = self.to_pandas().groupby("controller", sort=False)[names].mean()
-        rows = [[str(row[0]), *(f"{value:.6g}" for value in row[1:])] for row in means.itertuples()]
+        rows = means.map("{:.6g}".format).reset_index().to_numpy().tolist()
         return markdown_table(("controller", *names), rows)
 
     def write(self, folder: Path) -> None:
         """Write evaluation.csv, evaluation.png and timing.csv, each whole or not at all."""
         self.plot(folder / "evaluation.png")
-        clock = pd.concat({name: self.timing[name] for name in self.controllers})
-        clock = clock.rename_axis(["controller", "seed"]).reset_index()
-        for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock.round(3))):
+        clock = self._rows(self.timing).round(3)
+        for name, frame in ((EVALUATION, self.to_pandas()), (TIMING, clock)):
             # Write row by row: the text of all takes ten times the memory of the numbers.
             with replacing(folder / name) as path:
                 frame.to_csv(path, index=False, lineterminator="\n")
@@ -322,11 +311,11 @@ class Evaluation(Result):
             "parameters_hash": self.parameters[name],
             "intervals": estimates,
         }
-        cost, naive = self._cost(name), self._cost(self.naive)
+        cost, naive = self._cost(name), self._cost(NAIVE)
         if self.optimum is not None:
             resampled = bootstrapped(cost - self.optimal, magnitude(self.optimal))
             document["regret"] = regret(cost, self.optimal)._asdict() | {"bootstrap": resampled}
-        if self.optimum is not None and self.naive is not None:
+        if self.optimum is not None and NAIVE in self.controllers:
             document["gap_closed"] = gap_closed(cost, naive, self.optimal)._asdict()
         return document
 

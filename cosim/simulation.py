@@ -104,8 +104,7 @@ class _Run:
         self._length = min(max(PART, steps // 200), 10 * PART)
         self._columns = SignalColumns(self._scenario, steps, residuals)
         self._status: list[str] = []
-        self._predicted_states: Array | None = None
-        self._predicted_actions: Array | None = None
+        self._predicted: list[Array] = []
         self._final_state: Array | None = None
 
     def interpreted(
@@ -163,25 +162,18 @@ class _Run:
             table = np.empty((end - first, n + m + outputs + 6))
             self._final_state = plant.drive(loop, table)  # type: ignore[attr-defined]
             states, actions, output, rest = np.split(table, [n, n + m, n + m + outputs], axis=1)
-            value, residual, failed, *clock = rest.T
-            columns.fill(
-                first,
-                {
-                    "time": np.arange(first, end, dtype=np.float64) * scenario.sampling_time,
-                    "states": states,
-                    "actions": actions,
-                    "disturbances": output[:, 1:],
-                    "stage_cost": output[:, 0],
-                    "penalty": scenario.state_penalty.along(states),
-                    "value": value,
-                    "residual": residual,
-                    "failed": failed,
-                    **dict(
-                        zip(("prepare_time", "feedback_time", "plant_time"), clock, strict=True)
-                    ),
-                },
-            )
-            self._status += [FALLBACK if each else "solved" for each in failed]
+            names = ("value", "residual", "failed", "prepare_time", "feedback_time", "plant_time")
+            found = {
+                "time": np.arange(first, end, dtype=np.float64) * scenario.sampling_time,
+                "states": states,
+                "actions": actions,
+                "disturbances": output[:, 1:],
+                "stage_cost": output[:, 0],
+                "penalty": scenario.state_penalty.along(states),
+                **dict(zip(names, rest.T, strict=True)),
+            }
+            columns.fill(first, found)
+            self._status += [FALLBACK if each else "solved" for each in found["failed"]]
             progress(end)
 
     def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
@@ -207,29 +199,23 @@ class _Run:
         return CosimError(f"{controller_name(self._controller)} gave {given}{at}")
 
     def _keep_prediction(self, k: int, solution: Solution) -> None:
-        states, actions = solution.predicted_states, solution.predicted_actions
-        if states is None or actions is None:
+        given: list[Any] = [solution.predicted_states, solution.predicted_actions]
+        if any(values is None for values in given):
             return
-        if self._predicted_states is None or self._predicted_actions is None:
-            self._predicted_states = np.full((self._length, *np.shape(states)), np.nan)
-            self._predicted_actions = np.full((self._length, *np.shape(actions)), np.nan)
+        if not self._predicted:
+            shapes = [(self._length, *np.shape(values)) for values in given]
+            self._predicted = [np.full(shape, np.nan) for shape in shapes]
         try:
-            self._predicted_states[k % self._length] = states
-            self._predicted_actions[k % self._length] = actions
+            for kept, values in zip(self._predicted, given, strict=True):
+                kept[k % self._length] = values
         except (TypeError, ValueError) as error:
             raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
 
     def _part(self, first: int, end: int) -> RunPart:
-        count = end - first
-        states, actions = self._predicted_states, self._predicted_actions
-        self._predicted_states = self._predicted_actions = None
-        return RunPart(
-            first=first,
-            columns=self._columns.store(first),
-            status=self._status[first:end],
-            predicted_states=None if states is None else states[:count],
-            predicted_actions=None if actions is None else actions[:count],
-        )
+        states, actions = [kept[: end - first] for kept in self._predicted] or (None, None)
+        self._predicted = []
+        columns, status = self._columns.store(first), self._status[first:end]
+        return RunPart(first, columns, status, states, actions)
 
     def trajectory(self) -> Trajectory:
         scenario = self._scenario

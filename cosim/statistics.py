@@ -6,7 +6,7 @@ arrays are paired: entry s of each belongs to seed s. Intervals are of 95 %.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import floor, isfinite, log10
 from typing import Any, NamedTuple
 
@@ -62,15 +62,23 @@ def bootstrapped(numerator: Array, denominator: Array) -> Interval:
     without = (np.sum(numerator) - numerator) / (total - denominator)
     if np.ptp(without) <= 1e-12 * max(1.0, abs(value)):  # BCa is undefined where no seed counts
         return value, value
+
+    def quotient(above: Array, below: Array, axis: int) -> Any:
+        return np.mean(above, axis=axis) / np.mean(below, axis=axis)
+
+    return _bootstrap((numerator, denominator), quotient, paired=True, method="BCa")
+
+
+def _bootstrap(data: Sequence[Array], statistic: Callable[..., Any], **options: Any) -> Interval:
+    """Interval of a statistic of resampled data, with a fixed seed."""
     found = stats.bootstrap(
-        (numerator, denominator),
-        lambda a, b, axis: np.mean(a, axis=axis) / np.mean(b, axis=axis),
-        paired=True,
+        tuple(data),
+        statistic,
         n_resamples=RESAMPLES,
-        batch=max(1, AT_ONCE // seeds),
+        batch=max(1, AT_ONCE // max(map(len, data))),
         confidence_level=LEVEL,
-        method="BCa",
         rng=np.random.default_rng(0),
+        **options,
     ).confidence_interval
     return float(found.low), float(found.high)
 
@@ -147,17 +155,7 @@ def over_runs(strata: Sequence[Array]) -> Estimate:
     def middle(*resampled: Array, axis: int) -> Any:
         return interquartile_mean(np.concatenate(resampled, axis=axis), axis)
 
-    low, high = stats.bootstrap(
-        tuple(strata),
-        middle,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=max(1, AT_ONCE // max(map(len, strata))),
-        confidence_level=LEVEL,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Estimate(value, (float(low), float(high)))
+    return Estimate(value, _bootstrap(strata, middle, method="percentile"))
 
 
 def td_error_mean(

@@ -124,25 +124,22 @@ class SignalColumns:
     """
 
     def __init__(self, scenario: Scenario, steps: int, residuals: bool) -> None:
-        unwanted = () if residuals else (RESIDUAL,)
-        self._unwanted = {kind.name for kind in SIGNALS if kind.of in unwanted}
-        read = {kind: kind.of for kind in SIGNALS if isinstance(kind.of, str)}
-        scalars = {k: of for k, of in read.items() if not k.vector and of not in unwanted}
-        vectors = {kind: of for kind, of in read.items() if kind.vector}
-        # One call a sample reads all scalars, one all vectors.
-        self._scalars, self._vectors = attrgetter(*scalars.values()), attrgetter(*vectors.values())
-        self._derived = {k.name: k.of for k in SIGNALS if not isinstance(k.of, str)}
-        self._rows: list[list[float]] = []
         self._scenario = scenario
-        stored = [*scalars, *vectors]
-        stored += [kind for kind in SIGNALS if kind not in stored]
-        widths = [len(kind.names(scenario)) for kind in stored]
+        self._derived = {k.name: k.of for k in SIGNALS if not isinstance(k.of, str)}
+        read = {k: k.of for k in SIGNALS if isinstance(k.of, str)}
+        read = {kind: of for kind, of in read.items() if residuals or of != RESIDUAL}
+        kinds = sorted(read, key=lambda kind: kind.vector)
+        # One call a sample reads all scalars, one all vectors.
+        self._scalars = attrgetter(*(read[kind] for kind in kinds if not kind.vector))
+        self._vectors = attrgetter(*(read[kind] for kind in kinds if kind.vector))
+        self._rows: list[list[float]] = []
+        widths = {kind: len(kind.names(scenario)) for kind in SIGNALS}
+        self._names = [kind.name for kind in kinds]
+        self._cuts = np.cumsum([widths[kind] for kind in kinds])[:-1]
         # Column-major, so that a signal is a column and not a copy of one.
-        self._table = np.full((steps, sum(widths)), nan, order="F")
-        parts = np.split(self._table, np.cumsum(widths)[:-1], axis=1)
         self.columns: dict[str, Array] = {
-            kind.name: part if kind.vector else part[:, 0]
-            for kind, part in zip(stored, parts, strict=True)
+            kind.name: np.full((steps, width) if kind.vector else steps, nan, order="F")
+            for kind, width in widths.items()
         }
 
     def read(self, sample: Sample) -> None:
@@ -152,24 +149,19 @@ class SignalColumns:
             row += values.tolist()
         self._rows.append(row)
 
-    def fill(self, first: int, values: Mapping[str, Array]) -> None:
-        """Store given samples by name, from sample number `first` on."""
-        where = slice(first, first + len(values["time"]))
-        for name, column in self.columns.items():
-            if name in values and name not in self._unwanted:
-                column[where] = values[name]
-        self._derive(where)
-
     def store(self, first: int) -> dict[str, Array]:
         """Store the samples read, from sample number `first` on, and return them by name."""
-        where = slice(first, first + len(self._rows))
-        self._table[where, : len(self._rows[0])] = self._rows
+        parts = np.split(np.array(self._rows), self._cuts, axis=1)
         self._rows.clear()
-        return self._derive(where)
+        return self.fill(first, dict(zip(self._names, parts, strict=True)))
 
-    def _derive(self, where: slice) -> dict[str, Array]:
-        """Derive signals from the stored samples `where`; return all by name."""
+    def fill(self, first: int, values: Mapping[str, Array]) -> dict[str, Array]:
+        """Store K samples of signals by name, derive the others, and return all by name."""
+        where = slice(first, first + len(values["time"]))
         stored = {name: column[where] for name, column in self.columns.items()}
+        for name in self._names:
+            if name in values:
+                stored[name][:] = values[name].reshape(stored[name].shape)
         for name, derive in self._derived.items():
             stored[name][:] = derive(self._scenario, stored)
         return stored

@@ -66,7 +66,7 @@ def _execute(
 
     from cosim.errors import FailedRunsError
     from cosim.studies.plan import Study, plan
-    from cosim.studies.run import study
+    from cosim.studies.results import study
 
     definition = Study.load(file)
     folder = cli.open_folder(out)
@@ -134,7 +134,7 @@ def report(
 
 def _summary(found: StudyResults) -> dict[str, Any]:
     """The study as a JSON document; `timing` is timing.csv by run."""
-    from cosim.studies.store import TIMING, read_table
+    from cosim.studies.run import TIMING, read_table
 
     timing = read_table(found.folder / TIMING, types={"run": str})
     return {

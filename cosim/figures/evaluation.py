@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FormatStrFormatter
 
 from cosim.figures.style import (
     DASHED,
@@ -18,7 +18,6 @@ from cosim.figures.style import (
     dot_rows,
     figure,
     palette,
-    percent,
     plain,
     regret_axis,
 )
@@ -49,7 +48,7 @@ def evaluation_figure(
         left, right = drawn.subplots(1, 2, width_ratios=(1.0, 1.05))
         _rows(left, controllers, looks, optimal)
         _pareto(right, controllers, looks)
-        drawn.suptitle(plain(title), fontsize=8.5)
+        drawn.suptitle(plain(title))
     return drawn
 
 
@@ -108,7 +107,7 @@ def _pareto(axes: Axes, controllers: Mapping[str, pd.DataFrame], looks: Mapping[
     if top >= DECADE * VIOLATION:
         axes.set_xscale("symlog", linthresh=VIOLATION, linscale=0.5)
         axes.set_xlim(-0.2 * VIOLATION, 1.6 * top)
-        axes.xaxis.set_major_formatter(FuncFormatter(percent))
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.set_xlabel("mean violation per sample, in the states' units")
     axes.set_ylabel("economic cost per sample")
 

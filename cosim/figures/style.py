@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter
+from matplotlib.ticker import EngFormatter, FormatStrFormatter
 from numpy.typing import NDArray
 
 from cosim.errors import FigureError
@@ -180,11 +180,6 @@ def label(name: str, unit: str) -> str:
     return f"{text} [{shown}]" if shown else text
 
 
-def percent(value: float, _: object = None) -> str:
-    """A tick in plain digits."""
-    return f"{value:g}"
-
-
 def regret_axis(
     axes: Axes, which: Literal["x", "y"], values: NDArray[np.float64], floor: float = FLOOR
 ) -> None:
@@ -194,7 +189,7 @@ def regret_axis(
     lowest = low / 1.6 if low > floor else min(1.6 * low, -0.3 * floor)
     getattr(axes, f"set_{which}scale")("symlog", linthresh=floor, linscale=0.5)
     getattr(axes, f"set_{which}lim")(lowest, 1.6 * max(high, floor))
-    (axes.xaxis if which == "x" else axes.yaxis).set_major_formatter(FuncFormatter(percent))
+    (axes.xaxis if which == "x" else axes.yaxis).set_major_formatter(FormatStrFormatter("%g"))
 
 
 class Dots(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, FuncFormatter
+from matplotlib.ticker import EngFormatter, FormatStrFormatter
 
 from cosim.figures.style import (
     DASHED,
@@ -21,13 +21,12 @@ from cosim.figures.style import (
     figure,
     label_ends,
     palette,
-    percent,
     plain,
     samples_axis,
     symbol,
 )
 from cosim.protocols import Array
-from cosim.statistics import regrets
+from cosim.statistics import TD_WINDOW, regrets
 
 GREEDY = palette(["learnt"])["learnt"].color
 DECADES = 30.0
@@ -60,9 +59,9 @@ def training_figure(
     norms = {name: np.linalg.norm(values, axis=1) for name, values in theta.items()}
     order = sorted((n for n in norms if norms[n].any()), key=lambda n: -float(norms[n][-1]))
     panels = ["regret %" if best is not None else "J per sample"]
-    panels += ["greedy: violating samples %"] * _measured(log, "greedy_violating_share", 1)
-    # A single TD error makes no curve.
-    panels += ["TD error (r.m.s.)"] * _measured(log, "td_error", 2)
+    share, error = _known(log, "greedy_violating_share"), _known(log, "td_error")
+    panels += ["greedy: violating samples %"] * bool(share[0].size)
+    panels += ["TD error (r.m.s.)"] * (error[0].size > 1)  # a single one makes no curve
     panels += ["change of θ, by its scale"] * bool(order)
     columns = len(panels) if len(panels) < 4 else 2
     rows = -(-len(panels) // columns)
@@ -71,10 +70,9 @@ def training_figure(
         named = []
         for axes, name in zip(grid, panels, strict=True):
             if name.startswith("greedy"):
-                samples, share = _known(log, "greedy_violating_share")
-                _course(axes, samples, 100 * share, GREEDY, 1.0)
+                _course(axes, share[0], 100 * share[1], GREEDY, 1.0)
             elif name.startswith("TD"):
-                _course(axes, *_known(log, "td_error"), INK, 1e-12)
+                _course(axes, *error, INK, 1e-12)
             elif name.startswith("change"):
                 named.append((axes, _change(axes, log, {n: norms[n] for n in order[:BLOCKS]})))
             else:
@@ -83,18 +81,16 @@ def training_figure(
             samples_axis(axes, max(float(log["samples"][-1]), 1.0))
         for axes in grid[-columns:]:
             axes.set_xlabel("training samples")
-        drawn.suptitle(plain(title), fontsize=8.5)
+        drawn.suptitle(plain(title))
         label_ends(drawn, named)
     return drawn
 
 
-def _measured(log: Mapping[str, Array], name: str, least: int) -> bool:
-    return name in log and int(np.isfinite(log[name]).sum()) >= least
-
-
 def _known(log: Mapping[str, Array], name: str) -> tuple[Array, Array]:
-    known = np.isfinite(log[name])
-    return log["samples"][known], log[name][known]
+    """Samples and finite values of a column; empty where the log has none."""
+    values = log.get(name, np.full(len(log["samples"]), np.nan))
+    known = np.isfinite(values)
+    return log["samples"][known], values[known]
 
 
 def _cost(
@@ -124,7 +120,7 @@ def _course(axes: Axes, samples: Array, values: Array, color: str, least: float)
     """A line from 0 to `least` or more, logarithmic where it spans decades."""
     axes.plot(samples, values, marker="." if len(values) < POINTS else "", color=color, **_LINE)
     low, top = float(values.min()), max(float(values.max()), least)
-    short = EngFormatter(sep="") if top >= 1e3 else FuncFormatter(percent)
+    short = EngFormatter(sep="") if top >= 1e3 else FormatStrFormatter("%g")
     axes.yaxis.set_major_formatter(short)
     if 0 < DECADES * low < top:
         axes.set_yscale("log")
@@ -141,18 +137,16 @@ def _change(axes: Axes, log: Mapping[str, Array], moved: Mapping[str, Array]) ->
     top = max(float(norm.max()) for norm in moved.values())
     if top > DECADES:
         axes.set_yscale("symlog", linthresh=1.0)
-        axes.yaxis.set_major_formatter(FuncFormatter(percent))
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     axes.set_ylim(0.0, 1.05 * top)
     return labels
 
 
-def parameters_figure(
-    samples: Array, increments: Mapping[str, Array], td_error: Array, *, window: int = 10_000
-) -> Figure:
+def parameters_figure(samples: Array, increments: Mapping[str, Array], td_error: Array) -> Figure:
     """The paper's figure of a training: increments of θ by block, and the TD error.
 
     `increments` maps a block's name to θ − θ₀ (K, entries) at `samples` (K,); `td_error` (K,) is
-    the root mean square over the preceding `window` samples. Source: paper.tex, fig. nmpc_learn.
+    the root mean square over the preceding `TD_WINDOW` samples. Source: paper.tex, fig. nmpc_learn.
     """
     moving = {name: values for name, values in increments.items() if np.any(values)}
     looks = [{"linestyle": line, "color": color} for line, color in product(("-", DASHED), ENTRIES)]
@@ -173,7 +167,7 @@ def parameters_figure(
         axes = drawn.add_subplot(grid[rows, :], sharex=first)
         axes.plot(samples, td_error, color=INK, linewidth=1.0)
         samples_axis(axes, float(samples[-1]), "samples")
-        title = f"TD error in the stage cost's unit, r.m.s. of the preceding {window} samples"
+        title = f"TD error in the stage cost's unit, r.m.s. of the preceding {TD_WINDOW} samples"
         axes.set_title(title, loc="left", fontsize=8.0)
         most = max((values.shape[1] for values in moving.values()), default=0)
         if most:

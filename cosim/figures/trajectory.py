@@ -45,60 +45,57 @@ def trajectory_figure(trajectory: Run, scenario: Scenario, *, beside: Sequence[R
     data is named, not drawn. The axes span the runs `beside` this one too, so that figures of a
     set can be compared.
     """
-    plant, units = scenario.plant, {k: s.unit for k, s in trajectory.signals.items()}
+    units = {name: signal.unit for name, signal in trajectory.signals.items()}
     scale, unit = time_unit(trajectory.time)
     time = trajectory.time / scale
     who = trajectory.controller or "run"
     color = palette([who])[who].color
-    left = [*plant.states, *plant.actions]
-    right = [*plant.disturbances, "stage_cost", "penalty"]
+    held, costs = scenario.plant.disturbances, {"stage_cost": REFERENCE, "penalty": BOUND}
+    left, right = [*scenario.limits], [*held, *costs]
     rows = int(np.lcm(len(left), len(right)))
+    cells: Any = [
+        [names[row * len(names) // rows] for names in (left, right)] for row in range(rows)
+    ]
+    references = np.append(scenario.reference_state, scenario.reference_action)
+    failed = trajectory["failed"] > 0
     with figure(max(1.05 * max(len(left), len(right) * 0.8), 2.4) + 0.5) as drawn:
-        grid = drawn.add_gridspec(rows, 2, width_ratios=(1.35, 1.0))
-        axes: dict[str, Axes] = {}
-        for column, names in enumerate((left, right)):
-            span = rows // len(names)
-            for i, name in enumerate(names):
-                cell = grid[i * span : (i + 1) * span, column]
-                own = drawn.add_subplot(cell, sharex=next(iter(axes.values()), None))
-                own.set_ylabel(label(name, units[name]), fontsize=7.0)
-                own.tick_params(labelbottom=i == len(names) - 1)
-                for run in beside:
-                    values = run[name]
-                    own.update_datalim([(time[0], np.min(values)), (time[0], np.max(values))])
-                    own.autoscale_view()
-                axes[name] = own
-            axes[names[-1]].set_xlabel(f"time [{unit}]")
-        for i, name in enumerate(plant.states):
-            lower, upper = float(scenario.state_lower[i]), float(scenario.state_upper[i])
-            axes[name].plot(time, trajectory[name], color=color, linewidth=0.9)
-            _shade(axes[name], time, trajectory[name], lower, upper, BOUND)
-            _limits(axes[name], lower, upper)
-            axes[name].axhline(scenario.reference_state[i], color=REFERENCE, linewidth=0.7)
-        failed = trajectory["failed"] > 0
-        for i, name in enumerate(plant.actions):
-            own = axes[name]
-            own.step(time, trajectory[name], where="post", color=color, linewidth=0.9)
-            own.axhline(scenario.reference_action[i], color=REFERENCE, linewidth=0.7)
-            _limits(own, scenario.action_lower[i], scenario.action_upper[i])
-            if failed.any():
-                values = trajectory[name][failed]
-                own.plot(time[failed], values, "x", color=BOUND, ms=4, label="fallback")
-                own.legend(loc="upper right")
-        for name in plant.disturbances:
-            axes[name].step(time, trajectory[name], where="post", color=REFERENCE, linewidth=0.6)
-        for name, shade in (("stage_cost", REFERENCE), ("penalty", BOUND)):
-            _cost(axes[name], time, trajectory[name], shade)
-        axes["penalty"].set_ylim(bottom=0.0)
-        axes[left[0]].set_xlim(time[0], time[-1] + (time[1] - time[0] if len(time) > 1 else 1.0))
+        panels = drawn.subplot_mosaic(cells, sharex=True, width_ratios=(1.35, 1.0))
+        for name, axes in panels.items():
+            axes.set_ylabel(label(name, units[name]), fontsize=7.0)
+            for run in beside:
+                values = run[name]
+                axes.update_datalim([(time[0], np.min(values)), (time[0], np.max(values))])
+                axes.autoscale_view()
+        for name, reference in zip(left, references, strict=True):
+            axes, values = panels[name], trajectory[name]
+            _line(axes, time, trajectory, name, BOUND, color=color, linewidth=0.9)
+            _limits(axes, *scenario.limits[name])
+            axes.axhline(reference, color=REFERENCE, linewidth=0.7)
+            if name in scenario.plant.actions and failed.any():
+                axes.plot(time[failed], values[failed], "x", color=BOUND, ms=4, label="fallback")
+                axes.legend(loc="upper right")
+        for name in right:
+            shade = costs.get(name, REFERENCE)
+            panels[name].step(time, trajectory[name], where="post", color=shade, linewidth=0.6)
+        for name in costs:
+            mean = float(np.mean(trajectory[name]))
+            panels[name].axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
+            panels[name].annotate(
+                f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
+                (0.99, 0.95), xycoords="axes fraction", ha="right", va="top", fontsize=6.5,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
+            )  # fmt: skip
+        panels["penalty"].set_ylim(bottom=0.0)
+        for names in (left, right):
+            panels[names[-1]].set_xlabel(f"time [{unit}]")
+        panels[left[0]].set_xlim(time[0], time[-1] + (time[1] - time[0] if len(time) > 1 else 1.0))
         drawn.align_ylabels()
         summary = trajectory.summary()
         seed = "" if trajectory.seed is None else f", seed {trajectory.seed}"
         drawn.suptitle(
             f"{shown_case(who)} on {plain(scenario.name)}{seed}:   "
             f"J = {summary['J']:.0f},   economic cost {summary['economic_cost']:.0f},   "
-            f"violating {100 * summary['violating_share']:.1f} % of samples",
-            fontsize=8.5,
+            f"violating {100 * summary['violating_share']:.1f} % of samples"
         )
     return drawn
 
@@ -110,18 +107,16 @@ def overlay_figure(runs: Mapping[str, Run]) -> Figure:
     colour. The legend gives each J and the share of violating samples.
     """
     first = next(iter(runs.values()))
-    scenario, plant = first.scenario, first.scenario.plant
+    scenario = first.scenario
     scale, unit = time_unit(first.time)
     looks = palette(list(runs))
     with figure(1.2 * len(scenario.limits) + 0.6) as drawn:
         rows = drawn.subplots(len(scenario.limits), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, (name, (lower, upper)) in zip(rows, scenario.limits.items(), strict=True):
+        for axes, name in zip(rows, scenario.limits, strict=True):
             for controller, run in runs.items():
-                held = "steps-post" if name in plant.actions else "default"
                 color = looks[controller].color
-                axes.plot(run.time / scale, run[name], color=color, linewidth=1.1, drawstyle=held)
-                _shade(axes, run.time / scale, run[name], lower, upper, color)
-            _limits(axes, lower, upper)
+                _line(axes, run.time / scale, run, name, color, color=color, linewidth=1.1)
+            _limits(axes, *scenario.limits[name])
             axes.set_ylabel(label(name, first.signals[name].unit))
         rows[-1].set_xlabel(f"time [{unit}]")
         rows[-1].set_xlim(first.time[0] / scale, (first.time[-1] + scenario.sampling_time) / scale)
@@ -206,11 +201,15 @@ def time_unit(time: Array) -> tuple[float, str]:
     return (60.0, "min") if duration <= 86400.0 else (3600.0, "h")
 
 
-def _shade(axes: Axes, time: Array, values: Array, lower: float, upper: float, color: str) -> None:
+def _line(axes: Axes, time: Array, run: Run, name: str, shade: str, **look: Any) -> None:
+    """Draw a state, or an input, which is held, and shade what is beyond its bounds."""
+    values, (lower, upper) = run[name], run.scenario.limits[name]
+    held = "steps-post" if name in run.scenario.plant.actions else "default"
+    axes.plot(time, values, drawstyle=held, **look)
     for bound, outside in ((lower, values < lower), (upper, values > upper)):
         if outside.any():
             axes.fill_between(
-                time, values, bound, where=list(outside), color=color, alpha=0.3, linewidth=0,
+                time, values, bound, where=list(outside), color=shade, alpha=0.3, linewidth=0,
                 interpolate=True,
             )  # fmt: skip
 
@@ -235,14 +234,3 @@ def _limits(axes: Axes, lower: float, upper: float) -> None:
             f"bound {', '.join(far)}", (1.0, 1.0), xycoords="axes fraction", ha="right",
             va="bottom", fontsize=6.5, color=BOUND,
         )  # fmt: skip
-
-
-def _cost(axes: Axes, time: Array, values: Array, color: str) -> None:
-    axes.step(time, values, where="post", color=color, linewidth=0.6)
-    mean = float(np.mean(values))
-    axes.axhline(mean, color=INK, linewidth=0.8, linestyle=(0, (1, 1)))
-    axes.annotate(
-        f"mean {mean:.0f}" if abs(mean) >= 1000 else f"mean {mean:.4g}",
-        (0.99, 0.95), xycoords="axes fraction", ha="right", va="top", fontsize=6.5,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
-    )  # fmt: skip

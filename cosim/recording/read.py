@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, RrdReader
@@ -18,7 +19,7 @@ from rerun.error_utils import RerunWarning
 from cosim.errors import RecordingError
 from cosim.scenario import VIOLATING
 
-TIME, SAMPLE = "time", "sample"
+TIME, SAMPLE, STATUS = "time", "sample", "/solver/status"
 SIGNAL = "cosim.Signal"
 """Archetype of the static mark (name, unit) on every entity that holds a signal."""
 _SCALARS = rr.Scalars.descriptor_scalars().component
@@ -51,14 +52,15 @@ def read_recording(path: str | Path) -> Recording:
     Raises RecordingError where there is no such file, or it is no recording of this package.
     """
     static: dict[str, dict[str, list[str]]] = {}
-    rows: dict[str, list[pa.RecordBatch]] = defaultdict(list)
+    batches: dict[str, list[pa.RecordBatch]] = defaultdict(list)
     for chunk in _chunks(Path(path)):
         batch = chunk.to_record_batch()
         if chunk.is_static:
             texts = {name: _texts(batch.column(name)) for name in batch.schema.names}
             static.setdefault(chunk.entity_path, {}).update(texts)
         elif SAMPLE in batch.schema.names:
-            rows[chunk.entity_path].append(batch)
+            batches[chunk.entity_path].append(batch)
+    rows = {entity: _rows(parts) for entity, parts in batches.items()}
     marks = {entity: texts for entity, texts in static.items() if f"{SIGNAL}:name" in texts}
     if not marks:
         raise RecordingError(f"{path} holds no signals of rti-cosim")
@@ -71,18 +73,21 @@ def read_recording(path: str | Path) -> Recording:
         if len(names) != len(spelled):
             raise RecordingError(f"{path} was recorded by another version of rti-cosim")
         units |= dict(zip(names, spelled, strict=True))
-        found, values = _columns(rows[entity], len(names))
+        if entity not in rows:
+            signals |= dict.fromkeys(names, np.empty(0))
+            continue
+        values, moments = _values(rows[entity], len(names)), _time(rows[entity])
         if entity.startswith("/intermediate/"):
-            moments = np.column_stack([_time(rows[entity]), *values])
-            intermediate[names[0]] = moments[moments[:, 0].argsort(kind="stable")]
+            order = moments.argsort(kind="stable")
+            intermediate[names[0]] = np.column_stack([moments, *values])[order]
             continue
         signals |= dict(zip(names, values, strict=True))
-        if len(found) > len(samples):
-            samples, time = found, _time(rows[entity])
+        if len(rows[entity]) > len(samples):
+            samples, time = np.asarray(rows[entity][SAMPLE]), moments
     described = next((t for e, t in static.items() if e.endswith("/run")), {})
     properties = {key: text[0] for key, text in described.items() if ":" not in key and text}
     properties.pop("rerun.controls.RowId", None)
-    status = _status(rows.get("/solver/status", []), samples)
+    status = _status(rows[STATUS], samples) if STATUS in rows else []
     signals = dict(sorted(signals.items()))
     return Recording(signals, samples, time, units, properties, status, intermediate)
 
@@ -120,10 +125,16 @@ def summarise(path: str | Path) -> dict[str, Any]:
     }
 
 
+def existing(path: str | Path) -> Path:
+    """The path; raises RecordingError where there is no such file."""
+    if not Path(path).is_file():
+        raise RecordingError(f"there is no recording {path}")
+    return Path(path)
+
+
 def _chunks(path: Path) -> list[Chunk]:
     try:
-        if not path.is_file():
-            raise RecordingError(f"there is no recording {path}")
+        existing(path)
         with warnings.catch_warnings():
             # A file without its end is reported below, once.
             warnings.simplefilter("ignore", RerunWarning)
@@ -141,39 +152,27 @@ def _texts(column: pa.Array) -> list[str]:
     return [str(item) for item in value] if isinstance(value, list) else [str(value)]
 
 
-def _order(batches: list[pa.RecordBatch]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    samples = np.concatenate([np.asarray(batch.column(SAMPLE)) for batch in batches])
-    order = np.argsort(samples, kind="stable")
-    return samples[order], order
+def _rows(batches: list[pa.RecordBatch]) -> pa.Table:
+    """Rows of an entity, by sample."""
+    table = pa.Table.from_batches(batches)
+    return table.take(np.argsort(np.asarray(table[SAMPLE]), kind="stable"))
 
 
-def _columns(
-    batches: list[pa.RecordBatch], signals: int
-) -> tuple[NDArray[np.int64], list[NDArray[np.float64]]]:
-    """Sample numbers and, for each signal of a bundle, its values (K,) or (K, N)."""
-    if not batches:
-        return np.empty(0, np.int64), [np.empty(0)] * signals
-    samples, order = _order(batches)
-    lists = [batch.column(_SCALARS) for batch in batches]
-    flat = np.concatenate([column.flatten().to_numpy() for column in lists])
-    values = flat.reshape(len(samples), signals, -1)[order]
-    parts = [np.ascontiguousarray(values[:, i]) for i in range(signals)]
-    return samples, [part[:, 0] if part.shape[1] == 1 else part for part in parts]
+def _values(rows: pa.Table, signals: int) -> list[NDArray[np.float64]]:
+    """For each signal of a bundle its values, (K,) or (K, N)."""
+    flat = pc.list_flatten(rows[_SCALARS]).to_numpy()
+    parts = np.ascontiguousarray(flat.reshape(len(rows), signals, -1).swapaxes(0, 1))
+    return [part[:, 0] if part.shape[1] == 1 else part for part in parts]
 
 
-def _time(batches: list[pa.RecordBatch]) -> NDArray[np.float64]:
-    _, order = _order(batches)
-    if any(TIME not in batch.schema.names for batch in batches):
-        return np.full(len(order), np.nan)
-    columns = [np.asarray(batch.column(TIME).cast(pa.int64())) for batch in batches]
-    return np.concatenate(columns)[order] / 1e9
+def _time(rows: pa.Table) -> NDArray[np.float64]:
+    if TIME not in rows.schema.names:
+        return np.full(len(rows), np.nan)
+    return np.asarray(rows[TIME].cast(pa.int64())) / 1e9
 
 
-def _status(batches: list[pa.RecordBatch], samples: NDArray[np.int64]) -> list[str]:
+def _status(changes: pa.Table, samples: NDArray[np.int64]) -> list[str]:
     """Every sample's status from the changes that were recorded."""
-    if not batches:
-        return []
-    at, order = _order(batches)
-    texts = [text[0] for batch in batches for text in batch.column(_STATUS).to_pylist()]
-    last = np.searchsorted(at, samples, side="right") - 1
-    return [texts[order[i]] for i in last]
+    texts = [text[0] for text in changes[_STATUS].to_pylist()]
+    last = np.searchsorted(np.asarray(changes[SAMPLE]), samples, side="right") - 1
+    return [texts[i] for i in last]

@@ -18,7 +18,7 @@ from rerun.experimental import ViewerClient
 from cosim.errors import RecordingError
 from cosim.files import replacing
 from cosim.processes import child_process
-from cosim.recording.read import SAMPLE, TIME, worst_moment
+from cosim.recording.read import SAMPLE, TIME, existing, worst_moment
 
 LOOPBACK = "127.0.0.1"
 _NOWHERE = f"http://{LOOPBACK}:9"
@@ -31,7 +31,7 @@ def open_viewer(path: str | Path) -> None:
 
     Raises RecordingError where there is no such file, no display or no graphics driver.
     """
-    command = [*_viewer(), "--port", "auto", str(_existing(path))]
+    command = [*_viewer(), "--port", "auto", str(existing(path))]
     if sys.platform == "linux" and not os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}:
         raise RecordingError(f"no display to show {path} on; draw it with --png FILE instead")
     with child_process(command, env=_silent("warn")) as viewer:
@@ -58,7 +58,7 @@ def render(
     """
     if at is not None and not isfinite(at):
         raise RecordingError(f"the time of the cursor (--at) must be finite, not {at}")
-    path = _existing(path)
+    path = existing(path)
     if at is None:
         at = worst_moment(path)
     deadline = time.monotonic() + timeout
@@ -98,13 +98,6 @@ def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float)
             "the viewer did not answer in time; the machine may be busy: try again"
         ) from error
     return shots[1]
-
-
-def _existing(path: str | Path) -> Path:
-    path = Path(path)
-    if not path.is_file():
-        raise RecordingError(f"there is no recording {path}")
-    return path
 
 
 def _viewer() -> list[str]:

@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun import escape_entity_path_part as escaped
 
 from cosim.comparison import RunSignals
 from cosim.errors import RecordingError
@@ -41,6 +42,7 @@ _FOOTER = b"RRF2FOOT"
 _WRITE_SECONDS = 30.0
 _ABANDONED: list[rr.RecordingStream] = []
 
+AT = rr.TimeRangeBoundary.absolute
 Range = tuple[float, float]
 
 ALONE = ("states", "actions", "costs")
@@ -99,9 +101,8 @@ class RerunRecorder:
             "package": f"rti-cosim {version('rti-cosim')}",
         }
         title = f"{name} on {scenario.name}, seed {seed}"
-        stream = self._stream = Stream(self.path, title, self._layout())
-        stream.properties(properties)
-        stream.about(_about(scenario, properties))
+        about = _about(scenario, properties)
+        stream = self._stream = Stream(self.path, title, self._layout(), about, properties)
         good = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
         stream.rerun.log(_STATUS, good, static=True)
 
@@ -112,18 +113,16 @@ class RerunRecorder:
             return
         samples, time = np.arange(part.first, part.first + len(part)), part["time"]
         rows, ends = times(samples, time), times(samples[[0, -1]], time[[0, -1]])
-        bundles: dict[str, tuple[list[Channel], list[np.ndarray]]] = {}
+        bundles: dict[str, list[tuple[Channel, Array]]] = {}
         for kind, channels in self._kinds.items():
-            for channel, values in zip(
-                channels, part[kind.name].reshape(len(part), -1).T, strict=True
-            ):
+            columns = part[kind.name].reshape(len(part), -1).T
+            for channel, values in zip(channels, columns, strict=True):
                 channel.see(values, tail=0.05 if kind.clock else 0.0)
-                members, columns = bundles.setdefault(channel.entity, ([], []))
-                members.append(channel)
-                columns.append(values)
+                bundles.setdefault(channel.entity, []).append((channel, values))
             stream.bounds(channels, ends)
-        for members, columns in bundles.values():
-            stream.send(members, rows, np.column_stack(columns))
+        for bundle in bundles.values():
+            members = [channel for channel, _ in bundle]
+            stream.send(members, rows, np.column_stack([values for _, values in bundle]))
         with np.errstate(divide="ignore", invalid="ignore"):
             residual = np.log10(part["residual"])
         stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
@@ -155,24 +154,16 @@ class RerunRecorder:
             stream.rerun.send_columns(_STATUS, times(samples[rows], part["time"][rows]), states)
 
     def _predictions(self, stream: Stream, rows: list[rr.TimeColumn], part: RunPart) -> None:
-        for group, values in (
-            ("states", part.predicted_states),
-            ("actions", part.predicted_actions),
-        ):
+        predictions = {"states": part.predicted_states, "actions": part.predicted_actions}
+        for group, values in predictions.items():
             if values is None:
                 continue
             for i, channel in enumerate(self._group(group)):
-                predicted = self._predicted.setdefault(
-                    channel.name,
-                    Channel(
-                        f"prediction/{escaped(channel.name)}",
-                        f"prediction/{channel.name}",
-                        channel.unit,
-                        labels=[f"+{stage}" for stage in range(values.shape[1])],
-                    ),
-                )
-                predicted.see(values[:, :, i])
-                stream.send([predicted], rows, values[:, :, i])
+                stages, name = values[:, :, i], f"prediction/{escaped(channel.name)}"
+                labels = [f"+{stage}" for stage in range(stages.shape[1])]
+                own = Channel(name, f"prediction/{channel.name}", channel.unit, labels=labels)
+                own = self._predicted.setdefault(channel.name, own)
+                stream.send([own.see(stages)], rows, stages)
 
     def _intermediate(self, stream: Stream, samples: np.ndarray, time: Array) -> None:
         if not self._within:
@@ -191,7 +182,7 @@ class RerunRecorder:
 
     def _layout(self) -> rrb.Blueprint:
         """Left: states and actions with bounds; middle: costs, causes, solver; right: the rest."""
-        along = axis(seconds=self._seconds)
+        along = axis(AT(seconds=0.0), AT(seconds=self._seconds))
         loop = [
             view(c.title, [c, *(f for f in self._fine if f.name == c.name and f.window())], along)
             for c in self._group("states", "actions")
@@ -203,7 +194,7 @@ class RerunRecorder:
             view(self._residual.name, [self._residual], along),
             rrb.StateTimelineView(name="QP status", contents=[f"/{_STATUS}"], time_view=along),
         ]
-        about = about_view("about this run")
+        about = rrb.TextDocumentView(name="about this run", origin="/about")
         predicted = [view(c.title, [c], along, legend=False) for c in self._predicted.values()]
         right = rrb.Tabs(rrb.Vertical(*predicted, name="predictions"), about)
         return layout(
@@ -288,11 +279,9 @@ def _record(
     for name, plots in tabs.items():
         views = (view(p.title, [channel for channel, _, _ in p.signals], along) for p in plots)
         grids += [rrb.Grid(*views, grid_columns=3, name=name)] * bool(plots)
-    shown = layout(rrb.Tabs(*grids, about_view("about")), timeline)
-    with Stream(path, title, shown) as stream:
-        if properties:
-            stream.properties(properties)
-        stream.about(about)
+    page = rrb.TextDocumentView(name="about", origin="/about")
+    shown = layout(rrb.Tabs(*grids, page), timeline)
+    with Stream(path, title, shown, about, properties) as stream:
         for plot in chain(*tabs.values()):
             for channel, rows, values in plot.signals:
                 stream.bounds([channel], ends or [])
@@ -339,7 +328,7 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
     title, last = " / ".join(runs), max(map(len, runs.values())) - 1
     tabs = {title: overlaid, "difference": differences}
     ends = times([0, last], np.array([0.0, seconds]))
-    _record(path, title, tabs, axis(seconds=seconds), about, ends=ends)
+    _record(path, title, tabs, axis(AT(seconds=0.0), AT(seconds=seconds)), about, ends=ends)
 
 
 def record_training(path: str | Path, training: Training) -> None:
@@ -369,7 +358,7 @@ def record_training(path: str | Path, training: Training) -> None:
         rare = bool(np.isnan(values).any())
         column = Channel(f"log/{escaped(name)}", name, color=color, points=rare).see(values)
         course.append(Plot(name, [(column, rows, values)]))
-    along = axis(samples=int(samples[-1]) if len(samples) else 0)
+    along = axis(AT(seq=0), AT(seq=int(samples[-1]) if len(samples) else 0))
     title = f"{run.algorithm} on {run.scenario.name}"
     about = f"# {title}\n\n{table('training', properties)}\n"
     tabs = {"θ": theta, "log": course}
@@ -391,7 +380,7 @@ class Channel:
     name: str
     unit: str = ""
     color: str = SERIES[0]
-    bounds: Range = (-inf, inf)
+    bounds: Range = FREE
     labels: Sequence[str] = ()
     step: bool = False
     points: bool = False
@@ -429,12 +418,22 @@ class Channel:
 class Stream:
     """An open recording: `send`, then `close`; an exception in its context discards it.
 
+    `about` is the Markdown of the view `/about`; `properties` describe the run as a whole, shown in
+    the viewer when the recording is selected.
+
     The file is written beside `path` under a hidden name and renamed by `close`, so that `path`
     never holds half a recording; `rerun rrd optimize` repairs what a killed process leaves. Raises
     RecordingError where the folder does not exist or cannot be written.
     """
 
-    def __init__(self, path: str | Path, name: str, layout: rrb.Blueprint) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        name: str,
+        layout: rrb.Blueprint,
+        about: str,
+        properties: Mapping[str, object],
+    ) -> None:
         self.path = check_target(path)
         name_of_partial = f".{self.path.stem}.{secrets.token_hex(4)}.partial.rrd"
         self._partial = self.path.with_name(name_of_partial)
@@ -450,6 +449,13 @@ class Stream:
         self.rerun.send_recording_name(drawable(name))
         self._declared: set[str] = set()
         self._bounded(partial(self.rerun.save, self._partial, default_blueprint=layout))
+        described = rr.AnyValues()
+        for key, value in properties.items():
+            described.with_component_from_data(key, drawable(str(value)))
+        if properties:
+            self.rerun.send_property("run", described)
+        page = rr.TextDocument(drawable(about), media_type=rr.MediaType.MARKDOWN)
+        self.rerun.log("about", page, static=True)
 
     def __enter__(self) -> Self:
         return self
@@ -459,18 +465,6 @@ class Stream:
             self.close()
         else:
             self.discard()
-
-    def properties(self, values: Mapping[str, object]) -> None:
-        """Describe the run as a whole; shown in the viewer when the recording is selected."""
-        described = rr.AnyValues()
-        for key, value in values.items():
-            described.with_component_from_data(key, drawable(str(value)))
-        self.rerun.send_property("run", described)
-
-    def about(self, markdown: str) -> None:
-        """Give the text of the view `about`."""
-        page = rr.TextDocument(drawable(markdown), media_type=rr.MediaType.MARKDOWN)
-        self.rerun.log("about", page, static=True)
 
     def send(self, channels: Sequence[Channel], times: list[rr.TimeColumn], values: Array) -> None:
         """Send K rows of the signals of one entity: (K,), (K, m), or (K, labels)."""
@@ -569,11 +563,6 @@ def drawable(text: str) -> str:
     )
 
 
-def escaped(name: str) -> str:
-    """A variable's name, e.g. `tank[1].level`, as one part of an entity path."""
-    return rr.escape_entity_path_part(name)
-
-
 def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> list[rr.TimeColumn]:
     """Index columns of K rows: sample numbers and, where there is one, the time in s to 1 ns."""
     columns = [rr.TimeColumn(SAMPLE, sequence=np.asarray(samples, dtype=np.int64))]
@@ -583,12 +572,8 @@ def times(samples: Sequence[int] | np.ndarray, time: Array | None = None) -> lis
     return columns
 
 
-def axis(*, seconds: float | None = None, samples: int = 0) -> rrb.TimeAxis:
-    """Horizontal axis over a whole run of that length."""
-    at = rr.TimeRangeBoundary.absolute
-    start, end = (
-        (at(seq=0), at(seq=samples)) if seconds is None else (at(seconds=0.0), at(seconds=seconds))
-    )
+def axis(start: rr.TimeRangeBoundary, end: rr.TimeRangeBoundary) -> rrb.TimeAxis:
+    """Horizontal axis over a whole run."""
     return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
 
 
@@ -609,11 +594,6 @@ def view(
             corner=rrb.Corner2D.RightTop, visible=len(channels) > 1 if legend is None else legend
         ),
     )
-
-
-def about_view(name: str) -> rrb.TextDocumentView:
-    """The view of the text that `Stream.about` gives."""
-    return rrb.TextDocumentView(name=name, origin="/about")
 
 
 def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:

@@ -13,29 +13,25 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, FormatStrFormatter, LogLocator, NullFormatter
 
 from cosim.figures import style
 from cosim.figures.style import BOUND, DASHED, FLOOR, Dots, EndLabel, Look, palette, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
-from cosim.files import write_atomically
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
 from cosim.scenario import VIOLATING, Scenario
-from cosim.statistics import LEVEL, TD_WINDOW, regrets, td_error_mean
-from cosim.studies.document import TrajectoryTable
+from cosim.statistics import LEVEL, regrets, td_error_mean
 from cosim.studies.operation import Judged
 from cosim.studies.plan import Plan
 from cosim.studies.report import FOLDER
-from cosim.studies.store import LOG, PARAMETERS, read_table
-from cosim.studies.work import Run, safe
+from cosim.studies.run import LOG, PARAMETERS, Run, read_table, safe
 from cosim.trajectory import Trajectory, read_csv
 
 BANDED = 6
 """Largest number of curves with bands in a panel: more cannot be told apart."""
 Policy = Callable[[Array], Array]
-TRAJECTORIES, LOGS, KEPT = "trajectories", "logs", "parameters"
 PREFIX = "theta "
 GRID, BINS = 13, 80
 
@@ -179,7 +175,7 @@ def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Lo
         axes.set_xscale("log")
         axes.set_xlim(axis[0], axis[-1])
         axes.set_ylim(-0.02, 1.02)
-        axes.xaxis.set_major_formatter(FuncFormatter(style.percent))
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
         axes.set_xlabel("regret % at most")
         axes.set_ylabel("share of runs")
         drawn.legend(loc="outside right upper", handlelength=2.4)
@@ -250,49 +246,22 @@ def operation_figure(
     return drawn
 
 
-def keep(plan: Plan, out: Path) -> None:
-    """Copy the trajectories, logs and θ that the study keeps into folders of their own."""
-    for run in plan.runs:
-        files = {table.file: _trajectory(out, table, run) for table in run.trajectories}
-        if _is_logged(plan, run):
-            files[LOG] = out / LOGS / f"{_stem(run)}.csv"
-            files[PARAMETERS] = out / KEPT / f"{_stem(run)}.toml"
-        for name, target in files.items():
-            if (source := out / run.key.folder / name).is_file():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(target, source.read_bytes())
-
-
 def draw(plan: Plan, out: Path) -> list[str]:
     """Draw the kept trajectories and logs into `out`/figures; returns the figures' names."""
     return style.save_set(_figures(plan, out), out / FOLDER)
 
 
-def _trajectory(out: Path, table: TrajectoryTable, run: Run) -> Path:
-    return out / TRAJECTORIES / table.name / safe(run.key.scenario) / f"{safe(run.key.case)}.csv"
-
-
-def _stem(run: Run) -> str:
-    return f"{safe(run.key.scenario)}-{safe(run.key.case)}"
-
-
-def _is_logged(plan: Plan, run: Run) -> bool:
-    """Whether a run is the first training seed of a case whose log is kept."""
-    seeds = run.case.training_seeds
-    return bool(seeds) and run.key.seed == seeds[0] and run.key.case in plan.definition.table.logs
-
-
 def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
     for name, scenario in plan.definition.scenarios.items():
         for table in plan.definition.table.trajectory:
-            runs = [
-                run for run in plan.runs if run.key.scenario == name and table in run.trajectories
-            ]
-            runs = [run for run in runs if _trajectory(out, table, run).is_file()]
+            runs = {
+                run.key.case: run
+                for run in plan.runs
+                if run.key.scenario == name and (out / run.kept.get(table.file, "?")).is_file()
+            }
             found = {
-                case: replace(read_csv(_trajectory(out, table, run), scenario), controller=case)
-                for run in runs
-                for case in [run.key.case]
+                case: replace(read_csv(out / run.kept[table.file], scenario), controller=case)
+                for case, run in runs.items()
             }
             for kind in table.figures if found else ():
                 stem = f"{kind}-{safe(name)}-{table.name}"
@@ -305,18 +274,14 @@ def _figures(plan: Plan, out: Path) -> Iterator[tuple[str, Figure]]:
                 elif kind == "density":
                     yield stem, density_figure(found, scenario)
                 else:
-                    policies = {run.key.case: _policy(plan, run, out) for run in runs}
+                    policies = {case: _policy(run, out) for case, run in runs.items()}
                     yield stem, phase_figure(found, policies, scenario)
-    for run in plan.runs:
-        path = out / LOGS / f"{_stem(run)}.csv"
-        if _is_logged(plan, run) and path.is_file():
-            log = read_table(path)
-            if blocks := increments(log):
-                error = (log[name].to_numpy(float) for name in ("samples", "td_error", "updates"))
-                drawn = parameters_figure(
-                    log.samples.to_numpy(float), blocks, td_error_mean(*error), window=TD_WINDOW
-                )
-                yield f"parameters-{_stem(run)}", drawn
+    for path in (out / run.kept.get(LOG, "?") for run in plan.runs):
+        if path.is_file() and (blocks := increments(log := read_table(path))):
+            columns = (log[name].to_numpy(float) for name in ("samples", "td_error", "updates"))
+            samples, td_error, updates = columns
+            error = td_error_mean(samples, td_error, updates)
+            yield f"parameters-{path.stem}", parameters_figure(samples, blocks, error)
 
 
 def increments(log: pd.DataFrame) -> dict[str, Array]:
@@ -445,10 +410,9 @@ def _states(axes: Axes, states: Array, extent: tuple[float, float, float, float]
         cells.set(cmap="YlGnBu", norm=LogNorm(0.7, 20.0 * float(counts.max())))
 
 
-def _policy(plan: Plan, run: Run, out: Path) -> Policy:
-    scenario = plan.definition.scenarios[run.key.scenario]
+def _policy(run: Run, out: Path) -> Policy:
     controller: Controller = (
-        build_controller(run.case.controller or "", scenario)
+        build_controller(run.controller, run.scenario)
         if run.training is None
         else run.training.controller((out / run.key.folder / PARAMETERS).read_text("utf-8"))
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -15,19 +15,57 @@ from cosim.errors import StudyError
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, code_hash, depends_on, import_from, versions
 from cosim.scenario import Scenario, resolved
-from cosim.studies.document import DEFAULT, CaseTable, StudyTable, TrajectoryTable, read
-from cosim.studies.store import EVALUATION, GREEDY, check_folders, greedy_file, online_file
-from cosim.studies.work import Case, Noise, Run, RunKey, TrainingTask
+from cosim.studies.document import DEFAULT, CaseTable, StudyTable, read
+from cosim.studies.run import (
+    EVALUATION,
+    GREEDY,
+    LOG,
+    PARAMETERS,
+    Noise,
+    Run,
+    RunKey,
+    TrainingTask,
+    safe,
+)
 from cosim.validation import instead, validated
 from learning.algorithm import load_algorithm
 from learning.errors import ConfigurationError
 from learning.training import HELD_OUT
 
 BASELINES, NAIVE = "baselines", "naive"
+TRAJECTORIES, LOGS = "trajectories", "logs"
+"""Folders of what a study keeps of its runs."""
 ROW, CHECKPOINT = 500, 5000
 """Most samples between two rows of a log, and about those between two checkpoints."""
 T = TypeVar("T")
 SEQUENCES = (list, tuple, set, frozenset)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One point of a grid: a controller, or an algorithm with one set of settings.
+
+    `scenarios` are names; `training_seeds` is empty for a controller. `group` is the panel of the
+    figures that shows it; `against` the case that its paired difference is taken from.
+    """
+
+    name: str
+    scenarios: tuple[str, ...]
+    group: str
+    controller: str | None = None
+    algorithm: str | None = None
+    samples: int = 0
+    start: str = ""
+    nmpc: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+    training_seeds: tuple[int, ...] = ()
+    against: str | None = None
+
+    @property
+    def target(self) -> str:
+        """The algorithm or the controller."""
+        return self.algorithm or self.controller or ""
 
 
 class Study:
@@ -98,25 +136,19 @@ class Study:
     def _expanded(self, table: CaseTable) -> Iterator[Case]:
         """The points of a case's grid."""
         scenarios = tuple(self.scenarios if table.scenarios is None else table.scenarios)
-        if unknown := [name for name in scenarios if name not in self.scenarios]:
-            raise StudyError(
-                f"case '{table.name}': '{unknown[0]}' is none of the study's scenarios"
-                f"{instead(unknown[0], self.scenarios)}"
-            )
+        _check_known(scenarios, self.scenarios, f"case '{table.name}'", "scenario")
         if table.algorithm is None:
-            given = table.controller or ""
-            for source in given if isinstance(given, list) else [given]:
+            sources = table.controller or ""
+            for source in sources if isinstance(sources, list) else [sources]:
                 own = Path(source).stem if source.endswith(".toml") else source.replace(":", ".")
-                name = f"{table.name}({own})" if table.name and given[1:] else table.name or own
+                name = f"{table.name}({own})" if table.name and sources[1:] else table.name or own
                 group, file = table.group or BASELINES, self._file(source)
                 yield Case(name, scenarios, group, controller=file, against=table.against)
             return
-        axes: dict[str, list[Any]] = {}
-        for key in ("samples", "start", "nmpc"):
-            value = getattr(table, key)
-            axes[key] = value if isinstance(value, list) else [value]
-        for key, value in table.settings.items():
-            axes[key] = _axis(table.algorithm, key, value)
+        given = {"samples": table.samples, "start": table.start, "nmpc": table.nmpc}
+        axes: dict[str, list[Any]]
+        axes = {k: v if isinstance(v, list) else [v] for k, v in given.items()}
+        axes |= {k: _axis(table.algorithm, k, v) for k, v in table.settings.items()}
         if empty := [key for key, values in axes.items() if not values]:
             raise StudyError(f"case '{table.name}': the grid of {empty[0]} is empty")
         varied = [key for key, values in axes.items() if len(values) > 1]
@@ -226,11 +258,7 @@ class Study:
     def _of(self, value: T | dict[str, T], scenario: str, field: str) -> T:
         if not isinstance(value, dict):
             return value
-        names = [*self.scenarios, DEFAULT]
-        if unknown := [name for name in value if name not in names]:
-            raise StudyError(
-                f"{field}: '{unknown[0]}' is no scenario of the study{instead(unknown[0], names)}"
-            )
+        _check_known(value, [*self.scenarios, DEFAULT], field, "scenario")
         number = value.get(scenario, value.get(DEFAULT))
         if number is None:
             raise StudyError(f"{field}: has no number for '{scenario}', and no '{DEFAULT}'")
@@ -288,7 +316,14 @@ def plan(study: Study) -> Plan:
             plants[name] = {"scenario": described.hash, "fmu": plant.fmu_sha256}
     depends: dict[tuple[str, str], dict[str, str]] = {}
     runs = []
-    for case, name, seed in _order(study):
+    # Controllers first, then seed after seed: stopped early, every case has fewer seeds.
+    met = sorted({seed for case in study.cases for seed in case.training_seeds})
+    order = [
+        (seed, name, case)
+        for seed, name, case in product((None, *met), study.scenarios, study.all_cases)
+        if seed in (case.training_seeds or (None,)) and name in case.scenarios
+    ]
+    for seed, name, case in order:
         scenario = study.scenarios[name]
         training = None if seed is None else study.training(case, name, seed)
         if (case.name, name) not in depends:
@@ -316,57 +351,47 @@ def plan(study: Study) -> Plan:
         if training is None and any(case.algorithm for case in cases):
             noise[GREEDY] = study.held_out(name)
         at_mark = study.held_out(name)._replace(burn_in=own.burn_in)
-        noise |= {greedy_file(mark): at_mark._replace(mark=mark) for mark in marks}
-        kept = _trajectories(study, case, name, seed)
-        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in kept}
+        noise |= {f"greedy-{mark}.csv": at_mark._replace(mark=mark) for mark in marks}
+        first = seed in (None, *case.training_seeds[:1])  # only its files are kept
+        tables = [
+            table
+            for table in study.table.trajectory
+            if first
+            and case.name in (table.cases or [case.name])
+            and name in (table.scenarios or [name])
+        ]
+        noise |= {table.file: Noise((table.seed,), table.steps, whole=True) for table in tables}
+        where, stem = safe(name), safe(case.name)
+        kept = {t.file: f"{TRAJECTORIES}/{t.name}/{where}/{stem}.csv" for t in tables}
+        if first and case.name in study.table.logs:
+            kept[LOG] = f"{LOGS}/{where}-{stem}.csv"
+            kept[PARAMETERS] = f"parameters/{where}-{stem}.toml"
         seeds = tuple(sorted({seed for case in cases for seed in case.training_seeds}))
-        if training is None and seeds:
-            noise |= {online_file(mark): Noise(seeds, mark) for mark in marks}
+        if training is None and seeds:  # the optimum, on the noise of the training seeds
+            noise |= {f"online-{mark}.csv": Noise(seeds, mark) for mark in marks}
         key = RunKey(name, case.name, seed)
-        found = Run(key, case, scenario, case.controller, training, facts, noise, kept, marks)
-        runs.append(found)
+        runs.append(Run(key, scenario, case.controller, training, facts, noise, kept, marks))
     _check_names(study)
-    check_folders(runs)
     about = {"versions": versions(), "code_hash": code_hash()}
     return Plan(study, runs, about | {"scenarios": plants, "study": study.name})
-
-
-def _order(study: Study) -> Iterator[tuple[Case, str, int | None]]:
-    """Controllers first, then seed after seed: stopped early, every case has fewer seeds."""
-    seeds = {seed for case in study.cases for seed in case.training_seeds}
-    for seed in (None, *sorted(seeds)):
-        for scenario in study.scenarios:
-            for case in study.all_cases:
-                if seed in (case.training_seeds or (None,)) and scenario in case.scenarios:
-                    yield case, scenario, seed
-
-
-def _trajectories(
-    study: Study, case: Case, scenario: str, seed: int | None
-) -> tuple[TrajectoryTable, ...]:
-    """Trajectories that include a run; of trainings, only the first seed's."""
-    if case.training_seeds and seed != case.training_seeds[0]:
-        return ()
-    return tuple(
-        table
-        for table in study.table.trajectory
-        if case.name in (table.cases or [case.name]) and scenario in (table.scenarios or [scenario])
-    )
 
 
 def _check_names(study: Study) -> None:
     names = [case.name for case in study.all_cases]
     trained = [case.name for case in study.cases if case.algorithm is not None]
-    asked = [(f"trajectory '{t.name}'", t.cases or [], names) for t in study.table.trajectory]
-    asked.append(("logs", study.table.logs, trained))
+    for table in study.table.trajectory:
+        _check_known(table.cases or (), names, f"trajectory '{table.name}'", "case")
+    _check_known(study.table.logs, trained, "logs", "case")
     if (operation := study.table.operation) is not None:
-        asked.append(("operation.drawn", operation.drawn, trained))
-    for where, wanted, known in asked:
-        for name in wanted:
-            if name not in known:
-                raise StudyError(f"{where}: there is no case '{name}'{instead(name, known)}")
+        _check_known(operation.drawn, trained, "operation.drawn", "case")
     for case in study.cases:
         study.counterpart(case)
+
+
+def _check_known(words: Iterable[str], known: Iterable[str], where: str, kind: str) -> None:
+    for word in words:
+        if word not in known:
+            raise StudyError(f"{where}: there is no {kind} '{word}'{instead(word, known)}")
 
 
 def _is_sequence(annotation: Any) -> bool:

@@ -7,7 +7,7 @@ import json
 import re
 import shlex
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,46 +16,71 @@ import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-from cosim.files import write_atomically
-from cosim.protocols import Array
-from cosim.result import TextTable, markdown_table
-from cosim.statistics import Estimate, gain, shown
+from cosim.result import markdown_table
+from cosim.statistics import shown
 
 PAGE, TABLES, FOLDER = "report.html", "report.md", "figures"
-Rows = tuple[Sequence[str], list[list[str]]]
-"""Header and rows of texts."""
 
-COLUMNS = {
-    "case": "case", "rank": "rank", "samples": "plant samples", "finished": "finished",
-    "regret": "regret %, median [95 %]", "worst": "worst", "iqm": "IQM [95 %]",
-    "J": "J, median", "J-worst": "J, worst", "gap": "gap closed %", "economic": "economic cost",
-    "violation": "violation", "violating": "violating %", "against": "against",
-    "difference": "difference % [95 %]", "p": "p",
-}  # fmt: skip
-"""Headers of the columns of a scenario's table, by the names that options take."""
+Text = Callable[[Mapping[str, Any]], str]
+"""Text of a table's cell, from the row."""
+
+COLUMNS: dict[str, tuple[str, Text]] = {
+    "case": ("case", lambda row: row["case"]),
+    "rank": ("rank", lambda row: str(row["rank"])),
+    "samples": ("plant samples", lambda row: str(row["plant_samples"] or "")),
+    "finished": (
+        "finished",
+        lambda row: f"{row['finished']}/{row['runs']}" if row["samples"] else "",
+    ),
+    "regret": (
+        "regret %, median [95 %]",
+        lambda row: _percent(row, "regret_median", "regret_wide"),
+    ),
+    "worst": ("worst", lambda row: _percent(row, "regret_worst") if row["runs"] > 1 else ""),
+    "iqm": ("IQM [95 %]", lambda row: _percent(row, "regret_iqm") if row["runs"] > 1 else ""),
+    "J": ("J, median", lambda row: _number(row["J_median"])),
+    "J-worst": ("J, worst", lambda row: _number(row["J_worst"]) if row["runs"] > 1 else ""),
+    "gap": ("gap closed %", lambda row: _percent(row, "gap_closed_median", digits=4)),
+    "economic": ("economic cost", lambda row: _number(row["economic_cost"])),
+    "violation": ("violation", lambda row: f"{row['mean_violation']:.5f}"),
+    "violating": ("violating %", lambda row: f"{100 * row['violating_share']:.2f}"),
+    "against": ("against", lambda row: row["against"] if isinstance(row["against"], str) else ""),
+    "difference": ("difference % [95 %]", lambda row: _percent(row, "difference")),
+    "p": ("p", lambda row: "" if np.isnan(row["difference_p"]) else f"{row['difference_p']:.3f}"),
+}
+"""Columns of a scenario's table by the names that options take, of rows of the summary."""
 SHORT = ("case", "rank", "regret", "worst", "finished")
 """Columns that fit a terminal of 80 characters."""
+
+AGGREGATE: dict[str, Text] = {
+    "case": lambda row: row["case"],
+    "runs": lambda row: str(row["runs"]),
+    "regret %, IQM [95 %]": lambda row: _percent(row, "regret_iqm"),
+    "median": lambda row: _percent(row, "regret_median"),
+    "worst": lambda row: _percent(row, "regret_worst"),
+}
+CASES: dict[str, Text] = {
+    "case": lambda row: row["name"],
+    "algorithm or controller": lambda row: row["target"],
+    "samples": lambda row: str(row["samples"] or ""),
+    "start": lambda row: row["start"],
+    "NMPC": lambda row: row["nmpc"],
+    "settings": lambda row: ", ".join(f"{k} = {json.dumps(v)}" for k, v in row["settings"].items()),
+}
+EVERY_RUN: dict[str, Text] = {
+    "case": lambda row: row["case"],
+    "scenario": lambda row: row["scenario"],
+    "seed": lambda row: "" if pd.isna(row["training_seed"]) else str(row["training_seed"]),
+    "status": lambda row: row["status"],
+    "plant samples": lambda row: str(row["plant_samples"] or ""),
+    "regret % [95 %]": lambda row: _percent(row, "regret"),
+    "J": lambda row: _number(row["J"]),
+}
 
 PAPER = {"naive": 21.0, "tuned": 15.0}
 """Gain of the paper's RL-tuned RTI-NMPC over (a) and (b), in per cent."""
 NEAR = 3.0
 """Per cent within which a gain agrees with the paper's, which are approximate."""
-
-
-def write(page: Mapping[str, Any], folder: Path, study: Path) -> Path:
-    """Write report.html and report.md of a page's `sections` into a folder; returns the page.
-
-    A section has a title and may have a note, tables and names of figures, which are in `figures`
-    of `folder`, or of the study's own folder.
-    """
-
-    def figure(name: str) -> dict[str, str]:
-        paths = (where / FOLDER / f"{name}.svg" for where in (folder, study))
-        return image(next(path for path in paths if path.is_file()))
-
-    for name in (TABLES, PAGE):
-        write_atomically(folder / name, rendered(name, **page, picture=figure))
-    return folder / PAGE
 
 
 def rendered(template: str, **context: Any) -> str:
@@ -74,124 +99,23 @@ def rendered(template: str, **context: Any) -> str:
     return environment.get_template(template).render(context)
 
 
-def texts(row: Mapping[str, Any]) -> dict[str, str]:
-    """Texts of a row of a study's summary by the keys of `COLUMNS`."""
-    several, p, gap = row["runs"] > 1, row["difference_p"], row["gap_closed_median"]
-    return {
-        "case": row["case"],
-        "rank": str(row["rank"]),
-        "samples": str(row["plant_samples"] or ""),
-        "finished": f"{row['finished']}/{row['runs']}" if row["samples"] else "",
-        "regret": _percent(row, "regret_median", "regret_wide"),
-        "worst": _percent(row, "regret_worst") if several else "",
-        "iqm": _percent(row, "regret_iqm") if several else "",
-        "J": _number(row["J_median"]),
-        "J-worst": _number(row["J_worst"]) if several else "",
-        "gap": "" if np.isnan(gap) else shown(gap, None, 100.0, 4),
-        "economic": _number(row["economic_cost"]),
-        "violation": f"{row['mean_violation']:.5f}",
-        "violating": f"{100 * row['violating_share']:.2f}",
-        "against": row["against"] if isinstance(row["against"], str) else "",
-        "difference": _percent(row, "difference"),
-        "p": "" if np.isnan(p) else f"{p:.3f}",
-    }
+def texts(
+    rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Text]
+) -> tuple[Sequence[str], list[list[str]]]:
+    """Header and rows of a table, whose columns are texts of a row by their header."""
+    return list(columns), [[text(row) for text in columns.values()] for row in rows]
 
 
-def _percent(row: Mapping[str, Any], name: str, ends: str = "") -> str:
+def _percent(row: Mapping[str, Any], name: str, ends: str = "", digits: int = 3) -> str:
     """A share in per cent with its interval, if any; empty if undefined."""
     low, high = (float(row.get(f"{ends or name}_{end}", np.nan)) for end in ("low", "high"))
     if np.isnan(row[name]):
         return ""
-    return shown(float(row[name]), None if np.isnan(low) else (low, high), 100.0, 3)
+    return shown(float(row[name]), None if np.isnan(low) else (low, high), 100.0, digits)
 
 
 def _number(value: float) -> str:
-    return shown(float(value), None, 1.0, 6)
-
-
-def aggregate_table(aggregate: pd.DataFrame) -> Rows:
-    """Header and rows of the table over all scenarios."""
-    names = ("regret_iqm", "regret_median", "regret_worst")
-    return ("case", "runs", "regret %, IQM [95 %]", "median", "worst"), [
-        [row["case"], str(row["runs"]), *(_percent(row, name) for name in names)]
-        for row in aggregate.to_dict("records")
-    ]
-
-
-def case_table(cases: Mapping[str, Mapping[str, Any]]) -> Rows:
-    """Header and rows of the cases."""
-    return ("case", "algorithm or controller", "samples", "start", "NMPC", "settings"), [
-        [
-            name, case["target"], str(case["samples"] or ""), case["start"], case["nmpc"],
-            ", ".join(f"{key} = {json.dumps(v)}" for key, v in case["settings"].items()),
-        ]
-        for name, case in cases.items()
-    ]  # fmt: skip
-
-
-def run_table(runs: pd.DataFrame) -> Rows:
-    """Header and rows of every run."""
-    return ("case", "scenario", "seed", "status", "plant samples", "regret % [95 %]", "J"), [
-        [
-            row["case"], row["scenario"],
-            "" if pd.isna(row["training_seed"]) else str(row["training_seed"]), row["status"],
-            str(row["plant_samples"] or ""), _percent(row, "regret"), _number(row["J"]),
-        ]
-        for row in runs.to_dict("records")
-    ]  # fmt: skip
-
-
-def paper_table(
-    scenarios: Sequence[str], trained: Sequence[str], indicator: Callable[[str, str, str], Array]
-) -> TextTable:
-    """Title, header and rows: gains of each trained case's median run on every scenario.
-
-    `indicator` maps case, scenario and name to values (R, S) of runs on noise seeds. The paper's
-    two gains imply J(b)/J(a) = (1 − 0.21)/(1 − 0.15) = 0.93.
-    """
-    rows = []
-    for scenario in scenarios:
-        bases = {name: indicator(name, scenario, "J") for name in PAPER}
-        if not all(map(len, bases.values())):
-            continue
-        ratio = bases["tuned"].mean() / bases["naive"].mean()
-        for case in trained:
-            cost = indicator(case, scenario, "J")
-            if not len(cost):
-                continue
-            order = np.argsort(cost.mean(axis=1), kind="stable")
-            middle = order[(len(order) - 1) // 2]
-            gains: dict[str, list[Estimate]] = {}
-            for name in ("J", "economic_cost"):
-                own = indicator(case, scenario, name)[middle]
-                gains[name] = [gain(own, indicator(base, scenario, name)[0]) for base in PAPER]
-            agrees = [
-                f"({letter})"
-                for letter, found, wanted in zip("ab", gains["J"], PAPER.values(), strict=True)
-                if abs(100 * found.value - wanted) <= NEAR
-            ]
-            rows.append(
-                [
-                    scenario,
-                    case,
-                    f"{ratio:.3f}",
-                    shown(float(cost[middle].mean()), None, 1.0, 6),
-                    *(
-                        shown(one.value, one.interval, 100.0, 3)
-                        for each in gains.values()
-                        for one in each
-                    ),
-                    " and ".join(agrees),
-                ]
-            )
-    title = (
-        "Gains over the baselines: the paper's text states about 21 % over (a) and 15 % over (b)"
-    )
-    header = (
-        "scenario", "case", "J(b)/J(a)", "J, median", "gain over (a) %", "gain over (b) %",
-        "economic over (a) %", "economic over (b) %", "agrees with the paper on",
-    )  # fmt: skip
-    return title, header, rows
+    return shown(float(value), digits=6)
 
 
 def image(path: Path) -> dict[str, str]:

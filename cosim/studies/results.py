@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,42 +15,51 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cosim.errors import StudyError
+from cosim.errors import FailedRunsError, StudyError
 from cosim.figures.style import FLOOR, Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
+from cosim.simulation import reporting
 from cosim.statistics import (
     Estimate,
-    Interval,
+    gain,
     gap_closed,
     over_runs,
     paired_difference,
     regret,
     regrets,
+    shown,
     two_way,
 )
-from cosim.studies import figures, operation, report, store
-from cosim.studies.plan import BASELINES, NAIVE, Plan
-from cosim.studies.report import COLUMNS, SHORT
-from cosim.studies.store import (
-    CURVE,
+from cosim.studies import figures, operation, report
+from cosim.studies.plan import BASELINES, NAIVE, Plan, Study, plan
+from cosim.studies.report import COLUMNS, NEAR, PAPER, SHORT
+from cosim.studies.run import (
     EVALUATION,
     GREEDY,
     INDICATORS,
-    KEYS,
-    STATE,
+    LOG,
     TIMING,
-    WHERE,
+    Report,
+    Runner,
+    RunStore,
     read_table,
+    safe,
     to_csv,
 )
-from cosim.studies.work import safe
-from cosim.validation import instead
+from cosim.validation import instead, known_keywords
 
 ABOUT, SCHEMA = "study.json", 1
 CURVES, RUNS, SUMMARY, AGGREGATE = "curves.csv", "runs.csv", "summary.csv", "aggregate.csv"
 OPERATION = "operation.csv"
+WHERE = ["scenario", "case"]
+KEYS = [*WHERE, "training_seed"]
+STATE = [*KEYS, "status", "samples", "plant_samples"]
+LIVES = [*KEYS, "samples", *operation.LIFE]
+CURVE = ["samples", "J", "greedy_J", "td_error"]
+SAME = ("name", "group", "samples", "nmpc", "settings", "scenarios")
+"""What study.json says of a case as it is."""
 LEVELS = 4
 """Baselines that are lines in a figure of curves, at most."""
 
@@ -112,25 +122,32 @@ class StudyResults(Shown):
 
     @classmethod
     def written(
-        cls, plan: Plan, out: Path, stores: Collection[store.RunStore], *, draw: bool = True
+        cls, planned: Plan, out: Path, stores: Iterable[RunStore], *, draw: bool = True
     ) -> StudyResults:
         """Write the tables and kept files of a plan's finished runs, study.json last.
 
         `draw` draws the kept trajectories and logs, too.
         """
-        runs = _finished(plan, stores)
-        found = cls(out, document(plan), *store.frames(runs))
-        figures.keep(plan, out)
-        drawn = figures.draw(plan, out) if draw else []
+        cases = [case.name for case in planned.definition.all_cases]
+        places = {key: i for i, key in enumerate(product(planned.definition.scenarios, cases))}
+        runs = [store for store in stores if store.sealed]  # by training seed
+        runs.sort(key=lambda store: places[store.run.key.scenario, store.run.key.case])
+        found = cls(out, document(planned), *_frames(runs))
+        for run in planned.runs:
+            for name, target in run.kept.items():
+                if (source := out / run.key.folder / name).is_file():
+                    (out / target).parent.mkdir(parents=True, exist_ok=True)
+                    write_atomically(out / target, source.read_bytes())
+        drawn = figures.draw(planned, out) if draw else []
         tables = {
             EVALUATION: found.evaluation,
             CURVES: found.curves,
             RUNS: found.runs,
             SUMMARY: found.summary,
-            TIMING: store.timing(stores),
+            TIMING: _timing(stores),
         }
         if found.about.get("operation"):
-            tables[OPERATION], tables[GREEDY] = store.lives(runs)
+            tables[OPERATION], tables[GREEDY] = _lives(runs)
         if len(found.aggregate):
             tables[AGGREGATE] = found.aggregate
         for name, table in tables.items():
@@ -166,17 +183,16 @@ class StudyResults(Shown):
 
     @cached_property
     def _arrays(self) -> dict[tuple[str, str], dict[str, Array]]:
-        """Seeds, steps and indicators (R, S) by scenario and case."""
+        """Indicators (R, S) by scenario and case."""
         found: dict[tuple[str, str], dict[str, Array]] = {}
         rows = self.state[KEYS].merge(self.evaluation, on=KEYS, how="left")
-        for where, runs in self.state.groupby(WHERE, sort=False):
-            own = rows[(rows.scenario == where[0]) & (rows.case == where[1])]
-            if own.seed.isna().any() or len(own) % len(runs):
+        counts = self.state.groupby(WHERE).size()
+        for where, own in rows.groupby(WHERE, sort=False):
+            if own.seed.isna().any() or len(own) % counts[where]:
                 raise StudyError(f"the tables in '{self.folder}' are damaged: {where}")
-            found[where] = {
-                name: own[name].to_numpy(dtype=np.float64).reshape(len(runs), -1)
-                for name in ("seed", "steps", *INDICATORS)
-            }
+            values = own[[*INDICATORS]].to_numpy(dtype=np.float64).T
+            arrays = np.ascontiguousarray(values).reshape(len(values), counts[where], -1)
+            found[where] = dict(zip(INDICATORS, arrays, strict=True))
         return found
 
     def indicator(self, case: str, scenario: str, name: str = "J") -> Array:
@@ -213,15 +229,12 @@ class StudyResults(Shown):
         for (scenario, case), state in self.state.groupby(WHERE, sort=False):
             own = self._arrays[scenario, case]
             for run, known in enumerate(state.to_dict("records")):
-                found = self.regret(case, scenario, [run])
-                cost = float(own["J"][run].mean())
-                row = known | _columns("regret", found.value, found.interval)
-                row["J"] = cost if np.isfinite(cost) else np.inf
+                row = known | _columns("regret", self.regret(case, scenario, [run]))
+                row |= {name: float(own[name][run].mean()) for name in ("J", *MEANS)}
+                row["J"] = row["J"] if np.isfinite(row["J"]) else np.inf
                 row["gap_closed"] = self.gap_closed(case, scenario, [run]).value
-                row |= {name: float(own[name][run].mean()) for name in MEANS}
                 rows.append(row | {"failures": int(own["failures"][run].sum())})
-        frame = pd.DataFrame(rows, columns=RUN_COLUMNS)
-        return frame.astype({"training_seed": "Int64"})
+        return pd.DataFrame(rows, columns=RUN_COLUMNS).astype({"training_seed": "Int64"})
 
     @cached_property
     def summary(self) -> pd.DataFrame:
@@ -231,9 +244,8 @@ class StudyResults(Shown):
         """
         rows: list[dict[str, Any]] = []
         for scenario in self.scenarios:
-            known = [
-                self._summary(case, scenario) for case in self.cases if len(self.of(case, scenario))
-            ]
+            cases = [case for case in self.cases if len(self.indicator(case, scenario))]
+            known = [self._summary(case, scenario) for case in cases]
             rows += self._ranked(scenario, sorted(known, key=lambda row: float(row["J_median"])))
         return pd.DataFrame(rows, columns=SUMMARY_COLUMNS)
 
@@ -245,12 +257,12 @@ class StudyResults(Shown):
         median = self.regret(case, scenario, list(middle))
         spread = over_runs([values[order]]) if len(runs) > 1 else Estimate(values[0])
         best, other = self.reference("optimum", scenario), self.cases[case].get("against")
-        wide: Interval = None
-        found: tuple[float, Interval, float] = (np.nan, None, np.nan)
+        wide, difference, p = None, Estimate(np.nan), np.nan
         if best is not None and not self._single(case, scenario):
             wide = two_way(own["J"], best)
         if best is not None and other is not None and len(self.indicator(other, scenario)):
-            found = paired_difference(*self._pairs(case, other, scenario), best)
+            value, ends, p = paired_difference(*self._pairs(case, other, scenario), best)
+            difference = Estimate(value, ends)
         return {
             "scenario": scenario,
             "case": case,
@@ -258,19 +270,19 @@ class StudyResults(Shown):
             "plant_samples": runs.plant_samples.max(),
             "finished": int((~runs.status.str.startswith("diverged")).sum()),
             "runs": len(runs),
-            **_columns("regret_median", median.value, median.interval),
+            **_columns("regret_median", median),
             "regret_worst": float(values[order[-1]]),
-            **_columns("regret_iqm", spread.value, spread.interval),
+            **_columns("regret_iqm", spread),
             "J_median": float(np.median(cost)),
             "J_worst": float(cost[order[-1]]),
             "J_iqm": over_runs([cost[order]]).value,
             "gap_closed_median": self.gap_closed(case, scenario, list(middle)).value,
             **{name: float(np.median(runs[name])) for name in MEANS},
             "failures": int(own["failures"].sum()),
-            **_columns("regret_wide", np.nan, wide),
+            **_columns("regret_wide", Estimate(np.nan, wide)),
             "against": other,
-            **_columns("difference", *found[:2]),
-            "difference_p": found[2],
+            **_columns("difference", difference),
+            "difference_p": p,
         }
 
     def _single(self, case: str, scenario: str) -> bool:
@@ -332,7 +344,7 @@ class StudyResults(Shown):
             spread, everything = over_runs(strata), np.concatenate(strata)
             row = {"case": case, "scenarios": len(strata), "runs": len(everything)}
             row |= {"regret_median": np.median(everything), "regret_worst": everything.max()}
-            rows.append(row | _columns("regret_iqm", spread.value, spread.interval))
+            rows.append(row | _columns("regret_iqm", spread))
         rows.sort(key=lambda row: float(row["regret_iqm"]))
         return pd.DataFrame(rows, columns=AGGREGATE_COLUMNS)
 
@@ -354,10 +366,8 @@ class StudyResults(Shown):
         for name in columns:
             if name not in COLUMNS:
                 raise StudyError(f"a table has no column '{name}'{instead(name, COLUMNS)}")
-        own = self.summary[self.summary.scenario == scenario]
-        texts = [report.texts(row) for row in own.to_dict("records")]
-        header = [COLUMNS[name] for name in columns]
-        return header, [[row[name] for name in columns] for row in texts]
+        own = self.summary[self.summary.scenario == scenario].to_dict("records")
+        return report.texts(own, dict(COLUMNS[name] for name in columns))
 
     def table(self, scenario: str | None = None) -> str:
         """A scenario's table as Markdown, lowest J first; None: the tables of all scenarios."""
@@ -389,8 +399,38 @@ class StudyResults(Shown):
         return found
 
     def paper(self) -> TextTable:
-        """Title, header and rows: the gains that the paper's text states, beside the study's."""
-        return report.paper_table(self.scenarios, self.trained, self.indicator)
+        """Title, header and rows: gains of each trained case's median run on every scenario.
+
+        The paper's two gains imply J(b)/J(a) = (1 − 0.21)/(1 − 0.15) = 0.93.
+        """
+        rows = []
+        for scenario, case in product(self.scenarios, self.trained):
+            bases = [self.indicator(name, scenario) for name in PAPER]
+            cost = self.indicator(case, scenario)
+            if not all(map(len, (*bases, cost))):
+                continue
+            order = np.argsort(cost.mean(axis=1), kind="stable")
+            middle = order[(len(order) - 1) // 2]
+            gains = [
+                gain(self.indicator(case, scenario, name)[middle], base[0])
+                for name in ("J", "economic_cost")
+                for base in (self.indicator(base, scenario, name) for base in PAPER)
+            ]
+            agrees = [
+                f"({letter})"
+                for letter, found, wanted in zip("ab", gains[:2], PAPER.values(), strict=True)
+                if abs(100 * found.value - wanted) <= NEAR
+            ]
+            ratio = f"{bases[1].mean() / bases[0].mean():.3f}"
+            texts = (shown(one.value, one.interval, 100.0, 3) for one in gains)
+            best = shown(float(cost[middle].mean()), digits=6)
+            rows.append([scenario, case, ratio, best, *texts, " and ".join(agrees)])
+        said = "the paper's text states about 21 % over (a) and 15 % over (b)"
+        header = (
+            "scenario", "case", "J(b)/J(a)", "J, median", "gain over (a) %", "gain over (b) %",
+            "economic over (a) %", "economic over (b) %", "agrees with the paper on",
+        )  # fmt: skip
+        return f"Gains over the baselines: {said}", header, rows
 
     def figure(self, name: str | None = None) -> Figure:
         """Draw `curves`, `regret`, `profile` or `operation` of a scenario, as `curves-paper`.
@@ -452,34 +492,28 @@ class StudyResults(Shown):
         own = self.curves[self.curves.scenario == scenario]
         levels = own[own.training_seed.isna()].set_index("case").greedy_J
         trained = own[own.training_seed.notna()]
-        if not (trained.dropna(subset="greedy_J").groupby(KEYS).size() > 1).any():
+        greedy = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J
+        drawn = trained[~trained.case.isin(self.baselines)].groupby("case", sort=False)
+        if not (greedy.size() > 1).any() or not len(drawn):
             return None
-        best = float(levels.get(self.about["optimum"].get(scenario), np.nan))
-        known = np.isfinite(best)
-        curves = {
-            str(case): figures.learning_curve(rows, best if known else None)
-            for case, rows in trained.groupby("case", sort=False)
-            if case not in self.baselines
-        }
-        if not curves:
-            return None
-        ends = trained.dropna(subset="greedy_J").groupby(KEYS).greedy_J.last()
-        ends = ends.groupby("case").median()
         first, optimum = (self.about[kind].get(scenario) for kind in ("naive", "optimum"))
-        marks = {
-            name: float(level)
-            for name, level in pd.concat([levels, ends]).items()
-            if name in self.baselines and np.isfinite(level) and name != optimum
+        best = float(levels.get(optimum, np.nan))
+        known = bool(np.isfinite(best))
+        curves = {
+            str(case): figures.learning_curve(rows, best if known else None) for case, rows in drawn
         }
+        marks = pd.concat([levels, greedy.last().groupby("case").median()])
+        marks = marks[marks.index.isin(self.baselines) & (marks.index != optimum)]
+        marks = marks[np.isfinite(marks)]
         # Naive stays: it is where the curves begin.
-        chosen = sorted(marks, key=lambda name: (name != first, marks[name]))[:LEVELS]
-        shown = (lambda level: float(100 * regrets(np.array(level), best))) if known else float
-        drawn = {name: shown(marks[name]) for name in chosen}
-        return figures.curves_figure(curves, drawn, self._looks, relative=bool(known))
+        chosen = sorted(marks.index, key=lambda name: (name != first, marks[name]))[:LEVELS]
+        level = 100 * regrets(marks[chosen].to_numpy(), best) if known else marks[chosen]
+        levels = dict(zip(chosen, map(float, level), strict=True))
+        return figures.curves_figure(curves, levels, self._looks, relative=known)
 
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
-        lives = lives.reindex(columns=store.LIVES)  # an older table lacks the latest ones
+        lives = lives.reindex(columns=LIVES)  # an older table lacks the latest ones
         greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
         return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
@@ -520,24 +554,37 @@ class StudyResults(Shown):
     def report(self, folder: Path | None = None) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
         target = self.folder if folder is None else folder
-        drawn = self.draw(target / report.FOLDER)
-        return report.write(self._page(drawn), target, self.folder)
+        page, folders = self._page(self.draw(target / report.FOLDER)), (target, self.folder)
+
+        def picture(name: str) -> dict[str, str]:
+            paths = (where / report.FOLDER / f"{name}.svg" for where in folders)
+            return report.image(next(path for path in paths if path.is_file()))
+
+        for name in (report.TABLES, report.PAGE):
+            text = report.rendered(name, **page, picture=picture)
+            write_atomically(target / name, text)
+        return target / report.PAGE
 
     def _page(self, drawn: Mapping[str, list[str]]) -> dict[str, Any]:
-        """The report's sections, for its templates."""
+        """The report, for its templates.
+
+        A section has a title and may have a note, tables, and names of figures in `figures`.
+        """
         sections: list[dict[str, Any]] = []
         for scenario in self.scenarios:
             table = ("", *self.lines(scenario))
             section = {"title": f"Scenario {scenario}", "note": self._noise(scenario)}
             sections.append(section | {"tables": [table], "figures": drawn[scenario]})
         if len(self.aggregate):
-            table = ("", *report.aggregate_table(self.aggregate))
+            rows = self.aggregate.to_dict("records")
+            table = ("", *report.texts(rows, report.AGGREGATE))
             sections.append({"title": "All scenarios", "tables": [table], "figures": drawn[""]})
-        for title, header, rows in self.further():
-            sections.append({"title": title, "tables": [("", header, rows)]})
+        for title, header, lines in self.further():
+            sections.append({"title": title, "tables": [("", header, lines)]})
         if self.about["pictures"]:
             sections.append({"title": "Sample by sample", "figures": self.about["pictures"]})
-        sections.append({"title": "Cases", "tables": [("", *report.case_table(self.cases))]})
+        table = ("", *report.texts(self.cases.values(), report.CASES))
+        sections.append({"title": "Cases", "tables": [table]})
         made = self.about["made_with"]
         return {
             "title": self.about["title"] or self.name,
@@ -545,7 +592,7 @@ class StudyResults(Shown):
             "runs": len(self.state),
             "missing": self.about["runs"] - len(self.state),
             "sections": sections,
-            "every": report.run_table(self.runs),
+            "every": report.texts(self.runs.to_dict("records"), report.EVERY_RUN),
             "command": ["cosim", "study", "run", self.about.get("file") or f"{self.name}.toml"],
             "made": f"Made with {made['versions']}; code {made['code_hash']}"
             + (f"; commit {made['commit']}" if made.get("commit") else ""),
@@ -566,22 +613,75 @@ class StudyResults(Shown):
         )
 
 
-def _columns(name: str, value: float, interval: Interval) -> dict[str, float]:
-    low, high = interval or (np.nan, np.nan)
-    return {name: value, f"{name}_low": low, f"{name}_high": high}
+def _columns(name: str, found: Estimate) -> dict[str, float]:
+    low, high = found.interval or (np.nan, np.nan)
+    return {name: found.value, f"{name}_low": low, f"{name}_high": high}
 
 
-def _finished(plan: Plan, stores: Iterable[store.RunStore]) -> list[store.RunStore]:
-    """The runs that are finished, by scenario, case and training seed, in the study's order."""
-    cases = [case.name for case in plan.definition.all_cases]
-    scenarios = list(plan.definition.scenarios)
+def _stacked(parts: Iterable[pd.DataFrame], columns: list[str]) -> pd.DataFrame:
+    """The tables one below the other, with these columns."""
+    parts = [part for part in parts if len(part)]
+    table = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+    return table.reindex(columns=columns).astype({"training_seed": "Int64"})
 
-    def place(one: store.RunStore) -> tuple[int, int, int]:
-        key = one.run.key
-        seed = -1 if key.seed is None else key.seed
-        return scenarios.index(key.scenario), cases.index(key.case), seed
 
-    return sorted((one for one in stores if one.finished), key=place)
+def _frames(stores: Sequence[RunStore]) -> list[pd.DataFrame]:
+    """State, evaluation and curves of finished runs."""
+    states, evaluations, curves = [], [], []
+    for store in stores:
+        run, about = store.run, store.about
+        key = dict(zip(KEYS, (run.key.scenario, run.key.case, run.key.seed), strict=True))
+        counts = {name: int(about.get(name, 0)) for name in ("samples", "plant_samples")}
+        states.append(pd.DataFrame([key | {"status": store.status or "evaluated"} | counts]))
+        rows = store.measured(EVALUATION).rename_axis("seed").reset_index()
+        evaluations.append(rows.assign(**key, steps=run.noise[EVALUATION].steps))
+        if run.training is not None:
+            curves.append(read_table(store.folder / LOG).assign(**key))
+        elif GREEDY in run.noise:
+            greedy_J = float(store.measured(GREEDY).J.mean())
+            curves.append(pd.DataFrame([key | {"greedy_J": greedy_J}]))
+    curve = _stacked(curves, [*KEYS, *CURVE])
+    return [
+        _stacked(states, STATE),
+        _stacked(evaluations, [*KEYS, "seed", "steps", *INDICATORS]),
+        curve.astype({"samples": "Int64"} | dict.fromkeys(CURVE[1:], float)),
+    ]
+
+
+def _lives(stores: Sequence[RunStore]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows of the lives, by run and mark, and of the greedy evaluations, by noise seed, too.
+
+    The optimum has a life on the noise of every training seed, of which J is known.
+    """
+    alive, greedy = [], []
+    for store in stores:
+        run, key = store.run, store.run.key
+        names, online = {"scenario": key.scenario, "case": key.case}, []
+        for file, noise in run.noise.items():
+            if noise.mark:
+                rows = store.measured(file).rename_axis("seed").reset_index()
+                greedy.append(rows.assign(**names, training_seed=key.seed, samples=noise.mark))
+            elif file.startswith("online-"):
+                rows = store.measured(file)[["J"]].rename_axis("training_seed").reset_index()
+                online.append(rows.assign(**names, samples=noise.steps))
+        if run.marks and run.training is not None:
+            rows = read_table(store.folder / LOG, types={"samples": int})
+            alive.append(rows.assign(**names, training_seed=key.seed))
+        elif online:
+            alive.append(pd.concat(online).sort_values(["training_seed", "samples"]))
+    return _stacked(alive, LIVES), _stacked(greedy, [*KEYS, "samples", "seed", "J"])
+
+
+def _timing(stores: Iterable[RunStore]) -> pd.DataFrame:
+    """Seconds that each run's training took; in operation the processor's up to each mark, too."""
+    rows = []
+    for store in stores:
+        clock = store.about.get("timing", {})
+        seconds = {str(store.run.key): clock.get("wall_seconds", 0.0)}
+        marks = clock.get("processor_seconds", {})
+        seconds |= {f"{store.run.key}, sample {mark}": value for mark, value in marks.items()}
+        rows += [{"run": name, "training_seconds": float(value)} for name, value in seconds.items()]
+    return pd.DataFrame(rows, columns=["run", "training_seconds"])
 
 
 def document(plan: Plan) -> dict[str, Any]:
@@ -597,15 +697,10 @@ def document(plan: Plan) -> dict[str, Any]:
         "scenarios": scenarios,
         "cases": [
             {
-                "name": case.name,
-                "group": case.group,
+                **{name: getattr(case, name) for name in SAME},
+                "start": definition.relative(case.start),
                 "target": definition.relative(case.target),
                 "trained": case.algorithm is not None,
-                "samples": case.samples,
-                "start": definition.relative(case.start),
-                "nmpc": case.nmpc,
-                "settings": dict(case.settings),
-                "scenarios": list(case.scenarios),
                 "against": definition.counterpart(case),
             }
             for case in definition.all_cases
@@ -633,3 +728,47 @@ def document(plan: Plan) -> dict[str, Any]:
         }
     found: dict[str, Any] = json.loads(json.dumps(about))
     return found
+
+
+@known_keywords
+def study(
+    source: Study | str | Path | Mapping[str, Any],
+    out: str | Path,
+    *,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    progress: Report | bool = False,
+    planned: Plan | None = None,
+    figures: bool = True,
+) -> StudyResults:
+    """Do the runs of a study that `out` lacks, and write its tables there.
+
+    Raises StudyError and what scenarios and algorithms raise before any work is done;
+    FailedRunsError after all other runs are done and written.
+
+    Args:
+        source: a study, its file, or the same document as a mapping.
+        jobs: worker processes; 1 works in this process. No byte of a table depends on it.
+        scheduler: address of a Dask scheduler, used in place of `jobs`.
+        progress: a `Report`, called after every work item, and with a line for each run that ends;
+            True draws a bar.
+        planned: the study's plan, if it is known.
+        figures: whether the study's trajectories and logs are drawn.
+    """
+    if isinstance(source, Mapping):
+        source = Study.from_dict(source)
+    definition, folder = source if isinstance(source, Study) else Study.load(source), Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    planned = planned or plan(definition)
+    with reporting(progress, definition.name, planned.samples) as report:
+        runner = Runner(planned.runs, folder, (definition.folder, Path.cwd()), report)
+        for line in runner.remarks:
+            report(0, "", line)
+        runner.run(jobs, scheduler)
+    stores = runner.stores.values()
+    results = StudyResults.written(planned, folder, stores, draw=figures)
+    if runner.failures:
+        name, failure = next(iter(runner.failures.items()))
+        others = f" ({more} more failed)" if (more := len(runner.failures) - 1) else ""
+        raise FailedRunsError(f"{name}: {failure.message}{others}; run again to try anew")
+    return results

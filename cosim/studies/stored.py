@@ -17,11 +17,10 @@ from cosim.files import read_toml, write_atomically
 from cosim.scenario import Table
 from cosim.studies.document import StudyTable
 from cosim.studies.document import read as read_study
-from cosim.studies.figures import LOGS, TRAJECTORIES
+from cosim.studies.plan import LOGS, TRAJECTORIES
 from cosim.studies.report import rendered
-from cosim.studies.results import ABOUT, CURVES, StudyResults
-from cosim.studies.store import EVALUATION, KEYS, TIMING, to_csv
-from cosim.studies.work import RUNS
+from cosim.studies.results import ABOUT, CURVES, KEYS, StudyResults
+from cosim.studies.run import EVALUATION, RUNS, TIMING, to_csv
 from cosim.validation import instead, validated
 
 TOLERANCES, DIGITS = "tolerances.toml", 8
@@ -166,31 +165,27 @@ def _read(path: Path, keys: list[str]) -> pd.DataFrame:
 def _table_differences(
     name: str, stored: pd.DataFrame, now: pd.DataFrame, tolerances: Mapping[str, Tolerance]
 ) -> list[str]:
-    """Differences of two tables in words: unmatched rows, first differing row."""
-    lines = []
-    for one, other, text in (
-        (stored, now, "stored but not computed any more"),
-        (now, stored, "computed but not stored"),
+    """Differences of two tables in words: unmatched rows, first differing row of each signal."""
+    lines, lost = [], []
+    for one, other, rows, columns in (
+        (stored, now, "stored but not computed any more", "stored, not computed"),
+        (now, stored, "computed but not stored", "not stored"),
     ):
-        if len(lone := one.index[~one.index.isin(other.index)]):
-            lines.append(f"{name}: row {_row(one, lone[0])} is {text}")
-    common = stored.index[stored.index.isin(now.index)]
-    units = now.attrs | stored.attrs
-    found: list[tuple[int, str]] = []
-    for signal in (signal for signal in stored if signal in now):
-        allowed = _tolerance(signal, units[signal], tolerances)
-        was, value = (table.loc[common, signal].to_numpy() for table in (stored, now))
-        same = np.isclose(value, was, 0.0, allowed.absolute, equal_nan=True)
-        if not same.all():
-            k = int(same.argmin())
-            text = f"row {_row(stored, common[k])}: signal {signal} is {float(value[k])!r} now, "
-            text += f"{float(was[k])!r} stored, tolerance {allowed.absolute:g}"
-            found.append((k, f"{name}: {text} {allowed.unit.removeprefix('1')}".rstrip()))
-    lines += [text for _, text in sorted(found, key=lambda one: one[0])]
-    for one, other, text in ((stored, now, "stored, not computed"), (now, stored, "not stored")):
-        if lost := [signal for signal in one if signal not in other]:
-            lines.append(f"{name}: signal {', '.join(lost)} is {text}")
-    return lines
+        for row in one.index.difference(other.index, sort=False)[:1]:
+            lines.append(f"{name}: row {_row(one, row)} is {rows}")
+        if len(lone := one.columns.difference(other.columns, sort=False)):
+            lost.append(f"{name}: signal {', '.join(lone)} is {columns}")
+    common = stored.index.intersection(now.index, sort=False)
+    signals = [signal for signal in stored if signal in now]
+    allowed = [_tolerance(s, (now.attrs | stored.attrs)[s], tolerances) for s in signals]
+    was, value = (table.loc[common, signals].to_numpy() for table in (stored, now))
+    same = np.isclose(value, was, 0.0, [one.absolute for one in allowed], equal_nan=True)
+    first = {i: k for k, i in reversed(np.argwhere(~same).tolist())}
+    for k, i in sorted((k, i) for i, k in first.items()):
+        text = f"row {_row(stored, common[k])}: signal {signals[i]} is {float(value[k, i])!r} now, "
+        text += f"{float(was[k, i])!r} stored, tolerance {allowed[i].absolute:g}"
+        lines.append(f"{name}: {text} {allowed[i].unit.removeprefix('1')}".rstrip())
+    return lines + lost
 
 
 def _tolerance(signal: str, unit: str, tolerances: Mapping[str, Tolerance]) -> Tolerance:

@@ -16,7 +16,7 @@ from cosim.comparison import compare, load_run
 from cosim.errors import CosimError, StudyError
 from cosim.files import check_target, protect, write_atomically
 from cosim.recording import RerunRecorder
-from cosim.studies.work import RunKey
+from cosim.studies.run import RunKey
 from tests.helpers.command import run_cosim
 from tests.helpers.loop import Proportional
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cosim.errors import StudyError
-from cosim.studies.results import StudyResults
-from cosim.studies.store import KEYS, to_csv
+from cosim.studies.results import KEYS, StudyResults
+from cosim.studies.run import to_csv
 from tests.helpers.toy_study import GROW, run_toy
 
 ROOT = Path(__file__).parents[3]

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.cli.main import app
-from cosim.studies.store import read_table
+from cosim.studies.run import read_table
 from cosim.studies.stored import stored_studies
 
 STORED = Path(__file__).parents[3] / "results"

@@ -64,14 +64,14 @@ class Sample:
 class SignalKind:
     """A declared signal: its `name`, its source `of`, its `unit`.
 
-    `of` is an attribute of a `Sample`, or a function of other signals. A `vector` has a signal for
-    each variable that the scenario's plant names under `name`, in the variable's unit. `group` is
-    where a recording shows it, None: nowhere; `whole` marks 0 or 1, `clock` wall-clock times, which
-    the trajectory's file leaves out.
+    `of` is an attribute of a `Sample`, a function of other signals, or None for zero. A `vector`
+    has a signal for each variable that the scenario's plant names under `name`, in the variable's
+    unit. `group` is where a recording shows it, None: nowhere; `whole` marks 0 or 1, `clock`
+    wall-clock times, which the trajectory's file leaves out.
     """
 
     name: str
-    of: str | Derived
+    of: str | Derived | None
     unit: str = ""
     group: Group | None = "unseen"
     vector: bool = False
@@ -104,7 +104,7 @@ SIGNALS: tuple[SignalKind, ...] = (
     SignalKind("violation", _violation),
     SignalKind("value", "solution.value", COST),
     SignalKind("residual", RESIDUAL),
-    SignalKind("explored", lambda scenario, columns: np.zeros_like(columns["time"]), whole=True),
+    SignalKind("explored", None, whole=True),
     SignalKind("failed", "failed", whole=True),
     SignalKind("prepare_time", "prepare_time", "s", "step_time", clock=True),
     SignalKind("feedback_time", "feedback_time", "s", "step_time", clock=True),
@@ -125,7 +125,7 @@ class SignalColumns:
 
     def __init__(self, scenario: Scenario, steps: int, residuals: bool) -> None:
         self._scenario = scenario
-        self._derived = {k.name: k.of for k in SIGNALS if not isinstance(k.of, str)}
+        self._derived = {k.name: k.of for k in SIGNALS if callable(k.of)}
         read = {k: k.of for k in SIGNALS if isinstance(k.of, str)}
         read = {kind: of for kind, of in read.items() if residuals or of != RESIDUAL}
         kinds = sorted(read, key=lambda kind: kind.vector)
@@ -136,11 +136,14 @@ class SignalColumns:
         widths = {kind: len(kind.names(scenario)) for kind in SIGNALS}
         self._names = [kind.name for kind in kinds]
         self._cuts = np.cumsum([widths[kind] for kind in kinds])[:-1]
-        # Column-major, so that a signal is a column and not a copy of one.
+        # Column-major, so that a signal is a column and not a copy of one. What is never written
+        # takes no memory.
         self.columns: dict[str, Array] = {
-            kind.name: np.full((steps, width) if kind.vector else steps, nan, order="F")
+            kind.name: np.zeros((steps, width) if kind.vector else steps, order="F")
             for kind, width in widths.items()
         }
+        if not residuals:
+            self.columns["residual"][:] = nan
 
     def read(self, sample: Sample) -> None:
         """Copy the values of a sample, which plant and controller may overwrite."""

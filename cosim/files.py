@@ -11,7 +11,7 @@ import shutil
 import stat
 import tempfile
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,7 +107,7 @@ def lock(path: Path, timeout: float) -> filelock.AcquireReturnProxy[Any]:
 
 
 CACHE_VARIABLE = "COSIM_CACHE"
-_caches: dict[Path, Path] = {}
+_temporary: dict[Path, Path] = {}
 
 
 def cache_folder(kind: str) -> Path:
@@ -120,13 +120,12 @@ def cache_folder(kind: str) -> Path:
     chosen = os.environ.get(CACHE_VARIABLE)
     root = Path(chosen) if chosen else platformdirs.user_cache_path("rti-cosim", appauthor=False)
     folder = root.absolute() / kind
-    if folder not in _caches or not _caches[folder].is_dir():
-        if _is_ours_alone(folder):
-            _caches[folder] = folder
-        else:
-            _caches[folder] = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))
-            atexit.register(shutil.rmtree, _caches[folder], ignore_errors=True)
-    return _caches[folder]
+    if _is_ours_alone(folder):
+        return folder
+    if folder not in _temporary or not _temporary[folder].is_dir():
+        _temporary[folder] = Path(tempfile.mkdtemp(prefix=f"cosim-{kind}-"))
+        atexit.register(shutil.rmtree, _temporary[folder], ignore_errors=True)
+    return _temporary[folder]
 
 
 def _is_ours_alone(folder: Path) -> bool:
@@ -182,27 +181,20 @@ def read_toml(path: str | Path, origin: str, error: type[Exception]) -> dict[str
 
     Raises `error` where there is no such regular file, or where it is not UTF-8 or not TOML.
     """
-    text = _text(path, origin, error)
-    try:
-        return tomllib.loads(text)
-    # Nesting without end exhausts the parser's stack, a number without end Python's patience.
-    except (ValueError, RecursionError) as cause:
-        raise error(f"{origin} is not valid TOML: {cause}") from None
+    return dict(_parsed(tomllib.loads, "TOML", path, origin, error))
 
 
 def read_json(path: str | Path, origin: str, error: type[Exception]) -> dict[str, Any]:
     """Document of a JSON file, an object; raises `error` as `read_toml` does."""
-    text = _text(path, origin, error)
-    try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as cause:
-        raise error(f"{origin} is not valid JSON: {cause}") from None
+    document = _parsed(json.loads, "JSON", path, origin, error)
     if not isinstance(document, dict):
         raise error(f"{origin} is not a JSON object")
     return document
 
 
-def _text(path: str | Path, origin: str, error: type[Exception]) -> str:
+def _parsed(
+    parse: Callable[[str], Any], kind: str, path: str | Path, origin: str, error: type[Exception]
+) -> Any:
     try:
         if Path(path).exists() and not Path(path).is_file():
             raise error(f"{origin} is not a regular file")
@@ -213,6 +205,9 @@ def _text(path: str | Path, origin: str, error: type[Exception]) -> str:
         reason = getattr(cause, "strerror", None) or cause
         raise error(f"{origin} cannot be read: {reason}") from None
     try:
-        return content.decode("utf-8")
+        return parse(content.decode("utf-8"))
     except UnicodeDecodeError:
         raise error(f"{origin} is not UTF-8 text") from None
+    # Nesting without end exhausts the parser's stack, a number without end Python's patience.
+    except (ValueError, RecursionError) as cause:
+        raise error(f"{origin} is not valid {kind}: {cause}") from None

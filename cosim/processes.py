@@ -32,8 +32,9 @@ class Interrupted(BaseException):
     """Ctrl-C was pressed, and the command has unwound; its arguments say how it goes on."""
 
 
-_unwound = threading.Event()
-_commands: list[str] = []
+unwound = threading.Event()
+"""Set while no command runs in this process, and once one has unwound: signals are then ignored."""
+unwound.set()
 _watched = False
 """Whether another process has started this one, and watches it."""
 _SIGNALS = [
@@ -49,31 +50,16 @@ def command_process() -> Iterator[None]:
     ignores, as nohup and a shell's background jobs do, stay ignored. Restores the previous
     handlers; at interpreter shutdown the signals are ignored.
     """
-    _unwound.clear()
-    _commands.append(sys.argv[0])
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-    for number in _SIGNALS:
-        if before[number] in (signal.SIG_DFL, signal.default_int_handler):
-            signal.signal(number, _raise)
+    unwound.clear()
+    own = (signal.SIG_DFL, signal.default_int_handler)
+    before = {n: signal.signal(n, _raise) for n in _SIGNALS if signal.getsignal(n) in own}
     try:
         yield
     finally:
-        _unwound.set()
-        _commands.pop()
-        atexit.register(_ignore)
+        unwound.set()
         for number, handler in before.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-
-def unwound() -> None:
-    """Ignore the signals from now on: the command has unwound."""
-    _unwound.set()
-    _ignore()
-
-
-def _ignore() -> None:
-    for number in _SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+            signal.signal(number, handler)
+            atexit.register(signal.signal, number, signal.SIG_IGN)
 
 
 def _raise(number: int, _: FrameType | None) -> None:
@@ -81,11 +67,11 @@ def _raise(number: int, _: FrameType | None) -> None:
     found = sys.exception()
     while found is not None and not isinstance(found, KeyboardInterrupt | Terminated):
         found = found.__context__
-    if _unwound.is_set() or found is not None:
+    if unwound.is_set() or found is not None:
         return
 
     def again() -> None:
-        if not _unwound.is_set():
+        if not unwound.is_set():
             signal.raise_signal(number) if os.name == "nt" else os.kill(os.getpid(), number)
 
     timer = threading.Timer(1.0, again)
@@ -160,7 +146,7 @@ def child_process(
         env=environment,
         stdin=subprocess.DEVNULL,
         stdout=log,
-        stderr=log if log is None or log == subprocess.DEVNULL else subprocess.STDOUT,
+        stderr=None if log is None else subprocess.STDOUT,
         preexec_fn=_die_with_parent if sys.platform == "linux" else None,  # noqa: PLW1509
     )
     try:
@@ -238,10 +224,7 @@ def redirected_output() -> Iterator[int | None]:
 
     It is None where standard output is not this process's own, as in a test runner.
     """
-    try:
-        own = sys.stdout.fileno() == 1
-    except (OSError, ValueError, AttributeError):
-        own = False
+    own = sys.stdout is sys.__stdout__
     if not own:
         yield None
         return
@@ -288,7 +271,7 @@ def watch(suspect: str) -> None:
     To be called before foreign code, `suspect` in messages, is loaded. Returns in that child, and
     where no command line was called. Raises PlantError where the child ended before the command.
     """
-    if not _commands or _watched:
+    if unwound.is_set() or _watched:
         return
     flags = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
     folders = release()  # for the process that does the work

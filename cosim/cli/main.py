@@ -205,7 +205,7 @@ def _run() -> None:
     except (SystemExit, Finished) as error:
         sys.exit(error.args[0] if error.args else 0)
     except (Interrupted, Terminated) as error:
-        unwound()
+        unwound.set()
         stopped = isinstance(error, Interrupted)
         notes = error.args if stopped else getattr(error, "__notes__", ())
         print("; ".join(["interrupted" if stopped else "terminated", *notes]), file=sys.stderr)

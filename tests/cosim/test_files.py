@@ -88,7 +88,7 @@ def test_a_document_that_is_none_is_one_line_that_names_it(tmp_path, read, conte
 @pytest.fixture
 def own_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(files, "_caches", {})
+    monkeypatch.setattr(files, "_temporary", {})
     return tmp_path / "cache"
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from cosim.errors import CosimError
 
-class ControllerError(Exception):
+
+class ControllerError(CosimError):
     """Base of all errors that the package raises."""
 
 

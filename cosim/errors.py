@@ -1,8 +1,8 @@
-"""Exceptions of the co-simulation, all of them subclasses of `CosimError`."""
+"""Errors whose message is meant for the user: `CosimError`, and those of the co-simulation."""
 
 
 class CosimError(Exception):
-    """Base of every error that `cosim` raises on bad input or a failed co-simulation."""
+    """Base of every error that the four packages raise on bad input or a failed run."""
 
 
 class ArgumentError(CosimError, TypeError):

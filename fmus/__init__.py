@@ -8,13 +8,15 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from cosim.errors import CosimError
+
 __all__ = ["NAMES", "PLANTS", "BuildError", "CheckError", "FmuError", "path"]
 
 NAMES = ("evaporator", "evaporator_fmi3")
 PLANTS = ("reactor", "tanks")
 
 
-class FmuError(Exception):
+class FmuError(CosimError):
     """Base of every error that `fmus` raises for a bad input or environment."""
 
 

@@ -1,7 +1,9 @@
 """Errors of the learning package; each message names the mistake and its place."""
 
+from cosim.errors import CosimError
 
-class LearningError(Exception):
+
+class LearningError(CosimError):
     """Base of all errors that the package raises."""
 
 

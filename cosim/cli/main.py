@@ -130,13 +130,6 @@ EXIT_UNFORESEEN = 70
 EXIT_INTERRUPTED = 130
 EXIT_CLOSED_PIPE = 141
 EXIT_TERMINATED = 143
-KNOWN = (
-    "fmus.FmuError",
-    "cosim.errors.CosimError",
-    "controllers.errors.ControllerError",
-    "learning.errors.LearningError",
-)
-"""Errors whose message is meant for the user, by name: importing them would load their package."""
 
 
 def _version(wanted: bool) -> None:
@@ -222,7 +215,7 @@ def _run() -> None:
         if isinstance(error, OSError):
             name = f"'{error.filename}': " if error.filename else ""
             _fail(f"{name}{error.strerror or error}")
-        if {f"{kind.__module__}.{kind.__qualname__}" for kind in type(error).__mro__} & {*KNOWN}:
+        if isinstance(error, CosimError):
             _fail(str(error))
         _report(error)
 

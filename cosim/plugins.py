@@ -122,18 +122,20 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     RTI-NMPC; or a `module:factory` with factory(scenario) -> Controller.
     """
     known = registered(CONTROLLERS)
-    if name in known:
-        return _made(name, known[name], scenario)
-    if name.endswith(".toml"):
+    if name.endswith(".toml") and name not in known:
         # Import it by its name: `cosim` itself imports no controller here.
         read = load_plugin("controllers.factories:from_file", "θ", ControllerLookupError)
-        return _named(read(scenario, name), Path(name).stem)
-    if ":" in name:
-        return _made(name, name, scenario)
-    raise ControllerLookupError(
-        f"unknown controller '{name}'{suggestion(name, known)}; give one of "
-        f"{', '.join(sorted(known))}, a parameters file (.toml), or module:factory"
-    )
+        controller, name = read(scenario, name), Path(name).stem
+    elif name in known or ":" in name:
+        controller = _made(name, known.get(name, name), scenario)
+    else:
+        raise ControllerLookupError(
+            f"unknown controller '{name}'{suggestion(name, known)}; give one of "
+            f"{', '.join(sorted(known))}, a parameters file (.toml), or module:factory"
+        )
+    with suppress(AttributeError):  # as the user calls it, for tables and recordings
+        setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
+    return controller
 
 
 def _made(name: str, target: str, scenario: Scenario) -> Controller:
@@ -155,13 +157,6 @@ def _made(name: str, target: str, scenario: Scenario) -> Controller:
             f"controller '{name}' made a {type(controller).__name__}, which lacks reset, prepare "
             "or feedback"
         )
-    return _named(controller, name)
-
-
-def _named(controller: Controller, name: str) -> Controller:
-    """Name the controller as the user did, for tables and recordings."""
-    with suppress(AttributeError):
-        setattr(controller, "name", name)  # noqa: B010 (an optional attribute of the protocol)
     return controller
 
 

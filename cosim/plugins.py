@@ -125,7 +125,8 @@ def build_controller(name: str, scenario: Scenario) -> Controller:
     if name.endswith(".toml") and name not in known:
         # Import it by its name: `cosim` itself imports no controller here.
         read = load_plugin("controllers.factories:from_file", "θ", ControllerLookupError)
-        controller, name = read(scenario, name), Path(name).stem
+        controller: Controller = read(scenario, name)
+        name = Path(name).stem
     elif name in known or ":" in name:
         controller = _made(name, known.get(name, name), scenario)
     else:

@@ -29,7 +29,9 @@ def validated(
     try:
         return model.model_validate(document)
     except ValidationError as cause:
-        raise error(f"{origin}: {describe(cause, model)}") from None
+        first, *others = cause.errors(include_url=False)
+        more = f" ({len(others)} more problem{'s' * (len(others) > 1)})" if others else ""
+        raise error(f"{origin}: {_complaint(dict(first), model)}{more}") from None
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
@@ -55,14 +57,6 @@ def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **keywords)
 
     return checked
-
-
-def describe(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return the first complaint of a failed validation, and how many more there are."""
-    details = error.errors(include_url=False)
-    text = _complaint(dict(details[0]), model)
-    more = len(details) - 1
-    return f"{text} ({more} more problem{'s' if more > 1 else ''})" if more else text
 
 
 def _complaint(detail: dict[str, Any], model: type[BaseModel]) -> str:

@@ -110,15 +110,15 @@ class Difference:
 class Comparison:
     """The `differences` of two runs by signal, and all others.
 
-    `samples` are the two lengths; `only_a` and `only_b` signals of one run; `units` different units
-    by signal; `order` the first position at which the order of the signals differs; `status` the
-    first sample whose status differs; `times` (K,) in s are those of A.
+    `samples` are the two lengths; `only_first` and `only_second` signals of one run; `units`
+    different units by signal; `order` the first position at which the order of the signals differs;
+    `status` the first sample whose status differs; `times` (K,) in s are those of A.
     """
 
     samples: tuple[int, int]
     differences: Sequence[Difference]
-    only_a: Sequence[str] = ()
-    only_b: Sequence[str] = ()
+    only_first: Sequence[str] = ()
+    only_second: Sequence[str] = ()
     units: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     order: int | None = None
     status: int | None = None
@@ -145,13 +145,24 @@ class Comparison:
             text += [f"first difference at sample {step}{at}:", *(f"  {one}" for one in found)]
         if len(set(self.samples)) > 1:
             text.append(f"{self.samples[0]} samples against {self.samples[1]}")
-        for missing, side in ((self.only_a, "first"), (self.only_b, "second")):
+        for missing, side in ((self.only_first, "first"), (self.only_second, "second")):
             if missing:
                 text.append(f"only the {side} has {', '.join(missing)}")
         text += [f"{name} is in '{a}' against '{b}'" for name, (a, b) in self.units.items()]
         if self.order is not None:
             text.append(f"the columns stand in another order from column {self.order + 1} on")
         return text
+
+    def document(self) -> dict[str, Any]:
+        """The comparison as plain values, ready for JSON."""
+        names = ("samples", "only_first", "only_second", "units", "order")
+        shown = ("unit", "tolerance", "maximum", "at", "first")
+        return {
+            "equal": self.equal,
+            "first_difference": self.first,
+            **{name: getattr(self, name) for name in names},
+            "signals": {d.name: {key: getattr(d, key) for key in shown} for d in self.differences},
+        }
 
 
 def compare(
@@ -194,8 +205,8 @@ def compare(
     return Comparison(
         samples=(len(a), len(b)),
         differences=differences,
-        only_a=[name for name in a.signals if name not in b.signals],
-        only_b=[name for name in b.signals if name not in a.signals],
+        only_first=[name for name in a.signals if name not in b.signals],
+        only_second=[name for name in b.signals if name not in a.signals],
         units={
             name: units
             for name in both
@@ -227,19 +238,3 @@ def _difference(a: Signal, b: Signal, tolerance: float | None) -> Difference:
 def _first(differs: Sequence[bool] | np.ndarray) -> int | None:
     rows = np.flatnonzero(differs)
     return int(rows[0]) if rows.size else None
-
-
-def as_document(comparison: Comparison) -> dict[str, Any]:
-    """Return the comparison as plain values, ready for JSON."""
-    shown = ("unit", "tolerance", "maximum", "at", "first")
-    signals = {d.name: {key: getattr(d, key) for key in shown} for d in comparison.differences}
-    return {
-        "equal": comparison.equal,
-        "first_difference": comparison.first,
-        "samples": list(comparison.samples),
-        "only_first": list(comparison.only_a),
-        "only_second": list(comparison.only_b),
-        "units": {name: list(units) for name, units in comparison.units.items()},
-        "order": comparison.order,
-        "signals": signals,
-    }

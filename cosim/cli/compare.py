@@ -42,7 +42,9 @@ def compare(
 
         runs = comparison.load_run(a), comparison.load_run(b)
         protect(run.name for run in runs)  # of a folder, the file in it
-        result = comparison.compare(*runs, _tolerances(tolerance or []), relative=relative)
+        result = comparison.compare(
+            *runs, dict(map(_tolerance, tolerance or [])), relative=relative
+        )
         found = result.lines() or ["no signal differs by more than its tolerance"]
         if record is not None:
             from cosim.recording import record_overlay
@@ -65,21 +67,17 @@ def compare(
         header = ("signal", "unit", "largest difference", "at sample", "tolerance", "first beyond")
         out_.table(f"{a} against {b}, {min(result.samples)} samples", header, rows)
         out_.note("\n".join(found))
-        out_.json(comparison.as_document(result))
+        out_.json(result.document())
     if not result.equal:
         raise typer.Exit(1)
 
 
-def _tolerances(options: list[str]) -> dict[str, float]:
+def _tolerance(option: str) -> tuple[str, float]:
     from cosim.errors import ComparisonError
 
-    tolerances = {}
-    for option in options:
-        name, _, value = option.rpartition("=")
-        try:
-            tolerances[name] = float(value)
-        except ValueError:
-            name = ""
-        if not name:
-            raise ComparisonError(f"--tolerance {option}: give NAME=VALUE, e.g. X2=1e-9")
-    return tolerances
+    name, _, value = option.rpartition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        text = f"--tolerance {option}: give NAME=VALUE, e.g. X2=1e-9"
+        raise ComparisonError(text) from None

@@ -211,8 +211,8 @@ def check(
         local = Path("results")
         folder = folder or (local if local.is_dir() else stored.stored_results())
         studies, tolerances = stored.stored_studies(folder), stored.load_tolerances(folder)
-        quick = names or [name for name, table in studies.items() if table.check]
-        quick = stored.chosen(studies, quick)
+        checked = [name for name, table in studies.items() if table.check]
+        quick = stored.chosen(studies, names or checked)
         for name in quick:
             StudyResults.load(folder / name)
         found: dict[str, list[str]] = {}

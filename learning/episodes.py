@@ -1,0 +1,126 @@
+"""Algorithms that follow a plan: a generator of episodes that is sent what each one told.
+
+A checkpoint keeps what they told; restoring sends it to the deterministic plan once more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.protocols import Vector
+from learning.algorithm import Algorithm, Transition, Update
+from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.step import moved
+
+Told = dict[str, NDArray[Any]]
+
+
+@dataclass(eq=False)
+class Episode:
+    """The next `length` samples at θ (n_θ,); a subclass keeps what they tell.
+
+    On a simulator the plant is reset before them, where `seed` gives its noise, or put back to
+    where it was marked (`rewind`), noise included, and marked after them (`mark`).
+    """
+
+    KEPT: ClassVar[tuple[str, ...]] = ("length", "done")
+    theta: Vector
+    length: int
+    seed: int | None = None
+    rewind: bool = False
+    mark: bool = False
+    done: int = field(default=0, init=False)
+
+    def take(self, transition: Transition | None, cost: float) -> bool:
+        """Take a sample, None where the controller failed, and its share of J: was it the last?"""
+        self.done += 1
+        return self.done >= self.length
+
+    def told(self) -> Told:
+        """What the samples told, for the plan."""
+        raise NotImplementedError
+
+
+class Planned(Algorithm):
+    """An algorithm that takes the episodes of a plan (`follow`) until it ends.
+
+    `theta` is what the run would hand over; the controller carries the θ of the episode.
+    """
+
+    theta: Any
+
+    def follow(self, plan: Generator[Any, Told, None]) -> None:
+        """Begin a plan."""
+        self._plan, self._history = plan, list[Told]()
+        self._begin(next(plan, None))
+        self.first_episode = self._seed
+
+    def _begin(self, episode: Any) -> None:
+        """Set θ for an episode; with None the plan has ended."""
+        self._episode = episode
+        self.controller.theta = self.theta if episode is None else episode.theta
+
+    def _tell(self, told: Told) -> None:
+        """Tell the plan of the episode, and begin the next one."""
+        self._history.append(told)
+        try:
+            episode = self._plan.send(told)
+        except StopIteration:
+            episode = None
+        self._begin(episode)
+
+    def told(self) -> Told:
+        """What the episode told."""
+        found: Told = self._episode.told()
+        return found
+
+    @property
+    def _seed(self) -> int | None:
+        """Seed of the episode's noise, which only a simulator can choose."""
+        simulates = self._episode is not None and self.asks_for == "simulator"
+        return self._episode.seed if simulates else None
+
+    def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
+        """Take one sample; the last one of an episode begins the next."""
+        old, taken = self.controller.theta, self._episode
+        cost = cost if transition is None else transition.cost
+        if taken is None or not taken.take(transition, cost):
+            return None
+        self._tell(self.told())
+        parameters, begun = self.controller.parameters, self._episode
+        return moved(
+            parameters.blocks,
+            old,
+            parameters.theta,
+            episode=self._seed,
+            mark=taken.mark,
+            rewind=begun is not None and begun.rewind,
+        )
+
+    def failed(self, cost: float) -> Update | None:
+        """Take a sample at which the controller failed, with its share of J."""
+        return self.observe(None, cost)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What the plan was told, the open episode, and `KEPT`."""
+        state = super().state() | {"told": np.array(len(self._history))}
+        for number, told in enumerate(self._history):
+            state |= prefixed(f"told {number} ", told)
+        if self._episode is not None:
+            state |= prefixed("episode ", arrays_of(self._episode))
+        return state
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Restore what `state` returned."""
+        theta = self.controller.theta
+        for number in range(int(state["told"])):
+            self._tell(group(state, f"told {number} "))
+        self.controller.theta = theta
+        if self._episode is not None:
+            take_up(self._episode, group(state, "episode "))
+        super().restore(state)

@@ -448,10 +448,11 @@ class TrainingLoop:
 
         Raises KeyError, TypeError, ValueError or another error where it is something else.
         """
-        for name, rng in self._generators.items():
-            rng.bit_generator.state = values[name]
         self.controller.theta = stored["theta"]
         self.algorithm.restore(group(stored, "algorithm "))
+        # Only now: a rule may draw again what it drew before.
+        for name, rng in self._generators.items():
+            rng.bit_generator.state = values[name]
         take_up(self.counts, group(stored, "counts "))
         arrays = group(stored, "loop ")
         self.s, self._applied = arrays["s"], arrays["applied"]

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Transition
+from learning.episodes import Episode, Told
 from learning.errors import ConfigurationError
 from learning.prediction_errors import OneStepModel, known_penalty
 
@@ -27,12 +31,38 @@ BINDING = 0.05
 """Share of the samples in which a bound must bind to count as active."""
 
 
-class Segment(NamedTuple):
-    """A stretch of `steps` samples of a `round` with back-offs `kappa` (2n,)."""
+@dataclass(eq=False)
+class Segment(Episode):
+    """A stretch of operation; `asked` are the places in θ of the bounds (2n,) that may bind."""
+
+    KEPT = (*Episode.KEPT, "rows", "binding")
+    asked: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        self.rows: list[Vector] = []
+        self.binding: Vector = np.zeros(self.asked.size)
+
+    def take(self, transition: Transition | None, cost: float) -> bool:
+        """Keep a sample."""
+        if transition is not None:
+            measured = (transition.s, transition.a, transition.next_s)
+            self.rows.append(np.concatenate([[self.done, transition.stage_cost], *measured]))
+            if self.asked.size:
+                self.binding += transition.policy.value_gradient[self.asked] != 0
+        return super().take(transition, cost)
+
+    def told(self) -> Told:
+        """Rows of number, stage cost, s, a and s₊, (K, 2+2n+m); how often each bound bound."""
+        rows = np.array(self.rows) if self.rows else np.zeros((0, 2 + self.asked.size))
+        return {"rows": rows, "binding": self.binding / self.length}
+
+
+class Tried(NamedTuple):
+    """A bound's κ in a round: its `samples`, rows (K, 1+n) of stage cost and state."""
 
     round: int
-    steps: int
-    kappa: Vector
+    kappa: float
+    samples: Matrix
 
 
 class BackOffSearch:
@@ -44,69 +74,34 @@ class BackOffSearch:
     first round, which finds the others, and the last two. No true bound is loosened. Of back-offs
     whose estimates differ by less than `PLATEAU` the smallest is taken. Where the estimate falls to
     the end of its range, the best back-off that was run is taken, and the next round is about it;
-    `refused` says so of the latest round. Raises ConfigurationError on a budget that is too small.
+    `refused` says so where that was the latest. `start` is θ with no bound backed off, until the
+    `plan` begins. Raises ConfigurationError on a budget that is too small.
     """
 
-    KEPT = (
-        *("origin", "stretches", "kappa", "_unit", "_schedule", "_segment", "_step", "_binding"),
-        *("_share", "_seeds", "_first", "_rows"),
-    )
-
     def __init__(
-        self,
-        start: Parameters,
-        problem: Problem,
-        scenario: Scenario,
-        budget: int,
-        rng: np.random.Generator,
+        self, start: Parameters, scenario: Scenario, budget: int, rng: np.random.Generator
     ) -> None:
+        problem = Problem.from_scenario(scenario)
         least = 2 * SEGMENTS * problem.horizon
         if budget < least:
             raise ConfigurationError(
                 f"a search of the back-off needs at least {least} samples, it has {budget}"
             )
-        self.origin, self._parameters, self._budget = start.theta, start, budget
+        self.start, self._budget = start, budget
         self._penalty, self._model = scenario.state_penalty, OneStepModel(scenario)
         self._settling = problem.horizon
-        n, self._actions = problem.n_states, problem.n_actions
-        self._n = n
+        self._n = n = problem.n_states
         self._true = (scenario.state_lower, scenario.state_upper)
         self._seeds = rng.integers(2**63, size=2 * n * len(PHASES)).tolist()
         self.kappa = np.zeros(2 * n)
         """Best back-offs found, of lower then upper bounds, (2n,)."""
         self._unit = np.zeros(n)
-        self._schedule: list[tuple[int, int]] = []
-        self._plan = [Segment(0, budget // SEGMENTS, self.kappa.copy())]
-        self._segment = self._step = 0
         self.refused = False
-        self._binding, self._share = np.zeros(2 * n), np.zeros(2 * n)
-        self._first: list[Vector] = []
-        self._rows: list[Vector] = []
-
-    @property
-    def start(self) -> Parameters:
-        """θ with no bound backed off."""
-        return self._parameters.with_theta(self.origin)
-
-    @property
-    def seed(self) -> int:
-        """Seed of the noise of the present episode."""
-        return int(self._seeds[self._plan[self._segment].round])
 
     @property
     def theta(self) -> Parameters:
         """θ with the best back-offs found."""
         return self.at(self.kappa)
-
-    @property
-    def candidate(self) -> Parameters:
-        """θ that is tried now."""
-        return self.theta if self.done else self.at(self._plan[self._segment].kappa)
-
-    @property
-    def done(self) -> bool:
-        """Whether the budget is spent, or no bound is active."""
-        return self._segment >= len(self._plan)
 
     def at(self, kappa: Vector) -> Parameters:
         """θ with its bounds κ (2n,) backed off, within the true bounds, x_l kept below x_u."""
@@ -117,68 +112,58 @@ class BackOffSearch:
         lower[crossed], upper[crossed] = middle[crossed] - 1e-6, middle[crossed] + 1e-6
         return self.start.replace({"x_l": lower, "x_u": upper})
 
-    def observe(self, transition: Transition | None) -> bool:
-        """Take a sample, None after a failure; returns whether a new episode begins."""
-        if self.done:
-            return False
-        segment = self._plan[self._segment]
-        if transition is not None and self._step >= self._settling:
-            cost = [float(segment.round), transition.stage_cost]
-            self._rows.append(np.concatenate([cost, segment.kappa, transition.s]))
-        if transition is not None and segment.round == 0:
-            gradient, slices = transition.policy.value_gradient, self.start.blocks.slices
-            bounds = [gradient[slices[name]] for name in ("x_l", "x_u")]
-            self._binding += np.concatenate(bounds) != 0
-            if self._segment == 0:
-                self._first.append(np.concatenate([transition.s, transition.a, transition.next_s]))
-        self._step += 1
-        self.refused = False
-        if self._step < segment.steps:
-            return False
-        self._share = np.maximum(self._share, self._binding / segment.steps)
-        self._binding[:] = 0.0
-        self._step = 0
-        self._segment += 1
-        if self._segment == 1:
-            self._begin()
-        elif self.done:
-            self._end_round(segment.round)
-        return not self.done
-
-    def _begin(self) -> None:
-        """σ and the bound to begin with, from the first segment, at κ = 0."""
-        if not self._first or self._share.max() < BINDING:
+    def plan(self) -> Iterator[Segment]:
+        """The whole search; the segments of a round meet the same noise."""
+        n, slices = self._n, self.start.blocks.slices
+        bounds = np.concatenate(
+            [np.arange(self.start.theta.size)[slices[b]] for b in ("x_l", "x_u")]
+        )
+        steps = self._budget // SEGMENTS
+        segment = Segment(self.theta.theta, steps, self._seeds[0], asked=bounds)
+        yield segment
+        rows, share = segment.answer["rows"], segment.answer["binding"]
+        if not len(rows) or share.max() < BINDING:
             return
-        rows, n = np.array(self._first), self._n
-        errors = self._model.errors(rows[:, :n], rows[:, n:-n], rows[:, -n:], self.start)
+        states, following = rows[:, 2 : 2 + n], rows[:, -n:]
+        errors = self._model.errors(states, rows[:, 2 + n : -n], following, self.start)
         self._unit = errors.std(axis=0)
-        self._schedule = [(int(np.argmax(self._share)), 0)]
-        self._plan += self._segments(0)[1:]
+        first = int(np.argmax(share))
+        schedule, tried = [(first, 0)], [Tried(0, 0.0, self._settled(segment))]
+        for number, (bound, phase) in enumerate(schedule):
+            if number:
+                # The second round's samples count in the third one too.
+                tried = tried if phase == 2 else []
+            asked = bounds[: 0 if number else None]
+            left = 13 / sum(PHASES[later][0] for _, later in schedule[1:]) if number else 1.0
+            steps, kappas = self._segments(bound, phase, left)
+            for kappa in kappas[0 if number else 1 :]:
+                theta, seed = self.at(kappa).theta, self._seeds[number]
+                yield (segment := Segment(theta, steps, seed, asked=asked))
+                self.refused = False
+                tried.append(Tried(number, float(kappa[bound]), self._settled(segment)))
+                share = share if number else np.maximum(share, segment.answer["binding"])
+            self.kappa[bound] = self._best(bound, phase, tried)
+            if not number:
+                others = [int(i) for i in np.flatnonzero(share >= BINDING) if i != first]
+                schedule += [(other, phase) for other in others for phase in range(3)]
+                schedule += [(first, 1), (first, 2)]
 
-    def _end_round(self, number: int) -> None:
-        """Move κ to the estimated optimum and plan the next round about it."""
-        first = self._schedule[0][0]
-        self.kappa[self._schedule[number][0]] = self._best(number)
-        if number == 0:
-            others = [int(i) for i in np.flatnonzero(self._share >= BINDING) if i != first]
-            self._schedule += [(bound, phase) for bound in others for phase in range(3)]
-            self._schedule += [(first, 1), (first, 2)]
-        if number + 1 < len(self._schedule):
-            self._plan += self._segments(number + 1)
+    def _settled(self, segment: Segment) -> Matrix:
+        """Stage cost and state, (K, 1+n), of a segment's samples once the loop has settled."""
+        rows = segment.answer["rows"]
+        return rows[rows[:, 0] >= self._settling, 1 : 2 + self._n]
 
-    def _segments(self, number: int) -> list[Segment]:
-        bound, phase = self._schedule[number]
+    def _segments(self, bound: int, phase: int, left: float) -> tuple[int, list[Vector]]:
+        """Samples of each segment of a round, and their back-offs."""
         share, offsets = PHASES[phase]
         # The first round is about one bound; later rounds share the samples that it leaves.
-        left = 13 / sum(PHASES[later][0] for _, later in self._schedule[1:]) if number else 1.0
         steps = int(self._budget * left * share / (SEGMENTS * len(offsets)))
-        steps = max(steps, self._settling + 1)
         if phase == 0 and (least := max(self._least(bound), -offsets[-1])) < -1.0:
             offsets = (0.0, least, least / 2)  # of a start that is backed off, look for less
         kappas = [self.kappa.copy() for _ in offsets]
         for kappa, offset in zip(kappas, offsets, strict=True):
             kappa[bound] = max(kappa[bound] + offset, self._least(bound))
-        return [Segment(number, steps, kappa) for kappa in kappas]
+        return max(steps, self._settling + 1), kappas
 
     def _least(self, bound: int) -> float:
         """κ of the true bound; at most 0 if the start loosens no bound."""
@@ -190,15 +175,17 @@ class BackOffSearch:
         )
         return float(room / self._unit[state]) if self._unit[state] > 0 else 0.0
 
-    def _best(self, number: int) -> float:
-        """κ of least estimated cost of a round's bound, from this round and the second one."""
-        n, (bound, phase) = self._n, self._schedule[number]
-        rows = np.array(self._rows).reshape(len(self._rows), 2 + 3 * n)
-        rows = rows[rows[:, 0] >= number - (phase == 2)]
-        if not len(rows):  # the controller failed in all of them
+    def _best(self, bound: int, phase: int, tried: list[Tried]) -> float:
+        """κ of least estimated cost of a bound, from what was tried of it."""
+        n = self._n
+        counts = [len(each.samples) for each in tried]
+        if not sum(counts):  # the controller failed in all of them
             return float(self.kappa[bound])
-        kappa, states = rows[:, 2 + bound], rows[:, 2 + 2 * n :]
-        slope = self._slopes(rows[:, 0], kappa, np.column_stack([rows[:, 1], states]))
+        kappa = np.repeat([each.kappa for each in tried], counts)
+        rounds = np.repeat([each.round for each in tried], counts)
+        samples = np.concatenate([each.samples for each in tried])
+        costs, states = samples[:, 0], samples[:, 1:]
+        slope = self._slopes(rounds, kappa, samples)
         slope[1 + bound % n] = self._unit[bound % n] * (1 if bound < n else -1)
         reach = REACH * (2 if phase == 0 else 1)
 
@@ -212,7 +199,7 @@ class BackOffSearch:
             plateau = values[costs <= costs.min() + PLATEAU * abs(costs.min())]
             return float(plateau[np.argmin(np.abs(plateau))])
 
-        mean, least = float(rows[:, 1].mean()), self._least(bound)
+        mean, least = float(costs.mean()), self._least(bound)
         low, high = max(kappa.min() - reach, least), kappa.max() + reach
         # Multiples of the resolution, so that a start in its last digits has the same grid.
         steps = np.arange(np.ceil(low / RESOLUTION), np.floor(high / RESOLUTION) + 1)
@@ -233,12 +220,3 @@ class BackOffSearch:
             above += centred @ values[mine]
             below += float(centred @ centred)
         return np.asarray(above / below if below > 0 else above)
-
-    @property
-    def stretches(self) -> list[Vector]:
-        """The plan as rows: κ, the round, the samples."""
-        return [np.append(segment.kappa, segment[:2]) for segment in self._plan]
-
-    @stretches.setter
-    def stretches(self, rows: list[Vector]) -> None:
-        self._plan = [Segment(int(row[-2]), int(row[-1]), row[:-2]) for row in rows]

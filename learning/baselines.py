@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import least_squares
 
@@ -24,7 +25,9 @@ from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off_search import BackOffSearch
+from learning.checkpoint import take_up
 from learning.configuration import Configuration, Count
+from learning.episodes import Planned
 from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel
 from learning.step import moved
@@ -83,83 +86,41 @@ class IdentifiedConfiguration(GreedyConfiguration):
         return self.model_parameters or model.uncertain
 
 
-class BackOff(Algorithm):
+class BackOff(Planned):
     """One number κ a bound that binds, found by a line search (`BackOffSearch`).
 
-    All else of θ stays. A subclass has an estimate, in operation in place of the search, on a
-    simulator before it: it says how it `learn`s from a transition and how it `conclude`s. `theta`
-    is that of the estimate, or has the best back-off found so far.
+    All else of θ stays. `theta` has the best back-off found so far.
     """
 
     Configuration: ClassVar[type[Configuration]] = GreedyConfiguration
-    KEPT: ClassVar[tuple[str, ...]] = ("_count", "theta", "_search")
     budget: ClassVar[int] = 8000
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._problem = Problem.from_scenario(self.scenario)
         self._start = self.controller.parameters
-        self.theta = self._start.theta
-        self._count, self._estimation = 0, self._estimation_samples()
-        self._search: BackOffSearch | None = None
-        self.first_episode: int | None = None
+        self._found = self._start.theta
+        self._search: Any = None
         if (left := self.samples - self._estimation) > 0:
-            self._search = BackOffSearch(self._start, self._problem, self.scenario, left, self.rng)
-            self.first_episode = None if self._estimation else self._episode(self._search)
+            self._search = BackOffSearch(self._start, self.scenario, left, self.rng)
+            if not self._estimation:
+                self.follow(self._search.plan())
 
-    def _estimation_samples(self) -> int:
+    @property
+    def _estimation(self) -> int:
         """Samples before the search begins."""
         return 0
 
-    def learn(self, transition: Transition) -> Parameters | None:
-        """Take a sample of the estimation; the θ to go on with, or None."""
-        return None
-
-    def conclude(self) -> Parameters:
-        """θ at the end of the estimation."""
-        return self._reported
-
     @property
-    def _reported(self) -> Parameters:
-        return self._start.with_theta(self.theta)
+    def theta(self) -> Vector:
+        """θ with the best back-offs; before the search that of the estimate, (n_θ,)."""
+        theta: Vector = self._search.theta.theta if self._history else self._found
+        return theta
 
-    def _episode(self, search: BackOffSearch) -> int | None:
-        """Noise seed of the next episode; None in operation, which continues."""
-        return search.seed if self.asks_for == "simulator" else None
-
-    def failed(self, cost: float) -> Update | None:
-        """Count a sample at which the controller failed."""
-        return self.observe(None)
-
-    def observe(self, transition: Transition | None) -> Update | None:
-        """Take one sample of the estimation or of the search."""
-        self._count += 1
-        search = self._search
-        if search is not None and self._count > self._estimation:
-            if search.done:
-                return None
-            begins = search.observe(transition)
-            if not (begins or search.done):
-                return None
-            self.theta = search.theta.theta
-            episode = self._episode(search) if begins else None
-            return self._move(search.candidate, episode, search.refused)
-        found = None if transition is None else self.learn(transition)
-        if self._count == self._estimation and self.asks_for == "simulator":
-            found = self.conclude()
-        if found is None:
-            return None
-        self.theta = found.theta
-        if search is not None and self._count == self._estimation:
-            search.origin = found.theta
-            return self._move(search.candidate, self._episode(search))
-        return self._move(found)
-
-    def _move(
-        self, parameters: Parameters, episode: int | None = None, refused: bool = False
-    ) -> Update:
-        old, self.controller.theta = self.controller.theta, parameters.theta
-        return moved(parameters.blocks, old, parameters.theta, refused=refused, episode=episode)
+    def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
+        """Take one sample of the search."""
+        update = super().observe(transition, cost)
+        return update and update._replace(refused=self._search.refused)
 
 
 class BackOffSimulator(BackOff):
@@ -169,12 +130,64 @@ class BackOffSimulator(BackOff):
 
 
 class Estimate(BackOff):
-    """An estimate from the samples, with back-offs by its own errors of prediction."""
+    """An estimate from the samples: on a simulator before the search, in operation in its place.
 
-    def _estimation_samples(self) -> int:
+    A subclass says how it `learn`s from a transition and how it `conclude`s. In operation it backs
+    off by its own errors of prediction.
+    """
+
+    KEPT: ClassVar[tuple[str, ...]] = ("_count", "_found")
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._count = 0
+
+    @property
+    def _estimation(self) -> int:
         if self.asks_for == "operation" or not self.configuration.back_off:
             return self.samples
         return max(round(ESTIMATION * self.samples), 1)
+
+    def learn(self, transition: Transition) -> Parameters | None:
+        """Take a sample of the estimation; the θ to go on with, or None."""
+        raise NotImplementedError
+
+    def conclude(self) -> Parameters:
+        """θ at the end of the estimation."""
+        raise NotImplementedError
+
+    @property
+    def _reported(self) -> Parameters:
+        return self._start.with_theta(self._found)
+
+    def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
+        """Take one sample of the estimation or of the search."""
+        self._count += 1
+        if self._count > self._estimation:
+            return super().observe(transition, cost)
+        found = None if transition is None else self.learn(transition)
+        if self._count == self._estimation and self.asks_for == "simulator":
+            found = self.conclude()
+        if found is None:
+            return None
+        old, self._found = self.controller.theta, found.theta
+        self.controller.theta = found.theta
+        self._search_from_here()
+        return moved(found.blocks, old, self.controller.theta, episode=self._seed)
+
+    def _search_from_here(self) -> None:
+        """Begin the search, if there is one and the estimation is over."""
+        if self._search is not None and self._count >= self._estimation:
+            self._search.start = self._reported
+            self.follow(self._search.plan())
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Restore what `state` returned."""
+        take_up(self, state)
+        theta = self.controller.theta
+        self._search_from_here()
+        self.controller.theta = theta
+        super().restore(state)
 
     def backed_off(self, parameters: Parameters, errors: Matrix) -> Parameters:
         """θ in operation, its bounds set back by the greatest of its prediction errors (K, n).

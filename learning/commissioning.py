@@ -83,23 +83,22 @@ def spare(start: Parameters, scenario: Scenario) -> Parameters:
 
 
 def _search(start: Parameters, scenario: Scenario) -> Parameters:
-    problem, sample = Problem.from_scenario(scenario), _simulation(scenario)
+    sample = _simulation(scenario)
     controller = nmpc(scenario, start)
-    search = BackOffSearch(start, problem, scenario, SAMPLES, np.random.default_rng(0))
-
-    begins, s = True, scenario.initial_state
-    while not search.done:
-        if begins:
-            noise, s = np.random.default_rng(search.seed), scenario.initial_state
-            controller.reset()
-            controller.theta = search.candidate.theta
-        try:
-            transition = sample(controller, s, noise)
-            s = transition.next_s
-        except Exception as error:
-            recover(controller, error)
+    search = BackOffSearch(start, scenario, SAMPLES, np.random.default_rng(0))
+    for segment in search.plan():
+        noise, s = np.random.default_rng(segment.seed), scenario.initial_state
+        controller.reset()
+        controller.theta, ended = segment.theta, False
+        while not ended:
             transition = None
-        begins = search.observe(transition)
+            try:
+                transition = sample(controller, s, noise)
+                s = transition.next_s
+            except Exception as error:
+                recover(controller, error)
+            ended = segment.take(transition, 0.0)
+        segment.answer = segment.told()
     return search.theta
 
 

@@ -1,11 +1,11 @@
-"""Algorithms that follow a plan: a generator of episodes that is sent what each one told.
+"""Algorithms that follow a plan: a generator of episodes, which reads what each one told.
 
-A checkpoint keeps what they told; restoring sends it to the deterministic plan once more.
+A checkpoint keeps what they told; restoring lets the deterministic plan read it once more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -22,7 +22,7 @@ Told = dict[str, NDArray[Any]]
 
 @dataclass(eq=False)
 class Episode:
-    """The next `length` samples at θ (n_θ,); a subclass keeps what they tell.
+    """The next `length` samples at θ (n_θ,), whose `answer` the plan reads when it goes on.
 
     On a simulator the plant is reset before them, where `seed` gives its noise, or put back to
     where it was marked (`rewind`), noise included, and marked after them (`mark`).
@@ -35,6 +35,7 @@ class Episode:
     rewind: bool = False
     mark: bool = False
     done: int = field(default=0, init=False)
+    answer: Told = field(default_factory=dict, init=False)
 
     def take(self, transition: Transition | None, cost: float) -> bool:
         """Take a sample, None where the controller failed, and its share of J: was it the last?"""
@@ -42,7 +43,7 @@ class Episode:
         return self.done >= self.length
 
     def told(self) -> Told:
-        """What the samples told, for the plan."""
+        """The answer, when all samples are taken."""
         raise NotImplementedError
 
 
@@ -54,9 +55,15 @@ class Planned(Algorithm):
 
     theta: Any
 
-    def follow(self, plan: Generator[Any, Told, None]) -> None:
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._episode: Any = None
+        self._history: list[Told] = []
+        self.first_episode: int | None = None
+
+    def follow(self, plan: Iterator[Any]) -> None:
         """Begin a plan."""
-        self._plan, self._history = plan, list[Told]()
+        self._plan = plan
         self._begin(next(plan, None))
         self.first_episode = self._seed
 
@@ -66,13 +73,10 @@ class Planned(Algorithm):
         self.controller.theta = self.theta if episode is None else episode.theta
 
     def _tell(self, told: Told) -> None:
-        """Tell the plan of the episode, and begin the next one."""
+        """Answer the plan, and begin its next episode."""
         self._history.append(told)
-        try:
-            episode = self._plan.send(told)
-        except StopIteration:
-            episode = None
-        self._begin(episode)
+        self._episode.answer = told
+        self._begin(next(self._plan, None))
 
     def told(self) -> Told:
         """What the episode told."""

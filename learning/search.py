@@ -1,7 +1,7 @@
 """The search: a simulator decides which θ is kept, with or without a learning rule.
 
-`SearchPlan` decides what to try next. It is a generator that yields episodes (`Trial`), is sent
-what they told, and knows no plant, controller or rule. `Search` takes them as an algorithm.
+`SearchPlan` decides what to try next. It yields episodes (`Trial`), reads their answers, and knows
+no plant, controller or rule. `Search` takes the episodes as an algorithm.
 """
 
 from __future__ import annotations
@@ -113,8 +113,8 @@ class Trial(Episode):
         )
 
 
-Plan = Generator[Trial, Told, None]
-Verdict = Generator[Trial, Told, bool]
+Plan = Generator[Trial, None, None]
+Verdict = Generator[Trial, None, bool]
 
 
 class Spent(Exception):
@@ -298,7 +298,7 @@ class SearchPlan:
             PRIOR_WIDTH,
         )
 
-    def _along(self, direction: Vector, reach: float) -> Generator[Trial, Told, float]:
+    def _along(self, direction: Vector, reach: float) -> Generator[Trial, None, float]:
         """Line search both ways in scaled θ, (n_θ,); returns the first step of the next time."""
         longest = self.CAP / max(float(np.abs(direction).max()), np.finfo(float).tiny)
         origin, quarter = self.base.theta, max(len(self.base.realised) // 4, 1)
@@ -325,7 +325,7 @@ class SearchPlan:
             direction[where if state is None else where[state]] = inwards
         return direction
 
-    def _directions(self, *, turned: bool) -> Generator[Trial, Told, Matrix]:
+    def _directions(self, *, turned: bool) -> Generator[Trial, None, Matrix]:
         """Directions in scaled θ that change the policy by the exploration's σ, (n_θ, K)."""
         deviation = self._action_deviation
         trial = Trial(self.base.theta, self.stretch, rewind=True, deviation=deviation)
@@ -338,7 +338,7 @@ class SearchPlan:
             directions = directions @ np.linalg.qr(draw)[0]
         return np.asarray(directions)
 
-    def _rescale(self, decades: float) -> Generator[Trial, Told, float]:
+    def _rescale(self, decades: float) -> Generator[Trial, None, float]:
         """Search over the inputs' weights, each with its own back-off; the next time's step."""
         found = False
         while True:
@@ -371,7 +371,7 @@ class SearchPlan:
         hessian = hessian * np.outer(scale, scale)
         return parameters.replace({"B_l": hessian, "b_l": hessian @ minimiser}).theta
 
-    def _ask(self, trial: Trial) -> Generator[Trial, Told, tuple[Told, Matrix, Matrix]]:
+    def _ask(self, trial: Trial) -> Generator[Trial, None, tuple[Told, Matrix, Matrix]]:
         """What a trial told; apart its predictions and errors, of which no checkpoint has a use.
 
         Raises Spent where its samples are beyond the limit.
@@ -379,7 +379,8 @@ class SearchPlan:
         if self.spent + trial.length > self._limit:
             raise Spent
         self.spent += trial.length
-        told = yield trial
+        yield trial
+        told = trial.answer
         return told, told.pop("predictions", NONE), told.pop("errors", NONE)
 
     def _remember(self, errors: Matrix) -> None:
@@ -427,7 +428,7 @@ class SearchPlan:
 
     def _screen(
         self, theta: Vector, costs: Vector, patience: float = 0.0
-    ) -> Generator[Trial, Told, Candidate | None]:
+    ) -> Generator[Trial, None, Candidate | None]:
         """θ with its first stretches if it is never dearer on them, else None."""
         admissible = self.admissible(theta)
         if admissible is None:

@@ -14,9 +14,9 @@ STRETCHES = 8
 def drive(plan, answer):
     """What a generator of requests returns once each has been answered."""
     try:
-        request = next(plan)
         while True:
-            request = plan.send(answer(request))
+            request = next(plan)
+            request.answer = answer(request)
     except StopIteration as end:
         return end.value
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,14 +56,6 @@ class Segment(Episode):
         return {"rows": rows, "binding": self.binding / self.length}
 
 
-class Tried(NamedTuple):
-    """A bound's κ in a round: its `samples`, rows (K, 1+n) of stage cost and state."""
-
-    round: int
-    kappa: float
-    samples: Matrix
-
-
 class BackOffSearch:
     """Finds the κ of least cost for the active bounds x_l + κσ and x_u − κσ.
 
@@ -73,9 +64,9 @@ class BackOffSearch:
     line search of three rounds (docs/method.md). The bound that binds most often at κ = 0 has the
     first round, which finds the others, and the last two. No true bound is loosened. Of back-offs
     whose estimates differ by less than `PLATEAU` the smallest is taken. Where the estimate falls to
-    the end of its range, the best back-off that was run is taken, and the next round is about it;
-    `refused` says so where that was the latest. `start` is θ with no bound backed off, until the
-    `plan` begins. Raises ConfigurationError on a budget that is too small.
+    the end of its range, the best back-off that was run is taken, the next round is about it, and
+    the round's last segment is `refused`. `start` is θ with no bound backed off; it may be set
+    until the `plan` begins. Raises ConfigurationError on a budget that is too small.
     """
 
     def __init__(
@@ -96,7 +87,6 @@ class BackOffSearch:
         self.kappa = np.zeros(2 * n)
         """Best back-offs found, of lower then upper bounds, (2n,)."""
         self._unit = np.zeros(n)
-        self.refused = False
 
     @property
     def theta(self) -> Parameters:
@@ -128,30 +118,29 @@ class BackOffSearch:
         errors = self._model.errors(states, rows[:, 2 + n : -n], following, self.start)
         self._unit = errors.std(axis=0)
         first = int(np.argmax(share))
-        schedule, tried = [(first, 0)], [Tried(0, 0.0, self._settled(segment))]
+        schedule, tried = [(first, 0)], [self._settled(segment, 0, 0.0)]
         for number, (bound, phase) in enumerate(schedule):
-            if number:
-                # The second round's samples count in the third one too.
-                tried = tried if phase == 2 else []
-            asked = bounds[: 0 if number else None]
+            if number and phase != 2:  # the second round's samples count in the third one too
+                tried = []
             left = 13 / sum(PHASES[later][0] for _, later in schedule[1:]) if number else 1.0
             steps, kappas = self._segments(bound, phase, left)
             for kappa in kappas[0 if number else 1 :]:
-                theta, seed = self.at(kappa).theta, self._seeds[number]
-                yield (segment := Segment(theta, steps, seed, asked=asked))
-                self.refused = False
-                tried.append(Tried(number, float(kappa[bound]), self._settled(segment)))
+                asked = bounds[: 0 if number else None]
+                segment = Segment(self.at(kappa).theta, steps, self._seeds[number], asked=asked)
+                yield segment
+                tried.append(self._settled(segment, number, kappa[bound]))
                 share = share if number else np.maximum(share, segment.answer["binding"])
-            self.kappa[bound] = self._best(bound, phase, tried)
+            self.kappa[bound], segment.refused = self._best(bound, phase, np.concatenate(tried))
             if not number:
                 others = [int(i) for i in np.flatnonzero(share >= BINDING) if i != first]
                 schedule += [(other, phase) for other in others for phase in range(3)]
                 schedule += [(first, 1), (first, 2)]
 
-    def _settled(self, segment: Segment) -> Matrix:
-        """Stage cost and state, (K, 1+n), of a segment's samples once the loop has settled."""
+    def _settled(self, segment: Segment, number: int, kappa: float) -> Matrix:
+        """Round, κ, stage cost and state, (K, 3+n), of a segment once the loop has settled."""
         rows = segment.answer["rows"]
-        return rows[rows[:, 0] >= self._settling, 1 : 2 + self._n]
+        rows = rows[rows[:, 0] >= self._settling, 1 : 2 + self._n]
+        return np.hstack([np.full((len(rows), 2), (number, kappa)), rows])
 
     def _segments(self, bound: int, phase: int, left: float) -> tuple[int, list[Vector]]:
         """Samples of each segment of a round, and their back-offs."""
@@ -175,17 +164,16 @@ class BackOffSearch:
         )
         return float(room / self._unit[state]) if self._unit[state] > 0 else 0.0
 
-    def _best(self, bound: int, phase: int, tried: list[Tried]) -> float:
-        """κ of least estimated cost of a bound, from what was tried of it."""
+    def _best(self, bound: int, phase: int, tried: Matrix) -> tuple[float, bool]:
+        """κ of least estimated cost of a bound, and whether the estimate led beyond what was tried.
+
+        `tried` are rows of `_settled`.
+        """
         n = self._n
-        counts = [len(each.samples) for each in tried]
-        if not sum(counts):  # the controller failed in all of them
-            return float(self.kappa[bound])
-        kappa = np.repeat([each.kappa for each in tried], counts)
-        rounds = np.repeat([each.round for each in tried], counts)
-        samples = np.concatenate([each.samples for each in tried])
-        costs, states = samples[:, 0], samples[:, 1:]
-        slope = self._slopes(rounds, kappa, samples)
+        if not len(tried):  # the controller failed in all of them
+            return float(self.kappa[bound]), False
+        kappa, costs, states = tried[:, 1], tried[:, 2], tried[:, 3:]
+        slope = self._slopes(tried[:, 0], kappa, tried[:, 2:])
         slope[1 + bound % n] = self._unit[bound % n] * (1 if bound < n else -1)
         reach = REACH * (2 if phase == 0 else 1)
 
@@ -206,9 +194,8 @@ class BackOffSearch:
         grid = RESOLUTION * steps
         found = best_of(grid)
         if found == grid[-1] or (found == grid[0] and low > least):
-            self.refused = True
-            return best_of(np.unique(kappa))
-        return found
+            return best_of(np.unique(kappa)), True
+        return found, False
 
     @staticmethod
     def _slopes(rounds: Vector, kappa: Vector, values: Matrix) -> Vector:

@@ -8,11 +8,10 @@ before each of its stretches, on the same noise.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import least_squares
 
@@ -25,9 +24,8 @@ from cosim.protocols import Matrix, Vector
 from cosim.scenario import Scenario
 from learning.algorithm import Algorithm, Transition, Update
 from learning.back_off_search import BackOffSearch
-from learning.checkpoint import take_up
 from learning.configuration import Configuration, Count
-from learning.episodes import Planned
+from learning.episodes import Episode, Planned, Told
 from learning.errors import DivergenceError
 from learning.prediction_errors import OneStepModel
 from learning.step import moved
@@ -87,40 +85,22 @@ class IdentifiedConfiguration(GreedyConfiguration):
 
 
 class BackOff(Planned):
-    """One number κ a bound that binds, found by a line search (`BackOffSearch`).
-
-    All else of θ stays. `theta` has the best back-off found so far.
-    """
+    """One number κ a bound that binds, found by a line search (`BackOffSearch`); else θ stays."""
 
     Configuration: ClassVar[type[Configuration]] = GreedyConfiguration
     budget: ClassVar[int] = 8000
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._problem = Problem.from_scenario(self.scenario)
-        self._start = self.controller.parameters
-        self._found = self._start.theta
-        self._search: Any = None
-        if (left := self.samples - self._estimation) > 0:
-            self._search = BackOffSearch(self._start, self.scenario, left, self.rng)
-            if not self._estimation:
-                self.follow(self._search.plan())
-
-    @property
-    def _estimation(self) -> int:
-        """Samples before the search begins."""
-        return 0
+        self._search = BackOffSearch(
+            self.controller.parameters, self.scenario, self.samples, self.rng
+        )
+        self.follow(self._search.plan())
 
     @property
     def theta(self) -> Vector:
-        """θ with the best back-offs; before the search that of the estimate, (n_θ,)."""
-        theta: Vector = self._search.theta.theta if self._history else self._found
-        return theta
-
-    def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
-        """Take one sample of the search."""
-        update = super().observe(transition, cost)
-        return update and update._replace(refused=self._search.refused)
+        """θ with the best back-offs found so far, (n_θ,)."""
+        return self._search.theta.theta
 
 
 class BackOffSimulator(BackOff):
@@ -129,24 +109,35 @@ class BackOffSimulator(BackOff):
     asks_for = "simulator"
 
 
-class Estimate(BackOff):
+class Estimate(Planned):
     """An estimate from the samples: on a simulator before the search, in operation in its place.
 
     A subclass says how it `learn`s from a transition and how it `conclude`s. In operation it backs
     off by its own errors of prediction.
     """
 
-    KEPT: ClassVar[tuple[str, ...]] = ("_count", "_found")
+    KEPT: ClassVar[tuple[str, ...]] = ("_found",)
+    budget: ClassVar[int] = BackOff.budget
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._count = 0
+        self._problem = Problem.from_scenario(self.scenario)
+        self._start = self.controller.parameters
+        self._found = self._start.theta
+        self._search: BackOffSearch | None = None
+        samples = self.samples if self.asks_for == "simulator" else self.samples + 1
+        if self.asks_for == "simulator" and self.configuration.back_off:
+            samples = max(round(ESTIMATION * self.samples), 1)
+            left = self.samples - samples
+            self._search = BackOffSearch(self._start, self.scenario, left, self.rng)
+        self.follow(self._estimate_and_search(samples))
 
-    @property
-    def _estimation(self) -> int:
-        if self.asks_for == "operation" or not self.configuration.back_off:
-            return self.samples
-        return max(round(ESTIMATION * self.samples), 1)
+    def _estimate_and_search(self, samples: int) -> Iterator[Episode]:
+        yield (estimation := Episode(self._found, samples))
+        self._found = estimation.answer["theta"]
+        if self._search is not None:
+            self._search.start = self._reported
+            yield from self._search.plan()
 
     def learn(self, transition: Transition) -> Parameters | None:
         """Take a sample of the estimation; the θ to go on with, or None."""
@@ -157,37 +148,28 @@ class Estimate(BackOff):
         raise NotImplementedError
 
     @property
+    def theta(self) -> Vector:
+        """θ of the estimate, then with the best back-offs found so far, (n_θ,)."""
+        if self._search is None or len(self._history) < 2:
+            return self._found
+        return self._search.theta.theta
+
+    @property
     def _reported(self) -> Parameters:
         return self._start.with_theta(self._found)
 
+    def told(self) -> Told:
+        """What the episode told; the estimate's θ."""
+        return super().told() if self._history else {"theta": self.conclude().theta}
+
     def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
         """Take one sample of the estimation or of the search."""
-        self._count += 1
-        if self._count > self._estimation:
-            return super().observe(transition, cost)
-        found = None if transition is None else self.learn(transition)
-        if self._count == self._estimation and self.asks_for == "simulator":
-            found = self.conclude()
-        if found is None:
-            return None
-        old, self._found = self.controller.theta, found.theta
-        self.controller.theta = found.theta
-        self._search_from_here()
-        return moved(found.blocks, old, self.controller.theta, episode=self._seed)
-
-    def _search_from_here(self) -> None:
-        """Begin the search, if there is one and the estimation is over."""
-        if self._search is not None and self._count >= self._estimation:
-            self._search.start = self._reported
-            self.follow(self._search.plan())
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Restore what `state` returned."""
-        take_up(self, state)
-        theta = self.controller.theta
-        self._search_from_here()
-        self.controller.theta = theta
-        super().restore(state)
+        found = None if transition is None or self._history else self.learn(transition)
+        update = super().observe(transition, cost)
+        if update is None and found is not None:
+            update = moved(found.blocks, self.controller.theta, found.theta)
+            self._found = self.controller.theta = found.theta
+        return update
 
     def backed_off(self, parameters: Parameters, errors: Matrix) -> Parameters:
         """θ in operation, its bounds set back by the greatest of its prediction errors (K, n).

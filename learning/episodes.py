@@ -25,7 +25,8 @@ class Episode:
     """The next `length` samples at θ (n_θ,), whose `answer` the plan reads when it goes on.
 
     On a simulator the plant is reset before them, where `seed` gives its noise, or put back to
-    where it was marked (`rewind`), noise included, and marked after them (`mark`).
+    where it was marked (`rewind`), noise included, and marked after them (`mark`). The plan says of
+    an answer that it has `refused` to go where that led.
     """
 
     KEPT: ClassVar[tuple[str, ...]] = ("length", "done")
@@ -36,6 +37,7 @@ class Episode:
     mark: bool = False
     done: int = field(default=0, init=False)
     answer: Told = field(default_factory=dict, init=False)
+    refused: bool = field(default=False, init=False)
 
     def take(self, transition: Transition | None, cost: float) -> bool:
         """Take a sample, None where the controller failed, and its share of J: was it the last?"""
@@ -101,6 +103,7 @@ class Planned(Algorithm):
             parameters.blocks,
             old,
             parameters.theta,
+            refused=taken.refused,
             episode=self._seed,
             mark=taken.mark,
             rewind=begun is not None and begun.rewind,

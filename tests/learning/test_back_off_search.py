@@ -19,16 +19,14 @@ class Loop:
         self.noises = {}
 
     def run(self, search):
-        self.segments, self.refused = [], []
+        self.segments = []
         for segment in search.plan():
-            self.refused.append(search.refused)
             self.segments.append(segment)
             rng, ended = np.random.default_rng(segment.seed), False
             candidate = search.start.with_theta(segment.theta)
             while not ended:
                 ended = segment.take(self.transition(candidate, rng), 0.0)
             segment.answer = segment.told()
-        self.refused.append(search.refused)
         return search
 
     def transition(self, candidate, rng):
@@ -63,7 +61,7 @@ def search_of(problem, scenario, start, budget=8000):
 def test_the_least_cost_of_a_known_loop_is_found(problem, scenario, start):
     loop = Loop(problem, scenario)
     search = loop.run(search_of(problem, scenario, start))
-    assert not search.refused
+    assert not any(segment.refused for segment in loop.segments)
     # 50 = 1e5·P(noise < −δ) at the optimum, so δ = 1 − 1e-3.
     assert search.theta["x_l"] == pytest.approx([25.999, 40.0], abs=0.01)
     assert np.array_equal(search.theta["x_u"], start["x_u"])
@@ -142,4 +140,5 @@ def test_the_end_of_what_was_seen_is_not_taken_for_the_best(problem, scenario, s
     search = loop.run(search_of(problem, scenario, start, 4000))
     run = {segment.theta[start.blocks.slices["x_l"]][0] for segment in loop.segments}
     assert search.theta["x_l"][0] in run and search.kappa[0] >= 4.0
-    assert sum(loop.refused) == 3 and loop.refused[-1]
+    refused = [segment.refused for segment in loop.segments]
+    assert sum(refused) == 3 and refused[-1]

@@ -20,7 +20,7 @@ from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.simulation import recover
 from learning.algorithm import Transition
-from learning.back_off_search import BackOffSearch
+from learning.baselines import BackOffSearch
 from learning.prediction_errors import OneStepModel
 
 GUESS = 0.1

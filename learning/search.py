@@ -452,12 +452,8 @@ class SearchPlan:
         patience = _patience(costs) if stretches > 1 else np.inf
         finalists = [self.incumbent]
         for theta in rivals:
-            rival = Candidate(theta)
-            while len(rival.realised) < stretches:
-                yield from self._run(rival)
-                if (rival.costs - costs[: len(rival.realised)]).sum() >= patience:
-                    break
-            else:
+            rival = yield from self._screen(theta, costs, patience)
+            if rival is not None:
                 finalists.append(rival)
                 self.base = self.incumbent = self._winner(finalists)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controllers.theta import Parameters
-from learning.back_off_search import BackOffSearch
+from learning.baselines import BackOffSearch
 from learning.prediction_errors import OneStepModel
 
 

@@ -22,7 +22,7 @@ from cosim.protocols import Matrix, Step, Vector
 from cosim.scenario import Scenario
 from cosim.simulation import recover
 from cosim.validation import suggestion
-from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.checkpoint import arrays_of, as_array, from_array, group, prefixed, take_up
 from learning.configuration import Configuration
 from learning.errors import AlgorithmLookupError, ConfigurationError, PrivilegeError
 
@@ -261,6 +261,8 @@ class TrainingLoop:
     `PlantInOperation`. `rng` draws the exploration, `algorithm_rng` is the algorithm's own.
     """
 
+    KEPT = ("s", "_applied", "counts", "algorithm")
+
     def __init__(
         self,
         plant: FmuPlant | PlantInOperation,
@@ -280,9 +282,9 @@ class TrainingLoop:
             self._plant = plant if simulator else PlantInOperation(plant)
         self.controller, self.algorithm, self.rng = controller, algorithm, rng
         self._strategy = strategy
-        self._generators = {"exploration": rng}
+        self._generators = {"rng": rng}
         if algorithm_rng is not None:
-            self._generators["algorithm"] = algorithm_rng
+            self._generators["algorithm_rng"] = algorithm_rng
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
@@ -431,43 +433,35 @@ class TrainingLoop:
         else:
             self.renew()
 
-    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """State for `restore`, without the plant's: JSON-ready values, and arrays."""
-        arrays = {"s": self.s, "applied": self._applied, **_stored("point", self._point)}
+    def state(self) -> dict[str, NDArray[Any]]:
+        """State for `restore`, without the plant's."""
+        state = arrays_of(self) | {"theta": self.controller.theta} | _stored("point", self._point)
         if self._marked is not None:
             content = self._asked("mark").serialise(self._marked[0])
-            arrays |= {"marked_s": self._marked[1], "marked": np.frombuffer(content, np.uint8)}
-            arrays |= _stored("marked_point", self._marked[2])
-        values = {name: rng.bit_generator.state for name, rng in self._generators.items()}
-        stored = {"theta": self.controller.theta, **prefixed("loop ", arrays)}
-        stored |= prefixed("counts ", arrays_of(self.counts))
-        return values, stored | prefixed("algorithm ", self.algorithm.state())
+            state |= {"marked": np.frombuffer(content, np.uint8), "marked_s": self._marked[1]}
+            state |= _stored("marked_point", self._marked[2])
+        generators = self._generators.items()
+        return state | {name: as_array(rng.bit_generator.state) for name, rng in generators}
 
-    def restore(self, values: dict[str, Any], stored: dict[str, NDArray[Any]]) -> None:
-        """Restore what `state` returned; the plant must have been restored before.
-
-        Raises KeyError, TypeError, ValueError or another error where it is something else.
-        """
-        self.controller.theta = stored["theta"]
-        self.algorithm.restore(group(stored, "algorithm "))
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Restore what `state` returned; the plant must have been restored before."""
+        self.controller.theta = state["theta"]
+        take_up(self, state)
         # Only now: a rule may draw again what it drew before.
         for name, rng in self._generators.items():
-            rng.bit_generator.state = values[name]
-        take_up(self.counts, group(stored, "counts "))
-        arrays = group(stored, "loop ")
-        self.s, self._applied = arrays["s"], arrays["applied"]
+            rng.bit_generator.state = from_array(state[name])
         self._marked = None
-        if "marked" in arrays:
-            snapshot = self._asked("mark").deserialise(arrays["marked"].tobytes())
-            self._marked = (snapshot, arrays["marked_s"], _point("marked_point", arrays))
-        self._point = _point("point", arrays)
+        if "marked" in state:
+            snapshot = self._asked("mark").deserialise(state["marked"].tobytes())
+            self._marked = (snapshot, state["marked_s"], _point("marked_point", state))
+        self._point = _point("point", state)
         self.restart()
 
 
 def _stored(name: str, point: LinearisationPoint | None) -> dict[str, Vector]:
-    return {} if point is None else prefixed(f"{name}_", point._asdict())
+    return {} if point is None else prefixed(f"{name} ", point._asdict())
 
 
 def _point(name: str, arrays: dict[str, Vector]) -> LinearisationPoint | None:
-    parts = group(arrays, f"{name}_")
+    parts = group(arrays, f"{name} ")
     return LinearisationPoint(**parts) if parts else None

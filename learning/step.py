@@ -189,6 +189,8 @@ class ConstrainedStep:
     DivergenceError on a step that is not finite.
     """
 
+    KEPT = ("_smallest",)
+
     def __init__(
         self, controller: RtiNmpc, configuration: Configuration, scale: Vector | None = None
     ) -> None:

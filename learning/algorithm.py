@@ -331,16 +331,16 @@ class TrainingLoop:
             return cost, None
         self.counts.failures += update.failures
         if update.mark:
-            self._marked = (self._asked("mark").snapshot(), self.s, self._point)
+            self._marked = (self.simulator("mark").snapshot(), self.s, self._point)
         if update.rewind:
-            plant = self._asked("rewind")
+            plant = self.simulator("rewind")
             if self._marked is None:
                 raise PrivilegeError(f"{type(self.algorithm).__name__}: 'rewind' before any 'mark'")
             snapshot, self.s, self._point = self._marked
             plant.restore(snapshot)
             self.restart()
         elif update.episode is not None:
-            self.start(self._asked("episode").reset(update.episode))
+            self.start(self.simulator("episode").reset(update.episode))
         else:
             self.renew()
         return cost, update
@@ -398,12 +398,12 @@ class TrainingLoop:
             self.counts.saturated += bool(((a == self._lower) | (a == self._upper)).any())
         return a, explored is not None
 
-    def _asked(self, privilege: str) -> FmuPlant:
-        """The plant as a simulator; raises PrivilegeError if not asked for."""
+    def simulator(self, privilege: str) -> FmuPlant:
+        """The plant as a simulator, for a privilege; raises PrivilegeError if not asked for."""
         if self._simulator is None:
             raise PrivilegeError(
-                f"{type(self.algorithm).__name__} asks for a plant in operation, and its update "
-                f"has '{privilege}', which only a simulator can; state asks_for = \"simulator\""
+                f"{type(self.algorithm).__name__} asks for a plant in operation, and says "
+                f"'{privilege}', which only a simulator can; state asks_for = \"simulator\""
             )
         return self._simulator
 
@@ -437,7 +437,7 @@ class TrainingLoop:
         """State for `restore`, without the plant's."""
         state = arrays_of(self) | {"theta": self.controller.theta} | _stored("point", self._point)
         if self._marked is not None:
-            content = self._asked("mark").serialise(self._marked[0])
+            content = self.simulator("mark").serialise(self._marked[0])
             state |= {"marked": np.frombuffer(content, np.uint8), "marked_s": self._marked[1]}
             state |= _stored("marked_point", self._marked[2])
         generators = self._generators.items()
@@ -452,7 +452,7 @@ class TrainingLoop:
             rng.bit_generator.state = from_array(state[name])
         self._marked = None
         if "marked" in state:
-            snapshot = self._asked("mark").deserialise(state["marked"].tobytes())
+            snapshot = self.simulator("mark").deserialise(state["marked"].tobytes())
             self._marked = (snapshot, state["marked_s"], _point("marked_point", state))
         self._point = _point("point", state)
         self.restart()

@@ -165,7 +165,7 @@ class SearchPlan:
     the budget. A comparison has up to `stretches` stretches of `stretch` samples, a phase `phase`.
     """
 
-    KEPT = ("_errors", "pooled")
+    KEPT = ("_errors", "_pool")
     MEMORY = 6000
     """Prediction errors kept for expected penalties, whose tail counts."""
     FINAL = 0.25
@@ -200,20 +200,10 @@ class SearchPlan:
         """Least eigenvalue that the Hessians of a candidate may have."""
         self.spent, self._limit = 0, samples
         self._errors: Matrix = np.zeros((0, self._states))
-        self.pooled = self._errors
+        self._pool = SortedErrors(self._errors)
         self.base = self.incumbent = Candidate(start.theta)
         self._scale: Vector = np.ones(start.theta.size)
         self._past = [start.theta]
-
-    @property
-    def pooled(self) -> Matrix:
-        """The prediction errors that the penalties of this round's stretches are expected with."""
-        return self._pooled
-
-    @pooled.setter
-    def pooled(self, errors: Matrix) -> None:
-        # Sort once a round: a stretch only looks values up.
-        self._pooled, self._pool = errors, SortedErrors(errors)
 
     def plan(self) -> Plan:
         """The whole run."""
@@ -395,7 +385,7 @@ class SearchPlan:
         cost, penalty = map(float, told["cost"])
         if "expected" not in told:
             told["expected"] = np.array(penalty)  # where there is no pool yet
-            if len(predictions) and len(self._pool):
+            if len(predictions) and len(self._pool.errors):
                 due = expected_penalties(self._penalty, predictions, self._pool)
                 told["expected"] = np.array(due.mean(axis=-1).cumsum()[-1])
         candidate.realised.append(cost + penalty)
@@ -406,7 +396,7 @@ class SearchPlan:
         """Run the incumbent on new noise: on from where the plant is, or after a reset."""
         yield from self._ask(Trial(self.incumbent.theta, self.stretch, seed, mark=True))
         # One pool for the whole round, so that all θ are judged alike.
-        self.pooled = self._errors
+        self._pool = SortedErrors(self._errors)
         self.base = self.incumbent = Candidate(self.incumbent.theta)
         for _ in range(stretches):
             yield from self._run(self.incumbent)

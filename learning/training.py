@@ -37,7 +37,7 @@ from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Strategy, TrainingLoop, Update, load_algorithm
 from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
-from learning.errors import ConfigurationError, DivergenceError, PrivilegeError
+from learning.errors import ConfigurationError, DivergenceError
 from learning.step import smallest_eigenvalue
 
 if TYPE_CHECKING:
@@ -165,13 +165,9 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
     own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])
     rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
     loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
-    first: int | None = getattr(rule, "first_episode", None)
-    if first is not None and rule.asks_for != "simulator":
-        raise PrivilegeError(
-            f"{algorithm.__name__} asks for a plant in operation and states 'first_episode', which "
-            "only a simulator has"
-        )
-    loop.start(plant.reset(plant_seed if first is None else first))
+    if (first := getattr(rule, "first_episode", None)) is not None:
+        plant, plant_seed = loop.simulator("first_episode"), first
+    loop.start(plant.reset(plant_seed))
     return loop
 
 

@@ -6,6 +6,7 @@ draws the exploration and carries out an update's requests to the plant.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
@@ -18,7 +19,7 @@ from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
 from cosim.plugins import ALGORITHMS, load_plugin, registered
-from cosim.protocols import Matrix, Step, Vector
+from cosim.protocols import Matrix, Plant, Step, Vector
 from cosim.scenario import Scenario
 from cosim.simulation import recover
 from cosim.validation import suggestion
@@ -223,9 +224,10 @@ class PlantInOperation:
     """A plant that can only take its next sample: no reset, no snapshot, no choice of noise."""
 
     __slots__ = ("scenario", "step")
+    step: Callable[[Vector], Step]
 
-    def __init__(self, plant: FmuPlant) -> None:
-        self.scenario = plant.scenario
+    def __init__(self, plant: Plant | PlantInOperation) -> None:
+        self.scenario: Scenario = plant.scenario
 
         def step(a: Vector) -> Step:
             return plant.step(a)
@@ -274,12 +276,9 @@ class TrainingLoop:
         algorithm_rng: np.random.Generator | None = None,
     ) -> None:
         scenario = plant.scenario
-        self._simulator: FmuPlant | None = None
-        self._plant = plant
-        if not isinstance(plant, PlantInOperation):
-            simulator = algorithm.asks_for == "simulator"
-            self._simulator = plant if simulator else None
-            self._plant = plant if simulator else PlantInOperation(plant)
+        operates = algorithm.asks_for == "operation"
+        self._simulator: Any = None if operates else plant
+        self._plant = PlantInOperation(plant) if operates else plant
         self.controller, self.algorithm, self.rng = controller, algorithm, rng
         self._strategy = strategy
         self._generators = {"rng": rng}
@@ -398,7 +397,7 @@ class TrainingLoop:
             self.counts.saturated += bool(((a == self._lower) | (a == self._upper)).any())
         return a, explored is not None
 
-    def simulator(self, privilege: str) -> FmuPlant:
+    def simulator(self, privilege: str) -> Any:
         """The plant as a simulator, for a privilege; raises PrivilegeError if not asked for."""
         if self._simulator is None:
             raise PrivilegeError(

@@ -268,25 +268,16 @@ class SearchPlan:
         """Learn from the incumbent, then compare the candidates, the latest first."""
         trial = Trial(self.incumbent.theta, self._phase, learns=True, width=width)
         told, _, errors = yield from self._ask(trial)
-        self._measure(*told["deviations"])
+        # The coordinates of the searches, from the latest data about the incumbent.
+        start = self._start.with_theta(self.incumbent.theta)
+        level, (s, e) = abs(float(start["c_lambda"])), told["deviations"]
+        self._scale = prior_deviation(start, s, e, self._action_deviation, level, PRIOR_WIDTH)
         self._remember(errors)
         yield from self._renew()
         better = False
         for theta in told["candidates"][::-1]:
             better |= yield from self.compare(theta)
         return better
-
-    def _measure(self, state_deviation: Vector, error_deviation: Vector) -> None:
-        """Take the coordinates of the searches from the latest data about the incumbent."""
-        start = self._start.with_theta(self.incumbent.theta)
-        self._scale = prior_deviation(
-            start,
-            state_deviation,
-            error_deviation,
-            self._action_deviation,
-            abs(float(start["c_lambda"])),
-            PRIOR_WIDTH,
-        )
 
     def _along(self, direction: Vector, reach: float) -> Generator[Trial, None, float]:
         """Line search both ways in scaled θ, (n_θ,); returns the first step of the next time."""
@@ -336,20 +327,13 @@ class SearchPlan:
             theta = self._weighted(10.0**decades)
             self.least = min(least, 0.5 * smallest_eigenvalue(self._blocks, theta))
             self.base = Candidate(theta)
-            pays = False
-            try:
-                for _ in range(len(kept.costs)):
-                    yield from self._run(self.base)
-                yield from self._along(self._tightening(), 0.5)
-                pays = cheaper(self.base.costs - kept.costs)
-            finally:
-                if pays:
-                    self.incumbent = self.base
-                self.base = self.incumbent
-            if not pays:
-                self.least = least
+            for _ in range(len(kept.costs)):
+                yield from self._run(self.base)
+            yield from self._along(self._tightening(), 0.5)
+            if not cheaper(self.base.costs - kept.costs):
+                self.base, self.least = kept, least
                 return decades if found else -0.7 * decades
-            found = True
+            self.incumbent, found = self.base, True
 
     def _weighted(self, factor: float) -> Vector:
         """The incumbent with its input weights times `factor`, the cost's minimum kept, (n_θ,)."""

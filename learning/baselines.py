@@ -315,8 +315,10 @@ class Estimate(Planned):
         self._start = self.controller.parameters
         self._found = self._start.theta
         self._search: BackOffSearch | None = None
-        samples = self.samples if self.asks_for == "simulator" else self.samples + 1
-        if self.asks_for == "simulator" and self.configuration.back_off:
+        simulates = self.asks_for == "simulator"
+        # In operation the estimation does not end with the run: what it would conclude is learnt.
+        samples = self.samples if simulates else self.samples + 1
+        if simulates and self.configuration.back_off:
             samples = max(round(ESTIMATION * self.samples), 1)
             left = self.samples - samples
             self._search = BackOffSearch(self._start, self.scenario, left, self.rng)

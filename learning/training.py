@@ -631,8 +631,8 @@ class _Session:
         if judge is not None:
             verdict = judge.verdict(answer.theta)
             figures |= {f"greedy_{name}": verdict[name] for name in FIGURES}
-            known = {name: verdict[name] for name in ("regret", "gap_closed")}
-            figures |= {name: value for name, value in known.items() if value is not None}
+            for name in ("regret", "gap_closed"):
+                figures[name] = float("nan") if verdict[name] is None else verdict[name]
         return LogRow(figures, answer)
 
     def trouble(self, row: LogRow, judge: Judge) -> str | None:

@@ -50,22 +50,17 @@ class Episode:
 
 
 class Planned(Algorithm):
-    """An algorithm that takes the episodes of a plan (`follow`) until it ends.
+    """An algorithm that takes the episodes of a plan until it ends; its constructor `follow`s one.
 
     `theta` is what the run would hand over; the controller carries the θ of the episode.
     """
 
     theta: Any
-
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._episode: Any = None
-        self._history: list[Told] = []
-        self.first_episode: int | None = None
+    _episode: Any
 
     def follow(self, plan: Iterator[Any]) -> None:
         """Begin a plan."""
-        self._plan = plan
+        self._plan, self._history = plan, list[Told]()
         self._begin(next(plan, None))
         self.first_episode = self._seed
 

@@ -66,10 +66,8 @@ def load(path):
 
 
 def sealed(arrays):
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(name.encode() + arrays[name].tobytes())
-    return digest.hexdigest()
+    content = b"".join(name.encode() + arrays[name].tobytes() for name in sorted(arrays))
+    return hashlib.sha256(content).hexdigest()
 
 
 PAPER = Scenario.load("paper")

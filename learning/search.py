@@ -96,21 +96,21 @@ class Trial(Episode):
         E[∇π Σ⁻¹ ∇πᵀ] (n_θ, n_θ), with Σ = diag σ².
         """
         n = model.states
-        rows = np.array(self.rows[-LATEST:] if self.learns else self.rows)
-        rows = rows.reshape(len(rows), -1 if len(rows) else 2 * n)
+        kept = self.rows[-LATEST:] if self.learns else self.rows
+        rows = np.array(kept) if kept else np.zeros((0, 2 * n))
         predictions = np.array([model(row[:n], row[n:-n]) for row in rows]).reshape(-1, n)
         states, errors = rows[:, :n], rows[:, -n:] - predictions
         if self.learns:
-            if not len(rows):
+            if not kept:
                 states, errors = np.zeros((2, 1, n))
             candidates = np.array(self.candidates).reshape(-1, self.theta.size)
             deviations = np.array([states.std(axis=0), errors.std(axis=0)])
             return {"errors": errors, "candidates": candidates, "deviations": deviations}
         told = {"cost": np.array([self.stage_cost, self.penalty]) / self.length}
         told |= {"errors": errors, "predictions": predictions}
-        return (
-            told if self.metric is None else told | {"metric": self.metric / max(self.jacobians, 1)}
-        )
+        if self.deviation is not None:
+            told["metric"] = self.metric / max(self.jacobians, 1)
+        return told
 
 
 Plan = Generator[Trial, None, None]

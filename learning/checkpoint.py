@@ -97,11 +97,12 @@ def arrays_of(state: Any) -> dict[str, Array]:
     found: dict[str, Array] = {}
     for name in _kept(state):
         value = getattr(state, name)
-        if isinstance(value, dict) or _has_parts(value):
-            inner = value
-            if not isinstance(value, dict):
-                inner = value.state() if hasattr(value, "state") else arrays_of(value)
-            found |= prefixed(f"{name} ", {key: np.array(part) for key, part in inner.items()})
+        if callable(getattr(value, "state", None)):
+            value = value.state()
+        elif _has_parts(value):
+            value = arrays_of(value)
+        if isinstance(value, dict):
+            found |= prefixed(f"{name} ", {key: np.array(part) for key, part in value.items()})
         elif value is not None:
             found[name] = np.array(value)
     return found
@@ -134,4 +135,4 @@ def _kept(state: Any) -> Iterable[str]:
 
 
 def _has_parts(value: Any) -> bool:
-    return hasattr(value, "KEPT") or hasattr(value, "state") or is_dataclass(value)
+    return hasattr(value, "KEPT") or is_dataclass(value)

@@ -88,10 +88,10 @@ class Planned(Algorithm):
 
     def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
         """Take one sample; the last one of an episode begins the next."""
-        old, taken = self.controller.theta, self._episode
-        cost = cost if transition is None else transition.cost
+        taken, cost = self._episode, cost if transition is None else transition.cost
         if taken is None or not taken.take(transition, cost):
             return None
+        old = self.controller.theta
         self._tell(self.told())
         parameters, begun = self.controller.parameters, self._episode
         return moved(

@@ -136,9 +136,11 @@ class PolicySearch(Planned):
 
     def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
         """Count a sample's cost; the step of θ is that of the mean."""
-        before, blocks = self.theta, self.controller.parameters.blocks
-        update = super().observe(transition, cost)
-        return update and update._replace(step=moved(blocks, before, self.theta).step)
+        before, update = self.theta, super().observe(transition, cost)
+        if update is None:
+            return None
+        blocks = self.controller.parameters.blocks
+        return update._replace(step=moved(blocks, before, self.theta).step)
 
 
 class PolicySearchSimulator(PolicySearch):

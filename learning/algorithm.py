@@ -6,6 +6,7 @@ draws the exploration and carries out an update's requests to the plant.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal, NamedTuple, get_args
@@ -18,11 +19,11 @@ from controllers.rti import LinearisationPoint, RtiNmpc, RtiSolution
 from controllers.theta import Parameters
 from cosim.plant import FmuPlant
 from cosim.plugins import ALGORITHMS, load_plugin, registered
-from cosim.protocols import Matrix, Step, Vector
+from cosim.protocols import Matrix, Plant, Step, Vector
 from cosim.scenario import Scenario
 from cosim.simulation import recover
 from cosim.validation import suggestion
-from learning.checkpoint import arrays_of, group, prefixed, take_up
+from learning.checkpoint import arrays_of, as_array, from_array, group, prefixed, take_up
 from learning.configuration import Configuration
 from learning.errors import AlgorithmLookupError, ConfigurationError, PrivilegeError
 
@@ -223,9 +224,10 @@ class PlantInOperation:
     """A plant that can only take its next sample: no reset, no snapshot, no choice of noise."""
 
     __slots__ = ("scenario", "step")
+    step: Callable[[Vector], Step]
 
-    def __init__(self, plant: FmuPlant) -> None:
-        self.scenario = plant.scenario
+    def __init__(self, plant: Plant | PlantInOperation) -> None:
+        self.scenario: Scenario = plant.scenario
 
         def step(a: Vector) -> Step:
             return plant.step(a)
@@ -261,6 +263,8 @@ class TrainingLoop:
     `PlantInOperation`. `rng` draws the exploration, `algorithm_rng` is the algorithm's own.
     """
 
+    KEPT = ("s", "_applied", "counts", "algorithm")
+
     def __init__(
         self,
         plant: FmuPlant | PlantInOperation,
@@ -272,17 +276,14 @@ class TrainingLoop:
         algorithm_rng: np.random.Generator | None = None,
     ) -> None:
         scenario = plant.scenario
-        self._simulator: FmuPlant | None = None
-        self._plant = plant
-        if not isinstance(plant, PlantInOperation):
-            simulator = algorithm.asks_for == "simulator"
-            self._simulator = plant if simulator else None
-            self._plant = plant if simulator else PlantInOperation(plant)
+        operates = algorithm.asks_for == "operation"
+        self._simulator: Any = None if operates else plant
+        self._plant = PlantInOperation(plant) if operates else plant
         self.controller, self.algorithm, self.rng = controller, algorithm, rng
         self._strategy = strategy
-        self._generators = {"exploration": rng}
+        self._generators = {"rng": rng}
         if algorithm_rng is not None:
-            self._generators["algorithm"] = algorithm_rng
+            self._generators["algorithm_rng"] = algorithm_rng
         self.start_parameters = controller.parameters
         self._rest_after = inf if rest_after is None else rest_after
         self._lower, self._upper = scenario.action_lower, scenario.action_upper
@@ -329,16 +330,16 @@ class TrainingLoop:
             return cost, None
         self.counts.failures += update.failures
         if update.mark:
-            self._marked = (self._asked("mark").snapshot(), self.s, self._point)
+            self._marked = (self.simulator("mark").snapshot(), self.s, self._point)
         if update.rewind:
-            plant = self._asked("rewind")
+            plant = self.simulator("rewind")
             if self._marked is None:
                 raise PrivilegeError(f"{type(self.algorithm).__name__}: 'rewind' before any 'mark'")
             snapshot, self.s, self._point = self._marked
             plant.restore(snapshot)
             self.restart()
         elif update.episode is not None:
-            self.start(self._asked("episode").reset(update.episode))
+            self.start(self.simulator("episode").reset(update.episode))
         else:
             self.renew()
         return cost, update
@@ -396,12 +397,12 @@ class TrainingLoop:
             self.counts.saturated += bool(((a == self._lower) | (a == self._upper)).any())
         return a, explored is not None
 
-    def _asked(self, privilege: str) -> FmuPlant:
-        """The plant as a simulator; raises PrivilegeError if not asked for."""
+    def simulator(self, privilege: str) -> Any:
+        """The plant as a simulator, for a privilege; raises PrivilegeError if not asked for."""
         if self._simulator is None:
             raise PrivilegeError(
-                f"{type(self.algorithm).__name__} asks for a plant in operation, and its update "
-                f"has '{privilege}', which only a simulator can; state asks_for = \"simulator\""
+                f"{type(self.algorithm).__name__} asks for a plant in operation, and says "
+                f"'{privilege}', which only a simulator can; state asks_for = \"simulator\""
             )
         return self._simulator
 
@@ -431,42 +432,35 @@ class TrainingLoop:
         else:
             self.renew()
 
-    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """State for `restore`, without the plant's: JSON-ready values, and arrays."""
-        arrays = {"s": self.s, "applied": self._applied, **_stored("point", self._point)}
+    def state(self) -> dict[str, NDArray[Any]]:
+        """State for `restore`, without the plant's."""
+        state = arrays_of(self) | {"theta": self.controller.theta} | _stored("point", self._point)
         if self._marked is not None:
-            content = self._asked("mark").serialise(self._marked[0])
-            arrays |= {"marked_s": self._marked[1], "marked": np.frombuffer(content, np.uint8)}
-            arrays |= _stored("marked_point", self._marked[2])
-        values = {name: rng.bit_generator.state for name, rng in self._generators.items()}
-        stored = {"theta": self.controller.theta, **prefixed("loop ", arrays)}
-        stored |= prefixed("counts ", arrays_of(self.counts))
-        return values, stored | prefixed("algorithm ", self.algorithm.state())
+            content = self.simulator("mark").serialise(self._marked[0])
+            state |= {"marked": np.frombuffer(content, np.uint8), "marked_s": self._marked[1]}
+            state |= _stored("marked_point", self._marked[2])
+        generators = self._generators.items()
+        return state | {name: as_array(rng.bit_generator.state) for name, rng in generators}
 
-    def restore(self, values: dict[str, Any], stored: dict[str, NDArray[Any]]) -> None:
-        """Restore what `state` returned; the plant must have been restored before.
-
-        Raises KeyError, TypeError, ValueError or another error where it is something else.
-        """
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Restore what `state` returned; the plant must have been restored before."""
+        self.controller.theta = state["theta"]
+        take_up(self, state)
+        # Only now: a rule may draw again what it drew before.
         for name, rng in self._generators.items():
-            rng.bit_generator.state = values[name]
-        self.controller.theta = stored["theta"]
-        self.algorithm.restore(group(stored, "algorithm "))
-        take_up(self.counts, group(stored, "counts "))
-        arrays = group(stored, "loop ")
-        self.s, self._applied = arrays["s"], arrays["applied"]
+            rng.bit_generator.state = from_array(state[name])
         self._marked = None
-        if "marked" in arrays:
-            snapshot = self._asked("mark").deserialise(arrays["marked"].tobytes())
-            self._marked = (snapshot, arrays["marked_s"], _point("marked_point", arrays))
-        self._point = _point("point", arrays)
+        if "marked" in state:
+            snapshot = self.simulator("mark").deserialise(state["marked"].tobytes())
+            self._marked = (snapshot, state["marked_s"], _point("marked_point", state))
+        self._point = _point("point", state)
         self.restart()
 
 
 def _stored(name: str, point: LinearisationPoint | None) -> dict[str, Vector]:
-    return {} if point is None else prefixed(f"{name}_", point._asdict())
+    return {} if point is None else prefixed(f"{name} ", point._asdict())
 
 
 def _point(name: str, arrays: dict[str, Vector]) -> LinearisationPoint | None:
-    parts = group(arrays, f"{name}_")
+    parts = group(arrays, f"{name} ")
     return LinearisationPoint(**parts) if parts else None

@@ -22,7 +22,10 @@ from learning.step import Fit
 
 POINT = tuple(f"point_{name}" for name in LinearisationPoint._fields)
 NEXT_POINT = tuple(f"next_{name}" for name in POINT)
-COLUMNS = ("number", "s", "a", "explored", "cost", "next_s", *POINT, *NEXT_POINT)
+COLUMNS = (
+    *("number", "s", "a", "explored", "cost", "next_s", "error", "correction"),
+    *POINT, *NEXT_POINT,
+)  # fmt: skip
 
 
 class BatchQLearningConfiguration(ValueConfiguration):
@@ -50,23 +53,15 @@ class BatchQLearning(ValueRule):
     """
 
     Configuration = BatchQLearningConfiguration
-    KEPT = (
-        *ValueRule.KEPT,
-        *("_batch", "_buffer", "_anchor", "_information", "_mean", "_variance"),
-    )
+    KEPT = (*ValueRule.KEPT, "_buffer", "_anchor", "_information", "_mean", "_variance")
     needs_points = True
     configuration: BatchQLearningConfiguration
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self._variance = 0.0
-        rows, n = max(self._length, self.configuration.batch_size), self.scenario.state_lower.size
-        self._buffer = ReplayBuffer(self.controller, rows)
-        self._batch = {
-            "states": np.zeros((rows, n)),
-            "prediction_errors": np.zeros((rows, n)),
-            "corrections": np.zeros(rows),
-        }
+        longest = max(self._length, self.configuration.batch_size)
+        self._buffer = ReplayBuffer(self.controller, longest)
         self._anchor = self.controller.theta.copy()
         self._information: Matrix = np.eye(self._anchor.size)
         self._mean: Vector = np.zeros(self._anchor.size)
@@ -74,14 +69,11 @@ class BatchQLearning(ValueRule):
     def observe(self, transition: Transition) -> Update | None:
         """Take one sample; the last of a batch moves θ."""
         prediction = self._model(transition.s, transition.a)
-        error, row = transition.next_s - prediction, len(self._buffer)
+        error = transition.next_s - prediction
         self._errors.add(error)
-        batch = self._batch
-        batch["states"][row], batch["prediction_errors"][row] = transition.s, error
         expected = self._errors.expected_penalty(prediction)
-        batch["corrections"][row] = expected - transition.next_penalty
-        self._buffer.add(transition)
-        if len(self._buffer) < self._length:
+        self._buffer.add(transition, error, expected - transition.next_penalty)
+        if len(self._buffer.rows) < self._length:
             return None
         update = self._update()
         self._buffer.clear()
@@ -103,7 +95,8 @@ class BatchQLearning(ValueRule):
             if not len(replayed.rows):
                 break
             # The next penalty is replaced by its expectation.
-            corrections = self._average_cost.discount * self._batch["corrections"][replayed.rows]
+            corrections = self._buffer.rows["correction"][replayed.rows]
+            corrections = self._average_cost.discount * corrections
             td_error = replayed.target - replayed.action_value + corrections
             if not np.isfinite(td_error).all():
                 raise DivergenceError("TD errors are not finite")
@@ -117,7 +110,7 @@ class BatchQLearning(ValueRule):
             information = self._information + told
             slope = gradient.T @ innovation / self._variance
             slope -= self._information @ (self._present - self._mean)
-            fit = _newton(information, slope)
+            fit = Fit(slope, cho_solve(cho_factor(information), slope), information.copy)
             share = 1.0 / max(float(np.abs(fit.minimiser).max()) / settings.longest, 1.0)
             information = self._information + share * told
             fit = self._average_cost.take(fit.shrunk(share))
@@ -138,16 +131,11 @@ class BatchQLearning(ValueRule):
 
     def _begin_filter(self, td_error: Vector) -> None:
         """Take the noise, the widths and c_f from the samples of the first batch."""
-        batch = {name: values[: len(self._buffer)] for name, values in self._batch.items()}
+        rows = self._buffer.rows
         self._variance = max(float(np.mean(td_error**2)), np.finfo(np.float64).tiny)
-        start = self._begin(batch["states"], batch["prediction_errors"], self._variance**0.5)
+        start = self._begin(rows["s"], rows["error"], self._variance**0.5)
         self.controller.theta = start.theta
         self._anchor = start.theta.copy()
-
-
-def _newton(information: Matrix, slope: Vector) -> Fit:
-    """Step Λ⁻¹b in the metric Λ."""
-    return Fit(slope, cho_solve(cho_factor(information), slope), lambda: information)
 
 
 @dataclass(frozen=True)
@@ -166,46 +154,49 @@ class Replayed:
 
 
 class ReplayBuffer:
-    """Up to `capacity` transitions, each with its linearisation points.
+    """Up to `capacity` transitions with their linearisation points, a record each (`COLUMNS`).
 
     V and Q of a real-time iteration depend on the linearisation point, so a replay uses that of the
     loop, with the model and cost of the controller's θ. Values solved at the same θ are kept where
     the controller is `memoryless`; NaN stands for unknown ones.
     """
 
-    KEPT = ("_count", "_columns", "_theta", "_action_value", "_next_value", "_gradient")
+    KEPT = ("_count", "_records", "_theta", "_action_value", "_next_value", "_gradient")
 
     def __init__(self, controller: RtiNmpc, capacity: int) -> None:
         self._controller, self._capacity, self._count = controller, capacity, 0
-        self._columns: dict[str, NDArray[Any]] = {}
+        self._records: NDArray[Any] = np.zeros(0)
         self._theta = controller.theta
         self._action_value, self._next_value = np.full((2, capacity), np.nan)
         self._gradient = np.zeros((capacity, self._theta.size))
 
-    def __len__(self) -> int:
-        return self._count
+    @property
+    def rows(self) -> NDArray[Any]:
+        """The transitions kept, (K,), in time's order."""
+        return self._records[: self._count]
 
     def clear(self) -> None:
         """Keep no transition."""
         self._count = 0
         self._action_value[:] = self._next_value[:] = np.nan
 
-    def add(self, transition: Transition) -> None:
-        """Keep a transition, solved at the controller's θ."""
+    def add(self, transition: Transition, error: Vector, correction: float) -> None:
+        """Keep a transition, solved at the controller's θ.
+
+        `error` (n,) is its prediction's, `correction` the expectation of its next penalty less it.
+        """
         point, next_point = transition.point, transition.next_point
         assert point is not None and next_point is not None
         values = (
             *(transition.number, transition.s, transition.a, transition.explored),
-            *(transition.cost, transition.next_s, *point, *next_point),
+            *(transition.cost, transition.next_s, error, correction, *point, *next_point),
         )
-        if not self._columns:
+        if not self._records.size:
             kept = zip(COLUMNS, map(np.asarray, values), strict=True)
-            self._columns = {
-                name: np.empty((self._capacity, *value.shape), value.dtype) for name, value in kept
-            }
+            kinds = [(name, value.dtype, value.shape) for name, value in kept]
+            self._records = np.empty(self._capacity, kinds)
         row, self._count = self._count, self._count + 1
-        for name, value in zip(COLUMNS, values, strict=True):
-            self._columns[name][row] = value
+        self._records[row] = values
         if not self._controller.memoryless:
             return
         self._forget_other_theta()
@@ -221,7 +212,7 @@ class ReplayBuffer:
             self._action_value[:] = self._next_value[:] = np.nan
         rows = np.arange(self._count)
         self._solve(rows[np.isnan(self._action_value[rows] + self._next_value[rows])])
-        target = average_cost.target(self._columns["cost"][rows], self._next_value[rows])
+        target = average_cost.target(self.rows["cost"], self._next_value[rows])
         kept = np.isfinite(self._action_value[rows]) & np.isfinite(target)
         rows = rows[kept]
         return Replayed(
@@ -242,7 +233,7 @@ class ReplayBuffer:
         """Solve for unknown values of these rows, in time's order; a failing QP leaves NaN."""
         # V(s₊) of one transition is Q of the next: a successor shares the linearisation, and where
         # it was greedy the solution too.
-        controller, columns = self._controller, self._columns
+        controller, columns = self._controller, self._records
         at: int | None = None
         value: RtiSolution | None = None
         # Plain numbers: reading them one by one out of arrays costs as much as a gradient.

@@ -1,7 +1,7 @@
 """Checkpoints: one file, whole or absent, checked on reading, without pickle.
 
-The file is an NPZ archive of plain arrays; its entry `about` is JSON: schema version, the run, and
-the numbers that are no arrays. The archive's checksums detect damage.
+The file is an NPZ archive of plain arrays; its entry `run` is JSON and says whose they are. The
+archive's checksums detect damage.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,63 +19,55 @@ from numpy.typing import NDArray
 from cosim.files import read_arrays, write_atomically
 from learning.errors import CheckpointError
 
-SCHEMA = 8
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """State to resume a run: `run` identifies it, `state` and `arrays` hold its values."""
+def save(path: Path, run: Mapping[str, Any], arrays: Mapping[str, Array]) -> Path:
+    """Write the state of a run under a temporary name and rename it.
 
-    run: dict[str, Any]
-    state: dict[str, Any]
-    arrays: dict[str, Array]
-
-
-def save(path: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint under a temporary name and rename it; raises OSError, CheckpointError."""
-    about = {"schema": SCHEMA, "run": checkpoint.run, "state": checkpoint.state}
-    entries = dict(checkpoint.arrays)
-    entries["about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
-    for name, array in entries.items():
+    `run` identifies it. Raises OSError, CheckpointError.
+    """
+    for name, array in arrays.items():
         if array.dtype.hasobject:
             raise CheckpointError(f"checkpoint entry '{name}' holds Python objects, not numbers")
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **entries)
+    np.savez(stream, allow_pickle=False, run=as_array(run), **arrays)
     return write_atomically(path, stream.getvalue())
 
 
-def load(path: Path, run: Mapping[str, Any] | None = None) -> Checkpoint:
-    """Read a checkpoint; with `run`, refuse that of another run.
+def load(path: Path, run: Mapping[str, Any]) -> dict[str, Array]:
+    """Read the arrays of a run.
 
-    Raises CheckpointError where the file is missing, damaged, of another schema or another run.
+    Raises CheckpointError where the file is missing, damaged or of another run.
     """
     try:
         entries = read_arrays(path)
+        found = from_array(entries.pop("run"))
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: there is no checkpoint to resume from; run without --resume"
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
-    if "about" not in entries:
-        raise CheckpointError(f"{path}: not a checkpoint of a training; start the run anew")
-    about = json.loads(entries.pop("about").tobytes())
-    if about.get("schema") != SCHEMA:
-        raise CheckpointError(
-            f"{path}: schema is {about.get('schema')!r}; this version reads schema {SCHEMA}"
-        )
-    found: dict[str, Any] = about["run"]
-    if run is not None:
-        # Compare both as JSON, where tuples are lists.
-        there, here = _flat(found), _flat(json.loads(json.dumps(dict(run))))
-        for key in sorted(there.keys() | here.keys()):
-            if there.get(key) != here.get(key):
-                raise CheckpointError(
-                    f"{path}: the checkpoint is of another run: {key} is {there.get(key)!r} there "
-                    f"and {here.get(key)!r} here; use another --out or the same settings"
-                )
-    return Checkpoint(found, about["state"], entries)
+    # Compare both as JSON, where tuples are lists.
+    there, here = _flat(found), _flat(from_array(as_array(run)))
+    for key in sorted(there.keys() | here.keys()):
+        if there.get(key) != here.get(key):
+            raise CheckpointError(
+                f"{path}: the checkpoint is of another run: {key} is {there.get(key)!r} there and "
+                f"{here.get(key)!r} here; use another --out or the same settings"
+            )
+    return entries
+
+
+def as_array(document: Any) -> Array:
+    """A JSON document as an array of bytes."""
+    return np.frombuffer(json.dumps(document).encode(), dtype=np.uint8)
+
+
+def from_array(array: Array) -> Any:
+    """The JSON document of `as_array`; raises ValueError."""
+    return json.loads(array.tobytes())
 
 
 def _flat(run: Mapping[str, Any]) -> dict[str, Any]:
@@ -99,15 +91,18 @@ def arrays_of(state: Any) -> dict[str, Array]:
     """The state of an object as arrays by name.
 
     It is made of the attributes that its class names in `KEPT`, or of a dataclass's fields: arrays,
-    numbers and lists of arrays; tables of arrays and objects of this kind, whose names follow the
-    attribute's; None is left out.
+    numbers and lists of arrays; tables of arrays and objects of this kind or with a method `state`,
+    whose names follow the attribute's; None is left out.
     """
     found: dict[str, Array] = {}
     for name in _kept(state):
         value = getattr(state, name)
-        if isinstance(value, dict) or _has_parts(value):
-            inner = value if isinstance(value, dict) else arrays_of(value)
-            found |= prefixed(f"{name} ", {key: np.array(part) for key, part in inner.items()})
+        if callable(getattr(value, "state", None)):
+            value = value.state()
+        elif _has_parts(value):
+            value = arrays_of(value)
+        if isinstance(value, dict):
+            found |= prefixed(f"{name} ", {key: np.array(part) for key, part in value.items()})
         elif value is not None:
             found[name] = np.array(value)
     return found

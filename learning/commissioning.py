@@ -20,7 +20,7 @@ from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.simulation import recover
 from learning.algorithm import Transition
-from learning.back_off_search import BackOffSearch
+from learning.baselines import BackOffSearch
 from learning.prediction_errors import OneStepModel
 
 GUESS = 0.1
@@ -50,8 +50,25 @@ def back_off(start: Parameters, scenario: Scenario) -> Parameters:
     noise to guess, and θ stays. A process searches once for each scenario and start.
     """
     key = (scenario.hash, start.hash)
-    if key not in _found:
-        _found[key] = _search(start, scenario)
+    if key in _found:
+        return _found[key]
+    sample = _simulation(scenario)
+    controller = nmpc(scenario, start)
+    search = BackOffSearch(start, scenario, SAMPLES, np.random.default_rng(0))
+    for segment in search.plan():
+        noise, s = np.random.default_rng(segment.seed), scenario.initial_state
+        controller.reset()
+        controller.theta, ended = segment.theta, False
+        while not ended:
+            transition = None
+            try:
+                transition = sample(controller, s, noise)
+                s = transition.next_s
+            except Exception as error:
+                recover(controller, error)
+            ended = segment.take(transition, 0.0)
+        segment.answer = segment.told()
+    _found[key] = search.theta
     return _found[key]
 
 
@@ -80,27 +97,6 @@ def spare(start: Parameters, scenario: Scenario) -> Parameters:
         distance = np.clip(rooms[name] / 2, 0.0, most)
         moved[name] = start[name] + sign * np.where(binds, 0.0, distance)
     return start.replace(moved)
-
-
-def _search(start: Parameters, scenario: Scenario) -> Parameters:
-    problem, sample = Problem.from_scenario(scenario), _simulation(scenario)
-    controller = nmpc(scenario, start)
-    search = BackOffSearch(start, problem, scenario, SAMPLES, np.random.default_rng(0))
-
-    begins, s = True, scenario.initial_state
-    while not search.done:
-        if begins:
-            noise, s = np.random.default_rng(search.seed), scenario.initial_state
-            controller.reset()
-            controller.theta = search.candidate.theta
-        try:
-            transition = sample(controller, s, noise)
-            s = transition.next_s
-        except Exception as error:
-            recover(controller, error)
-            transition = None
-        begins = search.observe(transition)
-    return search.theta
 
 
 def _simulation(

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from cmaes import CMA
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import expm
 
 from controllers.theta import Parameters
 from cosim.protocols import Vector
 from cosim.scenario import Scenario
-from learning.algorithm import Algorithm, Transition, Update
+from learning.algorithm import Transition, Update
 from learning.baselines import GreedyConfiguration
 from learning.configuration import Count, Positive
-from learning.step import HESSIANS, moved, smallest_eigenvalue
+from learning.episodes import Episode, Planned, Told
+from learning.step import HESSIANS, moved
 
 
 class PolicySearchConfiguration(GreedyConfiguration):
@@ -76,7 +78,25 @@ class Coordinates:
         return start.replace(values)
 
 
-class PolicySearch(Algorithm):
+@dataclass(eq=False)
+class Candidate(Episode):
+    """A stretch that judges a θ: its `cost` is summed once it has taken `settling` samples."""
+
+    KEPT = (*Episode.KEPT, "cost")
+    settling: int = 0
+    cost: float = field(default=0.0, init=False)
+
+    def take(self, transition: Transition | None, cost: float) -> bool:
+        """Count a sample's cost."""
+        self.cost += cost if self.done >= self.settling else 0.0
+        return super().take(transition, cost)
+
+    def told(self) -> Told:
+        """The mean cost."""
+        return {"cost": np.array(self.cost / (self.length - self.settling))}
+
+
+class PolicySearch(Planned):
     """CMA-ES (Hansen) on the mean cost of stretches of operation, one for each candidate.
 
     A stretch begins where the last one ended; its first samples, as many as the horizon has, settle
@@ -85,82 +105,42 @@ class PolicySearch(Algorithm):
     """
 
     Configuration = PolicySearchConfiguration
-    KEPT = ("_told", "_costs", "_noise", "_sum", "_step")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        settings, start = self.configuration, self.controller.parameters
-        self._coordinates = Coordinates(start, self.scenario, settings.width)
-        self._seed = int(self.rng.integers(2**31))
-        self._search = self._new_search()
-        self._told: list[Vector] = []
-        self._costs: list[float] = []
-        self._sum, self._step = 0.0, 0
-        horizon = self.scenario.controller.horizon
-        self._settling = 0 if self._simulated else min(horizon, settings.episode - 1)
-        self._begin_generation()
-        self.first_episode = self._noise if self._simulated else None
-        self.controller.theta = self._coordinates.theta(self._population[0]).theta
+        start, width = self.controller.parameters, self.configuration.width
+        self._coordinates = Coordinates(start, self.scenario, width)
+        self.theta = self._coordinates.theta(np.zeros(self._coordinates.size)).theta
+        self.follow(self._generations())
 
-    @property
-    def _simulated(self) -> bool:
-        return self.asks_for == "simulator"
-
-    def _new_search(self) -> CMA:
-        return CMA(
+    def _generations(self) -> Iterator[Candidate]:
+        settings, count = self.configuration, self.configuration.population
+        search = CMA(
             mean=np.zeros(self._coordinates.size),
-            sigma=self.configuration.spread,
-            population_size=self.configuration.population,
-            seed=self._seed,
+            sigma=settings.spread,
+            population_size=count,
+            seed=int(self.rng.integers(2**31)),
         )
+        settling = min(self.scenario.controller.horizon, settings.episode - 1)
+        settling = 0 if self.asks_for == "simulator" else settling
+        while True:
+            population = [search.ask() for _ in range(count)]
+            noise, judged = int(self.rng.integers(2**63)), []
+            for z in population:
+                theta = self._coordinates.theta(z).theta
+                yield (stretch := Candidate(theta, settings.episode, noise, settling=settling))
+                judged.append((z, float(stretch.answer["cost"])))
+            search.tell(judged)
+            # θ at the mean of the search distribution.
+            self.theta = self._coordinates.theta(search.mean).theta
 
-    def _begin_generation(self) -> None:
-        self._population, self._costs = self._ask(), []
-        self._noise = int(self.rng.integers(2**63))
-
-    def _ask(self) -> list[Vector]:
-        return [self._search.ask() for _ in range(self.configuration.population)]
-
-    @property
-    def theta(self) -> Vector:
-        """θ at the mean of the search distribution, (n_θ,)."""
-        return self._coordinates.theta(self._search.mean).theta
-
-    def observe(self, transition: Transition) -> Update | None:
-        """Count a sample's cost."""
-        return self.failed(transition.cost)
-
-    def failed(self, cost: float) -> Update | None:
-        """Count a cost, the controller failed or not; the last of an episode brings a candidate."""
-        self._sum += cost if self._step >= self._settling else 0.0
-        self._step += 1
-        if self._step < self.configuration.episode:
+    def observe(self, transition: Transition | None, cost: float = 0.0) -> Update | None:
+        """Count a sample's cost; the step of θ is that of the mean."""
+        before, update = self.theta, super().observe(transition, cost)
+        if update is None:
             return None
-        self._costs.append(self._sum / (self._step - self._settling))
-        self._sum, self._step = 0.0, 0
-        before = self.theta
-        if len(self._costs) == len(self._population):
-            self._tell(np.array(self._population), self._costs)
-            self._begin_generation()
-        candidate = self._coordinates.theta(self._population[len(self._costs)])
-        self.controller.theta = candidate.theta
-        blocks, episode = candidate.blocks, self._noise if self._simulated else None
-        return moved(blocks, before, self.theta, episode=episode)._replace(
-            smallest_eigenvalue=smallest_eigenvalue(blocks, candidate.theta)
-        )
-
-    def _tell(self, population: NDArray[np.float64], costs: list[float]) -> None:
-        self._search.tell(list(zip(population, costs, strict=True)))
-        self._told.append(np.column_stack([population, costs]))
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Restore what `state` returned, by asking and telling all of it again."""
-        super().restore(state)
-        self._search, told, self._told = self._new_search(), self._told, []
-        for generation in told:
-            self._ask()
-            self._tell(generation[:, :-1], generation[:, -1].tolist())
-        self._population = self._ask()
+        blocks = self.controller.parameters.blocks
+        return update._replace(step=moved(blocks, before, self.theta).step)
 
 
 class PolicySearchSimulator(PolicySearch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import casadi as ca
 import numpy as np
 
@@ -85,27 +87,30 @@ def known_penalty(penalty: Penalty, states: Matrix) -> Vector:
 
 
 class SortedErrors:
-    """Errors (M, n) sorted state by state, for means beyond a threshold."""
+    """Errors (M, n), of each state in ascending order, for means beyond a threshold."""
+
+    KEPT = ("errors",)
 
     def __init__(self, errors: Matrix) -> None:
-        self._sorted = np.sort(errors, axis=0)
-        zero = np.zeros((1, errors.shape[1]))
-        self._sum = np.concatenate([zero, np.cumsum(self._sorted, axis=0)])
-        self._squares = np.concatenate([zero, np.cumsum(self._sorted**2, axis=0)])
+        self.restore({"errors": errors})
 
-    def __len__(self) -> int:
-        return len(self._sorted)
+    def restore(self, state: Mapping[str, Matrix]) -> None:
+        """Take other errors."""
+        self.errors = np.sort(state["errors"], axis=0)
+        zero = np.zeros((1, self.errors.shape[1]))
+        self._sum = np.concatenate([zero, np.cumsum(self.errors, axis=0)])
+        self._squares = np.concatenate([zero, np.cumsum(self.errors**2, axis=0)])
 
     def beyond(self, i: int, threshold: Vector, *, above: bool = False) -> tuple[Vector, Vector]:
         """Means of v and v² with v = max(t − e_i, 0), or max(e_i − t, 0), for each t of (K,)."""
-        count = np.searchsorted(self._sorted[:, i], threshold)
+        count = np.searchsorted(self.errors[:, i], threshold)
         number, first, second = count, self._sum[count, i], self._squares[count, i]
         if above:
-            number = len(self) - count
+            number = len(self.errors) - count
             first, second = self._sum[-1, i] - first, self._squares[-1, i] - second
         sign = -1.0 if above else 1.0
-        linear = sign * (number * threshold - first) / len(self)
-        quadratic = (number * threshold**2 - 2.0 * threshold * first + second) / len(self)
+        linear = sign * (number * threshold - first) / len(self.errors)
+        quadratic = (number * threshold**2 - 2.0 * threshold * first + second) / len(self.errors)
         return np.maximum(linear, 0.0), np.maximum(quadratic, 0.0)
 
 

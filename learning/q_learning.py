@@ -135,8 +135,8 @@ class QLearningConfiguration(ValueConfiguration):
 class ValueRule(Algorithm):
     """Common part of online and batch Q-learning: prediction errors, a mean cost, coordinates."""
 
-    # The scale comes first: setting it makes the mean cost, which is restored after it.
-    KEPT: ClassVar[tuple[str, ...]] = ("scale", "_average_cost", "_errors")
+    # The scale comes first: setting it makes step and mean cost, which are restored after it.
+    KEPT: ClassVar[tuple[str, ...]] = ("scale", "_step", "_average_cost", "_errors")
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)

@@ -189,13 +189,17 @@ class ConstrainedStep:
     DivergenceError on a step that is not finite.
     """
 
+    KEPT = ("_smallest",)
+
     def __init__(
         self, controller: RtiNmpc, configuration: Configuration, scale: Vector | None = None
     ) -> None:
         self._controller = controller
         self.blocks = controller.parameters.blocks
         self.scale: Vector = self.blocks.scale if scale is None else scale
-        self._smallest = least_allowed(configuration, controller.parameters)
+        own = smallest_eigenvalue(self.blocks, controller.parameters.theta)
+        least = configuration.smallest_eigenvalue
+        self._smallest = min(least, own / 2) if own > 0 else least
         self._least = {block.name: np.array(block.least) for block in self.blocks if block.least}
 
     def proposal(self, fit: Fit) -> tuple[Vector, Outcome]:
@@ -245,13 +249,6 @@ def moved(blocks: ThetaBlocks, old: Vector, new: Vector, **said: Any) -> Update:
         smallest_eigenvalue=smallest_eigenvalue(blocks, new),
         **said,
     )
-
-
-def least_allowed(configuration: Configuration, start: Parameters) -> float:
-    """ε of B ⪰ εI for a run that begins at `start`."""
-    own = smallest_eigenvalue(start.blocks, start.theta)
-    chosen = configuration.smallest_eigenvalue
-    return min(chosen, own / 2) if own > 0 else chosen
 
 
 def prior_deviation(

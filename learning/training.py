@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import reduce
 from importlib.metadata import version
 from itertools import islice
 from math import gcd, inf, isfinite, isnan
+from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -21,7 +23,7 @@ from controllers.optimum import stored_optimum
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
 from controllers.theta import Parameters, ThetaBlocks
-from cosim.errors import CapabilityError, PlantError
+from cosim.errors import CapabilityError
 from cosim.files import check_target, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller, depends_on
@@ -33,10 +35,9 @@ from cosim.statistics import gap_closed, regret, shown
 from cosim.validation import known_keywords, suggestion
 from learning import checkpoint
 from learning.algorithm import Algorithm, Privilege, Strategy, TrainingLoop, Update, load_algorithm
-from learning.checkpoint import Checkpoint
 from learning.commissioning import back_off, spare
 from learning.configuration import Configuration
-from learning.errors import CheckpointError, ConfigurationError, DivergenceError, PrivilegeError
+from learning.errors import ConfigurationError, DivergenceError
 from learning.step import smallest_eigenvalue
 
 if TYPE_CHECKING:
@@ -164,13 +165,9 @@ def begin(run: TrainingRun, algorithm: type[Algorithm], plant: FmuPlant) -> Trai
     own = np.random.default_rng(np.random.SeedSequence(run.seed).spawn(3)[2])
     rule = algorithm(controller, run.scenario, run.configuration, run.samples, strategy, own)
     loop = TrainingLoop(plant, controller, rule, strategy, rng, run.rest_after, own)
-    first: int | None = getattr(rule, "first_episode", None)
-    if first is not None and rule.asks_for != "simulator":
-        raise PrivilegeError(
-            f"{algorithm.__name__} asks for a plant in operation and states 'first_episode', which "
-            "only a simulator has"
-        )
-    loop.start(plant.reset(plant_seed if first is None else first))
+    if (first := getattr(rule, "first_episode", None)) is not None:
+        plant, plant_seed = loop.simulator("first_episode"), first
+    loop.start(plant.reset(plant_seed))
     return loop
 
 
@@ -223,8 +220,6 @@ COLUMNS = (
     "greedy_J", "greedy_economic_cost", "greedy_mean_violation", "greedy_violating_share",
     "greedy_failures", "regret", "gap_closed",
 )  # fmt: skip
-DAMAGED = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, PlantError)
-"""Raised by the restoring of a checkpoint with other content."""
 
 
 class LogRow(dict[str, float]):
@@ -240,49 +235,6 @@ class LogRow(dict[str, float]):
         self.parameters = parameters
 
 
-@dataclass
-class Totals:
-    """Sums since the last line of the log.
-
-    `cost` over the `samples`; `updates`, and over these `squares` of the TD error, norms of the
-    `step`, flags `corrected` and `refused`; `smallest_eigenvalue` is the least of all.
-    """
-
-    cost: float = 0.0
-    samples: int = 0
-    updates: int = 0
-    squares: float = 0.0
-    step: float = 0.0
-    corrected: int = 0
-    refused: int = 0
-    smallest_eigenvalue: float = inf
-
-    def add(self, cost: float, update: Update | None) -> None:
-        """Take a sample's cost and its update, if there was one."""
-        self.cost += cost
-        self.samples += 1
-        if update is None:
-            return
-        self.updates += 1
-        self.squares += update.td_error**2
-        self.step += update.step
-        self.corrected += update.corrected
-        self.refused += update.refused
-        self.smallest_eigenvalue = min(self.smallest_eigenvalue, update.smallest_eigenvalue)
-
-    def means(self) -> dict[str, float]:
-        """Means over the samples and their updates; NaN without any."""
-        count = self.updates or float("nan")
-        return {
-            "J": self.cost / (self.samples or float("nan")),
-            "updates": self.updates,
-            "td_error": (self.squares / count) ** 0.5,
-            "step": self.step / count,
-            "corrected": self.corrected,
-            "refused": self.refused,
-        }
-
-
 def to_csv(rows: Sequence[LogRow]) -> str:
     """The log as CSV: its figures, empty where not measured, and a column `theta NAME` an entry."""
     if not rows:
@@ -296,6 +248,11 @@ def to_csv(rows: Sequence[LogRow]) -> str:
 
 def _cell(value: float) -> str:
     return "" if isnan(value) else repr(int(value) if value == int(value) else value)
+
+
+def _total(values: Iterable[float]) -> float:
+    """The sum, in the order of the values: `sum` compensates for rounding in some versions."""
+    return reduce(add, values, 0.0)
 
 
 class Judge:
@@ -624,7 +581,8 @@ class _Session:
         self.loop = begin(run, algorithm, plant)
         self.start = self.loop.start_parameters
         self.rows: list[LogRow] = []
-        self.totals = Totals()
+        self.costs: list[float] = []  # and updates, since the last row
+        self.updates: list[Update] = []
         self.without_checkpoint: str | None = None
 
     def run_to_the_end(self, judge: Judge, progress: Callable[[int, LogRow], None]) -> str:
@@ -637,7 +595,8 @@ class _Session:
                 self.rows.append(self.row(number + 1, judge))
                 return f"diverged: {error} at sample {number + 1}"
             number += 1
-            self.totals.add(cost, update)
+            self.costs.append(cost)
+            self.updates += [] if update is None else [update]
             if number % run.log_every and number < run.samples:
                 continue
             judged = number % run.evaluate_every == 0 or number == run.samples
@@ -653,22 +612,27 @@ class _Session:
     def row(self, number: int, judge: Judge | None) -> LogRow:
         """A line of the log since the last one, with an evaluation by a judge."""
         answer, counts = self.loop.parameters, asdict(self.loop.counts)
-        figures = dict.fromkeys(COLUMNS, float("nan")) | self.totals.means() | counts
-        del figures["number"]
-        figures |= {
+        updates, count = self.updates, len(self.updates) or float("nan")
+        # Of all θ since the last row, whichever step gave it.
+        least = [inf, *(update.smallest_eigenvalue for update in updates)]
+        figures = dict.fromkeys(COLUMNS, float("nan")) | {
             "samples": number,
-            # The least eigenvalue of the updates since the last row, whichever step gave it.
-            "smallest_eigenvalue": min(
-                self.totals.smallest_eigenvalue, smallest_eigenvalue(answer.blocks, answer.theta)
-            ),
-            "plant_samples": counts["number"],
+            "updates": len(updates),
+            "J": _total(self.costs) / (len(self.costs) or float("nan")),
+            "td_error": (_total(update.td_error**2 for update in updates) / count) ** 0.5,
+            "step": _total(update.step for update in updates) / count,
+            "smallest_eigenvalue": min(*least, smallest_eigenvalue(answer.blocks, answer.theta)),
+            "corrected": sum(update.corrected for update in updates),
+            "refused": sum(update.refused for update in updates),
+            "plant_samples": counts.pop("number"),
         }
+        figures |= counts
+        self.costs, self.updates = [], []
         if judge is not None:
             verdict = judge.verdict(answer.theta)
             figures |= {f"greedy_{name}": verdict[name] for name in FIGURES}
-            known = {name: verdict[name] for name in ("regret", "gap_closed")}
-            figures |= {name: value for name, value in known.items() if value is not None}
-        self.totals = Totals()
+            for name in ("regret", "gap_closed"):
+                figures[name] = float("nan") if verdict[name] is None else verdict[name]
         return LogRow(figures, answer)
 
     def trouble(self, row: LogRow, judge: Judge) -> str | None:
@@ -692,35 +656,26 @@ class _Session:
         self.loop.parameters.save(self.out / PARAMETERS)
         try:
             plant = self.plant.serialise(self.plant.snapshot())
-            values, arrays = self.loop.state()
+            state = self.loop.state()
         except CapabilityError as error:
             self.without_checkpoint = str(error)
             return
-        values["columns"] = list(self.rows[0]) if self.rows else []
-        arrays |= {
+        state |= {
             "plant": np.frombuffer(plant, dtype=np.uint8),
             "rows": np.array([list(row.values()) for row in self.rows]),
             "row_thetas": np.array([row.parameters.theta for row in self.rows]),
         }
-        checkpoint.save(self.out / CHECKPOINT, Checkpoint(self.identity, values, arrays))
+        checkpoint.save(self.out / CHECKPOINT, self.identity, state)
 
     def load(self) -> None:
         """Load the folder's checkpoint; raises CheckpointError if none fits."""
         if self.out is None:
             raise ConfigurationError("a run without a folder cannot be resumed")
-        path = self.out / CHECKPOINT
-        found = checkpoint.load(path, self.identity)
-        try:
-            columns, arrays = found.state["columns"], found.arrays
-            rows = zip(arrays["rows"].tolist(), arrays["row_thetas"], strict=True)
-            self.rows = [
-                LogRow(dict(zip(columns, figures, strict=True)), self.start.with_theta(theta))
-                for figures, theta in rows
-            ]
-            self.plant.restore(self.plant.deserialise(arrays["plant"].tobytes()))
-            self.loop.restore(found.state, arrays)
-        except DAMAGED as e:
-            raise CheckpointError(
-                f"{path}: its content is not that of this run ({type(e).__name__}: {e}); start the "
-                "run anew"
-            ) from None
+        state = checkpoint.load(self.out / CHECKPOINT, self.identity)
+        rows = zip(state["rows"].tolist(), state["row_thetas"], strict=True)
+        self.rows = [
+            LogRow(dict(zip(COLUMNS, figures, strict=True)), self.start.with_theta(theta))
+            for figures, theta in rows
+        ]
+        self.plant.restore(self.plant.deserialise(state["plant"].tobytes()))
+        self.loop.restore(state)

@@ -61,11 +61,13 @@ class Reader:
         return False
 
 
-def sealed(checkpoint):
-    digest = hashlib.sha256(repr((checkpoint.run, checkpoint.state)).encode())
-    for name in sorted(checkpoint.arrays):
-        digest.update(name.encode() + checkpoint.arrays[name].tobytes())
-    return digest.hexdigest()
+def load(path):
+    return checkpoint.load(path, make_run().identity())
+
+
+def sealed(arrays):
+    content = b"".join(name.encode() + arrays[name].tobytes() for name in sorted(arrays))
+    return hashlib.sha256(content).hexdigest()
 
 
 PAPER = Scenario.load("paper")
@@ -75,7 +77,7 @@ READERS = {
     "theta": Reader(
         "theta.toml", lambda p: Parameters.load(p, PROBLEM), ParameterError, lambda t: t.hash
     ),
-    "checkpoint": Reader("checkpoint.npz", checkpoint.load, CheckpointError, sealed),
+    "checkpoint": Reader("checkpoint.npz", load, CheckpointError, sealed),
     "trajectory": Reader("trajectory.csv", lambda p: read_csv(p, PAPER), TrajectoryError),
     "recording": Reader("run.rrd", read_recording, RecordingError),
     "fmu": Reader("plant.fmu", unpack, PlantError),
@@ -165,10 +167,10 @@ def test_a_checkpoint_with_a_pickle_inside_is_refused_and_not_executed(tmp_path,
     stream = io.BytesIO()
     np.lib.format.write_array(stream, np.array([Evil()], dtype=object), allow_pickle=True)
     with zipfile.ZipFile("checkpoint.npz", "w") as archive:
-        archive.writestr("about.npy", stream.getvalue())
+        archive.writestr("run.npy", stream.getvalue())
     with pytest.raises(CheckpointError):
-        checkpoint.load(Path("checkpoint.npz"))
+        load(Path("checkpoint.npz"))
     Path("plain.npz").write_bytes(pickle.dumps(Evil()))
     with pytest.raises(CheckpointError):
-        checkpoint.load(Path("plain.npz"))
+        load(Path("plain.npz"))
     assert not Path("executed").exists()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controllers.theta import Parameters
-from learning.back_off_search import BackOffSearch
+from learning.baselines import BackOffSearch
 from learning.prediction_errors import OneStepModel
 
 
@@ -16,26 +16,30 @@ class Loop:
     def __init__(self, problem, scenario, both=False):
         self.problem, self.scenario, self.both = problem, scenario, both
         self.model = OneStepModel(scenario)
-        self.noises = {}
+        self.change = lambda sample, rng: None
 
-    def run(self, search):
-        self.refused = []
-        while not search.done:
-            rng = np.random.default_rng(search.seed)
-            begins = False
-            while not begins and not search.done:
-                begins = search.observe(self.transition(search, rng))
-            self.refused.append(search.refused)
+    def run(self, start, budget=8000):
+        search = BackOffSearch(start, self.scenario, budget, np.random.default_rng(1))
+        self.segments = []
+        for segment in search.plan():
+            self.segments.append(segment)
+            rng, ended = np.random.default_rng(segment.seed), False
+            candidate = search.start.with_theta(segment.theta)
+            while not ended:
+                sample = self.transition(candidate, rng)
+                self.change(sample, rng)
+                ended = segment.take(sample, 0.0)
+            segment.answer = segment.told()
         return search
 
-    def transition(self, search, rng):
-        candidate, reference = search.candidate, self.problem.reference_state
+    def transition(self, candidate, rng):
+        reference = self.problem.reference_state
         noise = rng.uniform(-1.0, 1.0, 2) * [1.0, 0.2]
         low, high = candidate["x_l"], candidate["x_u"]
         s = np.array([low[0] + noise[0], high[1] + noise[1] if self.both else reference[1]])
         gradient = np.zeros(candidate.blocks.size)
         gradient[candidate.blocks.slices["x_l"].start] = 1.0
-        if self.both and search._segment > 0:
+        if self.both and len(self.segments) > 1:
             gradient[candidate.blocks.slices["x_u"].start + 1] = -1.0
         a = self.problem.reference_action
         predicted = self.model.predict(s, a, self.model.parameters(candidate))[0]
@@ -53,89 +57,73 @@ def start(problem):
     return Parameters.naive(problem)
 
 
-def search_of(problem, scenario, start, budget=8000):
-    return BackOffSearch(start, problem, scenario, budget, np.random.default_rng(1))
-
-
 def test_the_least_cost_of_a_known_loop_is_found(problem, scenario, start):
-    search = Loop(problem, scenario).run(search_of(problem, scenario, start))
-    assert not search.refused
+    loop = Loop(problem, scenario)
+    search = loop.run(start)
+    assert not any(segment.refused for segment in loop.segments)
     # 50 = 1e5·P(noise < −δ) at the optimum, so δ = 1 − 1e-3.
     assert search.theta["x_l"] == pytest.approx([25.999, 40.0], abs=0.01)
     assert np.array_equal(search.theta["x_u"], start["x_u"])
-    assert sum(segment.steps for segment in search._plan) <= 8000
+    assert sum(segment.length for segment in loop.segments) <= 8000
 
 
 def test_a_bound_that_binds_once_another_is_backed_off_is_searched(problem, scenario, start):
     loop = Loop(problem, scenario, both=True)
-    search = loop.run(search_of(problem, scenario, start, 10000))
+    search = loop.run(start, 10000)
     assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.02)
     assert search.theta["x_u"][1] == pytest.approx(79.8, abs=0.01)
 
 
 def test_a_start_that_is_backed_off_too_far_is_taken_back(problem, scenario, start):
     cautious = start.replace({"x_l": [28.0, 40.0]})
-    search = Loop(problem, scenario).run(search_of(problem, scenario, cautious))
+    search = Loop(problem, scenario).run(cautious)
     assert search.theta["x_l"][0] == pytest.approx(25.999, abs=0.03)
 
 
 def test_without_an_active_bound_the_start_stands(problem, scenario, start):
-    loop, search = Loop(problem, scenario), search_of(problem, scenario, start)
-    rng = np.random.default_rng(0)
-    while not search.done:
-        free = loop.transition(search, rng)
-        free.policy.value_gradient[:] = 0.0
-        search.observe(free)
-    assert np.array_equal(search.theta.theta, start.theta)
+    loop = Loop(problem, scenario)
+    loop.change = lambda sample, rng: sample.policy.value_gradient.fill(0.0)
+    assert np.array_equal(loop.run(start).theta.theta, start.theta)
 
 
 def test_the_candidates_of_a_round_meet_the_same_noise(problem, scenario, start):
-    search, seeds = search_of(problem, scenario, start, 800), {}
-    loop, rng = Loop(problem, scenario), np.random.default_rng(0)
-    while not search.done:
-        seeds.setdefault(search._plan[search._segment].round, set()).add(search.seed)
-        search.observe(loop.transition(search, rng))
-    assert len(seeds) == 3 and all(len(each) == 1 for each in seeds.values())
-    assert len(set.union(*seeds.values())) == 3
+    loop = Loop(problem, scenario)
+    loop.run(start, 800)
+    seeds = [segment.seed for segment in loop.segments]
+    assert len(set(seeds)) == 3
+    assert seeds == sorted(seeds, key=seeds.index), "a round's candidates follow each other"
+    assert [seeds.count(seed) for seed in dict.fromkeys(seeds)] == [3, 3, 2]
 
 
 def test_no_true_bound_is_loosened_and_on_a_plateau_nothing_moves(problem, scenario, start):
     """The upper bound of P2 is active here, and what is kept of it changes no cost."""
     loop = Loop(problem, scenario, both=True)
-    transition = loop.transition
 
-    def indifferent(search, rng):
-        sample = transition(search, rng)
+    def indifferent(sample, rng):
         sample.s = np.array([30.0, 60.0]) + rng.uniform(-1.0, 1.0, 2)
         sample.stage_cost = 6000.0 * (1 + 1e-12 * rng.standard_normal())
-        return sample
 
-    loop.transition = indifferent
-    search = search_of(problem, scenario, start, 4000)
-    least, most = start["x_l"], start["x_u"]
-    while not search.done:
-        rng, begins = np.random.default_rng(search.seed), False
-        while not begins and not search.done:
-            assert (search.candidate["x_l"] >= scenario.state_lower).all()
-            assert (search.candidate["x_u"] <= scenario.state_upper).all()
-            begins = search.observe(loop.transition(search, rng))
+    loop.change = indifferent
+    search = loop.run(start, 4000)
+    for segment in loop.segments:
+        tried = start.with_theta(segment.theta)
+        assert (tried["x_l"] >= scenario.state_lower).all()
+        assert (tried["x_u"] <= scenario.state_upper).all()
     assert not search.kappa.any(), search.kappa
-    assert np.array_equal(search.theta["x_l"], least)
-    assert np.array_equal(search.theta["x_u"], most)
+    assert np.array_equal(search.theta["x_l"], start["x_l"])
+    assert np.array_equal(search.theta["x_u"], start["x_u"])
 
 
 def test_the_end_of_what_was_seen_is_not_taken_for_the_best(problem, scenario, start):
     """A cost that falls with κ without end leaves, round by round, a back-off that was run."""
     loop = Loop(problem, scenario)
-    transition = loop.transition
 
-    def falling(search, rng):
-        sample = transition(search, rng)
+    def falling(sample, rng):
         sample.stage_cost = 6000.0 - 10.0 * sample.s[0]
-        return sample
 
-    loop.transition = falling
-    search = loop.run(search_of(problem, scenario, start, 4000))
-    run = {segment.kappa[0] for segment in search._plan}
-    assert search.kappa[0] in run and search.kappa[0] >= 4.0
-    assert sum(loop.refused) == 3 and loop.refused[-1]
+    loop.change = falling
+    search = loop.run(start, 4000)
+    run = {segment.theta[start.blocks.slices["x_l"]][0] for segment in loop.segments}
+    assert search.theta["x_l"][0] in run and search.kappa[0] >= 4.0
+    refused = [segment.refused for segment in loop.segments]
+    assert sum(refused) == 3 and refused[-1]

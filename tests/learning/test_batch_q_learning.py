@@ -49,7 +49,7 @@ def filled(controller, samples, capacity=100):
     """A buffer that these samples were put into."""
     buffer = ReplayBuffer(controller, capacity)
     for sample in samples:
-        buffer.add(sample)
+        buffer.add(sample, np.zeros(2), 0.0)
     return buffer
 
 
@@ -148,7 +148,7 @@ def test_a_new_batch_knows_nothing_of_the_one_before(scenario, collected):
     buffer.replay(average_cost(scenario))
     buffer.clear()
     for sample in samples[30:]:
-        buffer.add(sample)
+        buffer.add(sample, np.zeros(2), 0.0)
     found = buffer.replay(average_cost(scenario))
     assert_same(found, replayed(controller, samples[30:], average_cost(scenario)))
 

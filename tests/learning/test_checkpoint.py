@@ -3,7 +3,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from learning.checkpoint import Checkpoint, arrays_of, load, save, take_up
+from learning.checkpoint import arrays_of, load, save, take_up
 from learning.errors import CheckpointError
 
 RUN = {"algorithm": "actor-critic", "seed": 3, "deviation": (5.0,)}
@@ -12,8 +12,7 @@ RUN = {"algorithm": "actor-critic", "seed": 3, "deviation": (5.0,)}
 @pytest.fixture
 def stored(tmp_path):
     path = tmp_path / "checkpoint.npz"
-    checkpoint = Checkpoint(RUN, {"number": 7}, {"theta": np.linspace(0, 1, 5)})
-    return save(path, checkpoint)
+    return save(path, RUN, {"theta": np.linspace(0, 1, 5)})
 
 
 def test_another_runs_checkpoint_is_refused_by_the_field_that_differs(stored):

@@ -62,7 +62,7 @@ def test_a_restored_search_goes_on_as_the_first_one(scenario, rule):
             whole.advance()
         whole.restart()
         second.restore(second.deserialise(first.serialise(first.snapshot())))
-        resumed.restore(*whole.state())
+        resumed.restore(whole.state())
         for _ in range(500):
             whole.advance()
             resumed.advance()

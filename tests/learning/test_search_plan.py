@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controllers.theta import Parameters
-from learning.search import Learn, Learned, PairedComparison, SearchPlan, Settle, Stretch, Trial
+from learning.search import SearchPlan
 
 STRETCHES = 8
 
@@ -14,11 +14,17 @@ STRETCHES = 8
 def drive(plan, answer):
     """What a generator of requests returns once each has been answered."""
     try:
-        request = next(plan)
         while True:
-            request = plan.send(answer(request))
+            request = next(plan)
+            request.answer = answer(request)
     except StopIteration as end:
         return end.value
+
+
+def told(cost, samples=0):
+    """What a stretch of this mean cost tells, its predictions within the bounds and right."""
+    predictions = np.full((samples, 2), 60.0)
+    return {"cost": np.array([cost, 0.0]), "predictions": predictions, "errors": 0 * predictions}
 
 
 class Plant:
@@ -33,14 +39,14 @@ class Plant:
 
     def answer(self, request):
         name = float(request.theta[self.where][0])
-        if isinstance(request, Settle):
-            self.episodes.append(request.episode)
+        if request.mark:
+            self.episodes.append(request.seed)
             cost = 0.0
         else:
-            self.stretch = 0 if request.begins else self.stretch + 1
+            self.stretch = 0 if request.rewind else self.stretch + 1
             cost = self.costs[name][self.stretch]
             self.run[name] = self.run.get(name, 0) + 1
-        return Stretch(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
+        return told(cost)
 
 
 @pytest.fixture
@@ -54,7 +60,8 @@ def rival(start):
 
 
 def comparison(scenario, start, samples=10_000):
-    return PairedComparison(scenario, start, samples, stretch=100, stretches=STRETCHES)
+    sizes = {"phase": 100, "stretch": 100, "stretches": STRETCHES}
+    return SearchPlan(scenario, start, np.ones(2), samples, 0, **sizes)
 
 
 def settled(scenario, start, costs):
@@ -117,7 +124,7 @@ def test_the_final_leaves_the_start_only_for_what_is_cheaper_by_a_standard_error
         assert np.array_equal(made.incumbent.theta, rival if leaves else start.theta)
 
 
-class Bowl:
+class Bowl(Plant):
     """A plant whose cost wants a back-off of X2 that depends on the inputs' weights.
 
     6300 + 40 (x_l − 25 − 2.5 − log₁₀ r)² + 10 (log₁₀ r − log₁₀ r*)², r the weight of P100.
@@ -133,11 +140,7 @@ class Bowl:
         return 6300.0 + 40.0 * back_off**2 + 10.0 * (decades - np.log10(self.best)) ** 2
 
     def answer(self, request):
-        cost = 0.0 if isinstance(request, Settle) else self.cost(request.theta)
-        return Stretch(cost, 0.0, np.zeros((0, 2)), np.zeros((0, 2)), None)
-
-    def drive(self, plan):
-        return drive(plan, self.answer)
+        return told(0.0 if request.mark else self.cost(request.theta))
 
 
 @pytest.fixture
@@ -158,17 +161,16 @@ def minimiser(parameters):
 
 def test_the_inputs_weights_are_found_each_with_its_own_back_off(lines, far):
     """With the back-off of before, a tenth of the weight would cost more: 30 > 0."""
-    comparison = lines.comparison
     plant = Bowl(far, 1e-2)
     same = lines._weighted(0.1)
     assert plant.cost(same) > plant.cost(far.theta)
-    plant.drive(comparison.renew(STRETCHES))
+    plant.drive(lines.renew(STRETCHES))
     assert plant.drive(lines._rescale(-1.0)) == -1.0
-    found = far.with_theta(comparison.incumbent.theta)
+    found = far.with_theta(lines.incumbent.theta)
     assert np.diag(found["B_l"]) == pytest.approx([1.0, 1.0, 1e-2, 1e-2])
     assert found["x_l"][0] == pytest.approx(25.5, abs=0.5)
     assert minimiser(found) == pytest.approx(minimiser(far))
-    assert 0 < comparison.least < 1e-2, "smaller weights are admissible from now on"
+    assert 0 < lines.least < 1e-2, "smaller weights are admissible from now on"
 
 
 SAMPLES = 20_000
@@ -198,29 +200,28 @@ class Quadratic:
         return 6300.0 + 30.0 * float(bound @ bound) + 10.0 * float(slope @ slope)
 
     def answer(self, request):
-        if isinstance(request, Learn):
-            self.samples += request.samples
-            candidate = self.learner(request.theta, request.width)
+        self.samples += request.length
+        if request.learns:
+            candidate = self.learner(request.theta, request.width or 1.0)
             errors = self.rng.uniform(-1, 1, size=(500, 2)) * [2.0, 0.2]
-            return Learned(candidate[None, :], errors, np.array([1.6, 1.5]), errors.std(axis=0))
-        self.samples += 100
-        if isinstance(request, Settle):
+            deviations = np.array([[1.6, 1.5], errors.std(axis=0)])
+            return {"candidates": candidate[None], "errors": errors, "deviations": deviations}
+        if request.mark:
             self.rounds += 1
             self.draws = np.random.default_rng(self.rounds).normal(size=1000)
-        elif request.begins:
+        elif request.rewind:
             self.stretch = 0
-        metric = None
-        if isinstance(request, Trial):
+        if not request.mark:
             self.tried.append(request.theta)
             self.stretch += 1
-            if request.sensitive:
-                jacobian = np.zeros((2, request.theta.size))
-                where = self.blocks.slices["b_l"]
-                jacobian[0, where.stop - 2] = jacobian[1, where.stop - 1] = -0.05
-                metric = jacobian.T @ jacobian
         draw = self.noise * self.draws[getattr(self, "stretch", 0)]
-        far = np.full((100, 2), 60.0)
-        return Stretch(self.cost(request.theta) + draw, 0.0, far, np.zeros((100, 2)), metric)
+        answer = told(self.cost(request.theta) + draw, 100)
+        if request.deviation is not None:
+            jacobian = np.zeros((2, request.theta.size))
+            where = self.blocks.slices["b_l"]
+            jacobian[0, where.stop - 2] = jacobian[1, where.stop - 1] = -0.05
+            answer["metric"] = jacobian.T @ jacobian
+        return answer
 
 
 def run(search, plant):
@@ -232,7 +233,7 @@ def test_line_searches_alone_come_near_the_best(scenario, problem):
     plant = Quadratic(scenario, sought._start)
     before = plant.cost(sought._start.theta)
     run(sought, plant)
-    assert plant.cost(sought.comparison.incumbent.theta) - 6300.0 < 0.05 * (before - 6300.0)
+    assert plant.cost(sought.incumbent.theta) - 6300.0 < 0.05 * (before - 6300.0)
 
 
 def test_the_samples_are_counted_and_never_exceeded(scenario, problem):
@@ -241,7 +242,7 @@ def test_the_samples_are_counted_and_never_exceeded(scenario, problem):
     run(sought, plant)
     # The last race ends early where nothing comes near the incumbent.
     assert 0.9 * (1 - sought.FINAL) * SAMPLES < plant.samples <= SAMPLES
-    assert plant.samples == sought.comparison.spent
+    assert plant.samples == sought.spent
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -253,23 +254,23 @@ def test_a_rule_that_only_does_harm_loses_nothing(scenario, problem, seed):
         return theta + width * rng.normal(size=theta.size)
 
     plant = Quadratic(scenario, sought._start, learner=harm, seed=seed)
-    sought.comparison.incumbent.theta = plant.best.copy()
+    sought.incumbent.theta = plant.best.copy()
     sought._start = sought._start.with_theta(plant.best)
     run(sought, plant)
-    assert plant.cost(sought.comparison.incumbent.theta) < 6300.0 + 0.1
+    assert plant.cost(sought.incumbent.theta) < 6300.0 + 0.1
 
 
 def test_what_is_reported_has_won(scenario, problem):
     sought = search(scenario, problem, 40_000)
     plant = Quadratic(scenario, sought._start, noise=0.0)
-    incumbents = [sought.comparison.incumbent.theta]
+    incumbents = [sought.incumbent.theta]
 
     def answer(request):
-        incumbents.append(sought.comparison.incumbent.theta)
+        incumbents.append(sought.incumbent.theta)
         return plant.answer(request)
 
     drive(sought.plan(), answer)
-    incumbents.append(sought.comparison.incumbent.theta)
+    incumbents.append(sought.incumbent.theta)
     costs = [plant.cost(theta) for theta in incumbents]
     changes = sum(not np.array_equal(one, other) for one, other in pairwise(incumbents))
     assert changes > 3

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from qpsolvers import solve_qp
 
 from controllers.theta import Parameters, ThetaBlocks
+from learning.checkpoint import arrays_of, take_up
 from learning.configuration import Configuration
 from learning.step import (
     ConstrainedStep,
@@ -218,3 +219,15 @@ def test_a_projection_keeps_what_is_admissible_and_mends_the_rest(controller):
     theta[step.blocks.slices["B_Vf"]] = [-1.0, 0.0, 2.0]
     assert step.move(theta).corrected
     assert controller.parameters["B_Vf"] == pytest.approx(np.diag([1e-3, 2.0]), abs=1e-5)
+
+
+def test_a_restored_step_keeps_the_least_eigenvalue_of_where_it_began(controller):
+    """Half of that θ's own, where this is less than the configuration's."""
+    small = Configuration(smallest_eigenvalue=10.0)
+    step = ConstrainedStep(controller, small)
+    parameters = controller.parameters
+    controller.theta = parameters.replace({"B_l": 0.5 * parameters["B_l"]}).theta
+    resumed = ConstrainedStep(controller, small)
+    assert resumed._smallest != step._smallest
+    take_up(resumed, arrays_of(step))
+    assert resumed._smallest == step._smallest

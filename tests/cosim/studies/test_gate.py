@@ -14,7 +14,7 @@ from controllers.problem import Problem
 from controllers.rti.nmpc import RtiSolution
 from cosim.cli.main import app
 from cosim.plant.fmu_plant import Wirer
-from learning.back_off_search import BackOffSearch
+from learning.baselines import BackOffSearch
 
 pytestmark = pytest.mark.campaign
 STORED = Path(__file__).parents[3] / "results"

@@ -44,7 +44,6 @@ VARIABLES = tuple(read_variables(RESOURCES / "evaporator.csv"))
 EVAPORATOR = FmuModel(
     name="Evaporator",
     identifier="evaporator",
-    version="1.0.0",
     description="Stochastic evaporation process, the plant of the RTI co-simulation benchmark",
     variables=VARIABLES,
     units=UNITS,

@@ -7,7 +7,7 @@ import hashlib
 import html
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from fractions import Fraction
 from functools import cache, cached_property
@@ -156,21 +156,22 @@ class FmuModel:
     `step_size` alone: its outputs are discrete, and no communication step may pass over a sample.
     Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
     variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
-    names.
+    names. `sources` are C headers of its own, by file name.
     """
 
     name: str
     identifier: str
-    version: str
     description: str
     variables: tuple[Variable, ...]
     units: tuple[Unit, ...]
     stop_time: float
     step_size: float
+    version: str = "1.0.0"
     model_exchange: bool = False
     derivatives: bool = False
     sampled: bool = False
     terminal: tuple[str, ...] = ()
+    sources: Mapping[str, bytes] = field(default_factory=dict)
 
     @cached_property
     def arrays(self) -> dict[str, list[Variable]]:

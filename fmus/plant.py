@@ -115,7 +115,6 @@ def plant_model(
     return FmuModel(
         name=name,
         identifier=name,
-        version="1.0.0",
         description=description,
         variables=tuple(table),
         units=tuple(unit(name) for name in units),

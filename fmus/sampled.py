@@ -3,88 +3,75 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from fmus import BuildError
 from fmus.build import SOURCES, assemble, files_of, sources_of
 from fmus.model import FmiVersion, FmuModel, Kind, Variable, render, unit
 
-_SAMPLES = 100
 
+def sampled_system(
+    *,
+    name: str,
+    identifier: str,
+    description: str,
+    sampling_time: float,
+    signals: Sequence[Variable],
+    sources: Mapping[str, bytes],
+    terminal: tuple[str, ...] = (),
+) -> FmuModel:
+    """The model of a function of inputs and parameters, evaluated once a `sampling_time` [s].
 
-@dataclass(frozen=True)
-class SampledSystem:
-    """A function of inputs and parameters that is evaluated once a `sampling_time` [s].
-
-    `name` and `description` are for readers, `identifier` is the model's C identifier. `signals`
-    are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
+    `signals` are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
     parameters; every output depends on every input and parameter. `sources` are C headers by name,
     of which ``core.h`` defines the functions that ``sampled_sources/model_state.h`` lists; their
-    arrays are ordered like the signals. `terminal` is that of `FmuModel`. Raises BuildError on
-    names that are taken twice.
+    arrays are ordered like the signals. Raises BuildError on names that are taken twice, in FMI or
+    in C.
     """
-
-    name: str
-    identifier: str
-    description: str
-    sampling_time: float
-    signals: tuple[Variable, ...]
-    sources: Mapping[str, bytes]
-    terminal: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        """Check that names are unique in FMI and in C."""
-        variables = self.model.variables
-        for names in ([v.name for v in variables], [v.identifier for v in variables]):
-            if twice := next((name for name in names if names.count(name) > 1), None):
-                raise BuildError(f"two variables of {self.name} are called '{twice}'")
-
-    @cached_property
-    def model(self) -> FmuModel:
-        """The table of variables with its units."""
-        time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
-        known = tuple(v.name for v in self.signals if v.settable)
-        table = (time, *(v if v.settable else replace(v, uses=known) for v in self.signals))
-        names = dict.fromkeys(variable.unit for variable in table)
-        return FmuModel(
-            name=self.name,
-            identifier=self.identifier,
-            version="1.0.0",
-            description=self.description,
-            variables=table,
-            units=tuple(unit(name) for name in names if name),
-            stop_time=_SAMPLES * self.sampling_time,
-            step_size=self.sampling_time,
-            sampled=True,
-            terminal=self.terminal,
-        )
+    time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
+    known = tuple(v.name for v in signals if v.settable)
+    table = (time, *(v if v.settable else replace(v, uses=known) for v in signals))
+    for names in ([v.name for v in table], [v.identifier for v in table]):
+        if twice := next((each for each in names if names.count(each) > 1), None):
+            raise BuildError(f"two variables of {name} are called '{twice}'")
+    return FmuModel(
+        name=name,
+        identifier=identifier,
+        description=description,
+        variables=table,
+        units=tuple(unit(each) for each in dict.fromkeys(v.unit for v in table) if each),
+        stop_time=100 * sampling_time,
+        step_size=sampling_time,
+        sampled=True,
+        terminal=terminal,
+        sources=sources,
+    )
 
 
-def sampled_sources(system: SampledSystem, version: FmiVersion) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of the FMU."""
-    kinds = [variable.kind for variable in system.model.variables]
+def sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
+    """File name → bytes of the folder `sources/` of a sampled system's FMU."""
+    kinds = [variable.kind for variable in system.variables]
     first_output = 1 + kinds.count(Kind.INPUT)
     header = render(
         "system.h",
         first_output=first_output,
         first_parameter=first_output + kinds.count(Kind.OUTPUT),
-        sampling_time=float(system.sampling_time),
+        sampling_time=float(system.step_size),
     )
     own = files_of("sampled_sources") | {**system.sources, "system.h": header.encode()}
     if version == 3:
-        own |= _array_sources(system.model)
+        own |= _array_sources(system)
     # The C checks every variable against a range.
     largest = sys.float_info.max
     rows = [
         replace(
             v, min=-largest if v.min is None else v.min, max=largest if v.max is None else v.max
         )
-        for v in system.model.variables
+        for v in system.variables
     ]
-    return sources_of(system.model, version, own, rows)
+    return sources_of(system, version, own, rows)
 
 
 def _array_sources(model: FmuModel) -> dict[str, bytes]:
@@ -101,7 +88,7 @@ def _array_sources(model: FmuModel) -> dict[str, bytes]:
 
 
 def build_sampled(
-    system: SampledSystem,
+    system: FmuModel,
     target: str | Path,
     version: FmiVersion = 2,
     *,
@@ -113,12 +100,12 @@ def build_sampled(
     As `fmus.build.build_fmu`, whose BuildError it raises; with the same compiler the bytes repeat.
     """
     return assemble(
-        system.model,
+        system,
         version,
         sampled_sources(system, version),
         target,
         remarks=(
-            f"Sampled every {system.sampling_time:g} s, at its multiples: a communication step "
+            f"Sampled every {system.step_size:g} s, at its multiples: a communication step "
             "ends at or before the next one. At a sample the outputs follow the inputs at once; "
             "between samples they are held."
         ),

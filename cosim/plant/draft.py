@@ -49,7 +49,7 @@ def draft_scenario(
     archive = unpack(fmu)
     for refusal in refusals(archive):
         raise PlantError(refusal)
-    known = {variable.name: variable for variable in archive.description.modelVariables}
+    known = archive.variables
     for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
         if name not in known:
             raise PlantError(

@@ -49,6 +49,22 @@ class UnpackedFmu:
     description: Any
     entries: frozenset[str]
 
+    @cached_property
+    def variables(self) -> dict[str, Any]:
+        """The variables by name."""
+        return {variable.name: variable for variable in self.description.modelVariables}
+
+    def variable(self, name: str) -> Any:
+        """Variable `name`, or the array whose element ``NAME[…]`` it is; None if there is none."""
+        array = self.variables.get(name.partition("[")[0])
+        return self.variables.get(name, array if array is not None and array.shape else None)
+
+    def unit(self, name: str) -> str:
+        """Unit of a variable or an array's element; empty where it is not stated."""
+        variable = self.variable(name)
+        stated = variable and (variable.unit or getattr(variable.declaredType, "unit", None))
+        return str(stated or "")
+
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
 _lock = threading.Lock()

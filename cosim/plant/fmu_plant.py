@@ -94,7 +94,6 @@ class Wirer:
         self._scenario = scenario
         self._fmu = fmu
         self._interface = interface
-        self._variables = {variable.name: variable for variable in fmu.description.modelVariables}
 
     def wiring(self) -> Wiring:
         """Value references of inputs, outputs (stage cost first), states and start values."""
@@ -142,12 +141,6 @@ class Wirer:
         lower = [-inf if v.min is None else float(v.min) for v in found]
         upper = [inf if v.max is None else float(v.max) for v in found]
         return np.array(lower), np.array(upper)
-
-    def units(self) -> dict[str, str]:
-        """Unit of each exchanged variable by name; empty if not stated."""
-        plant = self._scenario.plant
-        names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
-        return {name: _unit(self._find(name, "plant")) for name in names}
 
     def _starts(self) -> list[tuple[Place, float]]:
         scenario, mapping = self._scenario, self._scenario.plant.mapping
@@ -209,14 +202,13 @@ class Wirer:
         return Place(int(variable.valueReference), str(variable.type), index, starts)
 
     def _find(self, name: str, table: str) -> Any:
-        array = self._variables.get(name.partition("[")[0])
-        if name not in self._variables and not (array is not None and array.shape):
+        if (variable := self._fmu.variable(name)) is None:
             raise PlantError(
                 f"FMU '{self._fmu.path.name}' has no variable '{name}'"
-                f"{suggestion(name, self._variables)}, which {table} of scenario "
+                f"{suggestion(name, self._fmu.variables)}, which {table} of scenario "
                 f"'{self._scenario.name}' names"
             )
-        return self._variables.get(name, array)
+        return variable
 
     def _misfit(self, name: str, table: str, what: str) -> PlantError:
         return PlantError(
@@ -227,11 +219,6 @@ class Wirer:
 
 def _a(noun: str) -> str:
     return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
-
-
-def _unit(variable: Any) -> str:
-    declared = variable.declaredType.unit if variable.declaredType is not None else None
-    return str(variable.unit or declared or "")
 
 
 def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
@@ -262,10 +249,7 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
     """
     fmu = unpack(scenario.plant.fmu)
     wirer = Wirer(scenario, fmu, _interface(fmu))
-    names = {
-        (int(variable.valueReference), variable.type): variable.name
-        for variable in fmu.description.modelVariables
-    }
+    names = {(int(v.valueReference), v.type): name for name, v in fmu.variables.items()}
     found = {names[place[:2]]: (place.type, value) for place, value in wirer.wiring().starts}
     for place, value in seed_words(plant_seed, wirer.seeds()):
         signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
@@ -337,13 +321,15 @@ class FmuPlant:
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
         wiring = wirer.wiring()._replace(intermediate=intermediate)
-        self.units = wirer.units()
+        plant = self.scenario.plant
+        names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
+        self.units = {name: archive.unit(name) for name in names}
         self.state_range = wirer.state_range()
         self.penalty = self.scenario.state_penalty
         self._seeds = wirer.seeds()
         self._initial = wirer.initial_states()
         self._elsewhere = False
-        self._m = len(self.scenario.plant.actions)
+        self._m = len(plant.actions)
         self._k = _NOT_STARTED
         self._started = False
         self._penalty_now = 0.0

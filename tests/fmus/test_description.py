@@ -175,7 +175,7 @@ def members(model) -> dict[str, str]:
 def test_the_terminals_of_plant_and_controller_fit_each_other(name):
     plant = members(EVAPORATOR if name == "paper" else plants.model(name))
     scenario = Scenario.load(name).replace({"controller": {"horizon": 2}})
-    controller = members(sampled_controller(rti_controller("naive", scenario), scenario, {}).model)
+    controller = members(sampled_controller(rti_controller("naive", scenario), scenario))
     assert plant.keys() == controller.keys()
     assert all({plant[each], controller[each]} == {"input", "output"} for each in plant)
     assert [name for name in plant if plant[name] == "output"] == list(scenario.plant.states)
@@ -238,7 +238,7 @@ def test_a_plant_of_ones_own(version):
 def test_an_exported_controller_and_its_loop(tmp_path):
     scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})
     controller = rti_controller("naive", scenario, ("X1",))
-    system = sampled_controller(controller, scenario, {"X2": "%"}, ("X1",))
+    system = sampled_controller(controller, scenario, ("X1",))
     for version in (2, 3):
         fmu = build_sampled(system, tmp_path / f"c{version}.fmu", version)
         assert len(hold_archive(fmu, FMI[version] | BUILD)) == version

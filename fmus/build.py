@@ -303,7 +303,12 @@ def _model(description: bytes) -> tuple[str, str]:
 # The evaporator's sources that serve any model: FMI's functions and their parts.
 _FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
 _WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
-_GENERATED = ("variables.h", "buildDescription.xml")
+HEADER = "variables.h"
+# Stored results name the evaporator's file by its bytes: it keeps the token of its first build.
+_KEPT_TOKENS = {
+    "{057e4cbf-b1fc-5409-a668-78ce31bbba02}": "{4b2ab9db-c6a8-56b3-80d2-38ec28c993f3}",
+    "{3acfd11f-6951-5208-9ac5-27f319c4be69}": "{71dc0d9d-04bb-5505-8f86-367bbed9bbb2}",
+}
 
 
 def files_of(folder: str) -> dict[str, bytes]:
@@ -316,18 +321,20 @@ def sources_of(
     version: FmiVersion,
     own: Mapping[str, bytes],
     rows: Sequence[Variable] | None = None,
+    origin: str = "",
 ) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of an FMU without derivatives.
+    """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own.
 
-    `own` is the model's own C; `rows` is its table as the C shall check it, where that differs.
+    `own` is the model's own C; `rows` is its table as the C shall check it, where that differs;
+    `origin` says in the header where it comes from.
     """
     paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
     paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
     files = {path.name: path.read_bytes() for path in paths} | dict(own)
     variables = model.variables if rows is None else rows
-    token = token_of([model_description(version, "", model)], files)
-    header = c_header(token, model.identifier, variables, f"from the table of {model.name}")
-    files["variables.h"] = header.encode()
+    origin = f"from {origin or f'the table of {model.name}'}"
+    token = token_of(model, version, files)
+    files[HEADER] = c_header(token, model.identifier, variables, origin).encode()
     files["buildDescription.xml"] = build_description(version, model).encode()
     return files
 
@@ -341,13 +348,13 @@ def assemble(
     remarks: str = "",
     every_platform: bool = False,
     files: Mapping[str, bytes] | None = None,
+    warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
     """Build the FMU `target` from `sources_of`, with a page of its variables.
 
     `remarks` are sentences on that page, `files` further members of the archive. As `build_fmu`,
     whose BuildError it raises; with the same compiler the bytes repeat.
     """
-    written = {name: data for name, data in sources.items() if name not in _GENERATED}
     page = render("model.html", model=model, version=version, remarks=remarks)
     members = {
         "documentation/index.html": page.encode(),
@@ -355,14 +362,16 @@ def assemble(
         **(terminals(model) if version == 3 else {}),
         **(files or {}),
     }
-    token = token_of([model_description(version, "", model)], written)
-    text = model_description(version, token, model)
-    return build_fmu(target, sources, text, every_platform=every_platform, files=members)
+    text = model_description(version, token_of(model, version, sources), model)
+    return build_fmu(
+        target, sources, text, every_platform=every_platform, files=members, warnings=warnings
+    )
 
 
-def token_of(texts: Sequence[str], sources: Mapping[str, bytes]) -> str:
-    """GUID or instantiation token: a digest of all that makes a model."""
-    digest = hashlib.sha256("".join(texts).encode())
-    for name in sorted(sources):
+def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
+    """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model."""
+    digest = hashlib.sha256(model_description(version, "", model).encode())
+    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):  # they hold the token
         digest.update(name.encode() + b"\0" + sources[name])
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
+    token = "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
+    return _KEPT_TOKENS.get(token, token)

@@ -19,8 +19,8 @@ from controllers.factories import tuned
 from cosim import Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from fmus import PLATFORMS, Platform
-from fmus.build import cross_compiler
-from fmus.evaporator import EVAPORATOR, HEADER, sources
+from fmus.build import HEADER, cross_compiler
+from fmus.evaporator import EVAPORATOR, sources
 from fmus.model import FmiVersion, FmuModel
 from fmus.sampled import sampled_sources
 

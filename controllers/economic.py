@@ -78,10 +78,8 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         "error_on_fail": False,
     }
     solver = ca.nlpsol("steady_state", "ipopt", {"x": w, "f": cost, "g": x_next - x}, options)
-    lower = np.concatenate([problem.state_lower, problem.action_lower])
-    upper = np.concatenate([problem.state_upper, problem.action_upper])
-    start = np.concatenate([problem.reference_state, problem.reference_action])
-    found = solver(x0=start, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+    lower, upper = problem.lower, problem.upper
+    found = solver(x0=problem.reference, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
     stats = solver.stats()
     if not stats["success"]:
         raise TuningError(
@@ -331,9 +329,7 @@ def tune(
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
     q, C_x = steady.gradient, steady.C[:, :n]
     # θ's quadratics are about the reference, the tuning's about the optimal steady state.
-    shift = np.concatenate(
-        [problem.reference_state - steady.x, problem.reference_action - steady.u]
-    )
+    shift = problem.reference - np.concatenate([steady.x, steady.u])
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
     values = {
         "B_l": _symmetric(0.5 * M),

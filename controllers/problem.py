@@ -193,6 +193,21 @@ class Problem:
         """Number of actions m."""
         return len(self.model.actions)
 
+    @property
+    def reference(self) -> Vector:
+        """Reference (x_s, u_s), shape (n+m,)."""
+        return np.concatenate([self.reference_state, self.reference_action])
+
+    @property
+    def lower(self) -> Vector:
+        """Lower bounds of (x, u), shape (n+m,)."""
+        return np.concatenate([self.state_lower, self.action_lower])
+
+    @property
+    def upper(self) -> Vector:
+        """Upper bounds of (x, u), shape (n+m,)."""
+        return np.concatenate([self.state_upper, self.action_upper])
+
     @cached_property
     def penalty(self) -> Penalty:
         """Penalty of a state by the true bounds."""
@@ -208,13 +223,7 @@ class Problem:
     @cached_property
     def units(self) -> Units:
         """Orders of magnitude of states, actions and cost."""
-        return Units.of(
-            self.model,
-            np.concatenate([self.state_lower, self.action_lower]),
-            np.concatenate([self.state_upper, self.action_upper]),
-            np.concatenate([self.reference_state, self.reference_action]),
-            self.reference_cost,
-        )
+        return Units.of(self.model, self.lower, self.upper, self.reference, self.reference_cost)
 
     def value_level(self, discount: float | None = None) -> float:
         """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.

@@ -40,7 +40,7 @@ def _theta_part(
 ) -> ca.SX:
     """Terms of the Lagrangian with θ but for p; `at` (n+m, N), M_k = ∂(second-order term)/∂L_k."""
     horizon, gamma, size = problem.horizon, problem.discount, at.size1()
-    reference = np.concatenate([problem.reference_state, problem.reference_action])
+    reference = problem.reference
     part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
     part += symbols["c_lambda"]
     for k in range(horizon):
@@ -72,7 +72,7 @@ def _parameter_gradient(
 ) -> ca.SX:
     """∇_p of the QP's Lagrangian; `exact` is (M, χ̄), χ̄ the costates where D_k was taken."""
     size = problem.n_states + problem.n_actions
-    reference = ca.DM(np.concatenate([problem.reference_state, problem.reference_action]))
+    reference = ca.DM(problem.reference)
     of_stage = stage_parameter_gradient(problem, blocks, exact=exact is not None)
     total = ca.SX(0)
     for k in range(problem.horizon):

@@ -25,7 +25,7 @@ from controllers.qp import (
     multipliers_at_kink,
 )
 from controllers.rti.preparation import (
-    Lift,
+    Spectrum,
     embedding,
     make_hessian,
     preparation,
@@ -87,14 +87,13 @@ class Functions:
 class Prepared:
     """Data of a preparation phase, kept for read-outs after the next one has begun.
 
-    `memory` is a copy of the preparation's memory, `parameters` are θ. `spectrum` is the lift that
-    convexified the Hessians, None for Gauss–Newton. `functions` and `engine` are the controller's.
-    An engine that solves stage by stage condenses the QP only when it is asked for.
+    `memory` is a copy of the preparation's memory. `spectrum` is that of the exact Hessian's blocks
+    before the lift that made them convex. `functions` and `engine` are the controller's. An engine
+    that solves stage by stage condenses the QP only when it is asked for.
     """
 
     memory: Vector
-    parameters: Parameters
-    spectrum: Lift | None
+    spectrum: Spectrum | None
     functions: Functions
     engine: Engine | None = None
 
@@ -108,6 +107,10 @@ class Prepared:
         horizon = self.functions.problem.horizon
         parts = (self.part(name) for name in LinearisationPoint._fields)
         return LinearisationPoint(*(part.reshape(horizon, -1).copy() for part in parts))
+
+    def contract(self, seed: Vector) -> Vector:
+        """Adjoint of the lift's derivative (`Spectrum.contract`), of the identity without one."""
+        return seed if self.spectrum is None else self.spectrum.contract(seed)
 
 
 @dataclass(eq=False)
@@ -127,14 +130,16 @@ class RtiSolution:
     enforced: bool = False
     status: str = "solved"
 
+    def _flat(self, name: str) -> Vector:
+        return self.memory[self.prepared.functions.readout.places[name]]
+
     def _part(self, name: str) -> Matrix:
         return self.prepared.functions.readout.part(name, self.memory)
 
     @cached_property
     def multipliers(self) -> QpSolution:
         """Primal-dual solution of the condensed QP."""
-        places = self.prepared.functions.readout.places
-        return QpSolution(*(self.memory[places[name]] for name in ("v", "nu", "lam")))
+        return QpSolution(*(self._flat(name) for name in ("v", "nu", "lam")))
 
     @cached_property
     def qp(self) -> SoftQp:
@@ -187,15 +192,13 @@ class RtiSolution:
     def residual(self) -> float:
         """Largest KKT residual; compiled code has measured it when it solved."""
         if self.prepared.engine is not None and not self.enforced:
-            return float(self.memory[self.prepared.functions.readout.places["residual"]][0])
+            return float(self._flat("residual")[0])
         return self.multipliers.residual(self.qp)
 
     @property
     def iterations(self) -> int | None:
         """Steps of the compiled QP solver; None where another one solved."""
-        if self.prepared.engine is None:
-            return None
-        return int(self.memory[self.prepared.functions.readout.places["iterations"]][0])
+        return None if self.prepared.engine is None else int(self._flat("iterations")[0])
 
     @cached_property
     def weakly_active(self) -> bool:
@@ -216,7 +219,7 @@ class RtiSolution:
     def value_gradient(self) -> Vector:
         """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
         if self.prepared.engine is not None:
-            return self.memory[self.prepared.functions.readout.places["gradient"]]
+            return self._flat("gradient")
         function = self.prepared.functions.gradient
         self._write_solution(function)
         function()
@@ -252,9 +255,9 @@ class RtiSolution:
             inputs[name][:] = prepared.part(name)
         for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
             inputs[name][:] = direction.reshape(-1)
-        if (spectrum := prepared.spectrum) is not None:
+        if "dM" in inputs:
             step = self._step_from_point()
-            moved = curvature_directions(self.qp.rows, dv, step, spectrum.contract)
+            moved = curvature_directions(self.qp.rows, dv, step, prepared.contract)
             inputs["dM"][:] = moved.reshape(-1)
         function()
         by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))
@@ -262,15 +265,14 @@ class RtiSolution:
 
     def _write_solution(self, function: StackedFunction) -> None:
         inputs, prepared = function.inputs, self.prepared
-        places = prepared.functions.readout.places
         for name in SOLUTION:
-            inputs[name][:] = self.memory[places[name]]
+            inputs[name][:] = self._flat(name)
         for name in ("x", "u", "theta"):
             inputs[name][:] = prepared.part(name)
-        if prepared.spectrum is not None:
+        if "M" in inputs:
             step = self._step_from_point()
             seed = step[:, :, None] * step[:, None, :] / 2
-            inputs["M"][:] = prepared.spectrum.contract(seed).reshape(-1)
+            inputs["M"][:] = prepared.contract(seed).reshape(-1)
             inputs["guess"][:] = prepared.part("costates")
 
     def _step_from_point(self) -> Matrix:
@@ -436,7 +438,6 @@ class RtiNmpc:
         blocks = parameters.blocks
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
-        self._backend = self._make_backend()
         self._prepare = preparation(problem, blocks)
         self._readout = readout(problem, blocks, self._prepare)
         self._embed = embedding(problem, blocks, self._prepare, self._readout)
@@ -602,8 +603,7 @@ class RtiNmpc:
             memory[:first], memory[last:] = prepare.memory[:first], prepare.memory[last:]
         else:
             memory = prepare.memory.copy()
-        made = self._parameters, self._hessian.spectrum, self._functions, self._engine
-        self._prepared = Prepared(memory, *made)
+        self._prepared = Prepared(memory, self._hessian.spectrum, self._functions, self._engine)
 
     def _present_qp(self) -> SoftQp:
         """Copy of the QP for a QpError; compiled code may have left it uncondensed."""

@@ -270,7 +270,7 @@ def embedding(
         "embedding",
         {"s": s, "theta": symbols.theta, **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
-        {name: prepared.stack[prepared.slices[name]] for name in prior}
+        {name: prepared.memory[prepared.places[name]] for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
@@ -348,8 +348,10 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_u": ca.horzcat(v[:, 1:], v[:, -1]) + ca.repmat(u_s, 1, horizon),
             "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
-        {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
-        | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N", "theta")},
+        {
+            name: prepared.memory[prepared.places[name]]
+            for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
+        },
         room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
         | dict.fromkeys(("row_lower", "row_upper"), horizon * n)
         | {"residual": 1, "iterations": 1, "gradient": blocks.size},
@@ -403,31 +405,15 @@ class Spectrum:
         return self.vectors @ (divided * (transposed @ seed @ self.vectors)) @ transposed
 
 
-class Unlifted:
-    """In place of `Spectrum` where the blocks are left as they are: P is the identity."""
-
-    def undecided(self) -> bool:
-        """No: nothing is lifted."""
-        return False
-
-    def contract(self, seed: Vector) -> Vector:
-        """The identity's adjoint."""
-        return seed
-
-
-Lift = Spectrum | Unlifted
-"""How P changed the blocks of an exact Hessian."""
-
-
 class GaussNewton:
     """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is.
 
     It fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation; `functions` are
-    the CasADi functions that it calls.
+    the CasADi functions that it calls, `spectrum` that of the last blocks if they were lifted.
     """
 
     lifts = False
-    spectrum: Lift | None = None
+    spectrum: Spectrum | None = None
     functions: Sequence[StackedFunction] = ()
 
     def __init__(self, problem: Problem, prepared: StackedFunction) -> None:
@@ -465,7 +451,7 @@ class Exact(GaussNewton):
         super().__init__(problem, prepared)
         self.lifts = True
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        self._reference = np.concatenate([problem.reference_state, problem.reference_action])
+        self._reference = problem.reference
         given = {
             "x": ca.MX.sym("x", n, horizon),
             "u": ca.MX.sym("u", m, horizon),
@@ -502,8 +488,7 @@ class Exact(GaussNewton):
             lifted = np.maximum(values, floor)
             L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
         else:
-            self.spectrum = Unlifted()
-            L[:] = raw
+            self.spectrum, L[:] = None, raw
         at = np.concatenate([x, u], axis=1) - self._reference
         curved = np.einsum("kij,kj->ki", L, at)
         flat = 2 * discounts[:, None] * (at @ self._B)

@@ -212,10 +212,9 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     steady state is not locally optimal under these constraints.
     """
     size, n, n_c = len(H), len(A), len(C)
-    basis = [("α", H)]
-    basis += [("δP", rotation(A, B, e)) for e in _symmetric_basis(n)]
-    basis += [("F", C.T @ e @ C) for e in _symmetric_basis(n_c)]
-    columns = np.stack([svec(matrix) for _, matrix in basis], axis=1)
+    rotations = [rotation(A, B, e) for e in _symmetric_basis(n)]
+    forces = [C.T @ e @ C for e in _symmetric_basis(n_c)]
+    columns = np.stack([svec(matrix) for matrix in (H, *rotations, *forces)], axis=1)
     count, triangle = columns.shape[1], columns.shape[0]
     identity = svec(np.eye(size))[:, None]
     # Variables: α, δP, F, β, t with t ≥ ‖F‖.

@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -61,16 +61,25 @@ class Functions:
     """The CasADi functions that a controller of the `problem` calls.
 
     `preparation` and `embedding` make the QP, `readout` takes its value, `gradient` and `policy`
-    its derivatives in θ (`controllers.sensitivities`), the latter made when first asked for. The
-    memory of the first and the third hold a sample's QP and its solution.
+    its derivatives in θ, made when first asked for by `derivatives`, that is
+    `controllers.sensitivities`. The memory of the first and the third hold a sample's QP and its
+    solution.
     """
 
     problem: Problem
     preparation: StackedFunction
     embedding: StackedFunction
     readout: StackedFunction
-    gradient: StackedFunction
-    policy: Callable[[], StackedFunction]
+    derivatives: Callable[[], tuple[StackedFunction, Callable[[], StackedFunction]]]
+
+    @property
+    def gradient(self) -> StackedFunction:
+        """The gradient of the value."""
+        return self.derivatives()[0]
+
+    def policy(self) -> StackedFunction:
+        """The derivatives of the policy."""
+        return self.derivatives()[1]()
 
     def condense(self, before: Vector, after: Vector) -> None:
         """Write the condensed QP into copies of both memories."""
@@ -442,8 +451,9 @@ class RtiNmpc:
         self._readout = readout(problem, blocks, self._prepare)
         self._embed = embedding(problem, blocks, self._prepare, self._readout)
         self._hessian = make_hessian(hessian, problem, blocks, self._prepare)
-        gradient, policy = sensitivities(problem, blocks, exact=hessian != "gauss-newton")
-        made = (self._prepare, self._embed, self._readout, gradient, policy)
+        exact = hessian != "gauss-newton"
+        derivatives = cache(partial(sensitivities, problem, blocks, exact=exact))
+        made = (self._prepare, self._embed, self._readout, derivatives)
         self._functions = Functions(problem, *made)
         before, after = self._prepare.memory, self._readout.memory
         self._qp = qp_of(self._prepare, self._readout, before, after)

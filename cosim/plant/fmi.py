@@ -309,7 +309,6 @@ class Instance(ABC):
     _deserialise: ClassVar[str]
     _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
     """The calls that initialise, with their arguments after the instance."""
-    _step_arguments: tuple[Any, ...]
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         self.fmu = fmu
@@ -343,6 +342,11 @@ class Instance(ABC):
     @abstractmethod
     def _instantiate(self, **where: Any) -> Any:
         """An fmpy instance that logs to `messages`; `where`: constructor arguments."""
+
+    @cached_property
+    @abstractmethod
+    def _step_arguments(self) -> tuple[Any, ...]:
+        """The arguments of a step, the instance first."""
 
     @abstractmethod
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
@@ -485,8 +489,7 @@ class Instance(ABC):
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
-        if not self._interface.canGetAndSetFMUstate:
-            self._lacks("save and restore its state", "canGetAndSetFMUstate")
+        self._require("canGetAndSetFMUstate", "save and restore its state")
         self._call(f"Get{self._state}", self._component, ctypes.byref(handle))
 
     def load(self, handle: ctypes.c_void_p) -> None:
@@ -496,8 +499,7 @@ class Instance(ABC):
 
     def serialise(self, handle: ctypes.c_void_p) -> bytes:
         """Return a saved state as bytes that any instance of this FMU can read."""
-        if not self._interface.canSerializeFMUstate:
-            self._lacks("serialise its state", "canSerializeFMUstate")
+        self._require("canSerializeFMUstate", "serialise its state")
         size = ctypes.c_size_t()
         arguments = (self._component, handle)
         self._call(f"Serialized{self._state}Size", *arguments, ctypes.byref(size))
@@ -507,16 +509,16 @@ class Instance(ABC):
 
     def deserialise(self, data: bytes, handle: ctypes.c_void_p) -> None:
         """Fill a handle from bytes; raises PlantError if the FMU refuses them."""
-        if not self._interface.canSerializeFMUstate:
-            self._lacks("serialise its state", "canSerializeFMUstate")
+        self._require("canSerializeFMUstate", "serialise its state")
         buffer = ctypes.create_string_buffer(data, len(data))
         size = ctypes.c_size_t(len(data))
         self._call(self._deserialise, self._component, buffer, size, ctypes.byref(handle))
 
-    def _lacks(self, ability: str, flag: str) -> NoReturn:
-        raise CapabilityError(
-            f"FMU '{self.fmu.path}' cannot {ability}: its model description lacks {flag}"
-        )
+    def _require(self, flag: str, ability: str) -> None:
+        if not getattr(self._interface, flag):
+            raise CapabilityError(
+                f"FMU '{self.fmu.path}' cannot {ability}: its model description lacks {flag}"
+            )
 
     def fail(self, function: str, status: int) -> NoReturn:
         """Raise PlantError for a failed call, with the FMU's log messages."""
@@ -589,10 +591,10 @@ class Fmi2Instance(Instance):
         ("ExitInitializationMode", ()),
     )
 
-    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
-        super().__init__(fmu, wiring, step_size)
+    @cached_property
+    def _step_arguments(self) -> tuple[Any, ...]:
         # The last argument is false: a snapshot may take the FMU back before this step.
-        self._step_arguments = (self._component, self._time, self._step_size, _FALSE)
+        return (self._component, self._time, self._step_size, _FALSE)
 
     def _instantiate(self, **where: Any) -> Any:
         name = f"cosim-{next(_numbers)}"
@@ -630,20 +632,14 @@ class Fmi3Instance(Instance):
     )
     _raised: BaseException | None
 
-    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
-        super().__init__(fmu, wiring, step_size)
-        event = ctypes.c_bool()
-        self._terminate = ctypes.c_bool()
-        self._early = ctypes.c_bool()
+    @cached_property
+    def _step_arguments(self) -> tuple[Any, ...]:
+        event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
         self._last_time = ctypes.c_double()
         found = (event, self._terminate, self._early, self._last_time)
-        self._step_arguments = (
-            self._component,
-            self._time,
-            self._step_size,
-            _NO,  # a snapshot may take the FMU back before this step
-            *(ctypes.byref(each) for each in found),
-        )
+        # _NO: a snapshot may take the FMU back before this step.
+        given = (self._component, self._time, self._step_size, _NO)
+        return (*given, *(ctypes.byref(each) for each in found))
 
     def _instantiate(self, **where: Any) -> Any:
         messages = self.messages

@@ -311,7 +311,8 @@ class Elementwise:
         self._out_rows = list(function.sparsity_out(0).row())
         self._program: list[tuple[int, Sequence[Any], Sequence[int]]] = []
         for k in range(function.n_instructions()):
-            code, inputs = function.instruction_id(k), function.instruction_input(k)
+            code = function.instruction_id(k)
+            inputs: Sequence[Any] = function.instruction_input(k)
             if code == ca.OP_CONST:
                 inputs = [function.instruction_constant(k)]
             elif code not in (ca.OP_INPUT, ca.OP_OUTPUT, *_OPERATIONS):

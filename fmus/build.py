@@ -1,4 +1,4 @@
-"""The build of an FMU from C sources and a model description: compilers, equal archives."""
+"""The build of an FMU from C sources and a model or its description: compilers, equal archives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import uuid
 import zipfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -25,12 +25,14 @@ from fmus import PLATFORMS, UNIVERSAL, BuildError, Platform, present
 from fmus.model import (
     FmiVersion,
     FmuModel,
+    Kind,
     Variable,
     build_description,
     c_header,
     model_description,
     render,
     terminals,
+    unit,
 )
 
 PACKAGE = Path(__file__).parent
@@ -320,18 +322,22 @@ def sources_of(
     model: FmuModel,
     version: FmiVersion,
     own: Mapping[str, bytes],
-    rows: Sequence[Variable] | None = None,
     origin: str = "",
 ) -> dict[str, bytes]:
     """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own.
 
-    `own` is the model's own C; `rows` is its table as the C shall check it, where that differs;
-    `origin` says in the header where it comes from.
+    `own` is the model's own C; `origin` says in the header where it comes from.
     """
     paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
     paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
     files = {path.name: path.read_bytes() for path in paths} | dict(own)
-    variables = model.variables if rows is None else rows
+    variables = model.variables
+    if model.sampled:  # the C checks every variable against a range
+        largest = sys.float_info.max
+        ends = ((v, -largest if v.min is None else v.min, v.max) for v in variables)
+        variables = tuple(
+            replace(v, min=low, max=largest if high is None else high) for v, low, high in ends
+        )
     origin = f"from {origin or f'the table of {model.name}'}"
     token = token_of(model, version, files)
     files[HEADER] = c_header(token, model.identifier, variables, origin).encode()
@@ -375,3 +381,97 @@ def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes])
         digest.update(name.encode() + b"\0" + sources[name])
     token = "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
     return _KEPT_TOKENS.get(token, token)
+
+
+def sampled_system(
+    *,
+    name: str,
+    identifier: str,
+    description: str,
+    sampling_time: float,
+    signals: Sequence[Variable],
+    sources: Mapping[str, bytes],
+    terminal: tuple[str, ...] = (),
+) -> FmuModel:
+    """The model of a function of inputs and parameters, evaluated once a `sampling_time` [s].
+
+    `signals` are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
+    parameters; every output depends on every input and parameter. `sources` are C headers by name,
+    of which ``core.h`` defines the functions that ``sampled_sources/model_state.h`` lists; their
+    arrays are ordered like the signals. Raises BuildError on names that are taken twice, in FMI or
+    in C.
+    """
+    time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
+    known = tuple(v.name for v in signals if v.settable)
+    table = (time, *(v if v.settable else replace(v, uses=known) for v in signals))
+    for names in ([v.name for v in table], [v.identifier for v in table]):
+        if twice := next((each for each in names if names.count(each) > 1), None):
+            raise BuildError(f"two variables of {name} are called '{twice}'")
+    return FmuModel(
+        name=name,
+        identifier=identifier,
+        description=description,
+        variables=table,
+        units=tuple(unit(each) for each in dict.fromkeys(v.unit for v in table) if each),
+        stop_time=100 * sampling_time,
+        step_size=sampling_time,
+        sampled=True,
+        terminal=terminal,
+        sources=sources,
+    )
+
+
+def sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
+    """File name → bytes of the folder `sources/` of a sampled system's FMU."""
+    kinds = [variable.kind for variable in system.variables]
+    first_output = 1 + kinds.count(Kind.INPUT)
+    header = render(
+        "system.h",
+        first_output=first_output,
+        first_parameter=first_output + kinds.count(Kind.OUTPUT),
+        sampling_time=float(system.step_size),
+    )
+    own = files_of("sampled_sources") | {**system.sources, "system.h": header.encode()}
+    if version == 3:
+        own |= _array_sources(system)
+    return sources_of(system, version, own)
+
+
+def _array_sources(model: FmuModel) -> dict[str, bytes]:
+    """FMI 3.0's functions for scalars, and the adapter for the model's arrays."""
+    elements = dict.fromkeys(range(len(model.variables)), (1, 0))
+    for array in model.arrays.values():
+        own = [model.value_reference(variable.name) for variable in array]
+        for k, vr in enumerate(own):
+            elements[vr] = (0 if k else len(own), own[(k + 1) % len(own)])
+    table = render("arrays.h", model=model, elements=elements.values()).encode()
+    last = b'#include "snapshot.h"\n'
+    face = (SOURCES / "fmi3.c").read_bytes().replace(last, last + b'#include "arrays.h"\n')
+    return {"arrays.h": table, "fmi3.c": face}
+
+
+def build_sampled(
+    system: FmuModel,
+    target: str | Path,
+    version: FmiVersion = 2,
+    *,
+    every_platform: bool = False,
+    files: Mapping[str, bytes] | None = None,
+) -> Path:
+    """Build the FMU `target` of a sampled system; `files` are further members of the archive.
+
+    As `build_fmu`, whose BuildError it raises; with the same compiler the bytes repeat.
+    """
+    return assemble(
+        system,
+        version,
+        sampled_sources(system, version),
+        target,
+        remarks=(
+            f"Sampled every {system.step_size:g} s, at its multiples: a communication step "
+            "ends at or before the next one. At a sample the outputs follow the inputs at once; "
+            "between samples they are held."
+        ),
+        every_platform=every_platform,
+        files=files,
+    )

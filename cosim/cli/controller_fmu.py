@@ -19,8 +19,8 @@ from cosim.plant.fmu_plant import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
+from fmus.build import build_sampled, sampled_system
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
-from fmus.sampled import build_sampled, sampled_system
 from fmus.ssp import write_ssp
 
 SAMPLES = 100

@@ -15,6 +15,7 @@ import fmus
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_loop
 from cosim.scenario import Scenario
 from fmus import plant as plants
+from fmus.build import build_sampled
 from fmus.evaporator import EVAPORATOR, UNITS, VARIABLES
 from fmus.model import (
     Kind,
@@ -27,7 +28,6 @@ from fmus.model import (
     unit,
 )
 from fmus.plant import Signal, plant_model
-from fmus.sampled import build_sampled
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 

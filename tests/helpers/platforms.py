@@ -19,10 +19,9 @@ from controllers.factories import tuned
 from cosim import Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from fmus import PLATFORMS, Platform
-from fmus.build import HEADER, cross_compiler
+from fmus.build import HEADER, cross_compiler, sampled_sources
 from fmus.evaporator import EVAPORATOR, sources
 from fmus.model import FmiVersion, FmuModel
-from fmus.sampled import sampled_sources
 
 HOSTS = Path(__file__).parents[1] / "fmus" / "platforms"
 BY_NAME = {platform.tuple: platform for platform in PLATFORMS}

@@ -11,7 +11,7 @@ import pytest
 from controllers.factories import tuned
 from cosim import Scenario
 from cosim.cli.controller_fmu import sampled_controller
-from fmus.sampled import sampled_sources
+from fmus.build import sampled_sources
 
 SOAK = Path(__file__).parents[1] / "fmus" / "sampled" / "soak.c"
 COMPILER = os.environ.get("CC", "cc")

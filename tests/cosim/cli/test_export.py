@@ -24,7 +24,7 @@ from controllers.theta import ThetaBlocks
 from cosim import FmuPlant, Scenario, simulate
 from cosim.cli.controller_fmu import rti_controller, sampled_controller
 from cosim.cli.main import app
-from fmus.sampled import build_sampled
+from fmus.build import build_sampled
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.instance import Instance
 

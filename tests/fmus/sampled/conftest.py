@@ -7,8 +7,8 @@ import fmpy
 import pytest
 
 from fmus import BuildError
+from fmus.build import build_sampled, sampled_system
 from fmus.model import FmuModel, Kind, Variable
-from fmus.sampled import build_sampled, sampled_system
 from tests.helpers.instance import Instance
 
 CORE = b"""

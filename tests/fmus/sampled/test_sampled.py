@@ -10,8 +10,8 @@ import pytest
 from fmpy.fmi1 import FMICallException
 
 from fmus import evaporator
+from fmus.build import build_sampled, sampled_sources
 from fmus.model import FmuModel
-from fmus.sampled import build_sampled, sampled_sources
 
 
 def test_a_rebuild_repeats_its_bytes(

@@ -20,7 +20,7 @@ from fmus.build import (
     sources_of,
     token_of,
 )
-from fmus.model import LICENSE, FmiVersion, FmuModel, read_variables, render, terminals, unit
+from fmus.model import FmiVersion, FmuModel, read_variables, render, terminals, unit
 
 UNITS = tuple(
     unit(name)
@@ -46,7 +46,6 @@ EVAPORATOR = FmuModel(
 )
 
 
-FILE_NAMES: dict[FmiVersion, str] = {2: "evaporator.fmu", 3: "evaporator_fmi3.fmu"}
 BUILD_FILE = "extra/org.rti-cosim/build.json"
 
 
@@ -81,15 +80,17 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
     For the platform at hand by the local compiler, or for every one by the extra ``cross``.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    icons = {2: {"model.png": "icon.png"}, 3: {"terminalsAndIcons/icon.png": "icon.png"}}
+    faces: tuple[tuple[FmiVersion, str, str], ...] = (
+        (2, "evaporator.fmu", "model.png"),
+        (3, "evaporator_fmi3.fmu", "terminalsAndIcons/icon.png"),
+    )
     built = []
-    for version, name in FILE_NAMES.items():
-        files = {member: (RESOURCES / path).read_bytes() for member, path in icons[version].items()}
+    for version, name, icon in faces:
+        files = {icon: (RESOURCES / "icon.png").read_bytes()}
         files["documentation/index.html"] = render(
             "evaporator.html",
             model=EVAPORATOR,
             version=version,
-            license=LICENSE,
             diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
             build_file=BUILD_FILE,
         ).encode()

@@ -166,7 +166,6 @@ class FmuModel:
     units: tuple[Unit, ...]
     stop_time: float
     step_size: float
-    version: str = "1.0.0"
     model_exchange: bool = False
     derivatives: bool = False
     sampled: bool = False
@@ -243,7 +242,6 @@ def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
     return tuple(v.name for v in model.variables if v.name in names and v.settable)
 
 
-LICENSE = "MIT"
 TEMPLATES = Path(__file__).parent / "templates"
 
 Attributes = Mapping[str, object]
@@ -308,7 +306,6 @@ def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
         version=version,
         token=token,
         model=model,
-        license=LICENSE,
         # The shipped files stay the same from one version to the next.
         tool=f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
         types={variable.type.name for variable in model.variables},
@@ -415,9 +412,6 @@ def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, lis
     ]
 
 
-_SEED_MAX = 4294967295.0
-
-
 def c_header(token: str, identifier: str, variables: Sequence[Variable], origin: str) -> str:
     """The header's text: value references, types, starts and ranges, and the model's `token`.
 
@@ -441,6 +435,6 @@ def c_header(token: str, identifier: str, variables: Sequence[Variable], origin:
 def _numbers(variable: Variable) -> tuple[float, ...]:
     """Start, range and nominal value as the C has them."""
     seed = variable.type in (Type.SEED, Type.SEED_HIGH)
-    low, high = (0.0, _SEED_MAX) if seed else (variable.min, variable.max)
+    low, high = (0.0, 2.0**32 - 1) if seed else (variable.min, variable.max)
     nominal = 1.0 if variable.nominal is None else variable.nominal
     return tuple(float(number or 0.0) for number in (variable.start, low, high, nominal))

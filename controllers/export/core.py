@@ -64,10 +64,6 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     parameters θ stay an input. Raises ControllerError where `hessian` is not `gauss-newton` or
     `exact`, or the horizon is too long for a thread's stack.
     """
-    if hessian not in RULES:
-        raise ControllerError(
-            f"the Hessian '{hessian}' cannot be exported; choose {' or '.join(RULES)}"
-        )
     parameters.require_well_posed()
     blocks = parameters.blocks
     prepared = preparation(problem, blocks)
@@ -77,8 +73,7 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
         "EMBEDDED": embedding(problem, blocks, prepared, read),
         "READ": read,
     }
-    if hessian == "exact":
-        (functions["CURVATURE"],) = make_hessian(hessian, problem, blocks, prepared).functions
+    functions |= make_hessian(hessian, problem, blocks, prepared).functions
     if (size := stack_needed(problem, functions)) > STACK_LIMIT:
         raise ControllerError(
             f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "

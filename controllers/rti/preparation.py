@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -409,15 +409,15 @@ class GaussNewton:
     """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is.
 
     It fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation; `functions` are
-    the CasADi functions that it calls, `spectrum` that of the last blocks if they were lifted.
+    the CasADi functions that it calls, by the prefix of their constants in C, `spectrum` that of the last blocks if they were lifted.
     """
 
     lifts = False
     spectrum: Spectrum | None = None
-    functions: Sequence[StackedFunction] = ()
 
     def __init__(self, problem: Problem, prepared: StackedFunction) -> None:
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        self.functions: dict[str, StackedFunction] = {}
         self.discounts = problem.discount ** np.arange(horizon)
         self._end = problem.discount**horizon
         self.L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
@@ -461,7 +461,7 @@ class Exact(GaussNewton):
         *point, theta = given.values()
         D = stage_curvature(problem, blocks).map(horizon)(*point, ca.repmat(theta, 1, horizon))
         self._curvature = StackedFunction("curvature", given, {"D": D})
-        self.functions = (self._curvature,)
+        self.functions["CURVATURE"] = self._curvature
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over the costs of θ."""

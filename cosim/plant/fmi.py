@@ -25,7 +25,7 @@ import fmpy
 import numpy as np
 from fmpy import fmi2, fmi3
 from fmpy.logging import addLoggerProxy
-from fmpy.model_description import ValidationError, read_model_description
+from fmpy.model_description import read_model_description
 from numpy.typing import NDArray
 
 import fmus
@@ -148,15 +148,11 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
 def _describe(path: Path, folder: Path) -> Any:
     try:
         description = read_model_description(str(folder))
-    except ValidationError as error:
-        problems = error.problems
-        raise PlantError(
-            f"FMU '{path}' has an invalid model description: {problems[0]}"
-            + (f" ({len(problems) - 1} more)" if len(problems) > 1 else "")
-        ) from None
-    # fmpy raises bare Exception, and lxml's errors on text that is not XML.
+    # fmpy's ValidationError, its bare Exception, and lxml's errors on text that is not XML.
     except Exception as error:
-        raise PlantError(f"FMU '{path}' has an unreadable model description: {error}") from None
+        first, *others = getattr(error, "problems", [error])
+        more = f" ({len(others)} more)" if others else ""
+        raise PlantError(f"FMU '{path}' has an invalid model description: {first}{more}") from None
     if description.fmiVersion[:2] not in ("2.", "3."):
         raise PlantError(f"FMU '{path}' is FMI {description.fmiVersion}; 2.0 and 3.0 are supported")
     return description

@@ -445,22 +445,15 @@ class FmuPlant:
 
     def restore(self, snapshot: Snapshot) -> Array:
         """Go back to a snapshot; return its state (n,). Raises PlantError on another plant's."""
-        fmi = self._instance
-        if snapshot.plant is not self:
-            raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
-        fmi.load(snapshot.handle)
+        self._require_own(snapshot).load(snapshot.handle)
         self._k = snapshot.k
         self._penalty_now = self.penalty(self._states[:])
         return self._copy_states()
 
     def serialise(self, snapshot: Snapshot) -> bytes:
         """A snapshot as bytes, for any process; raises PlantError on another plant's."""
-        fmi = self._instance
-        if snapshot.plant is not self:
-            raise PlantError("this snapshot was taken from another plant")
-        return _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256)) + fmi.serialise(
-            snapshot.handle
-        )
+        state = self._require_own(snapshot).serialise(snapshot.handle)
+        return _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256)) + state
 
     def deserialise(self, data: bytes) -> Snapshot:
         """A snapshot from its bytes; raises PlantError where they are not of the same FMU file."""
@@ -475,6 +468,11 @@ class FmuPlant:
         handle = self._handle()
         fmi.deserialise(data[_HEADER.size :], handle)
         return Snapshot(self, handle, k)
+
+    def _require_own(self, snapshot: Snapshot) -> Instance:
+        if snapshot.plant is not self:
+            raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
+        return self._instance
 
     def _handle(self) -> ctypes.c_void_p:
         """Memory of a dropped snapshot, or a null handle, which the FMU allocates."""

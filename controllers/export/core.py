@@ -17,14 +17,7 @@ from numpy.typing import ArrayLike
 from controllers.errors import ControllerError
 from controllers.functions import StackedFunction, c_source
 from controllers.problem import Problem
-from controllers.rti.preparation import (
-    Exact,
-    embedding,
-    make_hessian,
-    preparation,
-    readout,
-    stage_linearisation,
-)
+from controllers.rti.preparation import Exact, SampleFunctions, stage_linearisation
 from controllers.theta import Parameters, ThetaBlocks
 from cosim.scenario import Scenario
 
@@ -66,14 +59,7 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     """
     parameters.require_well_posed()
     blocks = parameters.blocks
-    prepared = preparation(problem, blocks)
-    read = readout(problem, blocks, prepared)
-    functions: dict[str, StackedFunction] = {
-        "PREPARED": prepared,
-        "EMBEDDED": embedding(problem, blocks, prepared, read),
-        "READ": read,
-    }
-    functions |= make_hessian(hessian, problem, blocks, prepared).functions
+    functions = SampleFunctions(problem, blocks, hessian).named
     if (size := stack_needed(problem, functions)) > STACK_LIMIT:
         raise ControllerError(
             f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "

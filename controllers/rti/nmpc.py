@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -17,28 +17,15 @@ from controllers.errors import ControllerError, ParameterError, QpError
 from controllers.export.core import SOURCES, STACK_LIMIT, STATUSES, controller_sources, stack_needed
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
-from controllers.qp import (
-    QpBackend,
-    QpSolution,
-    SoftQp,
-    make_backend,
-    multipliers_at_kink,
-)
-from controllers.rti.preparation import (
-    Spectrum,
-    embedding,
-    make_hessian,
-    preparation,
-    qp_of,
-    readout,
-)
+from controllers.qp import QpBackend, QpSolution, SoftQp, make_backend, multipliers_at_kink
+from controllers.rti.preparation import SampleFunctions, Spectrum, qp_of
 from controllers.sensitivities import (
     SOLUTION,
     adjoint_directions,
     curvature_directions,
     sensitivities,
 )
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.theta import Parameters
 from cosim.protocols import CompiledLoop, Matrix, Vector
 from cosim.scenario import Scenario
 from cosim.validation import known_keywords
@@ -56,30 +43,25 @@ class LinearisationPoint(NamedTuple):
     costates: Matrix
 
 
-@dataclass(frozen=True)
-class Functions:
-    """The CasADi functions that a controller of the `problem` calls.
+class Functions(SampleFunctions):
+    """The CasADi functions of a controller: a sample's, and its derivatives in θ.
 
-    `preparation` and `embedding` make the QP, `readout` takes its value, `gradient` and `policy`
-    its derivatives in θ, made when first asked for by `derivatives`, that is
-    `controllers.sensitivities`. The memory of the first and the third hold a sample's QP and its
-    solution.
+    Those are `controllers.sensitivities`, made when they are first asked for.
     """
 
-    problem: Problem
-    preparation: StackedFunction
-    embedding: StackedFunction
-    readout: StackedFunction
-    derivatives: Callable[[], tuple[StackedFunction, Callable[[], StackedFunction]]]
+    @cached_property
+    def _derivatives(self) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
+        exact = bool(self.hessian.functions)
+        return sensitivities(self.problem, self.blocks, exact=exact)
 
     @property
     def gradient(self) -> StackedFunction:
         """The gradient of the value."""
-        return self.derivatives()[0]
+        return self._derivatives[0]
 
     def policy(self) -> StackedFunction:
         """The derivatives of the policy."""
-        return self.derivatives()[1]()
+        return self._derivatives[1]()
 
     def condense(self, before: Vector, after: Vector) -> None:
         """Write the condensed QP into copies of both memories."""
@@ -329,24 +311,19 @@ class Engine:
         self._split, self._m = size * m, m
 
     @classmethod
-    def compile(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
+    def compile(cls, functions: Functions) -> Engine | None:
         """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
         A QP of many stages, or too large for an exported controller, is solved stage by stage.
         """
-        named = {
-            "PREPARED": functions.preparation,
-            "EMBEDDED": functions.embedding,
-            "READ": functions.readout,
-            "GRADIENT": functions.gradient,
-            "POLICY": functions.policy(),
-        }
+        derivatives = {"GRADIENT": functions.gradient, "POLICY": functions.policy()}
+        named = functions.named | derivatives
         problem = functions.problem
         # A rule of thumb: where stage by stage becomes faster depends on the plant and on θ.
         stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
         stagewise = stagewise or stack_needed(problem, named) > STACK_LIMIT
         rule = "gauss-newton"
-        sources = controller_sources(problem, blocks, rule, named, stagewise=stagewise)
+        sources = controller_sources(problem, functions.blocks, rule, named, stagewise=stagewise)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)
@@ -444,17 +421,11 @@ class RtiNmpc:
         self.iterations = iterations
         self.problem = problem
         self._compilable = hessian == "gauss-newton" and backend == "daqp"
-        blocks = parameters.blocks
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
-        self._prepare = preparation(problem, blocks)
-        self._readout = readout(problem, blocks, self._prepare)
-        self._embed = embedding(problem, blocks, self._prepare, self._readout)
-        self._hessian = make_hessian(hessian, problem, blocks, self._prepare)
-        exact = hessian != "gauss-newton"
-        derivatives = cache(partial(sensitivities, problem, blocks, exact=exact))
-        made = (self._prepare, self._embed, self._readout, derivatives)
-        self._functions = Functions(problem, *made)
+        self._functions = made = Functions(problem, parameters.blocks, hessian)
+        self._prepare, self._embed = made.preparation, made.embedding
+        self._readout, self._hessian = made.readout, made.hessian
         before, after = self._prepare.memory, self._readout.memory
         self._qp = qp_of(self._prepare, self._readout, before, after)
         self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
@@ -490,7 +461,7 @@ class RtiNmpc:
         """
         if not self._compilable or (samples < LONG and switch() != "now"):
             return
-        self._engine = Engine.compile(self._functions, self._parameters.blocks)
+        self._engine = Engine.compile(self._functions)
         self.functions = INTERPRETED if self._engine is None else COMPILED
         self._compilable = self._engine is not None  # where it failed once it is not tried again
         self._prepared = None

@@ -409,7 +409,8 @@ class GaussNewton:
     """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is.
 
     It fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation; `functions` are
-    the CasADi functions that it calls, by the prefix of their constants in C, `spectrum` that of the last blocks if they were lifted.
+    the CasADi functions that it calls, by the prefix of their constants in C, `spectrum` that of
+    the last blocks if they were lifted.
     """
 
     lifts = False
@@ -505,3 +506,25 @@ def make_hessian(
     if name == "exact":
         return Exact(problem, blocks, prepared)
     raise ControllerError(f"there is no Hessian '{name}'; choose gauss-newton or exact")
+
+
+class SampleFunctions:
+    """The CasADi functions that make a sample's QP and read its solution out.
+
+    `preparation` and `embedding` make the QP with the rule `hessian`, `readout` takes its value.
+    The memory of the first and the last hold a sample's QP and its solution. Raises ControllerError
+    on an unknown Hessian.
+    """
+
+    def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
+        self.problem, self.blocks = problem, blocks
+        self.preparation = preparation(problem, blocks)
+        self.readout = readout(problem, blocks, self.preparation)
+        self.embedding = embedding(problem, blocks, self.preparation, self.readout)
+        self.hessian = make_hessian(hessian, problem, blocks, self.preparation)
+
+    @property
+    def named(self) -> dict[str, StackedFunction]:
+        """The functions by the prefix of their constants in C."""
+        own = {"PREPARED": self.preparation, "EMBEDDED": self.embedding, "READ": self.readout}
+        return own | self.hessian.functions

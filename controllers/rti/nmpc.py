@@ -18,7 +18,7 @@ from controllers.export.core import SOURCES, STACK_LIMIT, STATUSES, controller_s
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp, make_backend, multipliers_at_kink
-from controllers.rti.preparation import SampleFunctions, Spectrum, qp_of
+from controllers.rti.preparation import SampleFunctions, Spectrum
 from controllers.sensitivities import (
     SOLUTION,
     adjoint_directions,
@@ -138,7 +138,7 @@ class RtiSolution:
         functions, prepared = self.prepared.functions, self.prepared
         if prepared.engine is not None and prepared.engine.stagewise:
             functions.condense(prepared.memory, self.memory)
-        return qp_of(functions.preparation, functions.readout, prepared.memory, self.memory)
+        return functions.qp(prepared.memory, self.memory)
 
     @cached_property
     def predicted_states(self) -> Matrix:
@@ -427,7 +427,7 @@ class RtiNmpc:
         self._prepare, self._embed = made.preparation, made.embedding
         self._readout, self._hessian = made.readout, made.hessian
         before, after = self._prepare.memory, self._readout.memory
-        self._qp = qp_of(self._prepare, self._readout, before, after)
+        self._qp = made.qp(before, after)
         self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
         self._qp.upper[:] = np.tile(problem.action_upper - problem.reference_action, horizon)
         self._engine: Engine | None = None

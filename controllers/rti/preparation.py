@@ -358,24 +358,6 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
     )
 
 
-def qp_of(
-    prepared: StackedFunction, read: StackedFunction, before: Vector, after: Vector
-) -> SoftQp:
-    """The QP in memory of the preparation, `before`, and of the read-out, `after`, or copies."""
-    places = read.places
-    return SoftQp(
-        H=prepared.part("H", before),
-        f=after[places["f"]],
-        lower=after[places["lower"]],
-        upper=after[places["upper"]],
-        rows=prepared.part("Gamma", before),
-        row_lower=after[places["row_lower"]],
-        row_upper=after[places["row_upper"]],
-        w=before[prepared.places["w"]],
-        W=before[prepared.places["W"]],
-    )
-
-
 @dataclass(frozen=True)
 class Spectrum:
     """Eigenvalues (N, s) and eigenvectors (N, s, s) of the blocks before they were lifted."""
@@ -528,3 +510,16 @@ class SampleFunctions:
         """The functions by the prefix of their constants in C."""
         own = {"PREPARED": self.preparation, "EMBEDDED": self.embedding, "READ": self.readout}
         return own | self.hessian.functions
+
+    def qp(self, before: Vector, after: Vector) -> SoftQp:
+        """The QP in the memory of preparation and read-out, `before` and `after`, or copies."""
+        prepared, read = self.preparation.places, self.readout.places
+        return SoftQp(
+            H=self.preparation.part("H", before),
+            rows=self.preparation.part("Gamma", before),
+            **{name: before[prepared[name]] for name in ("w", "W")},
+            **{
+                name: after[read[name]]
+                for name in ("f", "lower", "upper", "row_lower", "row_upper")
+            },
+        )

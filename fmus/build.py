@@ -413,7 +413,6 @@ def sampled_system(
         description=description,
         variables=table,
         units=tuple(unit(each) for each in dict.fromkeys(v.unit for v in table) if each),
-        stop_time=100 * sampling_time,
         step_size=sampling_time,
         sampled=True,
         terminal=terminal,

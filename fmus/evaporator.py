@@ -38,7 +38,6 @@ EVAPORATOR = FmuModel(
     description="Stochastic evaporation process, the plant of the RTI co-simulation benchmark",
     variables=VARIABLES,
     units=UNITS,
-    stop_time=6000.0,
     step_size=60.0,
     model_exchange=True,
     derivatives=True,

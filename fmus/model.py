@@ -150,10 +150,11 @@ def unit(name: str) -> Unit:
 class FmuModel:
     """A model: its name, C identifier, table of variables with their units, and interfaces.
 
-    A variable's value reference is its position in the table. `stop_time` and `step_size` [s] are
-    the default experiment's; `model_exchange` and `derivatives` (directional, in FMI 3.0 adjoint,
-    too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the multiples of
-    `step_size` alone: its outputs are discrete, and no communication step may pass over a sample.
+    A variable's value reference is its position in the table. `step_size` [s] is that of the
+    default experiment, of 100 steps; `model_exchange` and `derivatives` (directional, in FMI 3.0
+    adjoint, too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the
+    multiples of `step_size` alone: its outputs are discrete, and no communication step may pass
+    over a sample.
     Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
     variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
     names. `sources` are C headers of its own, by file name.
@@ -164,7 +165,6 @@ class FmuModel:
     description: str
     variables: tuple[Variable, ...]
     units: tuple[Unit, ...]
-    stop_time: float
     step_size: float
     model_exchange: bool = False
     derivatives: bool = False

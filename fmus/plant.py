@@ -106,7 +106,6 @@ def plant_model(
         description=description,
         variables=tuple(table),
         units=tuple(unit(name) for name in units),
-        stop_time=100 * sampling_time,
         step_size=sampling_time,
         model_exchange=True,
         terminal=tuple(s.name for s in (*states, *inputs)),

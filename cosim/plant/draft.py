@@ -93,11 +93,7 @@ def draft_scenario(
             "action_upper": [high for _, high in limits],
         },
         "penalty": {"linear": [1.0] * len(x), "quadratic": [1.0] * len(x)},
-        "controller": {
-            "reference_state": x.tolist(),
-            "reference_action": u.tolist(),
-            "reference_cost": 0.0,
-        },
+        "controller": _reference(x, u, 0.0),
     }
     with FmuPlant(Scenario.from_dict(document | {"disturbance": {"law": "none"}})) as plant:
         x, u, found = nearest_steady_state(plant, x, u)
@@ -105,17 +101,19 @@ def draft_scenario(
     weight = 10.0 ** ceil(log10(10 * max(abs(found), 1.0)) - 0.5)
     document["penalty"]["linear"] = [weight] * len(x)
     document["plant"]["initial_state"] = x.tolist()
-    document["controller"] |= {
-        "reference_state": x.tolist(),
-        "reference_action": u.tolist(),
-        "reference_cost": found,
-    }
+    document["controller"] = _reference(x, u, found)
     if shipped:
         document["controller"]["model"] = "controllers.evaporator:model"
     else:
         document["plant"]["fmu"] = _relative(archive.path, target)
     notes = [f"# {field}: {note}" for field, note in _comments(document, units).items()]
     return "\n".join([HEAD, *notes, "", tomli_w.dumps(document)])
+
+
+def _reference(x: Array, u: Array, cost: float) -> dict[str, Any]:
+    return {
+        "reference_state": x.tolist(), "reference_action": u.tolist(), "reference_cost": cost,
+    }  # fmt: skip
 
 
 def _start(variables: Sequence[Any], given: Sequence[float], kind: str) -> Array:

@@ -61,29 +61,6 @@ def _theta_part(
     return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
 
 
-def _parameter_gradient(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    theta: ca.SX,
-    y: PrimalDual,
-    x: ca.SX,
-    u: ca.SX,
-    exact: tuple[ca.SX, ca.SX] | None,
-) -> ca.SX:
-    """∇_p of the QP's Lagrangian; `exact` is (M, χ̄), χ̄ the costates where D_k was taken."""
-    size = problem.n_states + problem.n_actions
-    reference = ca.DM(problem.reference)
-    of_stage = stage_parameter_gradient(problem, blocks, exact=exact is not None)
-    total = ca.SX(0)
-    for k in range(problem.horizon):
-        w = ca.vertcat(y.xi[:, k], y.v[:, k]) + reference
-        arguments = [x[:, k], u[:, k], theta, w, y.chi[:, k + 1]]
-        if exact is not None:
-            arguments += [exact[0][:, k * size : (k + 1) * size], exact[1][:, k]]
-        total += of_stage(*arguments)
-    return total
-
-
 def sensitivities(
     problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
@@ -93,8 +70,8 @@ def sensitivities(
     `gradient` (n_θ). The second takes the longest to make and few ask for it. It maps that, the
     QP's A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam (nN, m). Its
     results are `policy` (n_θ, m), dπ/dθ transposed, and `state` (n, m), dπ/ds transposed. With
-    `exact` both need M and χ̄ (see `_theta_part` and `_parameter_gradient`), the second also dM, the
-    directional derivative of M.
+    `exact` both need M (see `_theta_part`) and χ̄, the costates where the curvature was taken, the
+    second also dM, the directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
@@ -107,9 +84,13 @@ def sensitivities(
     part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
     gradient = ca.gradient(part, symbols.theta)
     if "p" in blocks:
-        gradient[blocks.slices["p"]] = _parameter_gradient(
-            problem, blocks, symbols.theta, y, x, u, (M, guess) if exact else None
-        )
+        of_stage = stage_parameter_gradient(problem, blocks, exact=exact)
+        total = ca.SX(0)
+        for k in range(horizon):
+            w = ca.vertcat(y.xi[:, k], y.v[:, k]) + ca.DM(problem.reference)
+            curved = [M[:, k * (n + m) : (k + 1) * (n + m)], guess[:, k]] if exact else []
+            total += of_stage(x[:, k], u[:, k], symbols.theta, w, y.chi[:, k + 1], *curved)
+        gradient[blocks.slices["p"]] = total
     solution = {name: getattr(y, name) for name in SOLUTION}
     inputs = {**solution, "x": x, "u": u, "theta": symbols.theta, **extra}
     value = StackedFunction("value_gradient", inputs, {"gradient": gradient})

@@ -230,12 +230,20 @@ def build_fmu(
     version, identifier = _model(text)
     if not any(name.endswith(".c") for name in sources):
         raise BuildError(f"{path}: there is no C source (*.c) to build it from")
-    members = {
-        **(files or {}),
-        "modelDescription.xml": text,
-        **_binaries(sources, identifier, version, compilers(every_platform), warnings),
-        **{f"sources/{name}": data for name, data in sources.items()},
-    }
+    used = compilers(every_platform)
+    with ThreadPoolExecutor(len(used)) as pool:
+        built = pool.map(lambda each: each.library(sources, identifier, warnings), used)
+        libraries = dict(zip((each.platform for each in used), built, strict=True))
+    macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]
+    members = {**(files or {}), "modelDescription.xml": text}
+    members |= {f"sources/{name}": data for name, data in sources.items()}
+    for platform, library in libraries.items():
+        folder = platform.folder(version)
+        # FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both
+        # are built, lies a universal binary.
+        universal = folder == "darwin64" and len(macos) > 1
+        name = f"binaries/{folder}/{identifier}{platform.suffix}"
+        members[name] = universal_binary(macos) if universal else library
     return write_archive(members, path)
 
 
@@ -251,31 +259,6 @@ def build_folder(folder: str | Path, target: str | Path, every_platform: bool = 
         raise BuildError(f"{description}: {error.strerror}") from None
     sources = {path.name: path.read_bytes() for path in Path(folder).glob("*.[ch]")}
     return build_fmu(target, sources, text, every_platform=every_platform)
-
-
-def _binaries(
-    sources: Mapping[str, bytes],
-    identifier: str,
-    version: str,
-    compilers: Sequence[Compiler],
-    warnings: tuple[str, ...],
-) -> dict[str, bytes]:
-    """The members under ``binaries/`` of an FMU for FMI `version`: one library a compiler.
-
-    FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both are
-    built, lies a universal binary.
-    """
-    with ThreadPoolExecutor(len(compilers)) as pool:
-        built = pool.map(lambda each: each.library(sources, identifier, warnings), compilers)
-        libraries = dict(zip((each.platform for each in compilers), built, strict=True))
-    macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]
-    found = {}
-    for platform, library in libraries.items():
-        folder = platform.folder(version)
-        universal = folder == "darwin64" and len(macos) > 1
-        name = f"binaries/{folder}/{identifier}{platform.suffix}"
-        found[name] = universal_binary(macos) if universal else library
-    return found
 
 
 def _model(description: bytes) -> tuple[str, str]:

@@ -62,17 +62,6 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     )
 
 
-def stage_curvature(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
-    """One stage's D_k, the second derivative of χᵀf(x, u) in w = (x, u), by (x, u, chi, theta)."""
-    x, u, symbols = _point(problem, blocks)
-    chi = ca.SX.sym("chi", problem.n_states)
-    return stage_function(
-        "curvature_of_stage",
-        {"x": x, "u": u, "chi": chi, "theta": symbols.theta},
-        {"D": _curvature(problem, symbols, x, u, chi)},
-    )
-
-
 def stage_parameter_gradient(problem: Problem, blocks: ThetaBlocks, *, exact: bool) -> ca.Function:
     """One stage's ∇_p of the QP's Lagrangian in the model parameters p that θ holds.
 
@@ -435,6 +424,13 @@ class Exact(GaussNewton):
         self.lifts = True
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = problem.reference
+        x, u, symbols = _point(problem, blocks)
+        chi = ca.SX.sym("chi", n)
+        stage = stage_function(
+            "curvature_of_stage",
+            {"x": x, "u": u, "chi": chi, "theta": symbols.theta},
+            {"D": _curvature(problem, symbols, x, u, chi)},
+        )
         given = {
             "x": ca.MX.sym("x", n, horizon),
             "u": ca.MX.sym("u", m, horizon),
@@ -442,7 +438,7 @@ class Exact(GaussNewton):
             "theta": ca.MX.sym("theta", blocks.size),
         }
         *point, theta = given.values()
-        D = stage_curvature(problem, blocks).map(horizon)(*point, ca.repmat(theta, 1, horizon))
+        D = stage.map(horizon)(*point, ca.repmat(theta, 1, horizon))
         self._curvature = StackedFunction("curvature", given, {"D": D})
         self.functions["CURVATURE"] = self._curvature
 

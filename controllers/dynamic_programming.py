@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from controllers.errors import ModelError, OptimumError
 from controllers.model import discretise, economic_cost
@@ -231,8 +231,13 @@ class Refinement:
 
     def __init__(self, coarse: ProductRule, fine: ProductRule) -> None:
         self.weights = fine.weights
-        axes = zip(coarse.axes, fine.axes, strict=True)
-        self._matrices = [lagrange_matrix(nodes, targets) for nodes, targets in axes]
+        self._matrices = []
+        for x, t in zip(coarse.axes, fine.axes, strict=True):
+            # The Lagrange polynomials of the nodes x at the targets t.
+            matrix = np.ones((len(t), len(x)))
+            for j, k in itertools.permutations(range(len(x)), 2):
+                matrix[:, j] *= (t - x[k]) / (x[j] - x[k])
+            self._matrices.append(matrix)
         # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
         while len(self._matrices) > 1 and self._matrices[-1].shape[1] < 4:
             last = self._matrices.pop()
@@ -249,17 +254,6 @@ class Refinement:
                 values = matrix @ values.reshape(-1, coarse, right)
             right *= fine
         return values.reshape(count, -1)
-
-
-def lagrange_matrix(nodes: ArrayLike, targets: ArrayLike) -> Array:
-    """Matrix (len(targets), len(nodes)) of the Lagrange polynomials of `nodes` at `targets`."""
-    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(targets, dtype=np.float64)
-    matrix = np.ones((len(t), len(x)))
-    for j in range(len(x)):
-        for k in range(len(x)):
-            if k != j:
-                matrix[:, j] *= (t - x[k]) / (x[j] - x[k])
-    return matrix
 
 
 _OPERATIONS: dict[int, Callable[..., Any]] = {

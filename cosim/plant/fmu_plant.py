@@ -101,8 +101,8 @@ class Wirer:
         outputs = (plant.stage_cost, *plant.disturbances)
         return Wiring(
             inputs=[self._written(name, "plant.actions") for name in plant.actions],
-            outputs=[self._number(name, "plant") for name in outputs],
-            states=[self._number(name, "plant.states") for name in plant.states],
+            outputs=self.numbers(outputs, "plant"),
+            states=self.numbers(plant.states, "plant.states"),
             starts=self._starts(),
         )
 
@@ -130,17 +130,9 @@ class Wirer:
                 break
         return words
 
-    def initial_states(self) -> list[Place]:
-        """Places of the states' start parameters; empty if the scenario has none."""
-        names = self._scenario.plant.mapping.initial_state
-        return [self._number(name, "plant.mapping.initial_state") for name in names]
-
-    def state_range(self) -> tuple[Array, Array]:
-        """Least and greatest value, (n,), that the FMU declares for the states; else infinite."""
-        found = [self._find(name, "plant.states") for name in self._scenario.plant.states]
-        lower = [-inf if v.min is None else float(v.min) for v in found]
-        upper = [inf if v.max is None else float(v.max) for v in found]
-        return np.array(lower), np.array(upper)
+    def numbers(self, names: Sequence[str], table: str) -> list[Place]:
+        """Places of variables that are numbers."""
+        return [self._number(name, table) for name in names]
 
     def _starts(self) -> list[tuple[Place, float]]:
         scenario, mapping = self._scenario, self._scenario.plant.mapping
@@ -324,10 +316,14 @@ class FmuPlant:
         plant = self.scenario.plant
         names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
         self.units = {name: archive.unit(name) for name in names}
-        self.state_range = wirer.state_range()
+        states = [archive.variable(name) for name in plant.states]
+        lower = np.array([-inf if v.min is None else float(v.min) for v in states])
+        upper = np.array([inf if v.max is None else float(v.max) for v in states])
+        self.state_range = lower, upper
         self.penalty = self.scenario.state_penalty
         self._seeds = wirer.seeds()
-        self._initial = wirer.initial_states()
+        initial = plant.mapping.initial_state
+        self._initial = wirer.numbers(initial, "plant.mapping.initial_state")
         self._elsewhere = False
         self._m = len(plant.actions)
         self._k = _NOT_STARTED

@@ -305,10 +305,7 @@ class Engine:
         self._prepare: Callable[..., int] = library_.engine_prepare
         self._feedback: Callable[..., int] = library_.engine_feedback
         self._policy: Callable[..., int] = library_.engine_policy
-        n, m, size = functions.problem.n_states, self.action.size, functions.gradient.stack.size
-        self._jacobians: Vector = np.zeros((size + n) * m)
-        self._jacobians_at = ctypes.c_void_p(self._jacobians.ctypes.data)
-        self._split, self._m = size * m, m
+        self._sizes = self.action.size, functions.blocks.size, functions.problem.n_states
 
     @classmethod
     def compile(cls, functions: Functions) -> Engine | None:
@@ -348,14 +345,14 @@ class Engine:
         return failed
 
     def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
-        """Copies of dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
+        """dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
+        m, n_theta, n = self._sizes
+        found: Vector = np.empty(m * (n_theta + n))
+        at, of, to = (ctypes.c_void_p(array.ctypes.data) for array in (before, after, found))
         # Use another workspace: the next feedback needs the preparation's factors.
-        given = (ctypes.c_void_p(array.ctypes.data) for array in (before, after))
-        if self._policy(*given, self._other, self._jacobians_at):
+        if self._policy(at, of, self._other, to):
             return None
-        parts = self._jacobians[: self._split], self._jacobians[self._split :]
-        by_theta, by_state = (part.reshape(self._m, -1).copy() for part in parts)
-        return by_theta, by_state
+        return found[: m * n_theta].reshape(m, n_theta), found[m * n_theta :].reshape(m, n)
 
     def begin(self) -> None:
         """Make ready for a closed loop: no earlier sample is known."""

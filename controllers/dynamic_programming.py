@@ -94,14 +94,6 @@ class Grid:
         mesh = np.meshgrid(*self.axes, indexing="ij")
         return np.stack([axis.reshape(-1) for axis in mesh], axis=1)
 
-    @cached_property
-    def boundary(self) -> NDArray[np.bool_]:
-        """Which grid states lie on the edge of the box, shape (G,)."""
-        on_edge = np.zeros(self.size, dtype=bool)
-        for axis, column in zip(self.axes, self.points.T, strict=True):
-            on_edge |= (column == axis[0]) | (column == axis[-1])
-        return on_edge
-
     def nearest(self, state: Sequence[float] | Array) -> int:
         """Index of the grid state nearest to `state` in each coordinate."""
         index = [int(np.abs(axis - x).argmin()) for axis, x in zip(self.axes, state, strict=True)]
@@ -726,7 +718,9 @@ class Optimum:
     @property
     def edge_mass(self) -> float:
         """Share of samples that the closed loop spends on the edge of the grid's box."""
-        return float(self.distribution[self.grid.boundary].sum())
+        ends = np.array([axis[[0, -1]] for axis in self.grid.axes])[:, :, None]
+        on_edge = (self.grid.points.T[:, None] == ends).any(axis=(0, 1))
+        return float(self.distribution[on_edge].sum())
 
 
 def evaluate_policy(

@@ -108,10 +108,21 @@ def sensitivities(
         for i in range(m):
             v_i = ca.reshape(dv[:, i], m, horizon)
             lam_i = ca.reshape(dlam[:, i], n, horizon)
-            xi_i, chi_i = _direction(problem, A, B, L, L_N, v_i, lam_i)
-            direction = ca.veccat(xi_i, v_i, dt[:, i], lam_i, chi_i, *([dM[:, i]] if exact else []))
+            # The directions of the states and costates that go with them.
+            xi_i = [ca.SX(n, 1)]
+            for k in range(horizon):
+                stage = slice(k * n, (k + 1) * n)
+                xi_i.append(A[:, stage].T @ xi_i[k] + B[:, stage].T @ v_i[:, k])
+            chi_i = [L_N @ xi_i[horizon] + lam_i[:, horizon - 1]]
+            for k in reversed(range(horizon)):
+                weight = L[:, k * (n + m) : (k + 1) * (n + m)]
+                costate = weight[:n, :] @ ca.vertcat(xi_i[k], v_i[:, k])
+                costate += A[:, k * n : (k + 1) * n] @ chi_i[0]
+                chi_i.insert(0, costate + (lam_i[:, k - 1] if k else 0))
+            curved = [dM[:, i]] if exact else []
+            direction = ca.veccat(*xi_i, v_i, dt[:, i], lam_i, *chi_i, *curved)
             policy.append(-ca.jtimes(gradient, symbol, direction))
-            state.append(-chi_i[:, 0])
+            state.append(-chi_i[0])
         moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
         return StackedFunction(
             "policy_jacobian",
@@ -120,23 +131,6 @@ def sensitivities(
         )
 
     return value, policy_jacobian
-
-
-def _direction(
-    problem: Problem, A: ca.SX, B: ca.SX, L: ca.SX, L_N: ca.SX, dv: ca.SX, dlam: ca.SX
-) -> tuple[ca.SX, ca.SX]:
-    """Directions of the states and costates that go with those of the controls and rows."""
-    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    xi = [ca.SX(n, 1)]
-    for k in range(horizon):
-        columns = slice(k * n, (k + 1) * n)
-        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ dv[:, k])
-    chi = [L_N @ xi[horizon] + dlam[:, horizon - 1]]
-    for k in reversed(range(horizon)):
-        weight = L[:, k * (n + m) : (k + 1) * (n + m)]
-        costate = weight[:n, :] @ ca.vertcat(xi[k], dv[:, k]) + A[:, k * n : (k + 1) * n] @ chi[0]
-        chi.insert(0, costate + (dlam[:, k - 1] if k else 0))
-    return ca.horzcat(*xi), ca.horzcat(*chi)
 
 
 def adjoint_directions(

@@ -414,22 +414,17 @@ def sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
         sampling_time=float(system.step_size),
     )
     own = files_of("sampled_sources") | {**system.sources, "system.h": header.encode()}
-    if version == 3:
-        own |= _array_sources(system)
+    if version == 3:  # its functions for scalars, and the adapter for the model's arrays
+        elements = dict.fromkeys(range(len(kinds)), (1, 0))
+        for array in system.arrays.values():
+            places = [system.value_reference(variable.name) for variable in array]
+            for k, place in enumerate(places):
+                elements[place] = (0 if k else len(places), places[(k + 1) % len(places)])
+        own["arrays.h"] = render("arrays.h", model=system, elements=elements.values()).encode()
+        last = b'#include "snapshot.h"\n'
+        scalars = (SOURCES / "fmi3.c").read_bytes()
+        own["fmi3.c"] = scalars.replace(last, last + b'#include "arrays.h"\n')
     return sources_of(system, version, own)
-
-
-def _array_sources(model: FmuModel) -> dict[str, bytes]:
-    """FMI 3.0's functions for scalars, and the adapter for the model's arrays."""
-    elements = dict.fromkeys(range(len(model.variables)), (1, 0))
-    for array in model.arrays.values():
-        own = [model.value_reference(variable.name) for variable in array]
-        for k, vr in enumerate(own):
-            elements[vr] = (0 if k else len(own), own[(k + 1) % len(own)])
-    table = render("arrays.h", model=model, elements=elements.values()).encode()
-    last = b'#include "snapshot.h"\n'
-    face = (SOURCES / "fmi3.c").read_bytes().replace(last, last + b'#include "arrays.h"\n')
-    return {"arrays.h": table, "fmi3.c": face}
 
 
 def build_sampled(

@@ -32,8 +32,12 @@ from cosim.validation import known_keywords, suggestion
 REALS = ("Real", "Float64", "Float32")
 
 
-def refusals(fmu: UnpackedFmu) -> Iterator[str]:
-    """Every reason for which `FmuPlant` refuses the FMU, as its error message says it."""
+def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
+    """Every reason for which `FmuPlant` refuses the FMU, as its error message says it.
+
+    One is a communication `step` [s] that is no multiple of a fixed internal step;
+    canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
+    """
     description, name = fmu.description, f"FMU '{fmu.path}'"
     simulation = description.coSimulation
     if simulation is None:
@@ -48,6 +52,13 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
             library_path(fmu)
         except PlantError as error:
             yield str(error)
+        internal = float(simulation.fixedInternalStepSize or 0)
+        count = step / internal if step and internal > 0 else 1.0
+        if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
+            yield (
+                f"{name} steps by multiples of {internal:g} s (fixedInternalStepSize), and the "
+                f"communication step of {step:g} s is none"
+            )
     numbers = [v for v in description.modelVariables if v.type not in _NO_NUMBERS]
     if not any(v.causality == "input" or v.variability == "tunable" for v in numbers):
         yield (
@@ -56,22 +67,6 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
         )
     if not any(v.causality in ("output", "local") for v in numbers):
         yield f"{name} has no output that is a number: there is nothing for a controller to see"
-
-
-def check_step(fmu: UnpackedFmu, step: float) -> None:
-    """Raise PlantError where a communication step [s] is no multiple of a fixed internal step.
-
-    canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
-    """
-    internal = fmu.description.coSimulation.fixedInternalStepSize
-    if internal is None or float(internal) <= 0:
-        return
-    count = step / float(internal)
-    if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
-        raise PlantError(
-            f"FMU '{fmu.path}' steps by multiples of {float(internal):g} s "
-            f"(fixedInternalStepSize), and the communication step of {step:g} s is none"
-        )
 
 
 _WIDE = ("Int64", "UInt64")
@@ -301,11 +296,10 @@ class FmuPlant:
         self._handles: list[ctypes.c_void_p] = []
         self._free_handles: list[ctypes.c_void_p] = []
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
-        for refusal in refusals(archive):
-            raise PlantError(refusal)
         self._h = self.scenario.sampling_time
         step = self.scenario.plant.communication_step or self._h
-        check_step(archive, step)
+        for refusal in refusals(archive, step):
+            raise PlantError(refusal)
         interface = _interface(archive)
         wirer = Wirer(self.scenario, archive, interface)
         self.unpacked = archive

@@ -18,7 +18,7 @@ from controllers.export.core import SOURCES, STACK_LIMIT, STATUSES, controller_s
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
 from controllers.qp import QpBackend, QpSolution, SoftQp, make_backend, multipliers_at_kink
-from controllers.rti.preparation import SampleFunctions, Spectrum
+from controllers.rti.preparation import Exact, SampleFunctions, Spectrum
 from controllers.sensitivities import (
     SOLUTION,
     adjoint_directions,
@@ -51,7 +51,7 @@ class Functions(SampleFunctions):
 
     @cached_property
     def _derivatives(self) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
-        exact = bool(self.hessian.functions)
+        exact = isinstance(self.hessian, Exact)
         return sensitivities(self.problem, self.blocks, exact=exact)
 
     @property

@@ -6,6 +6,7 @@ import ctypes
 import operator
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from math import ceil, inf, isfinite, prod
 from pathlib import Path
 from typing import Any, NoReturn, Self
@@ -252,18 +253,16 @@ _NOT_STARTED = -1
 _HEADER = struct.Struct("<q32s")
 
 
+@dataclass(eq=False, slots=True)
 class Snapshot:
     """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
 
     Its memory belongs to the FMU, which frees none: a later snapshot reuses it.
     """
 
-    __slots__ = ("handle", "k", "plant")
-
-    def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
-        self.plant = plant
-        self.handle = handle
-        self.k = k
+    plant: FmuPlant
+    handle: ctypes.c_void_p
+    k: int
 
     def __del__(self) -> None:
         self.plant.recycle(self.handle)

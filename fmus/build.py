@@ -334,17 +334,16 @@ def assemble(
     sources: Mapping[str, bytes],
     target: str | Path,
     *,
-    remarks: str = "",
     every_platform: bool = False,
     files: Mapping[str, bytes] | None = None,
     warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
     """Build the FMU `target` from `sources_of`, with a page of its variables.
 
-    `remarks` are sentences on that page, `files` further members of the archive. As `build_fmu`,
-    whose BuildError it raises; with the same compiler the bytes repeat.
+    `files` are further members of the archive. As `build_fmu`, whose BuildError it raises; with the
+    same compiler the bytes repeat.
     """
-    page = render("model.html", model=model, version=version, remarks=remarks)
+    page = render("model.html", model=model, version=version)
     members = {
         "documentation/index.html": page.encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
@@ -439,16 +438,5 @@ def build_sampled(
 
     As `build_fmu`, whose BuildError it raises; with the same compiler the bytes repeat.
     """
-    return assemble(
-        system,
-        version,
-        sampled_sources(system, version),
-        target,
-        remarks=(
-            f"Sampled every {system.step_size:g} s, at its multiples: a communication step "
-            "ends at or before the next one. At a sample the outputs follow the inputs at once; "
-            "between samples they are held."
-        ),
-        every_platform=every_platform,
-        files=files,
-    )
+    sources = sampled_sources(system, version)
+    return assemble(system, version, sources, target, every_platform=every_platform, files=files)

@@ -136,14 +136,8 @@ def build_plant(
         states=[model.by_name[name].identifier for name in model.names(Kind.STATE)],
         drawn=[n.removesuffix("_nominal") for n in model.by_name if n.endswith("_nominal")],
     ).encode()
-    return assemble(
-        model,
-        version,
-        sources_of(model, version, own),
-        target,
-        remarks=f"Disturbances are drawn every sampling_time, {model.step_size:g} s if not set.",
-        every_platform=every_platform,
-    )
+    sources = sources_of(model, version, own)
+    return assemble(model, version, sources, target, every_platform=every_platform)
 
 
 PLANTS = {

@@ -242,8 +242,6 @@ class RtiSolution:
         function = prepared.functions.policy()
         self._write_solution(function)
         inputs = function.inputs
-        for name in ("A", "B", "L", "L_N"):
-            inputs[name][:] = prepared.part(name)
         for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
             inputs[name][:] = direction.reshape(-1)
         if "dM" in inputs:
@@ -258,7 +256,7 @@ class RtiSolution:
         inputs, prepared = function.inputs, self.prepared
         for name in SOLUTION:
             inputs[name][:] = self._flat(name)
-        for name in ("x", "u", "theta"):
+        for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
         if "M" in inputs:
             step = self._step_from_point()

@@ -63,6 +63,11 @@ class Functions(SampleFunctions):
         """The derivatives of the policy."""
         return self._derivatives[1]()
 
+    @property
+    def named(self) -> dict[str, StackedFunction]:
+        """The functions by the prefix of their constants in C."""
+        return super().named | {"GRADIENT": self.gradient, "POLICY": self.policy()}
+
     def condense(self, before: Vector, after: Vector) -> None:
         """Write the condensed QP into copies of both memories."""
         own = self.preparation.memory, self.readout.memory
@@ -311,14 +316,11 @@ class Engine:
 
         A QP of many stages, or too large for an exported controller, is solved stage by stage.
         """
-        derivatives = {"GRADIENT": functions.gradient, "POLICY": functions.policy()}
-        named = functions.named | derivatives
         problem = functions.problem
         # A rule of thumb: where stage by stage becomes faster depends on the plant and on θ.
         stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
-        stagewise = stagewise or stack_needed(problem, named) > STACK_LIMIT
-        rule = "gauss-newton"
-        sources = controller_sources(problem, functions.blocks, rule, named, stagewise=stagewise)
+        stagewise = stagewise or stack_needed(functions) > STACK_LIMIT
+        sources = controller_sources(functions, stagewise=stagewise)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)

@@ -384,6 +384,8 @@ class GaussNewton:
     the last blocks if they were lifted.
     """
 
+    source = "gauss_newton.h"
+    """The rule in C."""
     lifts = False
     spectrum: Spectrum | None = None
 
@@ -417,6 +419,7 @@ class Exact(GaussNewton):
     `lifts` is false P is the identity, and the QP may be indefinite.
     """
 
+    source = "exact.h"
     FLOOR = 1e-3
 
     def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:

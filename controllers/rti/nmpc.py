@@ -568,11 +568,10 @@ class RtiNmpc:
             prepare()
             finite = prepare.finite()
         if not finite:
-            raise QpError(
+            raise self._failure(
                 "the QP is not finite: the model has no finite value or derivative at the point of "
                 "linearisation",
-                status="QP not finite",
-                qp=self._present_qp(),
+                "QP not finite",
             )
         if self._engine is None:
             self._backend.load(self._qp)
@@ -583,11 +582,11 @@ class RtiNmpc:
             memory = prepare.memory.copy()
         self._prepared = Prepared(memory, self._hessian.spectrum, self._functions, self._engine)
 
-    def _present_qp(self) -> SoftQp:
-        """Copy of the QP for a QpError; compiled code may have left it uncondensed."""
+    def _failure(self, message: str, status: str) -> QpError:
+        """An error with a copy of the QP, which compiled code may have left uncondensed."""
         self._prepare()
         self._embed()
-        return self._qp.copy()
+        return QpError(message, status=status, qp=self._qp.copy())
 
     @property
     def linearisation_point(self) -> LinearisationPoint:
@@ -630,10 +629,10 @@ class RtiNmpc:
         self._readout.inputs["s"][:] = s
         if a is not None:
             a = _vector("action", a, problem.reference_action.size)
-        if self._engine is None:
-            self._solve_interpreted(s, a)
-        else:
-            self._solve_compiled(s, a)
+        solve = self._solve_interpreted if self._engine is None else self._solve_compiled
+        if not solve(s, a):
+            message = f"the QP is not finite: state {s}, action {a!r}"
+            raise self._failure(message, "state or action not finite")
         memory = self._readout.memory.copy()
         return RtiSolution(
             action=memory[self._controls] + problem.reference_action,
@@ -643,20 +642,18 @@ class RtiNmpc:
             enforced=a is not None,
         )
 
-    def _solve_compiled(self, s: Vector, a: Vector | None) -> None:
+    def _solve_compiled(self, s: Vector, a: Vector | None) -> bool:
+        """Solve; whether state and action are finite."""
         engine = self._engine
         assert engine is not None
         if a is not None:
             engine.action[:] = a
         status = self._status or engine.feedback(a is not None)
-        if status == NOT_FINITE:
-            raise self._not_finite(s, a)
-        if status:
-            reason = STATUSES[status]
-            message = f"the QP was not solved: {reason}"
-            raise QpError(message, status=reason, qp=self._present_qp())
+        if status not in (0, NOT_FINITE):
+            raise self._failure(f"the QP was not solved: {STATUSES[status]}", STATUSES[status])
+        return status == 0
 
-    def _solve_interpreted(self, s: Vector, a: Vector | None) -> None:
+    def _solve_interpreted(self, s: Vector, a: Vector | None) -> bool:
         qp, read = self._qp, self._readout
         self._embed()
         known = self._embed.finite()
@@ -667,7 +664,7 @@ class RtiNmpc:
         else:
             self._first_lower[:], self._first_upper[:] = self._action_lower, self._action_upper
         if not known:
-            raise self._not_finite(s, a)
+            return False
         found = self._backend.solve(qp)
         if a is not None:
             found = multipliers_at_kink(qp, found, self._action_lower, self._action_upper)
@@ -676,13 +673,7 @@ class RtiNmpc:
         inputs["v"][:], inputs["lam"][:] = found.v, found.lam
         read.memory[read.places["nu"]] = found.nu
         read()
-
-    def _not_finite(self, s: Vector, a: Vector | None) -> QpError:
-        return QpError(
-            f"the QP is not finite: state {s}, action {a!r}",
-            status="state or action not finite",
-            qp=self._present_qp(),
-        )
+        return True
 
     def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:
         """A new closed loop in compiled code; None if only Python can run it.

@@ -183,8 +183,6 @@ def write_loop(
         if kind == "Enumeration" and types.get(f"{name}_number") == "Integer":
             del starts[name]
             starts[f"{name}_number"] = ("Integer", value)
+    names = (*plant.states, *measured), plant.actions
     length = SAMPLES * scenario.sampling_time
-    signals = (*plant.states, *measured)
-    return write_ssp(
-        target, controller, archive.path, signals, plant.actions, starts, stop_time=length
-    )
+    return write_ssp(target, controller, archive.path, *names, starts, stop_time=length)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from math import ceil, isfinite, log10
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def draft_scenario(
         "sampling_time": sampling_time or _sampling_time(archive, mapping),
         "discount": 0.99,
         "plant": {
-            "fmu": str(fmu) if shipped else str(archive.path),
+            "fmu": str(fmu) if shipped else archive.path.as_posix(),
             "states": states,
             "actions": actions,
             "disturbances": noise,
@@ -105,7 +106,9 @@ def draft_scenario(
     if shipped:
         document["controller"]["model"] = "controllers.evaporator:model"
     else:
-        document["plant"]["fmu"] = _relative(archive.path, target)
+        with suppress(ValueError):  # it is on another drive
+            path = os.path.relpath(archive.path, target.resolve().parent)
+            document["plant"]["fmu"] = Path(path).as_posix()
     notes = [f"# {field}: {note}" for field, note in _comments(document, units).items()]
     return "\n".join([HEAD, *notes, "", tomli_w.dumps(document)])
 
@@ -140,13 +143,6 @@ def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
     if not stated:
         raise PlantError(f"FMU '{fmu.path.name}' states no step size; give --sampling-time SECONDS")
     return float(stated)
-
-
-def _relative(path: Path, target: Path) -> str:
-    try:
-        return Path(os.path.relpath(path, target.resolve().parent)).as_posix()
-    except ValueError:  # another drive
-        return path.as_posix()
 
 
 def _comments(document: dict[str, Any], units: dict[str, str]) -> dict[str, str]:

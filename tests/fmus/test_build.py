@@ -104,9 +104,8 @@ def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
 
 def test_committed_header_is_not_stale() -> None:
     committed = (build.SOURCES / build.HEADER).read_bytes()
-    assert committed == evaporator.sources(2)[build.HEADER], (
-        "run `cosim fmu build --in-place` and commit what it writes"
-    )
+    remedy = "run `cosim fmu build --in-place` and commit what it writes"
+    assert committed == evaporator.sources(2)[build.HEADER], remedy
 
 
 @pytest.mark.slow

@@ -23,9 +23,6 @@ from fmus.build import build_sampled, sampled_system
 from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
 from fmus.ssp import write_ssp
 
-SAMPLES = 100
-"""Default length of the SSP's experiment."""
-SATURATE = "saturate"
 RECORD = "extra/org.rti-cosim/controller.json"
 
 
@@ -176,13 +173,13 @@ def write_loop(
     starts = start_values(scenario, plant_seed)
     archive = unpack(plant.fmu)
     types = {name: variable.type for name, variable in archive.variables.items()}
-    if SATURATE in types:
-        starts[SATURATE] = ("Boolean", 1.0)
+    if "saturate" in types:
+        starts["saturate"] = ("Boolean", 1.0)
     for name, (kind, value) in list(starts.items()):
         # libcosim ignores enumerations of FMI 2.0; our plants have an integer beside theirs.
         if kind == "Enumeration" and types.get(f"{name}_number") == "Integer":
             del starts[name]
             starts[f"{name}_number"] = ("Integer", value)
     names = (*plant.states, *measured), plant.actions
-    length = SAMPLES * scenario.sampling_time
-    return write_ssp(target, controller, archive.path, *names, starts, stop_time=length)
+    stop = 100 * scenario.sampling_time  # as in the FMU's own experiment
+    return write_ssp(target, controller, archive.path, *names, starts, stop_time=stop)

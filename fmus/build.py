@@ -302,10 +302,7 @@ def files_of(folder: str) -> dict[str, bytes]:
 
 
 def sources_of(
-    model: FmuModel,
-    version: FmiVersion,
-    own: Mapping[str, bytes],
-    origin: str = "",
+    model: FmuModel, version: FmiVersion, own: Mapping[str, bytes], origin: str = ""
 ) -> dict[str, bytes]:
     """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own.
 
@@ -316,10 +313,10 @@ def sources_of(
     files = {path.name: path.read_bytes() for path in paths} | dict(own)
     variables = model.variables
     if model.sampled:  # the C checks every variable against a range
-        largest = sys.float_info.max
-        ends = ((v, -largest if v.min is None else v.min, v.max) for v in variables)
+        most = sys.float_info.max
         variables = tuple(
-            replace(v, min=low, max=largest if high is None else high) for v, low, high in ends
+            replace(v, min=-most if v.min is None else v.min, max=most if v.max is None else v.max)
+            for v in variables
         )
     origin = f"from {origin or f'the table of {model.name}'}"
     token = token_of(model, version, files)
@@ -359,7 +356,7 @@ def assemble(
 def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
     """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model."""
     digest = hashlib.sha256(model_description(version, "", model).encode())
-    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):  # they hold the token
+    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):  # they are generated
         digest.update(name.encode() + b"\0" + sources[name])
     token = "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
     return _KEPT_TOKENS.get(token, token)

@@ -10,7 +10,7 @@ from fmpy.fmi2 import FMU2Slave
 from benchmarks.measuring import clock, figure
 from controllers import compile_functions
 from cosim import FmuPlant
-from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
+from cosim.cli.controller_fmu import rti_controller, write_fmu
 from cosim.files import temporary_folder
 from cosim.simulation import spawn_seeds
 
@@ -72,8 +72,7 @@ def measure(scenario, steps, controller="tuned"):
     seconds = {"Python": [], "FMU": []}
     lower, upper = scenario.action_lower, scenario.action_upper
     with FmuPlant(scenario) as plant, temporary_folder("cosim-") as folder:
-        system = sampled_controller(python, scenario, plant.units)
-        path = write_fmu(system, python, scenario, folder / "controller.fmu", 2, False)
+        path = write_fmu(python, scenario, folder / "controller.fmu", 2)
         fmu = SampledInstance(path, scenario.plant.states, scenario.plant.actions)
         s = plant.reset(spawn_seeds(0)[0])
         for _ in range(WARM_UP + steps):

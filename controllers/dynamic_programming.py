@@ -1,4 +1,4 @@
-"""Dynamic programming on a state grid: the Bellman operator, policy iteration, the certificate."""
+"""Dynamic programming on a grid of states: interpolation, Bellman operator, policy iteration."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ import operator
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from controllers.errors import ModelError, OptimumError
-from controllers.grid import Grid, graded_axis
 from controllers.model import discretise, economic_cost
 from controllers.problem import DisturbanceLaw, PlantProblem, Problem
 from cosim.protocols import Array
@@ -24,6 +23,167 @@ from cosim.protocols import Array
 # A stored optimum is read without SciPy, which takes longer to load than the optimum.
 if TYPE_CHECKING:
     from scipy import sparse
+
+Indices = NDArray[np.intp]
+POINTS = 4
+
+
+class AxisInterpolant:
+    """Polynomials through the points of an axis: cubic in the cells within `smooth`, linear else.
+
+    In cell c, x = axis[c] + t, the weight of point `first`[c] + j is Σ_i `weights`[i, j, c] tⁱ,
+    `weights` (powers, stencil points, cells). A cell's cubic runs through its ends and the next
+    point on either side. No cubic uses a point outside `smooth`, where there may be a kink; fewer
+    than four points within leave all linear.
+    """
+
+    def __init__(self, axis: Array, smooth: tuple[float, float] | None) -> None:
+        cells = np.arange(len(axis) - 1)
+        lower, upper = smooth or (np.inf, -np.inf)
+        tolerance = 1e-9 * (axis[-1] - axis[0])
+        cubic = (axis[:-1] >= lower - tolerance) & (axis[1:] <= upper + tolerance)
+        count = POINTS if cubic.sum() >= POINTS - 1 else 2
+        first = np.clip(cells - (count // 2 - 1), 0, len(axis) - count)
+        if count == POINTS:
+            within = np.flatnonzero(cubic)
+            first[cubic] = np.clip(first[cubic], within[0], within[-1] + 2 - POINTS)
+        weights = np.zeros((count, count, len(cells)))
+        for c in cells:
+            start, points = (first[c], POINTS) if count == POINTS and cubic[c] else (c, 2)
+            for j in range(start, start + points):
+                polynomial = np.ones(1)
+                for k in range(start, start + points):
+                    if k != j:
+                        step = axis[j] - axis[k]
+                        polynomial = np.convolve(polynomial, [(axis[c] - axis[k]) / step, 1 / step])
+                weights[: len(polynomial), j - first[c], c] = polynomial
+        self.axis, self.first, self.weights = axis, first, weights
+
+    def locate(self, x: Array) -> tuple[Indices, Array]:
+        """Cells of coordinates and offsets in them; outside the axis, those of its ends."""
+        inside = np.clip(x, self.axis[0], self.axis[-1])
+        cell = np.searchsorted(self.axis[1:-1], inside, side="right")
+        return cell, inside - self.axis[cell]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The product of increasing axes, one per state, at least two points each.
+
+    `smooth` has an interval per state in which interpolation is cubic; elsewhere it is multilinear.
+    Weights sum to one; multilinear ones are non-negative too, as those of a Markov chain. A state
+    outside the box is moved to the nearest one inside.
+    """
+
+    axes: tuple[Array, ...]
+    smooth: tuple[tuple[float, float], ...] | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of points per state."""
+        return tuple(len(axis) for axis in self.axes)
+
+    @property
+    def size(self) -> int:
+        """Number of grid states G."""
+        return int(np.prod(self.shape))
+
+    @cached_property
+    def points(self) -> Array:
+        """Grid states, shape (G, n), the last state running fastest."""
+        mesh = np.meshgrid(*self.axes, indexing="ij")
+        return np.stack([axis.reshape(-1) for axis in mesh], axis=1)
+
+    def nearest(self, state: Sequence[float] | Array) -> int:
+        """Index of the grid state nearest to `state` in each coordinate."""
+        index = [int(np.abs(axis - x).argmin()) for axis, x in zip(self.axes, state, strict=True)]
+        return int(np.ravel_multi_index(index, self.shape))
+
+    def weights(self, x: Sequence[Array]) -> list[tuple[Indices, Array]]:
+        """Grid indices and weights of interpolation at states given as one array per entry."""
+        positions, factors = [], []
+        strides = np.cumprod((1, *self.shape[:0:-1]))[::-1]
+        for interpolant, stride, values in zip(self._interpolants, strides, x, strict=True):
+            cell, offset = interpolant.locate(values)
+            start = interpolant.first[cell]
+            points = interpolant.weights.shape[1]
+            positions.append([stride * (start + j) for j in range(points)])
+            factors.append(
+                [_horner(interpolant.weights[:, j], cell, [offset]) for j in range(points)]
+            )
+        result = []
+        for stencil in itertools.product(*(range(len(row)) for row in positions)):
+            index, weight = np.zeros((), dtype=np.intp), np.ones(())
+            for position, factor, j in zip(positions, factors, stencil, strict=True):
+                index, weight = index + position[j], weight * factor[j]
+            result.append((index, weight))
+        return result
+
+    def interpolant(self, values: Array) -> Callable[[Sequence[Array]], Array]:
+        """Function that interpolates `values` (G,) at states given as one array per entry."""
+        table = values.reshape(self.shape)
+        for interpolant in self._interpolants:
+            stencil = interpolant.first + np.arange(interpolant.weights.shape[1])[:, None]
+            # The first axis becomes (power, cell), and both go last.
+            table = np.einsum("ijc,jc...->...ic", interpolant.weights, table[stencil])
+        n = len(self.axes)
+        table = table.transpose(*range(0, 2 * n, 2), *range(1, 2 * n, 2))
+        table = np.ascontiguousarray(table.reshape(*table.shape[:n], -1))
+
+        def function(x: Sequence[Array]) -> Array:
+            index: Indices = np.zeros((), dtype=np.intp)
+            offsets = []
+            for interpolant, entry in zip(self._interpolants, x, strict=True):
+                cell, offset = interpolant.locate(entry)
+                index = index * (len(interpolant.axis) - 1) + cell
+                offsets.append(offset)
+            return _horner(table, index, offsets)
+
+        return function
+
+    @cached_property
+    def _interpolants(self) -> list[AxisInterpolant]:
+        smooth = self.smooth or (None,) * len(self.axes)
+        return [AxisInterpolant(a, within) for a, within in zip(self.axes, smooth, strict=True)]
+
+    def resample(self, values: Array, other: Grid) -> Array:
+        """Values (G, k) at the states of another grid, interpolated multilinearly."""
+        x, linear = list(other.points.T), Grid(self.axes)
+        return np.stack([linear.interpolant(column)(x) for column in values.T], axis=1)
+
+
+def _horner(table: Array, index: Indices, offsets: Sequence[Array]) -> Array:
+    if not offsets:
+        return np.asarray(table[index])
+    first, *rest = offsets
+    total = _horner(table[-1], index, rest)
+    for part in table[-2::-1]:
+        total = total * first + _horner(part, index, rest)
+    return total
+
+
+Feature = tuple[float, float, float]
+"""First and last point of an interval of an axis, and the width that its cells shall not exceed."""
+
+
+def graded_axis(marks: Sequence[float], features: Sequence[Feature], growth: float) -> Array:
+    """Axis through all `marks`, dense at features, each cell outwards about `growth` times wider.
+
+    The width of a cell at x is the least over the features of spacing + (growth − 1)·distance.
+    """
+    parts = []
+    for lower, upper in pairwise(marks):
+        fine = np.linspace(lower, upper, 4001)
+        middle = 0.5 * (fine[1:] + fine[:-1])
+        width = np.full(len(middle), upper - lower)
+        for first, last, spacing in features:
+            distance = np.maximum(np.maximum(first - middle, middle - last), 0.0)
+            np.minimum(width, spacing + (growth - 1.0) * distance, out=width)
+        count = np.append(0.0, np.cumsum(np.diff(fine) / width))
+        cells = max(int(np.ceil(count[-1] - 1e-6)), 1)
+        inner = np.interp(np.arange(1, cells) * (count[-1] / cells), count, fine)
+        parts.append(np.concatenate([[lower], inner]))
+    return np.concatenate([*parts, [marks[-1]]])
 
 
 class ProductRule(NamedTuple):
@@ -63,8 +223,13 @@ class Refinement:
 
     def __init__(self, coarse: ProductRule, fine: ProductRule) -> None:
         self.weights = fine.weights
-        axes = zip(coarse.axes, fine.axes, strict=True)
-        self._matrices = [lagrange_matrix(nodes, targets) for nodes, targets in axes]
+        self._matrices = []
+        for x, t in zip(coarse.axes, fine.axes, strict=True):
+            # The Lagrange polynomials of the nodes x at the targets t.
+            matrix = np.ones((len(t), len(x)))
+            for j, k in itertools.permutations(range(len(x)), 2):
+                matrix[:, j] *= (t - x[k]) / (x[j] - x[k])
+            self._matrices.append(matrix)
         # Products of tiny matrices cost more in calls than in arithmetic: join the last axes.
         while len(self._matrices) > 1 and self._matrices[-1].shape[1] < 4:
             last = self._matrices.pop()
@@ -81,17 +246,6 @@ class Refinement:
                 values = matrix @ values.reshape(-1, coarse, right)
             right *= fine
         return values.reshape(count, -1)
-
-
-def lagrange_matrix(nodes: ArrayLike, targets: ArrayLike) -> Array:
-    """Matrix (len(targets), len(nodes)) of the Lagrange polynomials of `nodes` at `targets`."""
-    x, t = np.asarray(nodes, dtype=np.float64), np.asarray(targets, dtype=np.float64)
-    matrix = np.ones((len(t), len(x)))
-    for j in range(len(x)):
-        for k in range(len(x)):
-            if k != j:
-                matrix[:, j] *= (t - x[k]) / (x[j] - x[k])
-    return matrix
 
 
 _OPERATIONS: dict[int, Callable[..., Any]] = {
@@ -132,8 +286,8 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
 class Elementwise:
     """An SX function f(x, u, …) → y over arrays that broadcast.
 
-    Each argument is a sequence with one array per scalar entry; the result is the list of the
-    first output's entries. Five to ten times faster on large arrays than CasADi's `map`. Raises
+    Each argument is a sequence with one array per scalar entry; the result is the list of y's
+    entries. Five to ten times faster on large arrays than CasADi's `map`. Raises
     ModelError on an operation that has no NumPy counterpart here.
     """
 
@@ -141,36 +295,32 @@ class Elementwise:
         self._n_work = function.sz_w()
         self._n_out = function.size1_out(0)
         self._out_rows = list(function.sparsity_out(0).row())
-        self._program: list[tuple[int, Callable[..., Any] | None, tuple[Any, ...], Any]] = []
+        self._program: list[tuple[int, Sequence[Any], Sequence[int]]] = []
         for k in range(function.n_instructions()):
             code = function.instruction_id(k)
-            inputs = tuple(function.instruction_input(k))
-            outputs = function.instruction_output(k)
+            inputs: Sequence[Any] = function.instruction_input(k)
             if code == ca.OP_CONST:
-                self._program.append((code, None, (function.instruction_constant(k),), outputs[0]))
-            elif code in {ca.OP_INPUT, ca.OP_OUTPUT}:
-                self._program.append((code, None, inputs, tuple(outputs)))
-            elif code in _OPERATIONS:
-                self._program.append((code, _OPERATIONS[code], inputs, outputs[0]))
-            else:
+                inputs = [function.instruction_constant(k)]
+            elif code not in (ca.OP_INPUT, ca.OP_OUTPUT, *_OPERATIONS):
                 raise ModelError(
                     f"function '{function.name()}': operation {code} of CasADi cannot be "
                     "evaluated over arrays; write the model without it"
                 )
+            self._program.append((code, inputs, function.instruction_output(k)))
 
     def __call__(self, *arguments: Any) -> list[Any]:
         """Evaluate; `arguments[i][j]` is entry j of argument i."""
         work: list[Any] = [0.0] * self._n_work
         result: list[Any] = [0.0] * self._n_out
-        for code, operation, inputs, output in self._program:
-            if operation is not None:
-                work[output] = operation(*[work[i] for i in inputs])
-            elif code == ca.OP_CONST:
-                work[output] = inputs[0]
+        for code, inputs, output in self._program:
+            if code == ca.OP_CONST:
+                work[output[0]] = inputs[0]
             elif code == ca.OP_INPUT:
                 work[output[0]] = arguments[inputs[0]][inputs[1]]
-            elif output[0] == 0:
+            elif code == ca.OP_OUTPUT:
                 result[self._out_rows[output[1]]] = work[inputs[0]]
+            else:
+                work[output[0]] = _OPERATIONS[code](*[work[i] for i in inputs])
         return result
 
 
@@ -568,7 +718,9 @@ class Optimum:
     @property
     def edge_mass(self) -> float:
         """Share of samples that the closed loop spends on the edge of the grid's box."""
-        return float(self.distribution[self.grid.boundary].sum())
+        ends = np.array([axis[[0, -1]] for axis in self.grid.axes])[:, :, None]
+        on_edge = (self.grid.points.T[:, None] == ends).any(axis=(0, 1))
+        return float(self.distribution[on_edge].sum())
 
 
 def evaluate_policy(

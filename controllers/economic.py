@@ -78,10 +78,8 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         "error_on_fail": False,
     }
     solver = ca.nlpsol("steady_state", "ipopt", {"x": w, "f": cost, "g": x_next - x}, options)
-    lower = np.concatenate([problem.state_lower, problem.action_lower])
-    upper = np.concatenate([problem.state_upper, problem.action_upper])
-    start = np.concatenate([problem.reference_state, problem.reference_action])
-    found = solver(x0=start, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+    lower, upper = problem.lower, problem.upper
+    found = solver(x0=problem.reference, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
     stats = solver.stats()
     if not stats["success"]:
         raise TuningError(
@@ -214,10 +212,9 @@ def convexify(A: Array, B: Array, H: Array, C: Array, weight: float = 1e-2) -> C
     steady state is not locally optimal under these constraints.
     """
     size, n, n_c = len(H), len(A), len(C)
-    basis = [("α", H)]
-    basis += [("δP", rotation(A, B, e)) for e in _symmetric_basis(n)]
-    basis += [("F", C.T @ e @ C) for e in _symmetric_basis(n_c)]
-    columns = np.stack([svec(matrix) for _, matrix in basis], axis=1)
+    rotations = [rotation(A, B, e) for e in _symmetric_basis(n)]
+    forces = [C.T @ e @ C for e in _symmetric_basis(n_c)]
+    columns = np.stack([svec(matrix) for matrix in (H, *rotations, *forces)], axis=1)
     count, triangle = columns.shape[1], columns.shape[0]
     identity = svec(np.eye(size))[:, None]
     # Variables: α, δP, F, β, t with t ≥ ‖F‖.
@@ -331,9 +328,7 @@ def tune(
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
     q, C_x = steady.gradient, steady.C[:, :n]
     # θ's quadratics are about the reference, the tuning's about the optimal steady state.
-    shift = np.concatenate(
-        [problem.reference_state - steady.x, problem.reference_action - steady.u]
-    )
+    shift = problem.reference - np.concatenate([steady.x, steady.u])
     initial = convex.delta_P - C_x.T @ convex.F @ C_x
     values = {
         "B_l": _symmetric(0.5 * M),

@@ -89,8 +89,9 @@ def converged(scenario: Scenario) -> RtiNmpc:
 def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
     """Policy of least mean cost on the scenario's stochastic plant, solved once and then stored.
 
-    Where the plant's condenser fouls, the quasi-static one.
+    Where the plant fouls or jumps, the quasi-static one.
     """
-    from controllers.optimum import optimal as yardsticks_own  # noqa: PLC0415
+    from controllers.optimum import OptimalPolicy, QuasiStaticPolicy, change_of  # noqa: PLC0415
 
-    return yardsticks_own(scenario)
+    kind = OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy
+    return kind.from_scenario(scenario)

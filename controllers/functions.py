@@ -24,6 +24,12 @@ from cosim.protocols import Vector
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 
 
+def consecutive(sizes: Mapping[str, int], first: int = 0) -> dict[str, slice]:
+    """Slices, by name, of parts that follow each other from an index on."""
+    ends = np.cumsum([first, *sizes.values()]).tolist()
+    return {name: slice(*ends[i : i + 2]) for i, name in enumerate(sizes)}
+
+
 class StackedFunction:
     """A CasADi function of expressions whose arguments and results live in fixed NumPy arrays.
 
@@ -32,8 +38,8 @@ class StackedFunction:
     so that one copy keeps them all. The inputs follow each other in one array but for the `shared`
     ones, which are read from other memory, such as another function's output. Own inputs
     and results are one array, `memory`: a given one, or one with `room` behind them for more, by
-    name and size; `places` are slices of it by name. The expressions are scalar graphs
-    (SX) or, where stages repeat, graphs of calls (MX).
+    name and size; `places` are slices of it by name, `slices` the results' in `stack`. The
+    expressions are scalar graphs (SX) or, where stages repeat, graphs of calls (MX).
     """
 
     def __init__(
@@ -58,12 +64,8 @@ class StackedFunction:
         sizes = {name: argument.numel() for name, argument in arguments.items()}
         own = {name: size for name, size in sizes.items() if name not in shared}
         all_sizes = own | {"stack": function.numel_out(0)} | dict(room or {})
-        ends = np.cumsum(list(all_sizes.values())).tolist()
-        self.memory: Vector = np.zeros(ends[-1]) if memory is None else memory
-        self.places = {
-            name: slice(end - size, end)
-            for (name, size), end in zip(all_sizes.items(), ends, strict=True)
-        }
+        self.memory: Vector = np.zeros(sum(all_sizes.values())) if memory is None else memory
+        self.places = consecutive(all_sizes)
         assert all(a.shape == (sizes[name],) and a.flags.c_contiguous for name, a in shared.items())
         self.inputs = {
             name: shared[name] if name in shared else self.memory[self.places[name]]
@@ -74,15 +76,10 @@ class StackedFunction:
         for i, array in enumerate(self.inputs.values()):
             self._buffer.set_arg(i, memoryview(array))  # type: ignore[arg-type,call-arg]
         self._buffer.set_res(0, memoryview(self.stack))  # type: ignore[arg-type,call-arg]
-        ends = np.cumsum([result.numel() for result in results.values()]).tolist()
-        self.slices = {
-            key: slice(end - result.numel(), end)
-            for (key, result), end in zip(results.items(), ends, strict=True)
-        }
-        self.shapes = {key: result.shape for key, result in results.items()}
-        first = self.places["stack"].start
-        for key, part in self.slices.items():
-            self.places[key] = slice(first + part.start, first + part.stop)
+        sizes = {name: result.numel() for name, result in results.items()}
+        self.slices = consecutive(sizes)
+        self.places |= consecutive(sizes, self.places["stack"].start)
+        self.shapes = {name: result.shape for name, result in results.items()}
 
     def __call__(self) -> None:
         """Evaluate at `inputs`, into `stack`."""

@@ -22,13 +22,13 @@ from controllers.dynamic_programming import (
     Accuracy,
     BellmanOperator,
     Figure,
+    Grid,
     Optimum,
     Progress,
     Settings,
     solve,
 )
 from controllers.errors import ModelError, OptimumError, QpError
-from controllers.grid import Grid
 from controllers.model import Model
 from controllers.problem import VECTORS, PlantProblem, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
@@ -338,10 +338,6 @@ class Jumps:
             plants.append(plants[-1] | change.parameters)
         return cls((0.0, *(change.time for change in changes)), tuple(plants))
 
-    def present(self, time: float) -> dict[str, float]:
-        """The parameters that jump, by name, at a time in s."""
-        return dict(self.plants[int(self.position(time))])
-
     def position(self, time: ArrayLike) -> Vector:
         """Index of the plant at times in s."""
         return np.asarray(np.searchsorted(self.starts, time, side="right") - 1, dtype=np.float64)
@@ -437,12 +433,6 @@ class QuasiStaticPolicy:
             "clamped" if "clamped" in (first.status, second.status) else "solved",
             0.0,
         )
-
-
-def optimal(scenario: Scenario) -> OptimalPolicy | QuasiStaticPolicy:
-    """The optimal policy of a scenario, or the quasi-static one of a plant that changes."""
-    kind = OptimalPolicy if change_of(scenario) is None else QuasiStaticPolicy
-    return kind.from_scenario(scenario)
 
 
 def stored_optimum(scenario: Scenario) -> str | None:

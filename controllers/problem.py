@@ -46,16 +46,10 @@ class Units:
     dearest: float
 
     @classmethod
-    def of(
-        cls, model: Model, lower: Vector, upper: Vector, reference: Vector, cost: float
-    ) -> Units:
-        """Units of a nominal model at a reference w_s = (x_s, u_s) with this cost ℓ_s.
-
-        `lower`, `upper` and `reference` are (n+m,). Raises ModelError where the multipliers cannot
-        be computed.
-        """
-        n = len(model.states)
-        widths = upper - lower
+    def of(cls, problem: Problem) -> Units:
+        """Units of a problem; raises ModelError where the multipliers cannot be computed."""
+        model, n, reference = problem.model, problem.n_states, problem.reference
+        widths = problem.upper - problem.lower
         both = np.array([10.0**power for power in np.rint(_power(widths))])
         x, u, d, p = model.symbols()
         w = ca.vertcat(x, u)
@@ -67,11 +61,11 @@ class Units:
         gradient, curvature = (value.full().reshape(-1) for value in values[:2])
         rates = values[2].full()
         near = ACTIVE * widths
-        below, above = reference <= lower + near, reference >= upper - near
+        below, above = reference <= problem.lower + near, reference >= problem.upper - near
         found = multipliers(gradient * both, rates * both, below, above)
         dearest = float(found[:n].max())
         curved = float(np.nan_to_num(np.abs(curvature * both**2), posinf=0.0).max())
-        sizes = (dearest, curved, abs(cost))
+        sizes = (dearest, curved, abs(problem.reference_cost))
         # A size below rounding counts as zero.
         least = np.finfo(np.float64).eps ** 0.5 * max(sizes)
         powers = (float(10.0 ** (np.floor(_power(size)) + 1)) for size in sizes if size > least)
@@ -193,6 +187,21 @@ class Problem:
         """Number of actions m."""
         return len(self.model.actions)
 
+    @property
+    def reference(self) -> Vector:
+        """Reference (x_s, u_s), shape (n+m,)."""
+        return np.concatenate([self.reference_state, self.reference_action])
+
+    @property
+    def lower(self) -> Vector:
+        """Lower bounds of (x, u), shape (n+m,)."""
+        return np.concatenate([self.state_lower, self.action_lower])
+
+    @property
+    def upper(self) -> Vector:
+        """Upper bounds of (x, u), shape (n+m,)."""
+        return np.concatenate([self.state_upper, self.action_upper])
+
     @cached_property
     def penalty(self) -> Penalty:
         """Penalty of a state by the true bounds."""
@@ -208,13 +217,7 @@ class Problem:
     @cached_property
     def units(self) -> Units:
         """Orders of magnitude of states, actions and cost."""
-        return Units.of(
-            self.model,
-            np.concatenate([self.state_lower, self.action_lower]),
-            np.concatenate([self.state_upper, self.action_upper]),
-            np.concatenate([self.reference_state, self.reference_action]),
-            self.reference_cost,
-        )
+        return Units.of(self)
 
     def value_level(self, discount: float | None = None) -> float:
         """ℓ_s/(1−γ), the value of staying at the reference; ℓ_s where γ = 1.

@@ -297,10 +297,9 @@ class DaqpBackend:
     repeated and resumed bit by bit.
     """
 
-    def __init__(self) -> None:
-        self._model: Any = None
-        self._factorised = 0
-        self._failed = False
+    _model: Any = None
+    _factorised = 0
+    _failed = False
 
     def load(self, qp: SoftQp) -> None:
         """Factorise H and transform the rows; the first call allocates the workspace."""

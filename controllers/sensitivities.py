@@ -40,7 +40,7 @@ def _theta_part(
 ) -> ca.SX:
     """Terms of the Lagrangian with θ but for p; `at` (n+m, N), M_k = ∂(second-order term)/∂L_k."""
     horizon, gamma, size = problem.horizon, problem.discount, at.size1()
-    reference = np.concatenate([problem.reference_state, problem.reference_action])
+    reference = problem.reference
     part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
     part += symbols["c_lambda"]
     for k in range(horizon):
@@ -61,29 +61,6 @@ def _theta_part(
     return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
 
 
-def _parameter_gradient(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    theta: ca.SX,
-    y: PrimalDual,
-    x: ca.SX,
-    u: ca.SX,
-    exact: tuple[ca.SX, ca.SX] | None,
-) -> ca.SX:
-    """∇_p of the QP's Lagrangian; `exact` is (M, χ̄), χ̄ the costates where D_k was taken."""
-    size = problem.n_states + problem.n_actions
-    reference = ca.DM(np.concatenate([problem.reference_state, problem.reference_action]))
-    of_stage = stage_parameter_gradient(problem, blocks, exact=exact is not None)
-    total = ca.SX(0)
-    for k in range(problem.horizon):
-        w = ca.vertcat(y.xi[:, k], y.v[:, k]) + reference
-        arguments = [x[:, k], u[:, k], theta, w, y.chi[:, k + 1]]
-        if exact is not None:
-            arguments += [exact[0][:, k * size : (k + 1) * size], exact[1][:, k]]
-        total += of_stage(*arguments)
-    return total
-
-
 def sensitivities(
     problem: Problem, blocks: ThetaBlocks, *, exact: bool
 ) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
@@ -93,8 +70,8 @@ def sensitivities(
     `gradient` (n_θ). The second takes the longest to make and few ask for it. It maps that, the
     QP's A, B, L, L_N and the columns of m adjoint directions dv (mN, m), dt and dlam (nN, m). Its
     results are `policy` (n_θ, m), dπ/dθ transposed, and `state` (n, m), dπ/ds transposed. With
-    `exact` both need M and χ̄ (see `_theta_part` and `_parameter_gradient`), the second also dM, the
-    directional derivative of M.
+    `exact` both need M (see `_theta_part`) and χ̄, the costates where the curvature was taken, the
+    second also dM, the directional derivative of M.
     """
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
@@ -107,9 +84,13 @@ def sensitivities(
     part = _theta_part(problem, symbols, y, ca.vertcat(x, u), M if exact else None)
     gradient = ca.gradient(part, symbols.theta)
     if "p" in blocks:
-        gradient[blocks.slices["p"]] = _parameter_gradient(
-            problem, blocks, symbols.theta, y, x, u, (M, guess) if exact else None
-        )
+        of_stage = stage_parameter_gradient(problem, blocks, exact=exact)
+        total = ca.SX(0)
+        for k in range(horizon):
+            w = ca.vertcat(y.xi[:, k], y.v[:, k]) + ca.DM(problem.reference)
+            curved = [M[:, k * (n + m) : (k + 1) * (n + m)], guess[:, k]] if exact else []
+            total += of_stage(x[:, k], u[:, k], symbols.theta, w, y.chi[:, k + 1], *curved)
+        gradient[blocks.slices["p"]] = total
     solution = {name: getattr(y, name) for name in SOLUTION}
     inputs = {**solution, "x": x, "u": u, "theta": symbols.theta, **extra}
     value = StackedFunction("value_gradient", inputs, {"gradient": gradient})
@@ -127,10 +108,21 @@ def sensitivities(
         for i in range(m):
             v_i = ca.reshape(dv[:, i], m, horizon)
             lam_i = ca.reshape(dlam[:, i], n, horizon)
-            xi_i, chi_i = _direction(problem, A, B, L, L_N, v_i, lam_i)
-            direction = ca.veccat(xi_i, v_i, dt[:, i], lam_i, chi_i, *([dM[:, i]] if exact else []))
+            # The directions of the states and costates that go with them.
+            xi_i = [ca.SX(n, 1)]
+            for k in range(horizon):
+                stage = slice(k * n, (k + 1) * n)
+                xi_i.append(A[:, stage].T @ xi_i[k] + B[:, stage].T @ v_i[:, k])
+            chi_i = [L_N @ xi_i[horizon] + lam_i[:, horizon - 1]]
+            for k in reversed(range(horizon)):
+                weight = L[:, k * (n + m) : (k + 1) * (n + m)]
+                costate = weight[:n, :] @ ca.vertcat(xi_i[k], v_i[:, k])
+                costate += A[:, k * n : (k + 1) * n] @ chi_i[0]
+                chi_i.insert(0, costate + (lam_i[:, k - 1] if k else 0))
+            curved = [dM[:, i]] if exact else []
+            direction = ca.veccat(*xi_i, v_i, dt[:, i], lam_i, *chi_i, *curved)
             policy.append(-ca.jtimes(gradient, symbol, direction))
-            state.append(-chi_i[:, 0])
+            state.append(-chi_i[0])
         moved = {"A": A, "B": B, "L": L, "L_N": L_N, "dv": dv, "dt": dt, "dlam": dlam}
         return StackedFunction(
             "policy_jacobian",
@@ -139,23 +131,6 @@ def sensitivities(
         )
 
     return value, policy_jacobian
-
-
-def _direction(
-    problem: Problem, A: ca.SX, B: ca.SX, L: ca.SX, L_N: ca.SX, dv: ca.SX, dlam: ca.SX
-) -> tuple[ca.SX, ca.SX]:
-    """Directions of the states and costates that go with those of the controls and rows."""
-    n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-    xi = [ca.SX(n, 1)]
-    for k in range(horizon):
-        columns = slice(k * n, (k + 1) * n)
-        xi.append(A[:, columns].T @ xi[k] + B[:, columns].T @ dv[:, k])
-    chi = [L_N @ xi[horizon] + dlam[:, horizon - 1]]
-    for k in reversed(range(horizon)):
-        weight = L[:, k * (n + m) : (k + 1) * (n + m)]
-        costate = weight[:n, :] @ ca.vertcat(xi[k], dv[:, k]) + A[:, k * n : (k + 1) * n] @ chi[0]
-        chi.insert(0, costate + (dlam[:, k - 1] if k else 0))
-    return ca.horzcat(*xi), ca.horzcat(*chi)
 
 
 def adjoint_directions(

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from controllers.errors import ModelError, ParameterError
+from controllers.functions import consecutive
 from controllers.problem import Problem
 from cosim.files import read_toml, write_atomically
 from cosim.protocols import Vector
@@ -103,8 +104,7 @@ class ThetaBlocks:
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Slice of each block in θ."""
-        ends = np.cumsum([block.size for block in self.blocks]).tolist()
-        return {b.name: slice(end - b.size, end) for b, end in zip(self.blocks, ends, strict=True)}
+        return consecutive({block.name: block.size for block in self.blocks})
 
     @cached_property
     def size(self) -> int:

@@ -72,9 +72,8 @@ def present() -> Platform:
     """The platform at hand; raises BuildError for one that is not in `PLATFORMS`."""
     machine = host.machine().lower()
     name = f"{_ARCHITECTURES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
-    for platform in PLATFORMS:
-        if platform.tuple == name:
-            return platform
+    if found := next((each for each in PLATFORMS if each.tuple == name), None):
+        return found
     known = ", ".join(platform.tuple for platform in PLATFORMS)
     raise BuildError(f"no binaries are built for {name}; known are {known}")
 

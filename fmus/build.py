@@ -1,4 +1,4 @@
-"""The build of an FMU from C sources and a model description: compilers, equal archives."""
+"""The build of an FMU from C sources and a model or its description: compilers, equal archives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import uuid
 import zipfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -25,12 +25,14 @@ from fmus import PLATFORMS, UNIVERSAL, BuildError, Platform, present
 from fmus.model import (
     FmiVersion,
     FmuModel,
+    Kind,
     Variable,
     build_description,
     c_header,
     model_description,
     render,
     terminals,
+    unit,
 )
 
 PACKAGE = Path(__file__).parent
@@ -228,12 +230,20 @@ def build_fmu(
     version, identifier = _model(text)
     if not any(name.endswith(".c") for name in sources):
         raise BuildError(f"{path}: there is no C source (*.c) to build it from")
-    members = {
-        **(files or {}),
-        "modelDescription.xml": text,
-        **_binaries(sources, identifier, version, compilers(every_platform), warnings),
-        **{f"sources/{name}": data for name, data in sources.items()},
-    }
+    used = compilers(every_platform)
+    with ThreadPoolExecutor(len(used)) as pool:
+        built = pool.map(lambda each: each.library(sources, identifier, warnings), used)
+        libraries = dict(zip((each.platform for each in used), built, strict=True))
+    macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]
+    members = {**(files or {}), "modelDescription.xml": text}
+    members |= {f"sources/{name}": data for name, data in sources.items()}
+    for platform, library in libraries.items():
+        folder = platform.folder(version)
+        # FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both
+        # are built, lies a universal binary.
+        universal = folder == "darwin64" and len(macos) > 1
+        name = f"binaries/{folder}/{identifier}{platform.suffix}"
+        members[name] = universal_binary(macos) if universal else library
     return write_archive(members, path)
 
 
@@ -249,31 +259,6 @@ def build_folder(folder: str | Path, target: str | Path, every_platform: bool = 
         raise BuildError(f"{description}: {error.strerror}") from None
     sources = {path.name: path.read_bytes() for path in Path(folder).glob("*.[ch]")}
     return build_fmu(target, sources, text, every_platform=every_platform)
-
-
-def _binaries(
-    sources: Mapping[str, bytes],
-    identifier: str,
-    version: str,
-    compilers: Sequence[Compiler],
-    warnings: tuple[str, ...],
-) -> dict[str, bytes]:
-    """The members under ``binaries/`` of an FMU for FMI `version`: one library a compiler.
-
-    FMI 2.0 importers on Apple silicon look into the folder of macOS on x86: there, where both are
-    built, lies a universal binary.
-    """
-    with ThreadPoolExecutor(len(compilers)) as pool:
-        built = pool.map(lambda each: each.library(sources, identifier, warnings), compilers)
-        libraries = dict(zip((each.platform for each in compilers), built, strict=True))
-    macos = [library for platform, library in libraries.items() if platform.suffix == ".dylib"]
-    found = {}
-    for platform, library in libraries.items():
-        folder = platform.folder(version)
-        universal = folder == "darwin64" and len(macos) > 1
-        name = f"binaries/{folder}/{identifier}{platform.suffix}"
-        found[name] = universal_binary(macos) if universal else library
-    return found
 
 
 def _model(description: bytes) -> tuple[str, str]:
@@ -303,7 +288,12 @@ def _model(description: bytes) -> tuple[str, str]:
 # The evaporator's sources that serve any model: FMI's functions and their parts.
 _FACES = ("access.h", "exchange.h", "experiment.h", "grid.h", "instance.h", "snapshot.h")
 _WITHOUT_DERIVATIVES = ("adjoint.h", "derivatives.h")
-_GENERATED = ("variables.h", "buildDescription.xml")
+HEADER = "variables.h"
+# Stored results name the evaporator's file by its bytes: it keeps the token of its first build.
+_KEPT_TOKENS = {
+    "{057e4cbf-b1fc-5409-a668-78ce31bbba02}": "{4b2ab9db-c6a8-56b3-80d2-38ec28c993f3}",
+    "{3acfd11f-6951-5208-9ac5-27f319c4be69}": "{71dc0d9d-04bb-5505-8f86-367bbed9bbb2}",
+}
 
 
 def files_of(folder: str) -> dict[str, bytes]:
@@ -312,22 +302,25 @@ def files_of(folder: str) -> dict[str, bytes]:
 
 
 def sources_of(
-    model: FmuModel,
-    version: FmiVersion,
-    own: Mapping[str, bytes],
-    rows: Sequence[Variable] | None = None,
+    model: FmuModel, version: FmiVersion, own: Mapping[str, bytes], origin: str = ""
 ) -> dict[str, bytes]:
-    """File name → bytes of the folder `sources/` of an FMU without derivatives.
+    """File name → bytes of the folder `sources/` of an FMU, without derivatives but for its own.
 
-    `own` is the model's own C; `rows` is its table as the C shall check it, where that differs.
+    `own` is the model's own C; `origin` says in the header where it comes from.
     """
     paths = [SOURCES / name for name in (*_FACES, f"fmi{version}.c")]
     paths += [PACKAGE / "plant_sources" / name for name in _WITHOUT_DERIVATIVES]
     files = {path.name: path.read_bytes() for path in paths} | dict(own)
-    variables = model.variables if rows is None else rows
-    token = token_of([model_description(version, "", model)], files)
-    header = c_header(token, model.identifier, variables, f"from the table of {model.name}")
-    files["variables.h"] = header.encode()
+    variables = model.variables
+    if model.sampled:  # the C checks every variable against a range
+        most = sys.float_info.max
+        variables = tuple(
+            replace(v, min=-most if v.min is None else v.min, max=most if v.max is None else v.max)
+            for v in variables
+        )
+    origin = f"from {origin or f'the table of {model.name}'}"
+    token = token_of(model, version, files)
+    files[HEADER] = c_header(token, model.identifier, variables, origin).encode()
     files["buildDescription.xml"] = build_description(version, model).encode()
     return files
 
@@ -338,31 +331,109 @@ def assemble(
     sources: Mapping[str, bytes],
     target: str | Path,
     *,
-    remarks: str = "",
     every_platform: bool = False,
     files: Mapping[str, bytes] | None = None,
+    warnings: tuple[str, ...] = ("-w",),
 ) -> Path:
     """Build the FMU `target` from `sources_of`, with a page of its variables.
 
-    `remarks` are sentences on that page, `files` further members of the archive. As `build_fmu`,
-    whose BuildError it raises; with the same compiler the bytes repeat.
+    `files` are further members of the archive. As `build_fmu`, whose BuildError it raises; with the
+    same compiler the bytes repeat.
     """
-    written = {name: data for name, data in sources.items() if name not in _GENERATED}
-    page = render("model.html", model=model, version=version, remarks=remarks)
+    page = render("model.html", model=model, version=version)
     members = {
         "documentation/index.html": page.encode(),
         "documentation/licenses/license.txt": (RESOURCES / "license.txt").read_bytes(),
         **(terminals(model) if version == 3 else {}),
         **(files or {}),
     }
-    token = token_of([model_description(version, "", model)], written)
-    text = model_description(version, token, model)
-    return build_fmu(target, sources, text, every_platform=every_platform, files=members)
+    text = model_description(version, token_of(model, version, sources), model)
+    return build_fmu(
+        target, sources, text, every_platform=every_platform, files=members, warnings=warnings
+    )
 
 
-def token_of(texts: Sequence[str], sources: Mapping[str, bytes]) -> str:
-    """GUID or instantiation token: a digest of all that makes a model."""
-    digest = hashlib.sha256("".join(texts).encode())
-    for name in sorted(sources):
+def token_of(model: FmuModel, version: FmiVersion, sources: Mapping[str, bytes]) -> str:
+    """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model."""
+    digest = hashlib.sha256(model_description(version, "", model).encode())
+    for name in sorted(sources.keys() - {HEADER, "buildDescription.xml"}):  # they are generated
         digest.update(name.encode() + b"\0" + sources[name])
-    return "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
+    token = "{" + str(uuid.UUID(bytes=digest.digest()[:16], version=5)) + "}"
+    return _KEPT_TOKENS.get(token, token)
+
+
+def sampled_system(
+    *,
+    name: str,
+    identifier: str,
+    description: str,
+    sampling_time: float,
+    signals: Sequence[Variable],
+    sources: Mapping[str, bytes],
+    terminal: tuple[str, ...] = (),
+) -> FmuModel:
+    """The model of a function of inputs and parameters, evaluated once a `sampling_time` [s].
+
+    `signals` are real variables, or Boolean inputs: the inputs, then the outputs, then the tunable
+    parameters; every output depends on every input and parameter. `sources` are C headers by name,
+    of which ``core.h`` defines the functions that ``sampled_sources/model_state.h`` lists; their
+    arrays are ordered like the signals. Raises BuildError on names that are taken twice, in FMI or
+    in C.
+    """
+    time = Variable("time", Kind.INDEPENDENT, unit="s", description="simulation time")
+    known = tuple(v.name for v in signals if v.settable)
+    table = (time, *(v if v.settable else replace(v, uses=known) for v in signals))
+    for names in ([v.name for v in table], [v.identifier for v in table]):
+        if twice := next((each for each in names if names.count(each) > 1), None):
+            raise BuildError(f"two variables of {name} are called '{twice}'")
+    return FmuModel(
+        name=name,
+        identifier=identifier,
+        description=description,
+        variables=table,
+        units=tuple(unit(each) for each in dict.fromkeys(v.unit for v in table) if each),
+        step_size=sampling_time,
+        sampled=True,
+        terminal=terminal,
+        sources=sources,
+    )
+
+
+def sampled_sources(system: FmuModel, version: FmiVersion) -> dict[str, bytes]:
+    """File name → bytes of the folder `sources/` of a sampled system's FMU."""
+    kinds = [variable.kind for variable in system.variables]
+    first_output = 1 + kinds.count(Kind.INPUT)
+    header = render(
+        "system.h",
+        first_output=first_output,
+        first_parameter=first_output + kinds.count(Kind.OUTPUT),
+        sampling_time=float(system.step_size),
+    )
+    own = files_of("sampled_sources") | {**system.sources, "system.h": header.encode()}
+    if version == 3:  # its functions for scalars, and the adapter for the model's arrays
+        elements = dict.fromkeys(range(len(kinds)), (1, 0))
+        for array in system.arrays.values():
+            places = [system.value_reference(variable.name) for variable in array]
+            for k, place in enumerate(places):
+                elements[place] = (0 if k else len(places), places[(k + 1) % len(places)])
+        own["arrays.h"] = render("arrays.h", model=system, elements=elements.values()).encode()
+        last = b'#include "snapshot.h"\n'
+        scalars = (SOURCES / "fmi3.c").read_bytes()
+        own["fmi3.c"] = scalars.replace(last, last + b'#include "arrays.h"\n')
+    return sources_of(system, version, own)
+
+
+def build_sampled(
+    system: FmuModel,
+    target: str | Path,
+    version: FmiVersion = 2,
+    *,
+    every_platform: bool = False,
+    files: Mapping[str, bytes] | None = None,
+) -> Path:
+    """Build the FMU `target` of a sampled system; `files` are further members of the archive.
+
+    As `build_fmu`, whose BuildError it raises; with the same compiler the bytes repeat.
+    """
+    sources = sampled_sources(system, version)
+    return assemble(system, version, sources, target, every_platform=every_platform, files=files)

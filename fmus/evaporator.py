@@ -10,26 +10,17 @@ from cosim.files import temporary_folder
 from fmus import BuildError, plant
 from fmus.build import (
     COMPILER_FLAGS,
+    HEADER,
     PACKAGE,
     RESOURCES,
     SOURCES,
     WARNINGS,
-    build_fmu,
+    assemble,
     compilers,
+    sources_of,
     token_of,
 )
-from fmus.model import (
-    LICENSE,
-    FmiVersion,
-    FmuModel,
-    build_description,
-    c_header,
-    model_description,
-    read_variables,
-    render,
-    terminals,
-    unit,
-)
+from fmus.model import FmiVersion, FmuModel, read_variables, render, terminals, unit
 
 UNITS = tuple(
     unit(name)
@@ -44,11 +35,9 @@ VARIABLES = tuple(read_variables(RESOURCES / "evaporator.csv"))
 EVAPORATOR = FmuModel(
     name="Evaporator",
     identifier="evaporator",
-    version="1.0.0",
     description="Stochastic evaporation process, the plant of the RTI co-simulation benchmark",
     variables=VARIABLES,
     units=UNITS,
-    stop_time=6000.0,
     step_size=60.0,
     model_exchange=True,
     derivatives=True,
@@ -56,53 +45,15 @@ EVAPORATOR = FmuModel(
 )
 
 
-FILE_NAMES: dict[FmiVersion, str] = {2: "evaporator.fmu", 3: "evaporator_fmi3.fmu"}
-HEADER = "variables.h"
 BUILD_FILE = "extra/org.rti-cosim/build.json"
-
-
-# Stored results name FMI 2.0's file by its bytes; its token covered the face of FMI 3.0, too.
-_KEPT_TOKENS = {"{0200213d-e68e-5f01-bedd-123b2a53629a}": "{4b2ab9db-c6a8-56b3-80d2-38ec28c993f3}"}
-
-
-def header(token: str) -> str:
-    """The text of `variables.h` with the model's `token`."""
-    origin = "from fmus/evaporator.py by `cosim fmu build --in-place`"
-    return c_header(token, EVAPORATOR.identifier, VARIABLES, origin)
-
-
-def _hand_written(version: FmiVersion) -> dict[str, bytes]:
-    """File name → bytes of every C source of the FMU but the generated header."""
-    others = (HEADER, "fmi3.c" if version == 2 else "fmi2.c")
-    files = sorted(SOURCES.glob("*.[ch]"))
-    return {path.name: path.read_bytes() for path in files if path.name not in others}
-
-
-def model_token(version: FmiVersion) -> str:
-    """GUID of FMI 2.0 or instantiation token of FMI 3.0: a digest of all that makes the model."""
-    texts = [header(""), model_description(version, "", EVAPORATOR)]
-    token = token_of(texts, _hand_written(version))
-    return _KEPT_TOKENS.get(token, token)
 
 
 def sources(version: FmiVersion) -> dict[str, bytes]:
     """File name → bytes of the folder `sources/` of the FMU, generated files included."""
-    files = _hand_written(version)
-    files[HEADER] = header(model_token(version)).encode()
-    files["buildDescription.xml"] = build_description(version, EVAPORATOR).encode()
-    return files
-
-
-def documentation_page(version: FmiVersion) -> str:
-    """The text of documentation/index.html."""
-    return render(
-        "evaporator.html",
-        model=EVAPORATOR,
-        version=version,
-        license=LICENSE,
-        diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
-        build_file=BUILD_FILE,
-    )
+    others = (HEADER, "fmi3.c" if version == 2 else "fmi2.c")
+    own = {p.name: p.read_bytes() for p in SOURCES.glob("*.[ch]") if p.name not in others}
+    origin = "fmus/evaporator.py by `cosim fmu build --in-place`"
+    return sources_of(EVAPORATOR, version, own, origin=origin)
 
 
 def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
@@ -117,7 +68,7 @@ def _build_record(version: FmiVersion, every_platform: bool) -> bytes:
             }
             for compiler in compilers(every_platform)
         },
-        "model_token": model_token(version),
+        "model_token": token_of(EVAPORATOR, version, sources(version)),
     }
     return (json.dumps(record, indent=2) + "\n").encode()
 
@@ -128,20 +79,29 @@ def build(folder: Path, every_platform: bool = False) -> list[Path]:
     For the platform at hand by the local compiler, or for every one by the extra ``cross``.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    icons = {2: {"model.png": "icon.png"}, 3: {"terminalsAndIcons/icon.png": "icon.png"}}
+    faces: tuple[tuple[FmiVersion, str, str], ...] = (
+        (2, "evaporator.fmu", "model.png"),
+        (3, "evaporator_fmi3.fmu", "terminalsAndIcons/icon.png"),
+    )
     built = []
-    for version, name in FILE_NAMES.items():
-        resources = icons[version] | {"documentation/licenses/license.txt": "license.txt"}
-        files = {member: (RESOURCES / path).read_bytes() for member, path in resources.items()}
-        files["documentation/index.html"] = documentation_page(version).encode()
+    for version, name, icon in faces:
+        files = {icon: (RESOURCES / "icon.png").read_bytes()}
+        files["documentation/index.html"] = render(
+            "evaporator.html",
+            model=EVAPORATOR,
+            version=version,
+            diagram=(RESOURCES / "diagram.svg").read_text(encoding="utf-8"),
+            build_file=BUILD_FILE,
+        ).encode()
         files[BUILD_FILE] = _build_record(version, every_platform)
         if version == 3:
             files |= terminals(EVAPORATOR, icon=True)
         built.append(
-            build_fmu(
-                folder / name,
+            assemble(
+                EVAPORATOR,
+                version,
                 sources(version),
-                model_description(version, model_token(version), EVAPORATOR),
+                folder / name,
                 every_platform=every_platform,
                 files=files,
                 warnings=WARNINGS,
@@ -174,5 +134,5 @@ def compare_with_shipped() -> dict[str, list[str]]:
 
 def build_in_place() -> list[Path]:
     """Regenerate the C header and the shipped FMUs in the source tree (for developers)."""
-    (SOURCES / HEADER).write_text(header(model_token(2)))
+    (SOURCES / HEADER).write_bytes(sources(2)[HEADER])
     return [*build(PACKAGE, every_platform=True), *plant.build(PACKAGE, every_platform=True)]

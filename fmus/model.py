@@ -7,7 +7,7 @@ import hashlib
 import html
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from fractions import Fraction
 from functools import cache, cached_property
@@ -150,27 +150,27 @@ def unit(name: str) -> Unit:
 class FmuModel:
     """A model: its name, C identifier, table of variables with their units, and interfaces.
 
-    A variable's value reference is its position in the table. `stop_time` and `step_size` [s] are
-    the default experiment's; `model_exchange` and `derivatives` (directional, in FMI 3.0 adjoint,
-    too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the multiples of
-    `step_size` alone: its outputs are discrete, and no communication step may pass over a sample.
+    A variable's value reference is its position in the table. `step_size` [s] is that of the
+    default experiment, of 100 steps; `model_exchange` and `derivatives` (directional, in FMI 3.0
+    adjoint, too) say what it offers beside co-simulation. Where it is `sampled`, it acts at the
+    multiples of `step_size` alone: its outputs are discrete, and no communication step may pass
+    over a sample.
     Reals ``NAME[…]`` of a sampled model are one array NAME in FMI 3.0. `terminal` names the
     variables of FMI 3.0's terminal ``loop``, which a plant and its controller connect by their
-    names.
+    names. `sources` are C headers of its own, by file name.
     """
 
     name: str
     identifier: str
-    version: str
     description: str
     variables: tuple[Variable, ...]
     units: tuple[Unit, ...]
-    stop_time: float
     step_size: float
     model_exchange: bool = False
     derivatives: bool = False
     sampled: bool = False
     terminal: tuple[str, ...] = ()
+    sources: Mapping[str, bytes] = field(default_factory=dict)
 
     @cached_property
     def arrays(self) -> dict[str, list[Variable]]:
@@ -242,7 +242,6 @@ def initial_dependencies(name: str, model: FmuModel) -> tuple[str, ...]:
     return tuple(v.name for v in model.variables if v.name in names and v.settable)
 
 
-LICENSE = "MIT"
 TEMPLATES = Path(__file__).parent / "templates"
 
 Attributes = Mapping[str, object]
@@ -307,7 +306,6 @@ def model_description(version: FmiVersion, token: str, model: FmuModel) -> str:
         version=version,
         token=token,
         model=model,
-        license=LICENSE,
         # The shipped files stay the same from one version to the next.
         tool=f"rti-cosim {version_of('rti-cosim')}" if model.sampled else "rti-cosim",
         types={variable.type.name for variable in model.variables},
@@ -414,9 +412,6 @@ def _structure(version: FmiVersion, model: FmuModel) -> list[tuple[str, str, lis
     ]
 
 
-_SEED_MAX = 4294967295.0
-
-
 def c_header(token: str, identifier: str, variables: Sequence[Variable], origin: str) -> str:
     """The header's text: value references, types, starts and ranges, and the model's `token`.
 
@@ -440,6 +435,6 @@ def c_header(token: str, identifier: str, variables: Sequence[Variable], origin:
 def _numbers(variable: Variable) -> tuple[float, ...]:
     """Start, range and nominal value as the C has them."""
     seed = variable.type in (Type.SEED, Type.SEED_HIGH)
-    low, high = (0.0, _SEED_MAX) if seed else (variable.min, variable.max)
+    low, high = (0.0, 2.0**32 - 1) if seed else (variable.min, variable.max)
     nominal = 1.0 if variable.nominal is None else variable.nominal
     return tuple(float(number or 0.0) for number in (variable.start, low, high, nominal))

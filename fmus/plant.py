@@ -38,19 +38,12 @@ class Signal:
     description: str = ""
     range: float = 0.0
 
-    def variable(
-        self,
-        kind: Kind,
-        uses: tuple[str, ...] = (),
-        *,
-        name: str | None = None,
-        description: str | None = None,
-    ) -> Variable:
-        """The signal as a row of a table; a state or an output `uses` others and has no start."""
-        start = None if kind in (Kind.STATE, Kind.OUTPUT) else self.start
+    def variable(self, kind: Kind, uses: tuple[str, ...] = ()) -> Variable:
+        """The signal as a row of a table; one that is calculated `uses` others and has no start."""
+        start = None if kind in (Kind.STATE, Kind.DERIVATIVE, Kind.OUTPUT) else self.start
         return Variable(
-            name or self.name, kind, Type.REAL, self.unit, start, self.min, self.max,
-            _nominal(self.start), description or self.description, uses,
+            self.name, kind, Type.REAL, self.unit, start, self.min, self.max,
+            abs(self.start) or 1.0, self.description, uses,
         )  # fmt: skip
 
 
@@ -84,10 +77,9 @@ def plant_model(
         Variable("time", Kind.INDEPENDENT, unit="s", description="time"),
         *(s.variable(Kind.STATE, (f"{s.name}_start",)) for s in states),
         *(
-            Variable(
-                f"der({s.name})", Kind.DERIVATIVE, Type.REAL, f"{s.unit}/s", None, -1e6, 1e6,
-                _nominal(s.start), f"time derivative of {s.name}", known,
-            )
+            Signal(
+                f"der({s.name})", f"{s.unit}/s", s.start, -1e6, 1e6, f"time derivative of {s.name}"
+            ).variable(Kind.DERIVATIVE, known)
             for s in states
         ),
         *(s.variable(Kind.INPUT) for s in inputs),
@@ -97,29 +89,23 @@ def plant_model(
         ),
         *(s.variable(Kind.OUTPUT, known) for s in outputs),
         *switches,
-    ]  # fmt: skip
+    ]
+    about = "half width (uniform) or standard deviation (normal)"
     for d in disturbances:
-        mean = f"mean {d.description}"
-        table.append(d.variable(Kind.TUNABLE, name=f"{d.name}_nominal", description=mean))
-        table.append(
-            Variable(
-                f"{d.name}_range", Kind.TUNABLE, Type.REAL, d.unit, d.range, 0.0, d.max - d.min,
-                _nominal(d.range), "half width (uniform) or standard deviation (normal)",
-            )
-        )  # fmt: skip
+        spread = Signal(f"{d.name}_range", d.unit, d.range, 0.0, d.max - d.min, about)
+        mean = replace(d, name=f"{d.name}_nominal", description=f"mean {d.description}")
+        table += [mean.variable(Kind.TUNABLE), spread.variable(Kind.TUNABLE)]
     for s in states:
-        start = f"{s.name} at the start"
-        table.append(s.variable(Kind.FIXED, name=f"{s.name}_start", description=start))
+        start = replace(s, name=f"{s.name}_start", description=f"{s.name} at the start")
+        table.append(start.variable(Kind.FIXED))
     table += [s.variable(Kind.TUNABLE) for s in parameters]
     units = dict.fromkeys(v.unit for v in table if v.unit)
     return FmuModel(
         name=name,
         identifier=name,
-        version="1.0.0",
         description=description,
         variables=tuple(table),
         units=tuple(unit(name) for name in units),
-        stop_time=100 * sampling_time,
         step_size=sampling_time,
         model_exchange=True,
         terminal=tuple(s.name for s in (*states, *inputs)),
@@ -150,18 +136,8 @@ def build_plant(
         states=[model.by_name[name].identifier for name in model.names(Kind.STATE)],
         drawn=[n.removesuffix("_nominal") for n in model.by_name if n.endswith("_nominal")],
     ).encode()
-    return assemble(
-        model,
-        version,
-        sources_of(model, version, own),
-        target,
-        remarks=f"Disturbances are drawn every sampling_time, {model.step_size:g} s if not set.",
-        every_platform=every_platform,
-    )
-
-
-def _nominal(value: float) -> float:
-    return abs(value) or 1.0
+    sources = sources_of(model, version, own)
+    return assemble(model, version, sources, target, every_platform=every_platform)
 
 
 PLANTS = {

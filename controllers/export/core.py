@@ -15,23 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controllers.errors import ControllerError
-from controllers.functions import StackedFunction, c_source
+from controllers.functions import c_source
 from controllers.problem import Problem
-from controllers.rti.preparation import (
-    Exact,
-    embedding,
-    make_hessian,
-    preparation,
-    readout,
-    stage_linearisation,
-)
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.rti.preparation import Exact, SampleFunctions, stage_linearisation
+from controllers.theta import Parameters
 from cosim.scenario import Scenario
 
 SOURCES = Path(__file__).parent / "sources"
 QP_SOURCES = ("qp.h", "qp_enter.h", "qp_refine.h", "qp_residual.h", "qp_set.h")
 SOLVERS = ("condensed.h", *QP_SOURCES), ("stages.h", "qp_set.h")
-RULES = {"gauss-newton": "gauss_newton.h", "exact": "exact.h"}
 # A sample's arrays live on the stack, of which a thread has 1 MB on some platforms.
 STACK_LIMIT = 400_000
 STATUSES = (
@@ -64,63 +56,42 @@ def core(problem: Problem, parameters: Parameters, hessian: str = "gauss-newton"
     parameters θ stay an input. Raises ControllerError where `hessian` is not `gauss-newton` or
     `exact`, or the horizon is too long for a thread's stack.
     """
-    if hessian not in RULES:
-        raise ControllerError(
-            f"the Hessian '{hessian}' cannot be exported; choose {' or '.join(RULES)}"
-        )
     parameters.require_well_posed()
-    blocks = parameters.blocks
-    prepared = preparation(problem, blocks)
-    read = readout(problem, blocks, prepared)
-    functions: dict[str, StackedFunction] = {
-        "PREPARED": prepared,
-        "EMBEDDED": embedding(problem, blocks, prepared, read),
-        "READ": read,
-    }
-    if hessian == "exact":
-        (functions["CURVATURE"],) = make_hessian(hessian, problem, blocks, prepared).functions
-    if (size := stack_needed(problem, functions)) > STACK_LIMIT:
+    made = SampleFunctions(problem, parameters.blocks, hessian)
+    if (size := stack_needed(made)) > STACK_LIMIT:
         raise ControllerError(
             f"a horizon of {problem.horizon} needs {size / 1e3:.0f} kB of stack a sample, more "
             f"than the {STACK_LIMIT / 1e3:.0f} kB that an exported controller may take; shorten it"
         )
-    return Core(problem, parameters, controller_sources(problem, blocks, hessian, functions))
+    return Core(problem, parameters, controller_sources(made))
 
 
-def controller_sources(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    hessian: str,
-    functions: Mapping[str, StackedFunction],
-    *,
-    stagewise: bool = False,
-) -> dict[str, bytes]:
-    """C files by name of a controller made of `functions`, by the prefix of their constants.
-
-    Its QP is condensed, or solved stage by stage.
-    """
-    wanted = ("core.h", "rti.h", *SOLVERS[stagewise], "costs.h", "rotation.h", RULES[hessian])
+def controller_sources(made: SampleFunctions, *, stagewise: bool = False) -> dict[str, bytes]:
+    """C files by name of a controller; its QP is condensed, or solved stage by stage."""
+    wanted = ("core.h", "rti.h", *SOLVERS[stagewise], "costs.h", "rotation.h", made.hessian.source)
     sources = {name: (SOURCES / name).read_bytes() for name in wanted}
     unused = {"PREPARED", "EMBEDDED"} if stagewise else {"PREPARED"}
-    called = [each.function for name, each in functions.items() if name not in unused]
-    sources["linearise.h"] = _functions("linearise", [stage_linearisation(problem, blocks)])
+    called = [each.function for name, each in made.named.items() if name not in unused]
+    stage = stage_linearisation(made.problem, made.blocks)
+    sources["linearise.h"] = _functions("linearise", [stage])
     sources["functions.h"] = _functions("functions", called)
-    sources["problem.h"] = _constants(problem, blocks, hessian, functions, stagewise).encode()
+    sources["problem.h"] = _constants(made, stagewise).encode()
     return sources
 
 
-def stack_needed(problem: Problem, functions: Mapping[str, StackedFunction]) -> int:
+def stack_needed(made: SampleFunctions) -> int:
     """Upper bound of a sample's stack in bytes.
 
     CasADi's work vectors and the QP solver's arrays share their place; gcc and clang add 4 to 18 %
     and up to 4 kB.
     """
+    problem = made.problem
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     variables, limits = horizon * m, horizon * (m + n)
-    own = sum(functions[name].memory.size for name in ("PREPARED", "READ"))
+    own = made.preparation.memory.size + made.readout.memory.size
     solver = limits * (variables + limits + 10) + 2 * limits + variables * (variables + 1)
     condensing = (horizon + 5) * n * (variables + n + 1)
-    called = (each.function.sz_w() for name, each in functions.items() if name != "PREPARED")
+    called = (each.function.sz_w() for name, each in made.named.items() if name != "PREPARED")
     shared = max(solver, condensing, *called)
     return 4000 + round(1.2 * 8 * (own + shared))
 
@@ -133,17 +104,12 @@ def _functions(name: str, functions: Sequence[ca.Function]) -> bytes:
     return _filled("functions.h.in", code=code).encode()
 
 
-def _constants(
-    problem: Problem,
-    blocks: ThetaBlocks,
-    hessian: str,
-    functions: Mapping[str, StackedFunction],
-    stagewise: bool,
-) -> str:
+def _constants(made: SampleFunctions, stagewise: bool) -> str:
+    problem, blocks = made.problem, made.blocks
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     gamma = problem.discount
     sizes = {"N_X": n, "N_U": m, "N_W": n + m, "HORIZON": horizon, "N_THETA": blocks.size}
-    for prefix, call in functions.items():
+    for prefix, call in made.named.items():
         sizes |= {f"{prefix}_{name}": part.start for name, part in call.slices.items()}
         sizes[f"{prefix}_SIZE"] = call.stack.size
         of = call.function
@@ -164,7 +130,7 @@ def _constants(
         arrays="\n".join(_array(name, values) for name, values in arrays.items()),
         end_discount=repr(float(gamma**horizon)),
         floor=repr(Exact.FLOOR),
-        rule=RULES[hessian],
+        rule=made.hessian.source,
         solver=SOLVERS[stagewise][0],
         stagewise=str(int(stagewise)),
         **slack,

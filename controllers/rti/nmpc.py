@@ -17,28 +17,15 @@ from controllers.errors import ControllerError, ParameterError, QpError
 from controllers.export.core import SOURCES, STACK_LIMIT, STATUSES, controller_sources, stack_needed
 from controllers.functions import COMPILED, INTERPRETED, LONG, StackedFunction, library, switch
 from controllers.problem import Problem
-from controllers.qp import (
-    QpBackend,
-    QpSolution,
-    SoftQp,
-    make_backend,
-    multipliers_at_kink,
-)
-from controllers.rti.preparation import (
-    Lift,
-    embedding,
-    make_hessian,
-    preparation,
-    qp_of,
-    readout,
-)
+from controllers.qp import QpBackend, QpSolution, SoftQp, make_backend, multipliers_at_kink
+from controllers.rti.preparation import Exact, SampleFunctions, Spectrum
 from controllers.sensitivities import (
     SOLUTION,
     adjoint_directions,
     curvature_directions,
     sensitivities,
 )
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.theta import Parameters
 from cosim.protocols import CompiledLoop, Matrix, Vector
 from cosim.scenario import Scenario
 from cosim.validation import known_keywords
@@ -56,21 +43,30 @@ class LinearisationPoint(NamedTuple):
     costates: Matrix
 
 
-@dataclass(frozen=True)
-class Functions:
-    """The CasADi functions that a controller of the `problem` calls.
+class Functions(SampleFunctions):
+    """The CasADi functions of a controller: a sample's, and its derivatives in θ.
 
-    `preparation` and `embedding` make the QP, `readout` takes its value, `gradient` and `policy`
-    its derivatives in θ (`controllers.sensitivities`), the latter made when first asked for. The
-    memory of the first and the third hold a sample's QP and its solution.
+    Those are `controllers.sensitivities`, made when they are first asked for.
     """
 
-    problem: Problem
-    preparation: StackedFunction
-    embedding: StackedFunction
-    readout: StackedFunction
-    gradient: StackedFunction
-    policy: Callable[[], StackedFunction]
+    @cached_property
+    def _derivatives(self) -> tuple[StackedFunction, Callable[[], StackedFunction]]:
+        exact = isinstance(self.hessian, Exact)
+        return sensitivities(self.problem, self.blocks, exact=exact)
+
+    @property
+    def gradient(self) -> StackedFunction:
+        """The gradient of the value."""
+        return self._derivatives[0]
+
+    def policy(self) -> StackedFunction:
+        """The derivatives of the policy."""
+        return self._derivatives[1]()
+
+    @property
+    def named(self) -> dict[str, StackedFunction]:
+        """The functions by the prefix of their constants in C."""
+        return super().named | {"GRADIENT": self.gradient, "POLICY": self.policy()}
 
     def condense(self, before: Vector, after: Vector) -> None:
         """Write the condensed QP into copies of both memories."""
@@ -87,14 +83,13 @@ class Functions:
 class Prepared:
     """Data of a preparation phase, kept for read-outs after the next one has begun.
 
-    `memory` is a copy of the preparation's memory, `parameters` are θ. `spectrum` is the lift that
-    convexified the Hessians, None for Gauss–Newton. `functions` and `engine` are the controller's.
-    An engine that solves stage by stage condenses the QP only when it is asked for.
+    `memory` is a copy of the preparation's memory. `spectrum` is that of the exact Hessian's blocks
+    before the lift that made them convex. `functions` and `engine` are the controller's. An engine
+    that solves stage by stage condenses the QP only when it is asked for.
     """
 
     memory: Vector
-    parameters: Parameters
-    spectrum: Lift | None
+    spectrum: Spectrum | None
     functions: Functions
     engine: Engine | None = None
 
@@ -108,6 +103,10 @@ class Prepared:
         horizon = self.functions.problem.horizon
         parts = (self.part(name) for name in LinearisationPoint._fields)
         return LinearisationPoint(*(part.reshape(horizon, -1).copy() for part in parts))
+
+    def contract(self, seed: Vector) -> Vector:
+        """Adjoint of the lift's derivative (`Spectrum.contract`), of the identity without one."""
+        return seed if self.spectrum is None else self.spectrum.contract(seed)
 
 
 @dataclass(eq=False)
@@ -127,14 +126,16 @@ class RtiSolution:
     enforced: bool = False
     status: str = "solved"
 
+    def _flat(self, name: str) -> Vector:
+        return self.memory[self.prepared.functions.readout.places[name]]
+
     def _part(self, name: str) -> Matrix:
         return self.prepared.functions.readout.part(name, self.memory)
 
     @cached_property
     def multipliers(self) -> QpSolution:
         """Primal-dual solution of the condensed QP."""
-        places = self.prepared.functions.readout.places
-        return QpSolution(*(self.memory[places[name]] for name in ("v", "nu", "lam")))
+        return QpSolution(*(self._flat(name) for name in ("v", "nu", "lam")))
 
     @cached_property
     def qp(self) -> SoftQp:
@@ -142,7 +143,7 @@ class RtiSolution:
         functions, prepared = self.prepared.functions, self.prepared
         if prepared.engine is not None and prepared.engine.stagewise:
             functions.condense(prepared.memory, self.memory)
-        return qp_of(functions.preparation, functions.readout, prepared.memory, self.memory)
+        return functions.qp(prepared.memory, self.memory)
 
     @cached_property
     def predicted_states(self) -> Matrix:
@@ -187,15 +188,13 @@ class RtiSolution:
     def residual(self) -> float:
         """Largest KKT residual; compiled code has measured it when it solved."""
         if self.prepared.engine is not None and not self.enforced:
-            return float(self.memory[self.prepared.functions.readout.places["residual"]][0])
+            return float(self._flat("residual")[0])
         return self.multipliers.residual(self.qp)
 
     @property
     def iterations(self) -> int | None:
         """Steps of the compiled QP solver; None where another one solved."""
-        if self.prepared.engine is None:
-            return None
-        return int(self.memory[self.prepared.functions.readout.places["iterations"]][0])
+        return None if self.prepared.engine is None else int(self._flat("iterations")[0])
 
     @cached_property
     def weakly_active(self) -> bool:
@@ -216,7 +215,7 @@ class RtiSolution:
     def value_gradient(self) -> Vector:
         """dV/dθ or dQ/dθ, shape (n_θ,): ∇θ of the QP's Lagrangian at the solution."""
         if self.prepared.engine is not None:
-            return self.memory[self.prepared.functions.readout.places["gradient"]]
+            return self._flat("gradient")
         function = self.prepared.functions.gradient
         self._write_solution(function)
         function()
@@ -248,13 +247,11 @@ class RtiSolution:
         function = prepared.functions.policy()
         self._write_solution(function)
         inputs = function.inputs
-        for name in ("A", "B", "L", "L_N"):
-            inputs[name][:] = prepared.part(name)
         for name, direction in (("dv", dv), ("dt", dt), ("dlam", dlam)):
             inputs[name][:] = direction.reshape(-1)
-        if (spectrum := prepared.spectrum) is not None:
+        if "dM" in inputs:
             step = self._step_from_point()
-            moved = curvature_directions(self.qp.rows, dv, step, spectrum.contract)
+            moved = curvature_directions(self.qp.rows, dv, step, prepared.contract)
             inputs["dM"][:] = moved.reshape(-1)
         function()
         by_theta, by_state = (function.part(name).reshape(m, -1) for name in ("policy", "state"))
@@ -262,15 +259,14 @@ class RtiSolution:
 
     def _write_solution(self, function: StackedFunction) -> None:
         inputs, prepared = function.inputs, self.prepared
-        places = prepared.functions.readout.places
         for name in SOLUTION:
-            inputs[name][:] = self.memory[places[name]]
-        for name in ("x", "u", "theta"):
+            inputs[name][:] = self._flat(name)
+        for name in inputs.keys() & {"x", "u", "theta", "A", "B", "L", "L_N"}:
             inputs[name][:] = prepared.part(name)
-        if prepared.spectrum is not None:
+        if "M" in inputs:
             step = self._step_from_point()
             seed = step[:, :, None] * step[:, None, :] / 2
-            inputs["M"][:] = prepared.spectrum.contract(seed).reshape(-1)
+            inputs["M"][:] = prepared.contract(seed).reshape(-1)
             inputs["guess"][:] = prepared.part("costates")
 
     def _step_from_point(self) -> Matrix:
@@ -312,30 +308,19 @@ class Engine:
         self._prepare: Callable[..., int] = library_.engine_prepare
         self._feedback: Callable[..., int] = library_.engine_feedback
         self._policy: Callable[..., int] = library_.engine_policy
-        n, m, size = functions.problem.n_states, self.action.size, functions.gradient.stack.size
-        self._jacobians: Vector = np.zeros((size + n) * m)
-        self._jacobians_at = ctypes.c_void_p(self._jacobians.ctypes.data)
-        self._split, self._m = size * m, m
+        self._sizes = self.action.size, functions.blocks.size, functions.problem.n_states
 
     @classmethod
-    def compile(cls, functions: Functions, blocks: ThetaBlocks) -> Engine | None:
+    def compile(cls, functions: Functions) -> Engine | None:
         """Compiled engine of a Gauss–Newton controller, or None without a compiler.
 
         A QP of many stages, or too large for an exported controller, is solved stage by stage.
         """
-        named = {
-            "PREPARED": functions.preparation,
-            "EMBEDDED": functions.embedding,
-            "READ": functions.readout,
-            "GRADIENT": functions.gradient,
-            "POLICY": functions.policy(),
-        }
         problem = functions.problem
         # A rule of thumb: where stage by stage becomes faster depends on the plant and on θ.
         stagewise = problem.horizon >= 5 * (problem.n_states + problem.n_actions)
-        stagewise = stagewise or stack_needed(problem, named) > STACK_LIMIT
-        rule = "gauss-newton"
-        sources = controller_sources(problem, blocks, rule, named, stagewise=stagewise)
+        stagewise = stagewise or stack_needed(functions) > STACK_LIMIT
+        sources = controller_sources(functions, stagewise=stagewise)
         for name in ("sensitivities.h", "engine.c"):
             sources[name] = (SOURCES / name).read_bytes()
         path = library(sources)
@@ -360,14 +345,14 @@ class Engine:
         return failed
 
     def policy(self, before: Vector, after: Vector) -> tuple[Vector, Vector] | None:
-        """Copies of dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
+        """dπ/dθ (m, n_θ) and dπ/ds (m, n); None if LICQ fails."""
+        m, n_theta, n = self._sizes
+        found: Vector = np.empty(m * (n_theta + n))
+        at, of, to = (ctypes.c_void_p(array.ctypes.data) for array in (before, after, found))
         # Use another workspace: the next feedback needs the preparation's factors.
-        given = (ctypes.c_void_p(array.ctypes.data) for array in (before, after))
-        if self._policy(*given, self._other, self._jacobians_at):
+        if self._policy(at, of, self._other, to):
             return None
-        parts = self._jacobians[: self._split], self._jacobians[self._split :]
-        by_theta, by_state = (part.reshape(self._m, -1).copy() for part in parts)
-        return by_theta, by_state
+        return found[: m * n_theta].reshape(m, n_theta), found[m * n_theta :].reshape(m, n)
 
     def begin(self) -> None:
         """Make ready for a closed loop: no earlier sample is known."""
@@ -433,19 +418,13 @@ class RtiNmpc:
         self.iterations = iterations
         self.problem = problem
         self._compilable = hessian == "gauss-newton" and backend == "daqp"
-        blocks = parameters.blocks
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._make_backend = partial(make_backend, backend) if isinstance(backend, str) else backend
-        self._backend = self._make_backend()
-        self._prepare = preparation(problem, blocks)
-        self._readout = readout(problem, blocks, self._prepare)
-        self._embed = embedding(problem, blocks, self._prepare, self._readout)
-        self._hessian = make_hessian(hessian, problem, blocks, self._prepare)
-        gradient, policy = sensitivities(problem, blocks, exact=hessian != "gauss-newton")
-        made = (self._prepare, self._embed, self._readout, gradient, policy)
-        self._functions = Functions(problem, *made)
+        self._functions = made = Functions(problem, parameters.blocks, hessian)
+        self._prepare, self._embed = made.preparation, made.embedding
+        self._readout, self._hessian = made.readout, made.hessian
         before, after = self._prepare.memory, self._readout.memory
-        self._qp = qp_of(self._prepare, self._readout, before, after)
+        self._qp = made.qp(before, after)
         self._qp.lower[:] = np.tile(problem.action_lower - problem.reference_action, horizon)
         self._qp.upper[:] = np.tile(problem.action_upper - problem.reference_action, horizon)
         self._engine: Engine | None = None
@@ -479,7 +458,7 @@ class RtiNmpc:
         """
         if not self._compilable or (samples < LONG and switch() != "now"):
             return
-        self._engine = Engine.compile(self._functions, self._parameters.blocks)
+        self._engine = Engine.compile(self._functions)
         self.functions = INTERPRETED if self._engine is None else COMPILED
         self._compilable = self._engine is not None  # where it failed once it is not tried again
         self._prepared = None
@@ -589,11 +568,10 @@ class RtiNmpc:
             prepare()
             finite = prepare.finite()
         if not finite:
-            raise QpError(
+            raise self._failure(
                 "the QP is not finite: the model has no finite value or derivative at the point of "
                 "linearisation",
-                status="QP not finite",
-                qp=self._present_qp(),
+                "QP not finite",
             )
         if self._engine is None:
             self._backend.load(self._qp)
@@ -602,14 +580,13 @@ class RtiNmpc:
             memory[:first], memory[last:] = prepare.memory[:first], prepare.memory[last:]
         else:
             memory = prepare.memory.copy()
-        made = self._parameters, self._hessian.spectrum, self._functions, self._engine
-        self._prepared = Prepared(memory, *made)
+        self._prepared = Prepared(memory, self._hessian.spectrum, self._functions, self._engine)
 
-    def _present_qp(self) -> SoftQp:
-        """Copy of the QP for a QpError; compiled code may have left it uncondensed."""
+    def _failure(self, message: str, status: str) -> QpError:
+        """An error with a copy of the QP, which compiled code may have left uncondensed."""
         self._prepare()
         self._embed()
-        return self._qp.copy()
+        return QpError(message, status=status, qp=self._qp.copy())
 
     @property
     def linearisation_point(self) -> LinearisationPoint:
@@ -652,10 +629,10 @@ class RtiNmpc:
         self._readout.inputs["s"][:] = s
         if a is not None:
             a = _vector("action", a, problem.reference_action.size)
-        if self._engine is None:
-            self._solve_interpreted(s, a)
-        else:
-            self._solve_compiled(s, a)
+        solve = self._solve_interpreted if self._engine is None else self._solve_compiled
+        if not solve(s, a):
+            message = f"the QP is not finite: state {s}, action {a!r}"
+            raise self._failure(message, "state or action not finite")
         memory = self._readout.memory.copy()
         return RtiSolution(
             action=memory[self._controls] + problem.reference_action,
@@ -665,20 +642,18 @@ class RtiNmpc:
             enforced=a is not None,
         )
 
-    def _solve_compiled(self, s: Vector, a: Vector | None) -> None:
+    def _solve_compiled(self, s: Vector, a: Vector | None) -> bool:
+        """Solve; whether state and action are finite."""
         engine = self._engine
         assert engine is not None
         if a is not None:
             engine.action[:] = a
         status = self._status or engine.feedback(a is not None)
-        if status == NOT_FINITE:
-            raise self._not_finite(s, a)
-        if status:
-            reason = STATUSES[status]
-            message = f"the QP was not solved: {reason}"
-            raise QpError(message, status=reason, qp=self._present_qp())
+        if status not in (0, NOT_FINITE):
+            raise self._failure(f"the QP was not solved: {STATUSES[status]}", STATUSES[status])
+        return status == 0
 
-    def _solve_interpreted(self, s: Vector, a: Vector | None) -> None:
+    def _solve_interpreted(self, s: Vector, a: Vector | None) -> bool:
         qp, read = self._qp, self._readout
         self._embed()
         known = self._embed.finite()
@@ -689,7 +664,7 @@ class RtiNmpc:
         else:
             self._first_lower[:], self._first_upper[:] = self._action_lower, self._action_upper
         if not known:
-            raise self._not_finite(s, a)
+            return False
         found = self._backend.solve(qp)
         if a is not None:
             found = multipliers_at_kink(qp, found, self._action_lower, self._action_upper)
@@ -698,13 +673,7 @@ class RtiNmpc:
         inputs["v"][:], inputs["lam"][:] = found.v, found.lam
         read.memory[read.places["nu"]] = found.nu
         read()
-
-    def _not_finite(self, s: Vector, a: Vector | None) -> QpError:
-        return QpError(
-            f"the QP is not finite: state {s}, action {a!r}",
-            status="state or action not finite",
-            qp=self._present_qp(),
-        )
+        return True
 
     def compiled_loop(self, scenario: Scenario) -> CompiledLoop | None:
         """A new closed loop in compiled code; None if only Python can run it.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -59,17 +59,6 @@ def stage_linearisation(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
     offset = x_next - x_s - a @ (x - x_s) - b @ (u - u_s) + symbols["c_f"]
     return stage_function(
         "linearise", {"x": x, "u": u, "theta": symbols.theta}, {"A": a.T, "B": b.T, "r": offset}
-    )
-
-
-def stage_curvature(problem: Problem, blocks: ThetaBlocks) -> ca.Function:
-    """One stage's D_k, the second derivative of χᵀf(x, u) in w = (x, u), by (x, u, chi, theta)."""
-    x, u, symbols = _point(problem, blocks)
-    chi = ca.SX.sym("chi", problem.n_states)
-    return stage_function(
-        "curvature_of_stage",
-        {"x": x, "u": u, "chi": chi, "theta": symbols.theta},
-        {"D": _curvature(problem, symbols, x, u, chi)},
     )
 
 
@@ -270,7 +259,7 @@ def embedding(
         "embedding",
         {"s": s, "theta": symbols.theta, **prior},
         {"f": prior["f"] + prior["F"].T @ (s - x_s), "lower": lower, "upper": upper},
-        {name: prepared.stack[prepared.slices[name]] for name in prior}
+        {name: prepared.memory[prepared.places[name]] for name in prior}
         | {"theta": prepared.inputs["theta"], "s": read.inputs["s"]},
         memory=read.memory[read.places["f"].start : read.places["row_upper"].stop],
     )
@@ -348,29 +337,13 @@ def readout(problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) ->
             "next_u": ca.horzcat(v[:, 1:], v[:, -1]) + ca.repmat(u_s, 1, horizon),
             "next_chi": ca.horzcat(*(costate / gamma for costate in chi[2:]), chi[-1]),
         },
-        {name: prepared.stack[prepared.slices[name]] for name in ("A", "B", "r")}
-        | {name: prepared.inputs[name] for name in ("L", "q", "L_N", "q_N", "theta")},
+        {
+            name: prepared.memory[prepared.places[name]]
+            for name in ("A", "B", "r", "L", "q", "L_N", "q_N", "theta")
+        },
         room=dict.fromkeys(("f", "row_lower", "row_upper", "nu", "lower", "upper"), horizon * m)
         | dict.fromkeys(("row_lower", "row_upper"), horizon * n)
         | {"residual": 1, "iterations": 1, "gradient": blocks.size},
-    )
-
-
-def qp_of(
-    prepared: StackedFunction, read: StackedFunction, before: Vector, after: Vector
-) -> SoftQp:
-    """The QP in memory of the preparation, `before`, and of the read-out, `after`, or copies."""
-    places = read.places
-    return SoftQp(
-        H=prepared.part("H", before),
-        f=after[places["f"]],
-        lower=after[places["lower"]],
-        upper=after[places["upper"]],
-        rows=prepared.part("Gamma", before),
-        row_lower=after[places["row_lower"]],
-        row_upper=after[places["row_upper"]],
-        w=before[prepared.places["w"]],
-        W=before[prepared.places["W"]],
     )
 
 
@@ -403,35 +376,22 @@ class Spectrum:
         return self.vectors @ (divided * (transposed @ seed @ self.vectors)) @ transposed
 
 
-class Unlifted:
-    """In place of `Spectrum` where the blocks are left as they are: P is the identity."""
-
-    def undecided(self) -> bool:
-        """No: nothing is lifted."""
-        return False
-
-    def contract(self, seed: Vector) -> Vector:
-        """The identity's adjoint."""
-        return seed
-
-
-Lift = Spectrum | Unlifted
-"""How P changed the blocks of an exact Hessian."""
-
-
 class GaussNewton:
     """L_k = 2γᵏB_l, the Hessian of the cost: the QP then holds the paper's cost as it is.
 
     It fills the QP's stage costs ½wᵀL_k w + q_kᵀw in the memory of the preparation; `functions` are
-    the CasADi functions that it calls.
+    the CasADi functions that it calls, by the prefix of their constants in C, `spectrum` that of
+    the last blocks if they were lifted.
     """
 
+    source = "gauss_newton.h"
+    """The rule in C."""
     lifts = False
-    spectrum: Lift | None = None
-    functions: Sequence[StackedFunction] = ()
+    spectrum: Spectrum | None = None
 
     def __init__(self, problem: Problem, prepared: StackedFunction) -> None:
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
+        self.functions: dict[str, StackedFunction] = {}
         self.discounts = problem.discount ** np.arange(horizon)
         self._end = problem.discount**horizon
         self.L = prepared.inputs["L"].reshape(horizon, n + m, n + m)
@@ -459,13 +419,21 @@ class Exact(GaussNewton):
     `lifts` is false P is the identity, and the QP may be indefinite.
     """
 
+    source = "exact.h"
     FLOOR = 1e-3
 
     def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:
         super().__init__(problem, prepared)
         self.lifts = True
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
-        self._reference = np.concatenate([problem.reference_state, problem.reference_action])
+        self._reference = problem.reference
+        x, u, symbols = _point(problem, blocks)
+        chi = ca.SX.sym("chi", n)
+        stage = stage_function(
+            "curvature_of_stage",
+            {"x": x, "u": u, "chi": chi, "theta": symbols.theta},
+            {"D": _curvature(problem, symbols, x, u, chi)},
+        )
         given = {
             "x": ca.MX.sym("x", n, horizon),
             "u": ca.MX.sym("u", m, horizon),
@@ -473,9 +441,9 @@ class Exact(GaussNewton):
             "theta": ca.MX.sym("theta", blocks.size),
         }
         *point, theta = given.values()
-        D = stage_curvature(problem, blocks).map(horizon)(*point, ca.repmat(theta, 1, horizon))
+        D = stage.map(horizon)(*point, ca.repmat(theta, 1, horizon))
         self._curvature = StackedFunction("curvature", given, {"D": D})
-        self.functions = (self._curvature,)
+        self.functions["CURVATURE"] = self._curvature
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take over the costs of θ."""
@@ -502,8 +470,7 @@ class Exact(GaussNewton):
             lifted = np.maximum(values, floor)
             L[:] = (vectors * lifted[:, None, :]) @ vectors.transpose(0, 2, 1)
         else:
-            self.spectrum = Unlifted()
-            L[:] = raw
+            self.spectrum, L[:] = None, raw
         at = np.concatenate([x, u], axis=1) - self._reference
         curved = np.einsum("kij,kj->ki", L, at)
         flat = 2 * discounts[:, None] * (at @ self._B)
@@ -520,3 +487,38 @@ def make_hessian(
     if name == "exact":
         return Exact(problem, blocks, prepared)
     raise ControllerError(f"there is no Hessian '{name}'; choose gauss-newton or exact")
+
+
+class SampleFunctions:
+    """The CasADi functions that make a sample's QP and read its solution out.
+
+    `preparation` and `embedding` make the QP with the rule `hessian`, `readout` takes its value.
+    The memory of the first and the last hold a sample's QP and its solution. Raises ControllerError
+    on an unknown Hessian.
+    """
+
+    def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
+        self.problem, self.blocks = problem, blocks
+        self.preparation = preparation(problem, blocks)
+        self.readout = readout(problem, blocks, self.preparation)
+        self.embedding = embedding(problem, blocks, self.preparation, self.readout)
+        self.hessian = make_hessian(hessian, problem, blocks, self.preparation)
+
+    @property
+    def named(self) -> dict[str, StackedFunction]:
+        """The functions by the prefix of their constants in C."""
+        own = {"PREPARED": self.preparation, "EMBEDDED": self.embedding, "READ": self.readout}
+        return own | self.hessian.functions
+
+    def qp(self, before: Vector, after: Vector) -> SoftQp:
+        """The QP in the memory of preparation and read-out, `before` and `after`, or copies."""
+        prepared, read = self.preparation.places, self.readout.places
+        return SoftQp(
+            H=self.preparation.part("H", before),
+            rows=self.preparation.part("Gamma", before),
+            **{name: before[prepared[name]] for name in ("w", "W")},
+            **{
+                name: after[read[name]]
+                for name in ("f", "lower", "upper", "row_lower", "row_upper")
+            },
+        )

@@ -19,13 +19,10 @@ from cosim.plant.fmu_plant import start_values
 from cosim.plugins import build_controller
 from cosim.scenario import Scenario
 from cosim.simulation import spawn_seeds
-from fmus.model import FmiVersion, Kind, Type, Variable
-from fmus.sampled import SampledSystem, build_sampled
+from fmus.build import build_sampled, sampled_system
+from fmus.model import FmiVersion, FmuModel, Kind, Type, Variable
 from fmus.ssp import write_ssp
 
-SAMPLES = 100
-"""Default length of the SSP's experiment."""
-SATURATE = "saturate"
 RECORD = "extra/org.rti-cosim/controller.json"
 
 
@@ -50,12 +47,14 @@ def rti_controller(name: str, scenario: Scenario, measured: tuple[str, ...] = ()
 
 
 def sampled_controller(
-    controller: RtiNmpc, scenario: Scenario, units: dict[str, str], measured: tuple[str, ...] = ()
-) -> SampledSystem:
+    controller: RtiNmpc, scenario: Scenario, measured: tuple[str, ...] = ()
+) -> FmuModel:
     """The controller as a sampled system; raises ControllerError where it cannot be exported.
 
-    `units` are those of the plant's variables by name, `measured` what `rti_controller` was given.
+    Its signals have the names and units of the plant's variables; `measured` is what
+    `rti_controller` was given.
     """
+    plant = unpack(scenario.plant.fmu)
     hessian = scenario.controller.hessian
     origin = f"{scenario.hash} {hessian} {controller.parameters.hash}"
     problem, parameters = controller.problem, controller.parameters
@@ -65,7 +64,7 @@ def sampled_controller(
     start = dict(zip((*states, *actions), points, strict=True))
 
     def signal(kind: Kind, name: str, about: str, of: str, **more: Any) -> Variable:
-        return Variable(name, kind, unit=units.get(of, ""), description=about, **more)
+        return Variable(name, kind, unit=plant.unit(of), description=about, **more)
 
     signals = [signal(Kind.INPUT, x, "measured state", x, start=start[x]) for x in states]
     about = "whether the actions are those of manual_…, as of the next sample"
@@ -100,7 +99,7 @@ def sampled_controller(
         Variable(f"theta.{_structured(label)}", Kind.TUNABLE, start=value, description=about)
         for (label, value), about in zip(theta.items(), meanings, strict=True)
     ]
-    return SampledSystem(
+    return sampled_system(
         name=f"RTI-NMPC {scenario.name}",
         identifier=f"rti_nmpc_{hashlib.sha256(origin.encode()).hexdigest()[:12]}",
         description=(
@@ -108,7 +107,7 @@ def sampled_controller(
             f"{hessian} Hessian, θ {parameters.hash}"
         ),
         sampling_time=scenario.sampling_time,
-        signals=tuple(signals),
+        signals=signals,
         sources=exported.sources,
         terminal=(*states, *actions),
     )
@@ -135,14 +134,16 @@ def _structured(label: str) -> str:
 
 
 def write_fmu(
-    system: SampledSystem,
     controller: RtiNmpc,
     scenario: Scenario,
     target: Path,
     version: FmiVersion,
-    every_platform: bool,
+    *,
+    measured: tuple[str, ...] = (),
+    every_platform: bool = False,
 ) -> Path:
-    """Write the FMU with a record of its scenario and θ."""
+    """Write the FMU of `sampled_controller` with a record of its scenario and θ."""
+    system = sampled_controller(controller, scenario, measured)
     record = {
         "scenario": scenario.to_dict(),
         "scenario_hash": scenario.hash,
@@ -171,16 +172,14 @@ def write_loop(
     plant_seed, _ = spawn_seeds(seed)
     starts = start_values(scenario, plant_seed)
     archive = unpack(plant.fmu)
-    types = {variable.name: variable.type for variable in archive.description.modelVariables}
-    if SATURATE in types:
-        starts[SATURATE] = ("Boolean", 1.0)
+    types = {name: variable.type for name, variable in archive.variables.items()}
+    if "saturate" in types:
+        starts["saturate"] = ("Boolean", 1.0)
     for name, (kind, value) in list(starts.items()):
         # libcosim ignores enumerations of FMI 2.0; our plants have an integer beside theirs.
         if kind == "Enumeration" and types.get(f"{name}_number") == "Integer":
             del starts[name]
             starts[f"{name}_number"] = ("Integer", value)
-    length = SAMPLES * scenario.sampling_time
-    signals = (*plant.states, *measured)
-    return write_ssp(
-        target, controller, archive.path, signals, plant.actions, starts, stop_time=length
-    )
+    names = (*plant.states, *measured), plant.actions
+    stop = 100 * scenario.sampling_time  # as in the FMU's own experiment
+    return write_ssp(target, controller, archive.path, *names, starts, stop_time=stop)

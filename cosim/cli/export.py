@@ -51,7 +51,6 @@ def export(
         from cosim.cli import controller_fmu
         from cosim.errors import CosimError
         from cosim.files import check_target
-        from cosim.plant import FmuPlant
         from cosim.scenario import Scenario
         from fmus import PLATFORMS, present
         from fmus.model import FmiVersion
@@ -75,13 +74,11 @@ def export(
             return
         if single:
             raise CosimError("--single goes with --format c: an FMU's numbers are doubles")
-        out_.announce(loaded.plant.fmu)
-        with FmuPlant(loaded) as plant:
-            units = plant.units
-        system = controller_fmu.sampled_controller(rti, loaded, units, names)
         every_platform = not local and find_spec("ziglang") is not None
         version: FmiVersion = 3 if fmi == 3 else 2
-        path = controller_fmu.write_fmu(system, rti, loaded, out, version, every_platform)
+        path = controller_fmu.write_fmu(
+            rti, loaded, out, version, measured=names, every_platform=every_platform
+        )
         platforms = [p.tuple for p in (PLATFORMS if every_platform else [present()])]
         out_.note(f"wrote {path}: FMI {version}.0 for {', '.join(platforms)}")
         document = {

@@ -52,7 +52,7 @@ def optimum(
 
 
 def _show_quasi_static(policy: QuasiStaticPolicy, task: Scenario, out_: cli.Output) -> None:
-    names = list(policy.law.present(0.0))
+    names = [name for name, value in policy.law.plants[0].items() if value is not None]
     table = [{name: plant[name] for name in names} | {"J": gain} for plant, gain in policy.gains]
     rows = [tuple(f"{value:.4f}" for value in row.values()) for row in table]
     rows.append(("mean", *[""] * (len(names) - 1), f"{policy.gain:.4f}"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from math import ceil, isfinite, log10
 from pathlib import Path
 from typing import Any
@@ -49,17 +50,17 @@ def draft_scenario(
     archive = unpack(fmu)
     for refusal in refusals(archive):
         raise PlantError(refusal)
-    known = {variable.name: variable for variable in archive.description.modelVariables}
+    known = archive.variables
     for name in (*states, *actions, *([stage_cost] if stage_cost else [])):
         if name not in known:
             raise PlantError(
                 f"FMU '{archive.path.name}' has no variable '{name}'{suggestion(name, known)}"
             )
-    noise = [name for name in _reals(known, "output") if f"{name}_nominal" in known]
-    cost = stage_cost or _cost(archive, known)
-    states = list(states) or _states(archive, known, [*noise, cost])
-    actions = list(actions) or _actions(archive, known, noise)
-    mapping = _mapping(known, states, noise)
+    noise = [name for name in _reals(archive, "output") if f"{name}_nominal" in known]
+    cost = stage_cost or _cost(archive)
+    states = list(states) or _states(archive, [*noise, cost])
+    actions = list(actions) or _actions(archive, noise)
+    mapping = _mapping(archive, states, noise)
     starts = [known[name] for name in mapping.get("initial_state", states)]
     x = _start(starts, state, "state")
     u = _start([known[name] for name in actions], action, "action")
@@ -74,10 +75,10 @@ def draft_scenario(
         "schema": 1,
         "name": Path(fmu).stem,
         "description": str(archive.description.description or archive.description.modelName),
-        "sampling_time": sampling_time or _sampling_time(archive, known, mapping),
+        "sampling_time": sampling_time or _sampling_time(archive, mapping),
         "discount": 0.99,
         "plant": {
-            "fmu": str(fmu) if shipped else str(archive.path),
+            "fmu": str(fmu) if shipped else archive.path.as_posix(),
             "states": states,
             "actions": actions,
             "disturbances": noise,
@@ -93,11 +94,7 @@ def draft_scenario(
             "action_upper": [high for _, high in limits],
         },
         "penalty": {"linear": [1.0] * len(x), "quadratic": [1.0] * len(x)},
-        "controller": {
-            "reference_state": x.tolist(),
-            "reference_action": u.tolist(),
-            "reference_cost": 0.0,
-        },
+        "controller": _reference(x, u, 0.0),
     }
     with FmuPlant(Scenario.from_dict(document | {"disturbance": {"law": "none"}})) as plant:
         x, u, found = nearest_steady_state(plant, x, u)
@@ -105,17 +102,21 @@ def draft_scenario(
     weight = 10.0 ** ceil(log10(10 * max(abs(found), 1.0)) - 0.5)
     document["penalty"]["linear"] = [weight] * len(x)
     document["plant"]["initial_state"] = x.tolist()
-    document["controller"] |= {
-        "reference_state": x.tolist(),
-        "reference_action": u.tolist(),
-        "reference_cost": found,
-    }
+    document["controller"] = _reference(x, u, found)
     if shipped:
         document["controller"]["model"] = "controllers.evaporator:model"
     else:
-        document["plant"]["fmu"] = _relative(archive.path, target)
+        with suppress(ValueError):  # it is on another drive
+            path = os.path.relpath(archive.path, target.resolve().parent)
+            document["plant"]["fmu"] = Path(path).as_posix()
     notes = [f"# {field}: {note}" for field, note in _comments(document, units).items()]
     return "\n".join([HEAD, *notes, "", tomli_w.dumps(document)])
+
+
+def _reference(x: Array, u: Array, cost: float) -> dict[str, Any]:
+    return {
+        "reference_state": x.tolist(), "reference_action": u.tolist(), "reference_cost": cost,
+    }  # fmt: skip
 
 
 def _start(variables: Sequence[Any], given: Sequence[float], kind: str) -> Array:
@@ -135,20 +136,13 @@ def _limits(variable: Any, value: float) -> tuple[float, float]:
     return _number(variable.min, value - reach), _number(variable.max, value + reach)
 
 
-def _sampling_time(fmu: UnpackedFmu, known: dict[str, Any], mapping: Mapping[str, Any]) -> float:
-    parameter = known.get(mapping.get("sampling_time", ""))
+def _sampling_time(fmu: UnpackedFmu, mapping: Mapping[str, Any]) -> float:
+    parameter = fmu.variables.get(mapping.get("sampling_time", ""))
     experiment = getattr(fmu.description.defaultExperiment, "stepSize", None)
     stated = getattr(parameter, "start", None) or experiment
     if not stated:
         raise PlantError(f"FMU '{fmu.path.name}' states no step size; give --sampling-time SECONDS")
     return float(stated)
-
-
-def _relative(path: Path, target: Path) -> str:
-    try:
-        return Path(os.path.relpath(path, target.resolve().parent)).as_posix()
-    except ValueError:  # another drive
-        return path.as_posix()
 
 
 def _comments(document: dict[str, Any], units: dict[str, str]) -> dict[str, str]:
@@ -174,16 +168,16 @@ def _comments(document: dict[str, Any], units: dict[str, str]) -> dict[str, str]
     return comments
 
 
-def _reals(known: Mapping[str, Any], causality: str) -> list[str]:
+def _reals(fmu: UnpackedFmu, causality: str) -> list[str]:
     return [
         name
-        for name, variable in known.items()
+        for name, variable in fmu.variables.items()
         if variable.causality == causality and variable.type in REALS and not variable.shape
     ]
 
 
-def _cost(fmu: UnpackedFmu, known: Mapping[str, Any]) -> str:
-    outputs = _reals(known, "output")
+def _cost(fmu: UnpackedFmu) -> str:
+    outputs = _reals(fmu, "output")
     if not outputs:
         raise PlantError(f"FMU '{fmu.path.name}' has no scalar real output to draft from")
     found = [name for name in outputs if any(word in name.lower() for word in COSTS)]
@@ -196,36 +190,36 @@ def _cost(fmu: UnpackedFmu, known: Mapping[str, Any]) -> str:
     )
 
 
-def _states(fmu: UnpackedFmu, known: Mapping[str, Any], others: Sequence[str]) -> list[str]:
+def _states(fmu: UnpackedFmu, others: Sequence[str]) -> list[str]:
     """Continuous states, else outputs with a start parameter."""
-    rates = [variable for variable in known.values() if getattr(variable, "derivative", None)]
+    rates = [each for each in fmu.variables.values() if getattr(each, "derivative", None)]
     if rates:
-        return list(dict.fromkeys(variable.derivative.name for variable in rates))
-    outputs = [name for name in _reals(known, "output") if name not in others]
-    if started := [name for name in outputs if f"{name}_start" in known]:
+        return list(dict.fromkeys(each.derivative.name for each in rates))
+    outputs = [name for name in _reals(fmu, "output") if name not in others]
+    if started := [name for name in outputs if f"{name}_start" in fmu.variables]:
         return started
     raise PlantError(
         f"FMU '{fmu.path.name}' does not say what its state is (no derivatives, no parameters "
-        f"NAME_start); give --states A,B,…, of {', '.join(_reals(known, 'output'))}"
+        f"NAME_start); give --states A,B,…, of {', '.join(_reals(fmu, 'output'))}"
     )
 
 
-def _actions(fmu: UnpackedFmu, known: Mapping[str, Any], noise: Sequence[str]) -> list[str]:
+def _actions(fmu: UnpackedFmu, noise: Sequence[str]) -> list[str]:
     """Real inputs, but for an input D_in beside an output D: it takes the disturbance's place."""
-    inputs = [name for name in _reals(known, "input") if name.removesuffix("_in") not in noise]
+    inputs = [name for name in _reals(fmu, "input") if name.removesuffix("_in") not in noise]
     if inputs:
         return inputs
-    tunable = [n for n in _reals(known, "parameter") if known[n].variability == "tunable"]
+    parameters = _reals(fmu, "parameter")
+    tunable = [n for n in parameters if fmu.variables[n].variability == "tunable"]
     raise PlantError(
         f"FMU '{fmu.path.name}' has no real input to act on"
         + (f"; give --actions A,B,…, of its tunable {', '.join(tunable)}" if tunable else "")
     )
 
 
-def _mapping(
-    known: Mapping[str, Any], states: Sequence[str], noise: Sequence[str]
-) -> dict[str, Any]:
+def _mapping(fmu: UnpackedFmu, states: Sequence[str], noise: Sequence[str]) -> dict[str, Any]:
     """Start values that a reset can write, by the names of our own plants."""
+    known = fmu.variables
 
     def of(name: str, types: Sequence[str]) -> bool:
         return name in known and known[name].type in types and known[name].causality == "parameter"

@@ -25,7 +25,7 @@ import fmpy
 import numpy as np
 from fmpy import fmi2, fmi3
 from fmpy.logging import addLoggerProxy
-from fmpy.model_description import ValidationError, read_model_description
+from fmpy.model_description import read_model_description
 from numpy.typing import NDArray
 
 import fmus
@@ -48,6 +48,22 @@ class UnpackedFmu:
     folder: Path
     description: Any
     entries: frozenset[str]
+
+    @cached_property
+    def variables(self) -> dict[str, Any]:
+        """The variables by name."""
+        return {variable.name: variable for variable in self.description.modelVariables}
+
+    def variable(self, name: str) -> Any:
+        """Variable `name`, or the array whose element ``NAME[…]`` it is; None if there is none."""
+        array = self.variables.get(name.partition("[")[0])
+        return self.variables.get(name, array if array is not None and array.shape else None)
+
+    def unit(self, name: str) -> str:
+        """Unit of a variable or an array's element; empty where it is not stated."""
+        variable = self.variable(name)
+        stated = variable and (variable.unit or getattr(variable.declaredType, "unit", None))
+        return str(stated or "")
 
 
 _unpacked: dict[tuple[Path, int, int], UnpackedFmu] = {}
@@ -132,15 +148,11 @@ def _check_entries(path: Path, archive: zipfile.ZipFile) -> None:
 def _describe(path: Path, folder: Path) -> Any:
     try:
         description = read_model_description(str(folder))
-    except ValidationError as error:
-        problems = error.problems
-        raise PlantError(
-            f"FMU '{path}' has an invalid model description: {problems[0]}"
-            + (f" ({len(problems) - 1} more)" if len(problems) > 1 else "")
-        ) from None
-    # fmpy raises bare Exception, and lxml's errors on text that is not XML.
+    # fmpy's ValidationError, its bare Exception, and lxml's errors on text that is not XML.
     except Exception as error:
-        raise PlantError(f"FMU '{path}' has an unreadable model description: {error}") from None
+        first, *others = getattr(error, "problems", [error])
+        more = f" ({len(others)} more)" if others else ""
+        raise PlantError(f"FMU '{path}' has an invalid model description: {first}{more}") from None
     if description.fmiVersion[:2] not in ("2.", "3."):
         raise PlantError(f"FMU '{path}' is FMI {description.fmiVersion}; 2.0 and 3.0 are supported")
     return description
@@ -205,8 +217,6 @@ def library_path(fmu: UnpackedFmu) -> Path:
         if entry not in fmu.entries:
             continue
         path = fmu.folder / entry
-        if not path.resolve().is_relative_to(fmu.folder.resolve()):
-            raise PlantError(f"FMU '{fmu.path}' is refused: '{entry}' leads outside its folder")
         made_for = platforms_of(path.read_bytes())
         if platform.tuple in made_for:
             return path
@@ -293,7 +303,6 @@ class Instance(ABC):
     _deserialise: ClassVar[str]
     _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
     """The calls that initialise, with their arguments after the instance."""
-    _step_arguments: tuple[Any, ...]
 
     def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
         self.fmu = fmu
@@ -327,6 +336,11 @@ class Instance(ABC):
     @abstractmethod
     def _instantiate(self, **where: Any) -> Any:
         """An fmpy instance that logs to `messages`; `where`: constructor arguments."""
+
+    @cached_property
+    @abstractmethod
+    def _step_arguments(self) -> tuple[Any, ...]:
+        """The arguments of a step, the instance first."""
 
     @abstractmethod
     def _arguments(self, references: Sequence[int], values: Any) -> tuple[Any, ...]:
@@ -469,8 +483,7 @@ class Instance(ABC):
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
-        if not self._interface.canGetAndSetFMUstate:
-            self._lacks("save and restore its state", "canGetAndSetFMUstate")
+        self._require("canGetAndSetFMUstate", "save and restore its state")
         self._call(f"Get{self._state}", self._component, ctypes.byref(handle))
 
     def load(self, handle: ctypes.c_void_p) -> None:
@@ -480,8 +493,7 @@ class Instance(ABC):
 
     def serialise(self, handle: ctypes.c_void_p) -> bytes:
         """Return a saved state as bytes that any instance of this FMU can read."""
-        if not self._interface.canSerializeFMUstate:
-            self._lacks("serialise its state", "canSerializeFMUstate")
+        self._require("canSerializeFMUstate", "serialise its state")
         size = ctypes.c_size_t()
         arguments = (self._component, handle)
         self._call(f"Serialized{self._state}Size", *arguments, ctypes.byref(size))
@@ -491,16 +503,16 @@ class Instance(ABC):
 
     def deserialise(self, data: bytes, handle: ctypes.c_void_p) -> None:
         """Fill a handle from bytes; raises PlantError if the FMU refuses them."""
-        if not self._interface.canSerializeFMUstate:
-            self._lacks("serialise its state", "canSerializeFMUstate")
+        self._require("canSerializeFMUstate", "serialise its state")
         buffer = ctypes.create_string_buffer(data, len(data))
         size = ctypes.c_size_t(len(data))
         self._call(self._deserialise, self._component, buffer, size, ctypes.byref(handle))
 
-    def _lacks(self, ability: str, flag: str) -> NoReturn:
-        raise CapabilityError(
-            f"FMU '{self.fmu.path}' cannot {ability}: its model description lacks {flag}"
-        )
+    def _require(self, flag: str, ability: str) -> None:
+        if not getattr(self._interface, flag):
+            raise CapabilityError(
+                f"FMU '{self.fmu.path}' cannot {ability}: its model description lacks {flag}"
+            )
 
     def fail(self, function: str, status: int) -> NoReturn:
         """Raise PlantError for a failed call, with the FMU's log messages."""
@@ -573,10 +585,10 @@ class Fmi2Instance(Instance):
         ("ExitInitializationMode", ()),
     )
 
-    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
-        super().__init__(fmu, wiring, step_size)
+    @cached_property
+    def _step_arguments(self) -> tuple[Any, ...]:
         # The last argument is false: a snapshot may take the FMU back before this step.
-        self._step_arguments = (self._component, self._time, self._step_size, _FALSE)
+        return (self._component, self._time, self._step_size, _FALSE)
 
     def _instantiate(self, **where: Any) -> Any:
         name = f"cosim-{next(_numbers)}"
@@ -614,20 +626,14 @@ class Fmi3Instance(Instance):
     )
     _raised: BaseException | None
 
-    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
-        super().__init__(fmu, wiring, step_size)
-        event = ctypes.c_bool()
-        self._terminate = ctypes.c_bool()
-        self._early = ctypes.c_bool()
+    @cached_property
+    def _step_arguments(self) -> tuple[Any, ...]:
+        event, self._terminate, self._early = (ctypes.c_bool() for _ in range(3))
         self._last_time = ctypes.c_double()
         found = (event, self._terminate, self._early, self._last_time)
-        self._step_arguments = (
-            self._component,
-            self._time,
-            self._step_size,
-            _NO,  # a snapshot may take the FMU back before this step
-            *(ctypes.byref(each) for each in found),
-        )
+        # _NO: a snapshot may take the FMU back before this step.
+        given = (self._component, self._time, self._step_size, _NO)
+        return (*given, *(ctypes.byref(each) for each in found))
 
     def _instantiate(self, **where: Any) -> Any:
         messages = self.messages

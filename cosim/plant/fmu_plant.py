@@ -6,6 +6,7 @@ import ctypes
 import operator
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from math import ceil, inf, isfinite, prod
 from pathlib import Path
 from typing import Any, NoReturn, Self
@@ -32,8 +33,12 @@ from cosim.validation import known_keywords, suggestion
 REALS = ("Real", "Float64", "Float32")
 
 
-def refusals(fmu: UnpackedFmu) -> Iterator[str]:
-    """Every reason for which `FmuPlant` refuses the FMU, as its error message says it."""
+def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
+    """Every reason for which `FmuPlant` refuses the FMU, as its error message says it.
+
+    One is a communication `step` [s] that is no multiple of a fixed internal step;
+    canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
+    """
     description, name = fmu.description, f"FMU '{fmu.path}'"
     simulation = description.coSimulation
     if simulation is None:
@@ -48,6 +53,13 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
             library_path(fmu)
         except PlantError as error:
             yield str(error)
+        internal = float(simulation.fixedInternalStepSize or 0)
+        count = step / internal if step and internal > 0 else 1.0
+        if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
+            yield (
+                f"{name} steps by multiples of {internal:g} s (fixedInternalStepSize), and the "
+                f"communication step of {step:g} s is none"
+            )
     numbers = [v for v in description.modelVariables if v.type not in _NO_NUMBERS]
     if not any(v.causality == "input" or v.variability == "tunable" for v in numbers):
         yield (
@@ -56,22 +68,6 @@ def refusals(fmu: UnpackedFmu) -> Iterator[str]:
         )
     if not any(v.causality in ("output", "local") for v in numbers):
         yield f"{name} has no output that is a number: there is nothing for a controller to see"
-
-
-def check_step(fmu: UnpackedFmu, step: float) -> None:
-    """Raise PlantError where a communication step [s] is no multiple of a fixed internal step.
-
-    canHandleVariableCommunicationStepSize = false asks for steps of one size, whichever it be.
-    """
-    internal = fmu.description.coSimulation.fixedInternalStepSize
-    if internal is None or float(internal) <= 0:
-        return
-    count = step / float(internal)
-    if round(count) < 1 or abs(count - round(count)) > 1e-9 * count:
-        raise PlantError(
-            f"FMU '{fmu.path}' steps by multiples of {float(internal):g} s "
-            f"(fixedInternalStepSize), and the communication step of {step:g} s is none"
-        )
 
 
 _WIDE = ("Int64", "UInt64")
@@ -94,7 +90,6 @@ class Wirer:
         self._scenario = scenario
         self._fmu = fmu
         self._interface = interface
-        self._variables = {variable.name: variable for variable in fmu.description.modelVariables}
 
     def wiring(self) -> Wiring:
         """Value references of inputs, outputs (stage cost first), states and start values."""
@@ -102,8 +97,8 @@ class Wirer:
         outputs = (plant.stage_cost, *plant.disturbances)
         return Wiring(
             inputs=[self._written(name, "plant.actions") for name in plant.actions],
-            outputs=[self._number(name, "plant") for name in outputs],
-            states=[self._number(name, "plant.states") for name in plant.states],
+            outputs=self.numbers(outputs, "plant"),
+            states=self.numbers(plant.states, "plant.states"),
             starts=self._starts(),
         )
 
@@ -131,23 +126,9 @@ class Wirer:
                 break
         return words
 
-    def initial_states(self) -> list[Place]:
-        """Places of the states' start parameters; empty if the scenario has none."""
-        names = self._scenario.plant.mapping.initial_state
-        return [self._number(name, "plant.mapping.initial_state") for name in names]
-
-    def state_range(self) -> tuple[Array, Array]:
-        """Least and greatest value, (n,), that the FMU declares for the states; else infinite."""
-        found = [self._find(name, "plant.states") for name in self._scenario.plant.states]
-        lower = [-inf if v.min is None else float(v.min) for v in found]
-        upper = [inf if v.max is None else float(v.max) for v in found]
-        return np.array(lower), np.array(upper)
-
-    def units(self) -> dict[str, str]:
-        """Unit of each exchanged variable by name; empty if not stated."""
-        plant = self._scenario.plant
-        names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
-        return {name: _unit(self._find(name, "plant")) for name in names}
+    def numbers(self, names: Sequence[str], table: str) -> list[Place]:
+        """Places of variables that are numbers."""
+        return [self._number(name, table) for name in names]
 
     def _starts(self) -> list[tuple[Place, float]]:
         scenario, mapping = self._scenario, self._scenario.plant.mapping
@@ -209,14 +190,13 @@ class Wirer:
         return Place(int(variable.valueReference), str(variable.type), index, starts)
 
     def _find(self, name: str, table: str) -> Any:
-        array = self._variables.get(name.partition("[")[0])
-        if name not in self._variables and not (array is not None and array.shape):
+        if (variable := self._fmu.variable(name)) is None:
             raise PlantError(
                 f"FMU '{self._fmu.path.name}' has no variable '{name}'"
-                f"{suggestion(name, self._variables)}, which {table} of scenario "
+                f"{suggestion(name, self._fmu.variables)}, which {table} of scenario "
                 f"'{self._scenario.name}' names"
             )
-        return self._variables.get(name, array)
+        return variable
 
     def _misfit(self, name: str, table: str, what: str) -> PlantError:
         return PlantError(
@@ -227,11 +207,6 @@ class Wirer:
 
 def _a(noun: str) -> str:
     return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
-
-
-def _unit(variable: Any) -> str:
-    declared = variable.declaredType.unit if variable.declaredType is not None else None
-    return str(variable.unit or declared or "")
 
 
 def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
@@ -262,10 +237,7 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
     """
     fmu = unpack(scenario.plant.fmu)
     wirer = Wirer(scenario, fmu, _interface(fmu))
-    names = {
-        (int(variable.valueReference), variable.type): variable.name
-        for variable in fmu.description.modelVariables
-    }
+    names = {(int(v.valueReference), v.type): name for name, v in fmu.variables.items()}
     found = {names[place[:2]]: (place.type, value) for place, value in wirer.wiring().starts}
     for place, value in seed_words(plant_seed, wirer.seeds()):
         signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
@@ -281,18 +253,16 @@ _NOT_STARTED = -1
 _HEADER = struct.Struct("<q32s")
 
 
+@dataclass(eq=False, slots=True)
 class Snapshot:
     """A saved state of one plant; `FmuPlant.restore` goes back to it any number of times.
 
     Its memory belongs to the FMU, which frees none: a later snapshot reuses it.
     """
 
-    __slots__ = ("handle", "k", "plant")
-
-    def __init__(self, plant: FmuPlant, handle: ctypes.c_void_p, k: int) -> None:
-        self.plant = plant
-        self.handle = handle
-        self.k = k
+    plant: FmuPlant
+    handle: ctypes.c_void_p
+    k: int
 
     def __del__(self) -> None:
         self.plant.recycle(self.handle)
@@ -325,11 +295,10 @@ class FmuPlant:
         self._handles: list[ctypes.c_void_p] = []
         self._free_handles: list[ctypes.c_void_p] = []
         archive = unpack(self.scenario.plant.fmu if fmu is None else fmu)
-        for refusal in refusals(archive):
-            raise PlantError(refusal)
         self._h = self.scenario.sampling_time
         step = self.scenario.plant.communication_step or self._h
-        check_step(archive, step)
+        for refusal in refusals(archive, step):
+            raise PlantError(refusal)
         interface = _interface(archive)
         wirer = Wirer(self.scenario, archive, interface)
         self.unpacked = archive
@@ -337,13 +306,19 @@ class FmuPlant:
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
         wiring = wirer.wiring()._replace(intermediate=intermediate)
-        self.units = wirer.units()
-        self.state_range = wirer.state_range()
+        plant = self.scenario.plant
+        names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
+        self.units = {name: archive.unit(name) for name in names}
+        states = [archive.variable(name) for name in plant.states]
+        lower = np.array([-inf if v.min is None else float(v.min) for v in states])
+        upper = np.array([inf if v.max is None else float(v.max) for v in states])
+        self.state_range = lower, upper
         self.penalty = self.scenario.state_penalty
         self._seeds = wirer.seeds()
-        self._initial = wirer.initial_states()
+        initial = plant.mapping.initial_state
+        self._initial = wirer.numbers(initial, "plant.mapping.initial_state")
         self._elsewhere = False
-        self._m = len(self.scenario.plant.actions)
+        self._m = len(plant.actions)
         self._k = _NOT_STARTED
         self._started = False
         self._penalty_now = 0.0
@@ -459,22 +434,15 @@ class FmuPlant:
 
     def restore(self, snapshot: Snapshot) -> Array:
         """Go back to a snapshot; return its state (n,). Raises PlantError on another plant's."""
-        fmi = self._instance
-        if snapshot.plant is not self:
-            raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
-        fmi.load(snapshot.handle)
+        self._require_own(snapshot).load(snapshot.handle)
         self._k = snapshot.k
         self._penalty_now = self.penalty(self._states[:])
         return self._copy_states()
 
     def serialise(self, snapshot: Snapshot) -> bytes:
         """A snapshot as bytes, for any process; raises PlantError on another plant's."""
-        fmi = self._instance
-        if snapshot.plant is not self:
-            raise PlantError("this snapshot was taken from another plant")
-        return _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256)) + fmi.serialise(
-            snapshot.handle
-        )
+        state = self._require_own(snapshot).serialise(snapshot.handle)
+        return _HEADER.pack(snapshot.k, bytes.fromhex(self.fmu_sha256)) + state
 
     def deserialise(self, data: bytes) -> Snapshot:
         """A snapshot from its bytes; raises PlantError where they are not of the same FMU file."""
@@ -489,6 +457,11 @@ class FmuPlant:
         handle = self._handle()
         fmi.deserialise(data[_HEADER.size :], handle)
         return Snapshot(self, handle, k)
+
+    def _require_own(self, snapshot: Snapshot) -> Instance:
+        if snapshot.plant is not self:
+            raise PlantError("this snapshot was taken from another plant; serialise it to carry it")
+        return self._instance
 
     def _handle(self) -> ctypes.c_void_p:
         """Memory of a dropped snapshot, or a null handle, which the FMU allocates."""

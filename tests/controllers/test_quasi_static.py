@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from controllers.errors import OptimumError
-from controllers.optimum import Fouling, QuasiStaticPolicy, change_of, optimal, stored_optimum
+from controllers.factories import optimal
+from controllers.optimum import Fouling, QuasiStaticPolicy, change_of, stored_optimum
 from cosim import FmuPlant, Scenario
 
 

@@ -49,7 +49,7 @@ def _changed(path, old, new):
 REFUSED = {
     "text": (lambda p: _written(p, b"not a zip"), "not an FMU"),
     "no description": (lambda p: _zip(p, [("a", "b")]), "no modelDescription.xml"),
-    "no XML": (lambda p: _zip(p, [("modelDescription.xml", "hello")]), "unreadable"),
+    "no XML": (lambda p: _zip(p, [("modelDescription.xml", "hello")]), "invalid model description"),
     "schema": (lambda p: _changed(p, "ModelVariables>", "Mod>"), "invalid model description"),
     "FMI 9": (lambda p: _changed(p, 'fmiVersion="2.0"', 'fmiVersion="9"'), "9"),
     "parent folder": (lambda p: _zip(p, [("../evil", "x")]), "leads outside"),

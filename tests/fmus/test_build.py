@@ -103,9 +103,9 @@ def test_source_only_copy_builds_through_fmpy(tmp_path: Path, fmi: int) -> None:
 
 
 def test_committed_header_is_not_stale() -> None:
-    assert (build.SOURCES / evaporator.HEADER).read_text() == evaporator.header(
-        evaporator.model_token(2)
-    ), "run `cosim fmu build --in-place` and commit what it writes"
+    committed = (build.SOURCES / build.HEADER).read_bytes()
+    remedy = "run `cosim fmu build --in-place` and commit what it writes"
+    assert committed == evaporator.sources(2)[build.HEADER], remedy
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import fmus
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_loop
 from cosim.scenario import Scenario
 from fmus import plant as plants
+from fmus.build import build_sampled
 from fmus.evaporator import EVAPORATOR, UNITS, VARIABLES
 from fmus.model import (
     Kind,
@@ -27,7 +28,6 @@ from fmus.model import (
     unit,
 )
 from fmus.plant import Signal, plant_model
-from fmus.sampled import build_sampled
 
 NAMES = {2: "evaporator", 3: "evaporator_fmi3"}
 
@@ -175,7 +175,7 @@ def members(model) -> dict[str, str]:
 def test_the_terminals_of_plant_and_controller_fit_each_other(name):
     plant = members(EVAPORATOR if name == "paper" else plants.model(name))
     scenario = Scenario.load(name).replace({"controller": {"horizon": 2}})
-    controller = members(sampled_controller(rti_controller("naive", scenario), scenario, {}).model)
+    controller = members(sampled_controller(rti_controller("naive", scenario), scenario))
     assert plant.keys() == controller.keys()
     assert all({plant[each], controller[each]} == {"input", "output"} for each in plant)
     assert [name for name in plant if plant[name] == "output"] == list(scenario.plant.states)
@@ -238,7 +238,7 @@ def test_a_plant_of_ones_own(version):
 def test_an_exported_controller_and_its_loop(tmp_path):
     scenario = Scenario.load("paper").replace({"controller": {"horizon": 2}})
     controller = rti_controller("naive", scenario, ("X1",))
-    system = sampled_controller(controller, scenario, {"X2": "%"}, ("X1",))
+    system = sampled_controller(controller, scenario, ("X1",))
     for version in (2, 3):
         fmu = build_sampled(system, tmp_path / f"c{version}.fmu", version)
         assert len(hold_archive(fmu, FMI[version] | BUILD)) == version

@@ -15,14 +15,12 @@ import fmpy
 import pytest
 
 import fmus
-from controllers.factories import tuned
-from cosim import FmuPlant, Scenario
+from cosim import Scenario
 from cosim.cli.controller_fmu import rti_controller, sampled_controller, write_fmu
 from fmus import PLATFORMS, Platform
-from fmus.build import cross_compiler
-from fmus.evaporator import EVAPORATOR, HEADER, sources
+from fmus.build import HEADER, cross_compiler, sampled_sources
+from fmus.evaporator import EVAPORATOR, sources
 from fmus.model import FmiVersion
-from fmus.sampled import SampledSystem, sampled_sources
 
 HOSTS = Path(__file__).parents[1] / "fmus" / "platforms"
 BY_NAME = {platform.tuple: platform for platform in PLATFORMS}
@@ -132,20 +130,15 @@ def hosted_plant(version: FmiVersion, folder: Path) -> Hosted:
 
 def hosted_controller(version: FmiVersion, folder: Path) -> Hosted:
     """The tuned controller, exported for all platforms."""
-    scenario, system = Scenario.load("paper"), _tuned()
+    scenario = Scenario.load("paper")
     target = folder / f"controller{version}.fmu"
-    fmu = write_fmu(system, rti_controller("tuned", scenario), scenario, target, version, True)
+    controller = rti_controller("tuned", scenario)
+    system = sampled_controller(controller, scenario)
+    fmu = write_fmu(controller, scenario, target, version, every_platform=True)
     sources = sampled_sources(system, version)
     headers = {name: sources[name] for name in ("variables.h", "system.h")}
     importer = Importer("controller_host.c", headers, folder / f"host{version}")
     return Hosted(fmu, unzipped(fmu, folder / fmu.stem), importer, version, system.identifier)
-
-
-@cache
-def _tuned() -> SampledSystem:
-    scenario = Scenario.load("paper")
-    with FmuPlant(scenario) as plant:
-        return sampled_controller(tuned(scenario), scenario, plant.units)
 
 
 def verdict(native: list[str], other: list[str]) -> str:

@@ -9,9 +9,9 @@ import fmpy
 import pytest
 
 from controllers.factories import tuned
-from cosim import FmuPlant, Scenario
+from cosim import Scenario
 from cosim.cli.controller_fmu import sampled_controller
-from fmus.sampled import sampled_sources
+from fmus.build import sampled_sources
 
 SOAK = Path(__file__).parents[1] / "fmus" / "sampled" / "soak.c"
 COMPILER = os.environ.get("CC", "cc")
@@ -28,8 +28,7 @@ def test_nothing_is_allocated_or_broken_while_it_steps(tmp_path: Path, hessian: 
     if shutil.which(COMPILER) is None:
         pytest.skip("there is no C compiler")
     scenario = Scenario.load("paper").replace({"controller": {"hessian": hessian}})
-    with FmuPlant(scenario) as plant:
-        system = sampled_controller(tuned(scenario), scenario, plant.units)
+    system = sampled_controller(tuned(scenario), scenario)
     for name, data in sampled_sources(system, 2).items():
         (tmp_path / name).write_bytes(data)
     program, headers = tmp_path / "soak", Path(fmpy.__file__).parent / "c-code"

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from controllers.dynamic_programming import Accuracy, BellmanOperator, accurate_substeps
+from controllers.dynamic_programming import Accuracy, BellmanOperator, Grid, accurate_substeps
 from controllers.errors import OptimumError
-from controllers.grid import Grid
 from controllers.model import discretise, economic_cost
 from controllers.problem import DisturbanceLaw, PlantProblem
 from tests.helpers.sampling import evaporator_problem

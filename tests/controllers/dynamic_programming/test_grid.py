@@ -6,8 +6,15 @@ import pytest
 import scipy.optimize
 import scipy.stats
 
-from controllers.dynamic_programming import Elementwise, Refinement, gauss_rule, nelder_mead, scan
-from controllers.grid import Grid, graded_axis
+from controllers.dynamic_programming import (
+    Elementwise,
+    Grid,
+    Refinement,
+    gauss_rule,
+    graded_axis,
+    nelder_mead,
+    scan,
+)
 from controllers.problem import DisturbanceLaw
 
 GRID = Grid((np.array([0.0, 0.5, 2.0]), np.array([-1.0, 1.0, 1.5, 4.0]), np.array([0.0, 1.0])))

@@ -6,6 +6,7 @@ from scipy import sparse
 
 from controllers.dynamic_programming import (
     Figure,
+    Grid,
     Settings,
     certify,
     evaluate_policy,
@@ -15,7 +16,6 @@ from controllers.dynamic_programming import (
     solve,
 )
 from controllers.errors import OptimumError
-from controllers.grid import Grid
 from tests.helpers.linear_plant import PLANE, SCALAR, LinearPlant
 
 

@@ -24,7 +24,7 @@ from controllers.theta import ThetaBlocks
 from cosim import FmuPlant, Scenario, simulate
 from cosim.cli.controller_fmu import rti_controller, sampled_controller
 from cosim.cli.main import app
-from fmus.sampled import build_sampled
+from fmus.build import build_sampled
 from tests.helpers.compiler import needs_compiler
 from tests.helpers.instance import Instance
 
@@ -159,14 +159,14 @@ def test_theta_may_change_between_samples(tmp_path, version):
     blocks = ThetaBlocks.of(problem, model_parameters=("UA2",))
     naive_theta = Parameters.naive(problem, blocks)
     controller = nmpc(scenario, naive_theta.replace({"b_l": [0.1, 0.0, 0.2, 0.1]}))
-    system = sampled_controller(controller, scenario, {})
+    system = sampled_controller(controller, scenario)
     fmpy.extract(
         str(build_sampled(system, tmp_path / "c.fmu", version)), str(tmp_path / "unzipped")
     )
     fmu = Instance(tmp_path / "unzipped", version).initialise()
     everything = {block.name: naive_theta[block.name] for block in blocks}
-    names = [v.name for v in system.signals if v.name.startswith("theta.")]
-    arrays = system.model.arrays if version == 3 else {}
+    names = [v.name for v in system.variables if v.name.startswith("theta.")]
+    arrays = system.arrays if version == 3 else {}
     changes = [{}, {"x_l": [25.4, 40.0]}, {"p": [5.0]}, {}, everything]
     states = np.random.default_rng(2).normal((25.5, 50.0), (0.3, 0.5), (len(changes), 2))
     actions = []
@@ -193,7 +193,7 @@ def test_automatic_goes_on_from_what_the_operator_did_in_manual(tmp_path, versio
     """As the Python controller that is told of the actions; outside the bounds they are clipped."""
     scenario = Scenario.load("paper").replace({"controller": {"horizon": 3}})
     controller = rti_controller("tuned", scenario)
-    system = sampled_controller(controller, scenario, {})
+    system = sampled_controller(controller, scenario)
     names = ("time", "X2", "P2", "manual", "manual_P100", "manual_F200")
     rows = [
         (0.0, 25.0, 49.7, False, 0.0, 0.0),
@@ -226,7 +226,7 @@ def test_a_measured_feed_spares_violations(tmp_path):
     thinner = {"changes": [{"time": 600.0, "parameters": {"X1_nominal": 4.5}}]}
     scenario, violation = Scenario.load("paper").replace({"plant": thinner}), [0.0, 0.0]
     controller = rti_controller("tuned", scenario, ("X1",))
-    system = sampled_controller(controller, scenario, {}, ("X1",))
+    system = sampled_controller(controller, scenario, ("X1",))
     fmpy.extract(str(build_sampled(system, tmp_path / "c.fmu")), str(tmp_path / "c"))
     for measured in (False, True):
         fmu = Instance(tmp_path / "c", 2).initialise()

@@ -7,8 +7,8 @@ import fmpy
 import pytest
 
 from fmus import BuildError
-from fmus.model import Kind, Variable
-from fmus.sampled import SampledSystem, build_sampled
+from fmus.build import build_sampled, sampled_system
+from fmus.model import FmuModel, Kind, Variable
 from tests.helpers.instance import Instance
 
 CORE = b"""
@@ -35,8 +35,8 @@ STEP = 2.0
 
 
 @pytest.fixture(scope="session")
-def adder() -> SampledSystem:
-    return SampledSystem(
+def adder() -> FmuModel:
+    return sampled_system(
         name="adder",
         identifier="adder",
         description="adds its inputs",
@@ -51,7 +51,7 @@ def adder() -> SampledSystem:
 
 
 @pytest.fixture(scope="session", params=[2, 3], ids=["fmi2", "fmi3"])
-def built(request, adder: SampledSystem, tmp_path_factory) -> tuple[int, Path]:
+def built(request, adder: FmuModel, tmp_path_factory) -> tuple[int, Path]:
     folder = tmp_path_factory.mktemp("sampled")
     try:
         return request.param, build_sampled(adder, folder / "adder.fmu", request.param)

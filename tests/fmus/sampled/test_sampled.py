@@ -10,11 +10,12 @@ import pytest
 from fmpy.fmi1 import FMICallException
 
 from fmus import evaporator
-from fmus.sampled import SampledSystem, build_sampled, sampled_sources
+from fmus.build import build_sampled, sampled_sources
+from fmus.model import FmuModel
 
 
 def test_a_rebuild_repeats_its_bytes(
-    built: tuple[int, Path], adder: SampledSystem, tmp_path: Path
+    built: tuple[int, Path], adder: FmuModel, tmp_path: Path
 ) -> None:
     again = build_sampled(adder, tmp_path / "adder.fmu", built[0])
     assert again.read_bytes() == built[1].read_bytes()
@@ -29,7 +30,7 @@ STANDARD = """
 
 
 def test_sources_of_two_models_link_into_one_program(
-    adder: SampledSystem, tmp_path: Path, version: int
+    adder: FmuModel, tmp_path: Path, version: int
 ) -> None:
     """With the standard's headers: fmpy's of FMI 2.0 are changed to ignore the prefix."""
     shutil.copytree(Path(fmpy.__file__).parent / "c-code", tmp_path / "headers")

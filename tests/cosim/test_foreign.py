@@ -113,17 +113,6 @@ def test_references_that_collide_between_types_are_kept_apart(tmp_path):
     assert trajectory(scenario, seed=0) == expected()
 
 
-def test_an_array_beside_the_scalars_is_no_obstacle(tmp_path):
-    dimension = '<Dimension start="3"/>'
-    more = f'<Float64 name="profile" valueReference="5" causality="output">{dimension}</Float64>'
-    fmu = build_kind(tmp_path, 3, more=more)
-    scenario = scenario_for(tmp_path, fmu)
-    assert trajectory(scenario) == expected()
-    named = Scenario.load(scenario).replace({"plant": {"states": ["profile"]}})
-    with pytest.raises(PlantError, match=r"'profile'.* an array of \(3,\): name an element, up to"):
-        FmuPlant(named)
-
-
 FMI2_LEVEL = (
     '<ScalarVariable name="level" valueReference="2" causality="input" variability="discrete">'
     '<Integer start="0"/></ScalarVariable>'
@@ -165,7 +154,7 @@ def test_actions_of_other_types_and_elements_of_arrays(tmp_path, version, action
 def test_an_element_that_an_array_does_not_have_is_refused(tmp_path):
     fmu = build_kind(tmp_path, 3, more=FMI3_INPUTS)
     scenario = Scenario.load(scenario_for(tmp_path, fmu))
-    for name in ("profile[3]", "profile[-1]", "profile[1,0]", "profile[a]", "profile[]"):
+    for name in ("profile", "profile[3]", "profile[-1]", "profile[1,0]", "profile[a]", "profile[]"):
         with pytest.raises(PlantError, match=r"name an element, up to profile\[2\]"):
             FmuPlant(scenario.replace({"plant": {"actions": [name]}}))
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.helpers.code_blocks import COVERED, FENCE, ROOT, Session, blocks, is_slow, pages
+from tests.helpers.code_blocks import ROOT, Session, blocks, is_slow, pages
 
 PAGES = {str(page.relative_to(ROOT)): page for page in pages()}
 FOLDERS = "cosim|controllers|learning|fmus|tests|results|examples|benchmarks|docs"
@@ -33,17 +33,6 @@ def test_the_page_does_what_it_says(page, tmp_path, monkeypatch):
         for name in set(sys.modules) - before:
             if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
                 del sys.modules[name]
-
-
-def test_no_fence_escapes_the_collector():
-    for name, page in PAGES.items():
-        fences = [line for line in page.read_text().splitlines() if line.startswith("```")]
-        assert len(fences) == 2 * len(FENCE.findall(page.read_text())), name
-
-
-def test_what_is_not_typed_is_on_a_page():
-    text = "".join(page.read_text() for page in pages())
-    assert [command for command in COVERED if f"$ {command}" not in text] == []
 
 
 def anchors(page):

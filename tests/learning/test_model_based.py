@@ -160,13 +160,10 @@ def rule(scenario, base, rng):
     return ModelBased(controller, scenario, configuration, 1000, None, rng)
 
 
-def test_model_parameters_of_theta_are_the_fitted_ones(scenario, features, rng):
+def test_model_parameters_of_theta_are_the_fitted_ones(rule, scenario, features, rng):
     run = make_run("model-based", scenario, {"model_parameters": ["M", "UA2"]}, start="tuned")
-    start = run.starting_parameters()
-    controller = SimpleNamespace(parameters=start, theta=start.theta)
-    rule = ModelBased(controller, scenario, run.configuration, 1000, None, rng)
-    where = rule._carried
-    error = np.zeros(features.count)
+    start, error = run.starting_parameters(), np.zeros(features.count)
+    rule._base, rule._carried = start, (where := [8, 10])
     error[where] = -0.3, 0.1
     inputs, outputs = plant_data(features, rng, 2000, error)
     model = EmpiricalModel.fit(features, inputs, outputs)
@@ -178,8 +175,7 @@ def test_model_parameters_of_theta_are_the_fitted_ones(scenario, features, rng):
     assert (model.predict(inputs)[0][:, :-1] - own).mean(axis=0) == pytest.approx(0.0, abs=1e-9)
     assert gained == pytest.approx((own - former).mean(axis=0))
     few, none = rule._corrected(start, model, inputs[:50])
-    assert np.array_equal(few["p"], start["p"])
-    assert not none.any()
+    assert (few["p"] == start["p"]).all() and not none.any()
 
 
 def test_back_offs_shrink_little_further_than_the_plant_has_been(rule):

@@ -22,6 +22,7 @@ from controllers.factories import nmpc, optimal
 from cosim.plant import FmuPlant
 from cosim.scenario import Scenario
 from learning.model_based import BURN, FINE, RECENT, BackOffs, ModelBased
+from learning.step import clip_eigenvalues, smallest_eigenvalue
 from learning.training import begin, prepare
 
 ROUNDS, SAMPLES = 12, 3300
@@ -70,22 +71,23 @@ def gradient(problem, controller, theta, start, model, costs, picks):
 def descend(problem, controller, search, model, start, theta, rng):
     """θ after `ROUNDS` of steps that the model promises to pay."""
     radius = RADIUS
+    least = 0.5 * smallest_eigenvalue(controller.parameters.blocks, theta)
     for number in range(ROUNDS):
         picks = rng.integers(len(model.residuals), size=SAMPLES, dtype=np.int32)
         slope, metric = gradient(problem, controller, theta, start, model, search._costs, picks)
         w, V = np.linalg.eigh(metric)
-        steps = []
+        thetas, lengths = [theta], [radius / 16]
         for damping in DAMPINGS:
             p = -V @ ((V.T @ slope) / (w + damping * w[-1]))
-            steps += [(p * radius * r / np.sqrt(p @ metric @ p), radius * r) for r in LENGTHS]
+            for length in (radius * share for share in LENGTHS):
+                step = p * length / np.sqrt(p @ metric @ p)
+                thetas.append(clip_eigenvalues(controller.parameters.blocks, theta + step, least))
+                lengths.append(length)
         search.draw(FINE)
-        costs = [one.cost for one in search.promises([theta, *(theta + p for p, _ in steps)])]
+        costs = [one.cost for one in search.promises(thetas)]
         best = int(np.argmin(costs))
         print(f"round {number + 1:2d}: the model promises {costs[0]:.2f} -> {costs[best]:.2f}")
-        if best:
-            theta, radius = theta + steps[best - 1][0], steps[best - 1][1]
-        else:
-            radius /= 16
+        theta, radius = thetas[best], lengths[best]
     return theta
 
 

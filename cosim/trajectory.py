@@ -137,9 +137,13 @@ class SignalColumns:
         self._names = [kind.name for kind in kinds]
         self._cuts = np.cumsum([widths[kind] for kind in kinds])[:-1]
         # Column-major, so that a signal is a column and not a copy of one. What is never written
-        # takes no memory.
+        # takes no memory; a clock is not as precise as a float of 32 bits.
         self.columns: dict[str, Array] = {
-            kind.name: np.zeros((steps, width) if kind.vector else steps, order="F")
+            kind.name: np.zeros(
+                (steps, width) if kind.vector else steps,
+                np.float32 if kind.clock else np.float64,
+                order="F",
+            )
             for kind, width in widths.items()
         }
         if not residuals:
@@ -302,16 +306,7 @@ class Trajectory(Result):
 
     def timing_summary(self) -> dict[str, dict[str, float]]:
         """Median, 95 % and 99 % quantile and maximum of each wall-clock time, in µs."""
-        # np.quantile would load numpy.ma, 3 % of a short run's processor time.
-        return {
-            name: {
-                key: 1e6
-                * float(np.interp(q * last % 1, (0, 1), ordered[[int(q * last), ceil(q * last)]]))
-                for key, q in QUANTILES.items()
-            }
-            for name, values in self.timing.items()
-            for last, ordered in [(len(values) - 1, np.sort(values))]
-        }
+        return {name: _quantiles(values) for name, values in self.timing.items()}
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
@@ -343,6 +338,15 @@ class Trajectory(Result):
         numbers = _rows([signal.values for signal in signals])
         for row, status in zip(numbers, self.status, strict=True):
             writer.writerow([*(write(v) for write, v in zip(text, row, strict=True)), status])
+
+
+def _quantiles(seconds: Array) -> dict[str, float]:
+    # np.quantile would load numpy.ma, 3 % of a short run's processor time.
+    last, ordered = len(seconds) - 1, np.sort(seconds)
+    return {
+        key: 1e6 * float(np.interp(q * last % 1, (0, 1), ordered[[int(q * last), ceil(q * last)]]))
+        for key, q in QUANTILES.items()
+    }
 
 
 def _rows(columns: Sequence[Array]) -> Iterator[tuple[float, ...]]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from cosim.protocols import Controller
 from cosim.scenario import Scenario
 from cosim.simulation import simulate
 from learning import empirical_model, model_based
-from learning.training import begin, prepare
+from learning.training import TrainingRun, begin, prepare
 
 PARTS = {
     "parameters": (empirical_model, "PARAMETER_DEVIATION", 1e-6),  # W alone is fitted
@@ -57,35 +58,41 @@ def greedy(scenario: Scenario, controller: Controller) -> float:
     return float(np.mean(costs))
 
 
-def main() -> None:
-    """Run one trajectory and print a line for each update."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def asked(about: str | None, samples: int, parts: Iterable[str]) -> tuple[str, TrainingRun]:
+    """The part to take out and the run of `model-based`, of so many samples, from the arguments."""
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("scenario")
     parser.add_argument("start")
     parser.add_argument("seed", type=int)
-    parser.add_argument("--samples", type=int, default=960)
-    parser.add_argument("--without", choices=PARTS, default="nothing")
+    parser.add_argument("--samples", type=int, default=samples)
+    parser.add_argument("--without", choices=parts, default="nothing")
     parser.add_argument("--parameters", nargs="*", default=[], help="of the model, in θ")
     chosen = parser.parse_args()
-    setattr(*PARTS[chosen.without])
-    scenario = Scenario.load(chosen.scenario)
-    options = {"seed": chosen.seed, "start": chosen.start}
     settings = {"model_parameters": chosen.parameters}
-    run = prepare("model-based", scenario, chosen.samples, settings, options)
+    options = {"seed": chosen.seed, "start": chosen.start}
+    scenario = Scenario.load(chosen.scenario)
+    return chosen.without, prepare("model-based", scenario, chosen.samples, settings, options)
+
+
+def main() -> None:
+    """Run one trajectory and print a line for each update."""
+    without, run = asked(__doc__, 960, PARTS)
+    setattr(*PARTS[without])
+    scenario, samples = run.scenario, run.samples
     best: dict[str, float] = {}
     costs: list[float] = []
     with FmuPlant(scenario) as plant:
         loop = begin(run, model_based.ModelBased, plant)
         judged = nmpc(scenario, loop.parameters)
-        compile_functions(loop.controller, chosen.samples)
-        print(f"{chosen.scenario} from {chosen.start}, seed {chosen.seed}, -{chosen.without}")
+        compile_functions(loop.controller, samples)
+        print(f"{scenario.name} from {run.start}, seed {run.seed}, -{without}")
         print("sample   J of life    greedy J  regret %  s of CPU  elapsed  back-offs", flush=True)
-        for number in range(1, chosen.samples + 1):
+        for number in range(1, samples + 1):
             begun, at = time.process_time(), time.perf_counter()
             cost, update = loop.advance()
             seconds, elapsed = time.process_time() - begun, time.perf_counter() - at
             costs.append(cost)
-            if update is None and number < chosen.samples:
+            if update is None and number < samples:
                 continue
             now = scenario.at(number * scenario.sampling_time)
             if now.hash not in best:

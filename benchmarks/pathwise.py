@@ -6,24 +6,22 @@ After so many samples of operation all of θ follows dJ/dθ. J is the model's me
 expected penalties. The gradient is exact but for what the linearisation point owes to θ. With
 X = ds/dθ, from zero, and the QP's own dπ/ds and dπ/dθ, U = da/dθ = dπ/ds X + dπ/dθ and
 X₊ = F_s X + F_a U. Steps are p = −(M + λ)⁻¹ dJ/dθ, M the mean of dπ/dθᵀ R dπ/dθ, for several λ and
-lengths √(pᵀMp); the model chooses among them on new noise. Greedy J is that of five held-out runs
-of 1000 samples, after 300. Development seeds are 11 to 19.
+lengths √(pᵀMp); the model chooses among them on new noise. `--without gradient` has a random vector
+in its place, all else the same. Greedy J is that of five held-out runs of 1000 samples, after 300.
+Development seeds are 11 to 19.
 """
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 
-from benchmarks.model_based import greedy
+from benchmarks.model_based import asked, greedy
 from controllers import compile_functions
 from controllers.factories import nmpc, optimal
 from cosim.plant import FmuPlant
-from cosim.scenario import Scenario
 from learning.model_based import BURN, FINE, RECENT, BackOffs, ModelBased
 from learning.step import clip_eigenvalues, smallest_eigenvalue
-from learning.training import begin, prepare
+from learning.training import begin
 
 ROUNDS, SAMPLES = 12, 3300
 DAMPINGS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
@@ -34,21 +32,17 @@ STEP = 1e-4
 """Of central differences, in the units of (s, a)."""
 
 
-def gradient(problem, controller, theta, start, model, costs, picks):
-    """dJ/dθ (n_θ,) and M (n_θ, n_θ) of one rollout; `costs` are the model's `ExpectedCosts`."""
-    n, count = problem.n_states, len(picks)
-    inputs = np.empty((count, n + problem.n_actions))
-    controller.theta = theta
+def gradient(problem, controller, inputs, model, costs, picks):
+    """dJ/dθ (n_θ,) and M (n_θ, n_θ) at the controller's θ, along its rollout's inputs (s, a).
+
+    `costs` are the model's `ExpectedCosts`.
+    """
+    n, count, jacobians = problem.n_states, len(inputs), []
     controller.reset()
-    jacobians, s, (c, W) = [], start, model.coefficients
-    for row, pick in zip(inputs, picks, strict=True):
+    for row in inputs:
         controller.prepare()
-        solution = controller.feedback(s)
-        action = np.clip(solution.action, problem.action_lower, problem.action_upper)
+        solution = controller.feedback(row[:n])
         jacobians.append((solution.policy_state_jacobian, solution.policy_jacobian))
-        row[:] = np.concatenate([s, action])
-        y, _, h = model.features(row[None], c)
-        s = (y[0] + W @ np.append(1.0, row) + h[0] * model.residuals[pick])[:-1]
     F, cost = np.empty((count, n, inputs.shape[1])), np.empty(inputs.shape)
     for j, unit in enumerate([*problem.units.state, *problem.units.action]):
         ends = []
@@ -58,7 +52,7 @@ def gradient(problem, controller, theta, start, model, costs, picks):
             ends.append((after, costs(predicted, h)[0]))
         F[:, :, j], cost[:, j] = ((a - b) / (2 * STEP * unit) for a, b in zip(*ends, strict=True))
     R = np.diag((problem.action_upper - problem.action_lower) ** -2.0)
-    X, slope, metric = np.zeros((n, theta.size)), 0.0, 0.0
+    X, slope, metric = np.zeros((n, controller.theta.size)), 0.0, 0.0
     for k, (by_state, by_theta) in enumerate(jacobians):
         U = by_state @ X + by_theta
         if k >= BURN:
@@ -68,14 +62,18 @@ def gradient(problem, controller, theta, start, model, costs, picks):
     return slope / (count - BURN), metric / (count - BURN)
 
 
-def descend(problem, controller, search, model, start, theta, rng):
+def descend(problem, controller, search, rollout, model, start, theta, rng, without):
     """θ after `ROUNDS` of steps that the model promises to pay."""
     radius = RADIUS
     least = 0.5 * smallest_eigenvalue(controller.parameters.blocks, theta)
     for number in range(ROUNDS):
         picks = rng.integers(len(model.residuals), size=SAMPLES, dtype=np.int32)
-        slope, metric = gradient(problem, controller, theta, start, model, search._costs, picks)
+        ((inputs, _, _),) = rollout([theta], start, model, picks)
+        controller.theta = theta
+        slope, metric = gradient(problem, controller, inputs, model, search._costs, picks)
         w, V = np.linalg.eigh(metric)
+        if without == "gradient":
+            slope = V @ (np.sqrt(np.maximum(w, 0.0)) * rng.normal(size=w.size))
         thetas, lengths = [theta], [radius / 16]
         for damping in DAMPINGS:
             p = -V @ ((V.T @ slope) / (w + damping * w[-1]))
@@ -93,20 +91,12 @@ def descend(problem, controller, search, model, start, theta, rng):
 
 def main() -> None:
     """Operate, descend on the model, and print greedy J before and after."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenario")
-    parser.add_argument("start")
-    parser.add_argument("seed", type=int)
-    parser.add_argument("--samples", type=int, default=1440)
-    parser.add_argument("--parameters", nargs="*", default=[], help="of the model, in θ")
-    chosen = parser.parse_args()
-    scenario, settings = Scenario.load(chosen.scenario), {"model_parameters": chosen.parameters}
-    options = {"seed": chosen.seed, "start": chosen.start}
-    run = prepare("model-based", scenario, chosen.samples, settings, options)
+    without, run = asked(__doc__, 1440, ("nothing", "gradient"))
+    scenario = run.scenario
     with FmuPlant(scenario) as plant:
         loop = begin(run, ModelBased, plant)
-        compile_functions(loop.controller, chosen.samples)
-        for _ in range(chosen.samples):
+        compile_functions(loop.controller, run.samples)
+        for _ in range(run.samples):
             loop.advance()
         rule, before, rng = loop.algorithm, loop.parameters, np.random.default_rng(1)
     model, (latest, _) = rule._data.fit(), rule._data.latest(RECENT)
@@ -114,7 +104,8 @@ def main() -> None:
     compile_functions(controller)
     search = BackOffs(problem, rule._rollout, before, model, latest, 0.0, rng)
     start = latest[-1, : problem.n_states]
-    after = descend(problem, controller, search, model, start, before.theta, rng)
+    loops = search, rule._rollout, model
+    after = descend(problem, controller, *loops, start, before.theta, rng, without)
     best = greedy(scenario, optimal(scenario))
     for name, theta in (("model-based", before.theta), ("and the gradient", after)):
         controller.theta = theta

@@ -32,7 +32,8 @@ SYSTEMS = {
 def preset_sources() -> list[dict[str, bytes]]:
     """C files by name of each library that a preset's controller and its rollouts need.
 
-    θ has the slack's weights, as in a training, or not.
+    θ has the slack's weights, as in a training, or not; that of rollouts, which `model-based` has
+    alone, the model's parameters too.
     """
     found: list[dict[str, bytes]] = []
 
@@ -47,11 +48,12 @@ def preset_sources() -> list[dict[str, bytes]]:
     ):
         for preset in presets():
             problem = Problem.from_scenario(Scenario.load(preset))
+            names = tuple(parameter.name for parameter in problem.model.parameters)
             for slack_weights in (False, True):
                 blocks = ThetaBlocks.of(problem, slack_weights=slack_weights)
-                parameters = Parameters.naive(problem, blocks)
-                RtiNmpc(problem, parameters).compile(LONG)
-                Rollout(problem, parameters, Features(problem))
+                RtiNmpc(problem, Parameters.naive(problem, blocks)).compile(LONG)
+            blocks = ThetaBlocks.of(problem, slack_weights=True, model_parameters=names)
+            Rollout(problem, Parameters.naive(problem, blocks), Features(problem))
     return found
 
 

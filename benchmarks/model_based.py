@@ -66,7 +66,7 @@ def asked(about: str | None, samples: int, parts: Iterable[str]) -> tuple[str, T
     parser.add_argument("seed", type=int)
     parser.add_argument("--samples", type=int, default=samples)
     parser.add_argument("--without", choices=parts, default="nothing")
-    parser.add_argument("--parameters", nargs="*", default=[], help="of the model, in θ")
+    parser.add_argument("--parameters", nargs="*", default=["all"], help="of the model, in θ")
     chosen = parser.parse_args()
     settings = {"model_parameters": chosen.parameters}
     options = {"seed": chosen.seed, "start": chosen.start}

@@ -92,7 +92,7 @@ class IdentifiedConfiguration(GreedyConfiguration):
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """The parameters to fit."""
-        return self.model_parameters or model.uncertain
+        return super().learned_parameters(model) or model.uncertain
 
 
 @dataclass(eq=False)

@@ -13,11 +13,17 @@ from cosim.scenario import Scenario
 from cosim.validation import validated
 from learning.errors import ConfigurationError
 
+ALL = ("all",)
+"""In place of names: every parameter of the controller's model."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
-# The rules differ in how much exploration they need, so these two have other defaults in each.
+# The rules differ in these three, so they have other defaults in each.
+ModelParameters = Annotated[
+    tuple[str, ...],
+    Field(description='parameters of the controller\'s model that θ has; all of them by ["all"]'),
+]
 ExplorationProbability = Annotated[Share, Field(description="share of samples that explore")]
 ExplorationShare = Annotated[
     Positive, Field(description="standard deviation of e as a share of the input's range")
@@ -42,9 +48,7 @@ class Configuration(BaseModel):
         "discounted",
         description="c_lambda at the start: ℓ_s (paper) or ℓ_s/(1−γ), unless the scenario says",
     )
-    model_parameters: tuple[str, ...] = Field(
-        (), description="parameters of the controller's model that θ has, in its block p"
-    )
+    model_parameters: ModelParameters = ()
     smallest_eigenvalue: Positive = Field(
         1e-3, description="least eigenvalue that B_l and B_Vf may have, in the problem's own units"
     )
@@ -94,7 +98,9 @@ class Configuration(BaseModel):
 
     def learned_parameters(self, model: Model) -> tuple[str, ...]:
         """Names of the model parameters that θ has."""
-        return self.model_parameters
+        if self.model_parameters != ALL:
+            return self.model_parameters
+        return tuple(parameter.name for parameter in model.parameters)
 
     def without_part(self) -> Mapping[str, str]:
         """Hyperparameters without effect here, each with the part that it belongs to."""

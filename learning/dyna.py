@@ -12,12 +12,9 @@ from cosim.protocols import Array, Step
 from cosim.scenario import Scenario
 from learning.algorithm import PlantInOperation, TrainingLoop, Transition, Update
 from learning.configuration import Count
-from learning.empirical_model import WINDOWS, EmpiricalModel, Features, PlantData
+from learning.empirical_model import GROWTH, WINDOWS, EmpiricalModel, Features, PlantData
 from learning.q_learning import QLearning, QLearningConfiguration
 from learning.step import moved
-
-GROWTH = 8
-"""The model is fitted anew where its data have grown by one in so many."""
 
 
 class DynaConfiguration(QLearningConfiguration):

@@ -53,6 +53,10 @@ WINDOWS = (15, 60, 240, 960)
 """Latest samples of which that mean is taken, every `WINDOWS[0]` samples."""
 FORETOLD, EVIDENCE = 240, 3.0
 """Samples, at least, and nats by which the older data must spoil their prediction to be dropped."""
+BLOCK = 250
+"""Rows of the fit that are factored at a time."""
+GROWTH = 8
+"""A model of many samples is fitted anew where its data have grown by one in so many."""
 POOL = 480
 """Number of residuals up to which those from before a change are kept."""
 
@@ -392,15 +396,25 @@ def _design(G: Array, standardised: Array) -> Array:
     return design
 
 
+def _triangle(rows: Array) -> Array:
+    """R (q, q) of the QR factors of rows (M, q), M ≥ q.
+
+    Some outputs are nearly exact, others noisy: normal equations would lose the latter. Blocks that
+    fit in a processor's cache are factored first, which takes a third of the time.
+    """
+    whole = len(rows) // BLOCK * BLOCK
+    blocks = np.linalg.qr(rows[:whole].reshape(-1, BLOCK, rows.shape[1]), mode="r")
+    return np.asarray(np.linalg.qr(np.concatenate([*blocks, rows[whole:]]), mode="r"))
+
+
 def _posterior(
     design: Array, target: Array, noise: Array, priors: Sequence[Array]
 ) -> tuple[Array, Array]:
     """Mean and covariance of the coefficients, with the prior deviations of greatest evidence."""
     whiten = np.linalg.inv(np.linalg.cholesky(noise))
     rows = (whiten @ design).reshape(-1, design.shape[2])
-    # Some outputs are nearly exact, others noisy: the normal equations would lose the latter.
     rows = np.column_stack([rows, (target @ whiten.T).reshape(-1)])
-    R: Array = np.asarray(np.linalg.qr(rows, mode="r"))
+    R = _triangle(rows)
     found = []
     for prior in priors:
         Q, root = np.linalg.qr(np.concatenate([R[:, :-1] * prior, np.eye(prior.size)]))

@@ -1,8 +1,8 @@
 """`model-based`: θ searched on a model of the plant that its own operation has taught.
 
 The cost is tuned on the nominal model, and c_f is what this lacks on average on the plant, as in
-offset-free control. Model parameters that θ has (`model_parameters`) are the fitted ones. What is
-searched are the back-offs of the state bounds. A θ costs what the empirical model promises: the
+offset-free control. Parameters of its model that θ has, all by default, are the fitted ones. What
+is searched are the back-offs of the state bounds. A θ costs what the empirical model promises: the
 mean stage cost of one long rollout and the expectation of the penalty over all errors of
 prediction. Of back-offs between which the model cannot tell the smallest is taken, but where a
 bound does not bind, which costs nothing: there it is a spare one, against a plant that changes.
@@ -24,19 +24,27 @@ from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.scenario import Penalty
 from learning.algorithm import Algorithm, Transition, Update
-from learning.configuration import Configuration, Count
-from learning.empirical_model import ALARM, WINDOWS, EmpiricalModel, Features, PlantData, Rollout
+from learning.configuration import ALL, Configuration, Count, ModelParameters
+from learning.empirical_model import (
+    ALARM,
+    GROWTH,
+    WINDOWS,
+    EmpiricalModel,
+    Features,
+    PlantData,
+    Rollout,
+)
 from learning.prediction_errors import SortedErrors, expected_penalties
 from learning.step import moved
 
 Array = NDArray[np.float64]
 
 BURN, COARSE, FINE = 300, 1800, 5300
-"""Samples of a rollout before it counts, of one on the grid, and of one about its best point."""
+"""Samples of a rollout before it counts, of a short one, and of a long one."""
 LEVELS = (0.0, 2.0, 3.0, 7.0, 18.0, 50.0)
 """Back-offs of the grid, in standard deviations of the one-step error."""
-FACTORS = ((0.72, 0.85, 1.18, 1.4), (0.93, 1.07), (0.97, 1.03))
-"""Of a back-off, in the three sweeps about the best point of the grid."""
+SWEEPS = ((COARSE, (0.72, 0.85, 1.18, 1.4)), (FINE, (0.93, 1.07)), (FINE, (0.97, 1.03)))
+"""Samples of a rollout, and factors of a back-off, in the three sweeps about the best point."""
 ROOM = 0.45
 """Largest back-off, as a share of the distance of the bounds."""
 DOUBT = 1.0
@@ -68,14 +76,13 @@ THINNED = 10
 class ModelBasedConfiguration(Configuration):
     """Hyperparameters of `model-based`."""
 
+    model_parameters: ModelParameters = ALL
     first_update: Count = Field(30, description="samples before the first update of θ")
     longest_interval: Count = Field(
         1440, description="most samples between updates, which double with the model's data"
     )
     memory: Count = Field(20_000, description="samples that the model remembers")
-    exploration_samples: Count = Field(
-        480, description="samples that explore after the start and after a change of the plant"
-    )
+    exploration_samples: Count = Field(120, description="samples at the start that explore")
     spare: float = Field(
         18.0,
         ge=0,
@@ -95,7 +102,7 @@ class ModelBased(Algorithm):
     """
 
     Configuration = ModelBasedConfiguration
-    KEPT = ("back_off", "_due", "model_samples", "_limits", "_data")
+    KEPT = ("back_off", "_due", "model_samples", "_limits", "_floor", "_era", "_data")
     configuration: ModelBasedConfiguration
     budget: ClassVar[int] = 10_080
 
@@ -113,6 +120,8 @@ class ModelBased(Algorithm):
         self.back_off: Array = np.maximum(backed, 0.0)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
         self._due = settings.first_update  # samples at the next update
+        # Samples before the plant of the latest update, and the back-offs when that plant began.
+        self._era, self._floor = 0, np.zeros_like(self.back_off)
         self._limits: Array = np.full(len(WINDOWS), np.inf)  # of the mean cost, for each window
         self.model_samples = 0
         """Samples of the model that its rollouts have taken so far."""
@@ -120,47 +129,50 @@ class ModelBased(Algorithm):
     @property
     def explores(self) -> bool:
         """Whether the samples explore now."""
-        return self._data.count - self._data.era < self.configuration.exploration_samples
+        return self._data.count < self.configuration.exploration_samples
 
     def observe(self, transition: Transition) -> Update | None:
         """Keep a transition; move θ when an update is due."""
         data = self._data
         data.add(transition)
-        if data.model is not None and (data.count - data.fitted) % WINDOWS[0] == 0:
-            self._watch(data.model)
-        return self._update() if data.count >= self._due else None
+        judged = (data.count - data.fitted) % WINDOWS[0] == 0
+        alarmed = judged and data.model is not None and self._alarmed(data.model)
+        return self._update(alarmed) if alarmed or data.count >= self._due else None
 
-    def _watch(self, model: EmpiricalModel) -> None:
-        """Make an update due where the promise is broken or, on new data, the plant is another."""
-        data = self._data
+    def _alarmed(self, model: EmpiricalModel) -> bool:
+        """Whether the promise is broken or, on new data, the plant is another."""
+        data, alarmed = self._data, False
         since = data.count - data.fitted
         if len(model.residuals) < CAUTION:
-            return
+            return False
         predicted, h, errors, designs = data.errors()
         costs = ExpectedCosts(self._problem, model)(predicted, h)[0]
         for window, limit in zip(WINDOWS, self._limits, strict=True):
             if window > since:
-                return
+                break
             broken = since > SETTLING and costs[-window:].mean() > limit
             alarm = SUSPICION if broken else ALARM
-            changed = data.changed(errors[-window:], designs[-window:], alarm)
-            if broken or changed:
-                self._due = data.count
-            if changed:
-                return
+            if data.changed(errors[-window:], designs[-window:], alarm):
+                return True
+            alarmed |= broken
+        return alarmed
 
     def _least(self, present: Array, inputs: Array) -> Array:
         """Least back-offs (2n,) that inputs (s, a) of the present plant, (M, n+m), allow.
 
         A present one shrinks little beyond the state that came closest to its bound: what lies
-        behind it the model only extrapolates. Of few samples none shrinks.
+        behind it the model only extrapolates. Of few samples none shrinks, nor while they explore,
+        which no rollout does. A plant that has changed may go on to: until it has been the same for
+        `longest_interval` samples none shrinks below what it was before.
         """
         problem = self._problem
-        if len(inputs) < CAUTION:
+        if self.explores or len(inputs) < CAUTION:
             return present
+        changing = self._era > 0 and len(inputs) < self.configuration.longest_interval
+        floor = np.minimum(self._floor, present) if changing else np.zeros_like(present)
         states = inputs[:, : problem.n_states]
         rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)
-        least: Array = np.clip(SHRINKS * rooms.min(axis=0), 0.0, present)
+        least: Array = np.clip(SHRINKS * rooms.min(axis=0), floor, present)
         return least
 
     def _corrected(
@@ -183,19 +195,24 @@ class ModelBased(Algorithm):
         kept["c_f"] = model.lack(inputs, after)
         return self._base.replace(kept), model.lack(inputs, before) - present["c_f"]
 
-    def _update(self) -> Update:
-        data = self._data
+    def _update(self, alarmed: bool) -> Update:
+        data, longest = self._data, self.configuration.longest_interval
         model = data.fit()
         inputs, _ = data.present
-        interval = max(data.count - data.era, self.configuration.first_update)
-        self._due = data.count + min(interval, self.configuration.longest_interval)
+        age = data.count - data.era
+        if data.era != self._era:
+            self._era, self._floor = data.era, self.back_off
+        # Day by day an optimum moves little: then the search begins at the present back-offs.
+        settled = age > longest and not alarmed and np.isfinite(self._limits).all()
+        interval = min(age, max(longest, age // GROWTH))
+        self._due = data.count + max(interval, self.configuration.first_update)
         latest, _ = data.latest(RECENT)
         spare, rng = self.configuration.spare, self.rng
         present = self.controller.parameters
         base, more = self._corrected(present, model, inputs[-RECENT:])
         kept = np.maximum(self.back_off + np.concatenate([more, -more]), 0.0)
         search = BackOffs(self._problem, self._rollout, base, model, latest, spare, rng)
-        found = search.best(kept, self._least(kept, inputs))
+        found = search.best(kept, self._least(kept, inputs), () if settled else LEVELS)
         new = search.theta(found)
         search.draw(FINE)
         promise, held = search.promises([new, present.theta])
@@ -329,15 +346,16 @@ class BackOffs:
         deviation = float(row @ self._model.covariance @ row) ** 0.5
         return float((one.cost - other.cost) / max(deviation, PLATEAU * abs(one.cost)))
 
-    def best(self, delta: Array, least: Array) -> Array:
+    def best(self, delta: Array, least: Array, levels: Sequence[float]) -> Array:
         """The smallest δ, not below `least`, whose cost the model cannot tell from the least one.
 
-        First a grid, at once over the bounds whose penalty shows anywhere, up to two, and one by
-        one over what others there are; then each about the best point, on longer rollouts. Bounds
-        whose penalty shows nowhere have a spare back-off.
+        First a grid of `levels`, in standard deviations of the one-step error, at once over the
+        bounds whose penalty shows anywhere, up to two, and one by one over what others there are;
+        without levels δ alone. Then sweeps over each about the best point, on longer rollouts.
+        Bounds whose penalty shows nowhere have a spare back-off.
         """
         grids = [
-            self._rounded(i, [max(level * unit, least[i]) for level in LEVELS])
+            self._rounded(i, [max(level * unit, least[i]) for level in levels])
             for i, unit in enumerate(self._unit)
         ]
         active: list[int] = []
@@ -352,8 +370,9 @@ class BackOffs:
             together = active if len(active) <= 2 else active[-1:]
             corners = product(*(grids[i] for i in together))
             points = [delta, *(_with(delta, together, corner) for corner in corners)]
-        self.draw(FINE)
-        for factors in FACTORS:
+        for steps, factors in SWEEPS:
+            if steps > len(self._picks):
+                self.draw(steps)
             for i in active:
                 wanted = [delta[i] * factor for factor in factors] if delta[i] else [self._unit[i]]
                 values = self._rounded(i, [max(value, least[i]) for value in wanted])

@@ -135,15 +135,23 @@ def search(problem, base, rng):
 
 
 def test_the_back_off_of_a_known_loop_is_found(search):
-    found = search.best(np.zeros(4), np.zeros(4))
+    found = search.best(np.zeros(4), np.zeros(4), model_based.LEVELS)
     # slope = 1e5 · P(noise < −δ) at the optimum; the tails are widened by a per cent.
     assert found[0] == pytest.approx(0.8, abs=0.06)
     assert (found[1:] == 0).all()
 
 
+def test_without_a_grid_the_search_begins_at_the_present_back_offs(search):
+    search.best(np.array([0.7, 0.0, 0.0, 0.0]), np.zeros(4), model_based.LEVELS)
+    with_grid, search.samples = search.samples, 0
+    found = search.best(np.array([0.7, 0.0, 0.0, 0.0]), np.zeros(4), ())
+    assert found[0] == pytest.approx(0.8, abs=0.06)
+    assert search.samples < 0.8 * with_grid
+
+
 def test_a_bound_that_does_not_bind_has_a_spare_back_off(search):
     search._spare = 18.0
-    spared = search.best(np.zeros(4), np.zeros(4))
+    spared = search.best(np.zeros(4), np.zeros(4), model_based.LEVELS)
     assert spared[0] == pytest.approx(0.8, abs=0.06)
     assert spared[2] == pytest.approx(18.0 * search._unit[2], abs=0.05)
 
@@ -181,8 +189,18 @@ def test_model_parameters_of_theta_are_the_fitted_ones(rule, scenario, features,
 def test_back_offs_shrink_little_further_than_the_plant_has_been(rule):
     present = np.array([2.0, 0.0, 0.0, 5.0])
     inputs = np.tile([26.0, 77.0, 220.0, 230.0], (200, 1))
+    assert rule._least(present, inputs) == pytest.approx(present)  # it explores still
+    rule._data.count = 480
     assert rule._least(present, inputs) == pytest.approx([0.7, 0.0, 0.0, 2.1])
     assert rule._least(present, inputs[:50]) == pytest.approx(present)
+
+
+def test_of_a_plant_that_has_changed_no_back_off_shrinks_below_what_it_was_before(rule):
+    rule._data.count, rule._era, rule._floor = 2000, 500, np.array([1.5, 0.0, 0.0, 6.0])
+    inputs = np.tile([26.0, 77.0, 220.0, 230.0], (1500, 1))
+    present = np.array([2.0, 0.0, 0.0, 5.0])
+    assert rule._least(present, inputs[:1000]) == pytest.approx([1.5, 0.0, 0.0, 5.0])
+    assert rule._least(present, inputs) == pytest.approx([0.7, 0.0, 0.0, 2.1])
 
 
 def filled(rule, inputs, outputs, model):
@@ -197,7 +215,7 @@ def test_a_change_of_the_plant_is_seen_and_its_absence_not(rule, features, fitte
     error = -0.2 * np.eye(features.count)[0]
     for offset, window in ((0.0, 0), (0.3, 15)):
         data = filled(rule, *plant_data(features, rng, 240, error, offset), fitted)
-        rule._watch(fitted)
+        assert rule._alarmed(fitted) == bool(window)
         assert data.count - data.era == (window or 240)
 
 
@@ -217,15 +235,13 @@ def test_a_plant_that_nears_its_bound_breaks_the_promise(rule, features, fitted,
     inputs, outputs = plant_data(features, rng, 240, error)
     cost = ExpectedCosts(rule._problem, fitted)(*fitted.predict(inputs)[:2])[0].mean()
     data = filled(rule, inputs, outputs, fitted)
-    rule._due = 960
-    for factor, due in ((1.01, 960), (0.99, 240)):
+    for factor, broken in ((1.01, False), (0.99, True)):
         rule._limits = np.array([np.inf, np.inf, factor * cost, np.inf])
-        rule._watch(fitted)
-        assert (rule._due, data.era) == (due, 0)
+        assert (rule._alarmed(fitted), data.era) == (broken, 0)
 
 
 def test_a_run_resumed_after_a_kill_ends_in_the_same_digits(scenario, tmp_path, monkeypatch):
-    smaller = {"BURN": 5, "COARSE": 25, "FINE": 30, "LEVELS": (0.0, 3.0), "FACTORS": ((1.2,),)}
+    smaller = {"BURN": 5, "COARSE": 25, "FINE": 30, "LEVELS": (0.0, 3.0), "SWEEPS": ((25, (1.2,)),)}
     for name, value in smaller.items():
         monkeypatch.setattr(model_based, name, value)
     every = {"samples": 60, "log_every": 20, "evaluate_every": 60, "checkpoint_every": 20}

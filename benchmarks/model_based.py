@@ -34,6 +34,7 @@ PARTS = {
     "doubt": (model_based, "DOUBT", 0.0),  # the least promised cost, not the smallest back-off
     "tail": (model_based, "TAIL", 0.0),
     "caution": (model_based, "CAUTION", 0),
+    "steadiness": (model_based, "STEADY", 0),  # on a changed plant back-offs shrink at once
     "reach": (model_based, "REACH", 1e9),  # a rollout is lost by its cost alone
     "promise": (model_based, "BROKEN", 1e9),  # no promise is ever broken
     "dropping": (empirical_model, "EVIDENCE", np.inf),  # the fit uses all data

@@ -15,6 +15,7 @@ from cosim.protocols import (
     Array,
     CompiledLoop,
     Controller,
+    Decision,
     Plant,
     Recorder,
     RunPart,
@@ -23,7 +24,6 @@ from cosim.protocols import (
 from cosim.scenario import Scenario
 from cosim.trajectory import (
     FALLBACK,
-    NO_SOLUTION,
     SIGNALS,
     Sample,
     Signal,
@@ -32,6 +32,8 @@ from cosim.trajectory import (
 )
 from cosim.validation import known_keywords
 
+NO_SOLUTION = Decision(np.empty(0))
+"""Stands for the solution where there is none: its numbers are NaN."""
 PART = 500
 """Samples of a part; of more than 10⁵ samples it is longer, since a recording indexes each."""
 

@@ -31,16 +31,6 @@ Derived = Callable[[Scenario, Mapping[str, Array]], Array]
 """K values of a signal, (K,), from a scenario and K values of each signal declared before it."""
 
 
-class NoSolution:
-    """Placeholder for a failed solution: every number is NaN."""
-
-    def __getattr__(self, name: str) -> float:
-        return nan
-
-
-NO_SOLUTION = NoSolution()
-
-
 @dataclass(slots=True)
 class Sample:
     """A sample of the loop.
@@ -53,7 +43,7 @@ class Sample:
     s: Array
     action: Array
     step: Step
-    solution: Solution | NoSolution
+    solution: Solution
     failed: bool
     prepare_time: float
     feedback_time: float

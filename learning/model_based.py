@@ -65,6 +65,8 @@ REACH = 2.0
 """Ranges of the latest states by which a rollout's mean may differ from theirs."""
 CAUTION = 120
 """Samples of the present plant below which back-offs only grow; errors below which none tells."""
+STEADY = 1440
+"""Samples of a changed plant below which no back-off shrinks beneath what it was before."""
 SHRINKS = 0.7
 """A back-off shrinks at most to this share of the least distance from its bound so far."""
 RECENT = 1440
@@ -163,12 +165,12 @@ class ModelBased(Algorithm):
         A present one shrinks little beyond the state that came closest to its bound: what lies
         behind it the model only extrapolates. Of few samples none shrinks, nor while they explore,
         which no rollout does. A plant that has changed may go on to: until it has been the same for
-        `longest_interval` samples none shrinks below what it was before.
+        `STEADY` samples none shrinks below what it was before.
         """
         problem = self._problem
         if self.explores or len(inputs) < CAUTION:
             return present
-        changing = self._era > 0 and len(inputs) < self.configuration.longest_interval
+        changing = self._era > 0 and len(inputs) < STEADY
         floor = np.minimum(self._floor, present) if changing else np.zeros_like(present)
         states = inputs[:, : problem.n_states]
         rooms = np.concatenate([states - problem.state_lower, problem.state_upper - states], axis=1)

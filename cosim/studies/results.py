@@ -112,11 +112,7 @@ class StudyResults(Shown):
             folder,
             about,
             read_table(folder / RUNS, STATE, {"samples": int, "plant_samples": int}),
-            read_table(
-                folder / EVALUATION,
-                [*KEYS, "seed", "steps", *INDICATORS],
-                {"seed": int, "steps": int},
-            ),
+            read_table(folder / EVALUATION, [*KEYS, "seed", "steps", *INDICATORS], {"steps": int}),
             read_table(folder / CURVES, [*KEYS, *CURVE], {"samples": "Int64"}),
         )
 
@@ -514,7 +510,7 @@ class StudyResults(Shown):
     def _judged(self, scenario: str) -> operation.Judged:
         lives = read_table(self.folder / OPERATION, types={"samples": int})
         lives = lives.reindex(columns=LIVES)  # an older table lacks the latest ones
-        greedy = read_table(self.folder / GREEDY, types={"samples": int, "seed": int})
+        greedy = read_table(self.folder / GREEDY, types={"samples": int})
         own = [table[table.scenario == scenario] for table in (lives, greedy)]
         return operation.judged(own[0], own[1], self.about["optimum"].get(scenario, ""))
 
@@ -551,19 +547,16 @@ class StudyResults(Shown):
         most = max((float(one.max()) for each in strata.values() for one in each), default=0.0)
         return figures.profile_figure(strata, self._looks) if most > FLOOR else None
 
-    def report(self, folder: Path | None = None) -> Path:
+    def report(self) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
-        target = self.folder if folder is None else folder
-        page, folders = self._page(self.draw(target / report.FOLDER)), (target, self.folder)
+        page = self._page(self.draw(self.folder / report.FOLDER))
 
         def picture(name: str) -> dict[str, str]:
-            paths = (where / report.FOLDER / f"{name}.svg" for where in folders)
-            return report.image(next(path for path in paths if path.is_file()))
+            return report.image(self.folder / report.FOLDER / f"{name}.svg")
 
         for name in (report.TABLES, report.PAGE):
-            text = report.rendered(name, **page, picture=picture)
-            write_atomically(target / name, text)
-        return target / report.PAGE
+            write_atomically(self.folder / name, report.rendered(name, **page, picture=picture))
+        return self.folder / report.PAGE
 
     def _page(self, drawn: Mapping[str, list[str]]) -> dict[str, Any]:
         """The report, for its templates.
@@ -604,12 +597,11 @@ class StudyResults(Shown):
         own = self.evaluation[self.evaluation.scenario == scenario]
         if own.empty:
             return "No run is finished."
-        curves = "other noise, and fewer samples"  # of a folder that an older version wrote
-        if noise := self.about.get("curves", {}).get(scenario):
-            curves = f"{noise[0]} other seeds × {noise[1]} samples"
+        seeds, steps = self.about["curves"][scenario]
         return (
             f"Table, regret and profile: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
-            f"samples. Learning curves: {curves}. Regrets of a case differ between the two."
+            f"samples. Learning curves: {seeds} other seeds × {steps} samples. Regrets of a case "
+            "differ between the two."
         )
 
 

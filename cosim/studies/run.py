@@ -64,7 +64,9 @@ INDICATORS = (
     "J", "economic_cost", "mean_violation", "violating_share", "input_effort", "failures",
 )  # fmt: skip
 KEY = ["seed", "steps", "burn_in"]
-TYPES: dict[str, Any] = {"scenario": str, "case": str, "training_seed": "Int64", "status": str}
+TYPES: dict[str, Any] = {
+    "scenario": str, "case": str, "training_seed": "Int64", "status": str, "seed": "uint64",
+}  # fmt: skip
 """Types of columns by name; all others are floats, NaN where a cell is empty."""
 PAUSE = 20
 """Least time between two writes of the tables, in multiples of the time that one takes."""
@@ -90,19 +92,12 @@ def read_table(
     """
     import pandas as pd  # noqa: PLC0415
 
-    def converted(texts: pd.Series[str], kind: Any) -> Any:
-        if kind is float:
-            return texts.replace("", "nan").astype(float)
-        if kind == "Int64":
-            return pd.array([int(text) if text else pd.NA for text in texts], dtype=kind)
-        return texts.map(kind)  # whole numbers of 64 bits, too
-
     kinds = TYPES | dict(types or {})
     try:
-        texts = pd.read_csv(path, dtype=str, na_filter=False)
+        texts = pd.read_csv(path, dtype="string", keep_default_na=False, na_values=[""])
         names = dict.fromkeys([*(columns or texts), *(types or ())])
-        return pd.DataFrame({n: converted(texts[n], kinds.get(n, float)) for n in names})
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        return texts[[*names]].astype({name: kinds.get(name, float) for name in names})
+    except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise StudyError(f"'{path}' is missing or damaged: {error}") from None
 
 
@@ -454,7 +449,7 @@ class RunStore:
         if path.is_file():
             wanted = () if file == TIMING else (*KEY, *INDICATORS)
             try:
-                rows = read_table(path, wanted, dict.fromkeys(KEY, int)).set_index("seed")
+                rows = read_table(path, wanted, dict.fromkeys(KEY[1:], int)).set_index("seed")
             except StudyError:
                 self.remarks.append(f"'{path}' is damaged; made anew")
                 return found

@@ -270,7 +270,7 @@ def nearest_steady_state(
     low, high = plant.state_range
     bounds = np.concatenate([low, lower]), np.concatenate([high, upper])
     start, n = np.concatenate([state, action]), len(state)
-    scale = np.maximum(np.abs(start), 1e-2)
+    scale: Array = np.maximum(np.abs(start), 1e-2)
 
     def residual(z: Array) -> Array:
         plant.reset(0, z[:n])

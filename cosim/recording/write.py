@@ -423,7 +423,7 @@ class Stream:
 
     The file is written beside `path` under a hidden name and renamed by `close`, so that `path`
     never holds half a recording; `rerun rrd optimize` repairs what a killed process leaves. Raises
-    RecordingError where the folder does not exist or cannot be written.
+    OSError where the folder does not exist or cannot be written.
     """
 
     def __init__(
@@ -437,12 +437,7 @@ class Stream:
         self.path = check_target(path)
         name_of_partial = f".{self.path.stem}.{secrets.token_hex(4)}.partial.rrd"
         self._partial = self.path.with_name(name_of_partial)
-        try:
-            self._partial.touch()
-        except OSError as error:
-            raise RecordingError(
-                f"cannot write the recording {self.path}: {error.strerror}"
-            ) from None
+        self._partial.touch()
         # Otherwise a column of the wrong shape is dropped with a warning.
         rr.set_strict_mode(True)
         self.rerun = rr.RecordingStream("rti-cosim")

@@ -602,8 +602,7 @@ def finer_grid(
     return Grid(tuple(axes), tuple(intervals) if smooth else None)
 
 
-Rows = NDArray[np.intp]
-Objective = Callable[[Rows, Array], Array]
+Objective = Callable[[Indices, Array], Array]
 
 
 def nelder_mead(
@@ -769,7 +768,7 @@ def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int
     problem, grid = operator.problem, iterate.grid
     lower, upper = problem.action_lower, problem.action_upper
 
-    def objective(rows: Rows, actions: Array) -> Array:
+    def objective(rows: Indices, actions: Array) -> Array:
         return operator.values(grid.points[rows], actions, grid, iterate.W)
 
     start, _ = scan(objective, iterate.actions, lower, upper, scan_points)

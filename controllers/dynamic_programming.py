@@ -350,17 +350,6 @@ class Accuracy:
             tuple(min(count, 10) for count in self.penalty_nodes),
         )
 
-    def finer(self) -> Accuracy:
-        """Half the integration step, two more `nodes`, half as many again `penalty_nodes`.
-
-        A disturbance with one node keeps it.
-        """
-        return Accuracy(
-            2 * self.substeps,
-            tuple(count + 2 if count > 1 else 1 for count in self.nodes),
-            tuple(count + (count + 1) // 2 if count > 1 else 1 for count in self.penalty_nodes),
-        )
-
 
 class BellmanOperator:
     """Q(s, a) = E[ℓ(s, a, d) + penalty(s₊) + W(s₊)] with V = penalty + W.
@@ -602,8 +591,7 @@ def finer_grid(
     return Grid(tuple(axes), tuple(intervals) if smooth else None)
 
 
-Rows = NDArray[np.intp]
-Objective = Callable[[Rows, Array], Array]
+Objective = Callable[[Indices, Array], Array]
 
 
 def nelder_mead(
@@ -769,7 +757,7 @@ def improve_policy(operator: BellmanOperator, iterate: Optimum, scan_points: int
     problem, grid = operator.problem, iterate.grid
     lower, upper = problem.action_lower, problem.action_upper
 
-    def objective(rows: Rows, actions: Array) -> Array:
+    def objective(rows: Indices, actions: Array) -> Array:
         return operator.values(grid.points[rows], actions, grid, iterate.W)
 
     start, _ = scan(objective, iterate.actions, lower, upper, scan_points)
@@ -864,19 +852,17 @@ def refine(
     settings: Settings,
     optimum: Optimum,
     *,
-    level: int | None = None,
-    accuracy: Accuracy | None = None,
+    level: int,
     progress: Progress | None = None,
 ) -> Optimum:
-    """Solve again from a solution, on the grid of another level or with another accuracy.
+    """Solve again from a solution, on the grid of another level.
 
     Raises OptimumError as `solve` does.
     """
-    operator = BellmanOperator(plant, accuracy or optimum.accuracy, workers=2)
+    operator = BellmanOperator(plant, optimum.accuracy, workers=2)
     start = begin(operator, optimum.grid, optimum.actions)
-    grid = optimum.grid if level is None else finer_grid(operator, start, settings, level)
+    grid = finer_grid(operator, start, settings, level)
     start = begin(operator, grid, start.grid.resample(start.actions, grid), 0.1)
-    level = settings.level if level is None else level
     return _accepted(_iterate(operator, start, level, settings, progress), operator.accuracy)
 
 
@@ -970,14 +956,13 @@ def certify(
     """A solution on the grid of the next level, with a certificate.
 
     Its figures: `solution`, the gain and its bounds on the given grid; `refinement`, those on the
-    next level; `quadrature`, those on the given grid with the `finer` accuracy; `simulation`, the
-    mean cost of the refined policy on the plant's model, 95 %; where it is added, `policy search`,
-    the best θ that a search found, on the same noise. Raises OptimumError as `solve` does.
+    next level; `simulation`, the mean cost of the refined policy on the plant's model, 95 %; where
+    it is added, `policy search`, the best θ that a search found, on the same noise. Raises
+    OptimumError as `solve` does.
     """
     refined = refine(plant, settings, optimum, level=settings.level + 1, progress=progress)
-    finer = refine(plant, settings, optimum, accuracy=optimum.accuracy.finer(), progress=progress)
     mean, half_width = simulate_policy(plant, refined, paths=paths, steps=steps)
-    solved = {"solution": optimum, "refinement": refined, "quadrature": finer}
+    solved = {"solution": optimum, "refinement": refined}
     figures = [Figure(name, one.gain, one.lower, one.upper) for name, one in solved.items()]
     figures.append(Figure("simulation", mean, mean - half_width, mean + half_width))
     return replace(refined, certificate=tuple(figures))

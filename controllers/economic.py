@@ -12,7 +12,7 @@ import clarabel
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.linalg import null_space, solve_discrete_are
+from scipy.linalg import null_space, solve_discrete_are, solve_discrete_lyapunov
 
 from controllers.errors import TuningError
 from controllers.model import discretise, runge_kutta
@@ -29,10 +29,9 @@ class SteadyState:
     """Optimum of min ℓ(x, u) s.t. x = f(x, u) and the bounds, for the sampled nominal model.
 
     `x` (n,), `u` (m,), `cost` ℓ_s; `costate` λ (n,) of f(x, u) − x = 0; `multipliers` (n+m,) of the
-    bounds of w = (x, u), positive at a lower and negative at an upper bound; `A` (n, n), `B` (n, m)
-    Jacobians of f; `hessian` H = ∇²_w (ℓ + λᵀf) (n+m, n+m); `gradient` (n+m,) of ℓ + λᵀ(f − x),
-    which equals `multipliers`; `C` (n_c, n+m) gradients of the strictly active bounds, `active`
-    these in words.
+    bounds of w = (x, u), positive at a lower and negative at an upper bound, are the gradient of
+    ℓ + λᵀ(f − x); `A` (n, n), `B` (n, m) Jacobians of f; `hessian` H = ∇²_w (ℓ + λᵀf) (n+m, n+m);
+    `C` (n_c, n+m) gradients of the strictly active bounds, `active` these in words.
     """
 
     x: Array
@@ -43,7 +42,6 @@ class SteadyState:
     A: Array
     B: Array
     hessian: Array
-    gradient: Array
     C: Array
     active: tuple[str, ...]
 
@@ -91,8 +89,7 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
     hessian, gradient = ca.hessian(lagrangian, w)
     derivatives = ca.Function("d", [w], [hessian, gradient, ca.jacobian(x_next, w)])
     hessian, gradient, jacobian = (value.full() for value in derivatives(point))
-    # CasADi's bound multipliers are those of +w ≤ upper: the other sign.
-    multipliers = -found["lam_x"].full().reshape(-1)
+    multipliers = gradient.reshape(-1)
     strict = np.flatnonzero(np.abs(multipliers) > _STRICT * max(1.0, np.abs(multipliers).max()))
     for i in strict[strict < n]:
         if abs(multipliers[i]) >= problem.penalty_linear[i]:
@@ -115,7 +112,6 @@ def optimal_steady_state(problem: Problem) -> SteadyState:
         A=jacobian[:, :n],
         B=jacobian[:, n:],
         hessian=hessian,
-        gradient=gradient.reshape(-1),
         C=np.eye(len(point))[strict],
         active=tuple(active),
     )
@@ -170,8 +166,7 @@ def local_feedback(A: Array, B: Array, H: Array, C: Array) -> LocalFeedback:
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
         raise TuningError("the active constraints, once kept, make the closed loop unstable")
     # P = stage + closedᵀ P closed: the Riccati solver's P is accurate in the gain's part only.
-    system, cost = np.eye(n * n) - np.kron(closed.T, closed.T), stage.T @ H @ stage
-    P = np.linalg.solve(system, cost.reshape(-1)).reshape(n, n)
+    P = solve_discrete_lyapunov(closed.T, stage.T @ H @ stage, method="direct")
     return LocalFeedback(gain, _symmetric(P))
 
 
@@ -326,7 +321,7 @@ def tune(
         ) from error
     P, dynamics = tuned.value, np.hstack([A, B])
     M = convex.hessian + (1.0 - problem.discount) * dynamics.T @ P @ dynamics
-    q, C_x = steady.gradient, steady.C[:, :n]
+    q, C_x = steady.multipliers, steady.C[:, :n]
     # θ's quadratics are about the reference, the tuning's about the optimal steady state.
     shift = problem.reference - np.concatenate([steady.x, steady.u])
     initial = convex.delta_P - C_x.T @ convex.F @ C_x

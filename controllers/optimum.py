@@ -7,7 +7,7 @@ import io
 import itertools
 import json
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import isfinite, modf, prod
@@ -291,68 +291,62 @@ class Fouling:
         since = np.mod(days, self.period)
         return self.clean * (self.floor + (1.0 - self.floor) * np.exp(-self.rate * since))
 
-    @property
-    def nodes(self) -> list[float]:
-        """Increasing values of the parameter at which the reference has an optimum."""
-        fouled = self.clean * (self.floor + (1 - self.floor) * np.exp(-self.rate * self.period))
-        values: list[float] = np.linspace(fouled, self.clean, NODES).round(6).tolist()
-        return values
-
-    @property
-    def plants(self) -> list[Mapping[str, float | None]]:
-        """Plant parameters of a condenser that stays at each node."""
-        return [{self.parameter: value, **dict.fromkeys(FOULING)} for value in self.nodes]
-
     def present(self, time: float) -> dict[str, float]:
         """The parameter by name at a time in s."""
         return {self.parameter: float(self.heat_transfer(time / DAY))}
 
-    def position(self, time: ArrayLike) -> Vector:
-        """Where among the nodes the parameter is at times in s: 1.5 is midway between 1 and 2."""
-        values = self.heat_transfer(np.asarray(time) / DAY)
-        return np.asarray(np.interp(values, self.nodes, np.arange(NODES)), dtype=np.float64)
-
-    def quadrature(self) -> tuple[Vector, Vector]:
-        """Times in s and weights of a mean over one cycle."""
+    def change(self) -> Change:
+        """The law between six values of the parameter, from fouled to clean, over one cycle."""
+        fouled = self.clean * (self.floor + (1 - self.floor) * np.exp(-self.rate * self.period))
+        nodes = np.linspace(fouled, self.clean, NODES).round(6).tolist()
         x, weights = np.polynomial.legendre.leggauss(40)
-        return 0.5 * self.period * DAY * (x + 1.0), weights / 2.0
+
+        def position(time: ArrayLike) -> Vector:
+            values = self.heat_transfer(np.asarray(time) / DAY)
+            return np.asarray(np.interp(values, nodes, np.arange(NODES)), dtype=np.float64)
+
+        return Change(
+            [{self.parameter: value, **dict.fromkeys(FOULING)} for value in nodes],
+            position,
+            times=0.5 * self.period * DAY * (x + 1.0),
+            weights=weights / 2.0,
+        )
 
 
 @dataclass(frozen=True)
-class Jumps:
-    """Parameters that jump: those of `plants[i]` hold from `starts[i]` in s on."""
+class Change:
+    """A change that the reference knows, among plants that stay as they are.
 
-    starts: tuple[float, ...]
-    plants: tuple[Mapping[str, float], ...]
+    `plants` are their parameters; `position` says where among them the plant is at times in s: 1.5
+    is midway between 1 and 2. A mean over time is that over `times` in s with `weights`.
+    """
 
-    @classmethod
-    def from_scenario(cls, scenario: Scenario) -> Jumps | None:
-        """Parameter jump of a scenario's plant, or None."""
-        changes = scenario.plant.changes
-        if not changes:
-            return None
-        model = load_model(scenario.plant.model or scenario.controller.model)
-        names = dict.fromkeys(name for change in changes for name in change.parameters)
-        plants = [{name: _parameter(scenario, model, name) for name in names}]
-        for change in changes:
-            plants.append(plants[-1] | change.parameters)
-        return cls((0.0, *(change.time for change in changes)), tuple(plants))
-
-    def position(self, time: ArrayLike) -> Vector:
-        """Index of the plant at times in s."""
-        return np.asarray(np.searchsorted(self.starts, time, side="right") - 1, dtype=np.float64)
-
-    def quadrature(self) -> tuple[Vector, Vector]:
-        """Times in s and weights of a mean from the start to the last change."""
-        return np.array(self.starts[:-1]), np.diff(self.starts) / self.starts[-1]
+    plants: Sequence[Mapping[str, float | None]]
+    position: Callable[[ArrayLike], Vector]
+    times: Vector
+    weights: Vector
 
 
-def change_of(scenario: Scenario) -> Fouling | Jumps | None:
+def change_of(scenario: Scenario) -> Change | None:
     """Change of a scenario's plant, or None; raises OptimumError where it has two."""
-    fouling, jumps = Fouling.from_scenario(scenario), Jumps.from_scenario(scenario)
-    if fouling and jumps:
+    fouling, changes = Fouling.from_scenario(scenario), scenario.plant.changes
+    if fouling and changes:
         raise OptimumError("a condenser that fouls and plant.changes have no common reference")
-    return fouling or jumps
+    if not changes:
+        return None if fouling is None else fouling.change()
+    model = load_model(scenario.plant.model or scenario.controller.model)
+    names = dict.fromkeys(name for change in changes for name in change.parameters)
+    starts = np.array([0.0, *(change.time for change in changes)])
+
+    def position(time: ArrayLike) -> Vector:
+        return np.asarray(np.searchsorted(starts, time, side="right") - 1, dtype=np.float64)
+
+    return Change(
+        [{n: _parameter(scenario.at(start), model, n) for n in names} for start in starts.tolist()],
+        position,
+        times=starts[:-1],
+        weights=np.diff(starts) / starts[-1],
+    )
 
 
 def _parameter(scenario: Scenario, model: Model, name: str) -> float:
@@ -372,7 +366,7 @@ class QuasiStaticPolicy:
     name = "optimal"
 
     def __init__(
-        self, law: Fouling | Jumps, policies: Sequence[OptimalPolicy], sampling_time: float
+        self, law: Change, policies: Sequence[OptimalPolicy], sampling_time: float
     ) -> None:
         self.law = law
         self.policies = tuple(policies)
@@ -401,8 +395,7 @@ class QuasiStaticPolicy:
     @property
     def gain(self) -> float:
         """Mean of J* over one cycle of fouling, or from the start to the last jump."""
-        times, weights = self.law.quadrature()
-        return float(self.gain_at(times) @ weights)
+        return float(self.gain_at(self.law.times) @ self.law.weights)
 
     def gain_at(self, time: ArrayLike) -> Vector:
         """J* of the plant as it is at times in s, between the nodes by monotone cubics."""

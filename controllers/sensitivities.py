@@ -7,9 +7,8 @@ Sensitivities). Both need one expression only: the part of the Lagrangian that c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,26 +24,19 @@ SOLUTION = ("xi", "t", "chi", "v", "lam")
 """First inputs of the sensitivities: a solution's parts."""
 
 
-class PrimalDual(NamedTuple):
-    """Symbols of a solution: `xi`, `chi` (n, N+1), `v` (m, N), slack `t` and `lam` (n, N)."""
-
-    xi: ca.SX
-    v: ca.SX
-    t: ca.SX
-    lam: ca.SX
-    chi: ca.SX
-
-
 def _theta_part(
-    problem: Problem, symbols: SymbolicTheta, y: PrimalDual, at: ca.SX, M: ca.SX | None
+    problem: Problem, symbols: SymbolicTheta, y: Mapping[str, ca.SX], at: ca.SX, M: ca.SX | None
 ) -> ca.SX:
-    """Terms of the Lagrangian with θ but for p; `at` (n+m, N), M_k = ∂(second-order term)/∂L_k."""
+    """Terms of the Lagrangian with θ but for p; `at` (n+m, N), M_k = ∂(second-order term)/∂L_k.
+
+    The solution y has `xi`, `chi` (n, N+1), `v` (m, N), slack `t` and `lam` (n, N).
+    """
     horizon, gamma, size = problem.horizon, problem.discount, at.size1()
     reference = problem.reference
-    part = ca.bilin(symbols["B_lambda"], y.xi[:, 0]) + ca.dot(symbols["b_lambda"], y.xi[:, 0])
+    part = ca.bilin(symbols["B_lambda"], y["xi"][:, 0]) + ca.dot(symbols["b_lambda"], y["xi"][:, 0])
     part += symbols["c_lambda"]
     for k in range(horizon):
-        w = ca.vertcat(y.xi[:, k], y.v[:, k])
+        w = ca.vertcat(y["xi"][:, k], y["v"][:, k])
         stage = ca.dot(symbols["b_l"], w)
         if M is None:
             stage += ca.bilin(symbols["B_l"], w)
@@ -52,12 +44,12 @@ def _theta_part(
             point, M_k = at[:, k] - reference, M[:, k * size : (k + 1) * size]
             stage += ca.bilin(symbols["B_l"], point, 2 * w - point)
             stage += 2 * ca.dot(M_k, symbols["B_l"])
-        part += gamma**k * stage + ca.dot(y.chi[:, k + 1], symbols["c_f"])
-        part += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], y.t[:, k])
-        part += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], y.t[:, k] ** 2)
-        part += ca.dot(ca.fmax(-y.lam[:, k], 0), symbols["x_l"])
-        part -= ca.dot(ca.fmax(y.lam[:, k], 0), symbols["x_u"])
-    end = y.xi[:, horizon]
+        part += gamma**k * stage + ca.dot(y["chi"][:, k + 1], symbols["c_f"])
+        part += gamma ** (k + 1) * ca.dot(symbols["w_sigma"], y["t"][:, k])
+        part += gamma ** (k + 1) * ca.dot(symbols["W_sigma"], y["t"][:, k] ** 2)
+        part += ca.dot(ca.fmax(-y["lam"][:, k], 0), symbols["x_l"])
+        part -= ca.dot(ca.fmax(y["lam"][:, k], 0), symbols["x_u"])
+    end = y["xi"][:, horizon]
     return part + gamma**horizon * (ca.bilin(symbols["B_Vf"], end) + ca.dot(symbols["b_Vf"], end))
 
 
@@ -76,7 +68,7 @@ def sensitivities(
     n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
     symbols = SymbolicTheta.of(problem, blocks)
     columns = {"xi": horizon + 1, "v": horizon, "t": horizon, "lam": horizon, "chi": horizon + 1}
-    y = PrimalDual(*(ca.SX.sym(k, m if k == "v" else n, c) for k, c in columns.items()))
+    y = {name: ca.SX.sym(name, m if name == "v" else n, c) for name, c in columns.items()}
     x, u = ca.SX.sym("x", n, horizon), ca.SX.sym("u", m, horizon)
     M = ca.SX.sym("M", n + m, horizon * (n + m))
     guess = ca.SX.sym("guess", n, horizon)
@@ -87,11 +79,11 @@ def sensitivities(
         of_stage = stage_parameter_gradient(problem, blocks, exact=exact)
         total = ca.SX(0)
         for k in range(horizon):
-            w = ca.vertcat(y.xi[:, k], y.v[:, k]) + ca.DM(problem.reference)
+            w = ca.vertcat(y["xi"][:, k], y["v"][:, k]) + ca.DM(problem.reference)
             curved = [M[:, k * (n + m) : (k + 1) * (n + m)], guess[:, k]] if exact else []
-            total += of_stage(x[:, k], u[:, k], symbols.theta, w, y.chi[:, k + 1], *curved)
+            total += of_stage(x[:, k], u[:, k], symbols.theta, w, y["chi"][:, k + 1], *curved)
         gradient[blocks.slices["p"]] = total
-    solution = {name: getattr(y, name) for name in SOLUTION}
+    solution = {name: y[name] for name in SOLUTION}
     inputs = {**solution, "x": x, "u": u, "theta": symbols.theta, **extra}
     value = StackedFunction("value_gradient", inputs, {"gradient": gradient})
 
@@ -103,7 +95,7 @@ def sensitivities(
             ca.SX.sym(name, rows * horizon, m) for name, rows in (("dv", m), ("dt", n), ("dlam", n))
         )
         dM = ca.SX.sym("dM", (n + m) * horizon * (n + m), m)
-        symbol = ca.veccat(*y, *([M] if exact else []))
+        symbol = ca.veccat(*y.values(), *([M] if exact else []))
         policy, state = [], []
         for i in range(m):
             v_i = ca.reshape(dv[:, i], m, horizon)

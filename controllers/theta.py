@@ -68,7 +68,7 @@ class ThetaBlock:
         return len(self.shape) == 2
 
     def pack(self, value: ArrayLike) -> Vector:
-        """Flatten an unpacked value; raises ParameterError on a wrong shape, NaN or asymmetry."""
+        """Flatten an unpacked value; raises ParameterError on a wrong shape or asymmetry."""
         try:
             array = np.asarray(value)
         except ValueError:  # ragged nesting
@@ -80,11 +80,9 @@ class ThetaBlock:
             raise ParameterError(
                 f"θ block {self.name} has shape {array.shape}; it must have {self.shape}"
             )
-        if not np.isfinite(array).all():
-            raise ParameterError(f"θ block {self.name} has an entry that is not finite: {array}")
         if not self.symmetric:
             return array.reshape(-1)
-        if not np.array_equal(array, array.T):
+        if not np.array_equal(array, array.T, equal_nan=True):
             raise ParameterError(f"θ block {self.name} must be symmetric: {array.tolist()}")
         return array[upper_triangle(len(array))]
 

@@ -79,7 +79,7 @@ class Result(Shown):
         return markdown_table((type(self).__name__, "value"), rows)
 
     def plot(self, path: str | Path) -> Path:
-        """Draw `figure` to a PNG or SVG file; raises FigureError where it cannot be written."""
+        """Draw `figure` to a PNG or SVG file; raises FigureError on another suffix."""
         from cosim.figures.style import save  # noqa: PLC0415 - matplotlib
 
         return save(self.figure(), path)

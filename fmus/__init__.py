@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import platform as host
 import struct
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,18 +62,16 @@ PLATFORMS = (
     Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos.11.0"),
 )
 
-_ARCHITECTURES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
-_SYSTEMS = {"linux": "linux", "win32": "windows", "darwin": "darwin"}
-
 
 def present() -> Platform:
     """The platform at hand; raises BuildError for one that is not in `PLATFORMS`."""
-    machine = host.machine().lower()
-    name = f"{_ARCHITECTURES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
-    if found := next((each for each in PLATFORMS if each.tuple == name), None):
-        return found
-    known = ", ".join(platform.tuple for platform in PLATFORMS)
-    raise BuildError(f"no binaries are built for {name}; known are {known}")
+    from fmpy import platform_tuple  # noqa: PLC0415 - a tenth of a second
+
+    known = {platform.tuple: platform for platform in PLATFORMS}
+    if platform_tuple not in known:
+        words = ", ".join(known)
+        raise BuildError(f"no binaries are built for {platform_tuple}; known are {words}")
+    return known[platform_tuple]
 
 
 _ELF = {0x3E: "x86_64", 0xB7: "aarch64", 0x03: "x86", 0x28: "aarch32"}

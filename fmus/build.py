@@ -250,13 +250,9 @@ def build_fmu(
 def build_folder(folder: str | Path, target: str | Path, every_platform: bool = False) -> Path:
     """Build `modelDescription.xml` and every `*.c` and `*.h` of a folder into the FMU `target`.
 
-    As `build_fmu`; raises BuildError also where a file is missing.
+    As `build_fmu`; raises OSError where there is no model description.
     """
-    description = Path(folder) / "modelDescription.xml"
-    try:
-        text = description.read_bytes()
-    except OSError as error:
-        raise BuildError(f"{description}: {error.strerror}") from None
+    text = (Path(folder) / "modelDescription.xml").read_bytes()
     sources = {path.name: path.read_bytes() for path in Path(folder).glob("*.[ch]")}
     return build_fmu(target, sources, text, every_platform=every_platform)
 

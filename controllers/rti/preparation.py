@@ -16,6 +16,7 @@ from controllers.problem import Problem
 from controllers.qp import SoftQp
 from controllers.theta import Parameters, SymbolicTheta, ThetaBlocks
 from cosim.protocols import Vector
+from cosim.validation import instead
 
 
 def sampled_jacobian(
@@ -389,7 +390,7 @@ class GaussNewton:
     lifts = False
     spectrum: Spectrum | None = None
 
-    def __init__(self, problem: Problem, prepared: StackedFunction) -> None:
+    def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self.functions: dict[str, StackedFunction] = {}
         self.discounts = problem.discount ** np.arange(horizon)
@@ -423,7 +424,7 @@ class Exact(GaussNewton):
     FLOOR = 1e-3
 
     def __init__(self, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction) -> None:
-        super().__init__(problem, prepared)
+        super().__init__(problem, blocks, prepared)
         self.lifts = True
         n, m, horizon = problem.n_states, problem.n_actions, problem.horizon
         self._reference = problem.reference
@@ -478,15 +479,7 @@ class Exact(GaussNewton):
         return float((at * (curved - flat)).sum() / 2)
 
 
-def make_hessian(
-    name: str, problem: Problem, blocks: ThetaBlocks, prepared: StackedFunction
-) -> GaussNewton:
-    """Rule by name; raises ControllerError on an unknown one."""
-    if name == "gauss-newton":
-        return GaussNewton(problem, prepared)
-    if name == "exact":
-        return Exact(problem, blocks, prepared)
-    raise ControllerError(f"there is no Hessian '{name}'; choose gauss-newton or exact")
+HESSIANS = {"gauss-newton": GaussNewton, "exact": Exact}
 
 
 class SampleFunctions:
@@ -498,11 +491,13 @@ class SampleFunctions:
     """
 
     def __init__(self, problem: Problem, blocks: ThetaBlocks, hessian: str) -> None:
+        if hessian not in HESSIANS:
+            raise ControllerError(f"there is no Hessian '{hessian}'{instead(hessian, HESSIANS)}")
         self.problem, self.blocks = problem, blocks
         self.preparation = preparation(problem, blocks)
         self.readout = readout(problem, blocks, self.preparation)
         self.embedding = embedding(problem, blocks, self.preparation, self.readout)
-        self.hessian = make_hessian(hessian, problem, blocks, self.preparation)
+        self.hessian = HESSIANS[hessian](problem, blocks, self.preparation)
 
     @property
     def named(self) -> dict[str, StackedFunction]:

@@ -22,7 +22,7 @@ def optimum(
         bool,
         typer.Option(
             "--refine",
-            help="Solve, refine grid and quadrature, simulate the policy; keep the certificate.",
+            help="Solve, refine the grid, simulate the policy; keep the certificate.",
         ),
     ] = False,
     recompute: Annotated[

@@ -74,10 +74,9 @@ def _styled() -> Iterator[None]:
 def save(drawn: Figure, path: str | Path) -> Path:
     """Write a figure as PNG (200 dpi) or SVG, by the path's suffix; same figure, same bytes.
 
-    Raises FigureError on another suffix and where the file cannot be written.
+    Raises FigureError on another suffix, OSError where the file cannot be written.
     """
-    path = Path(path)
-    kind = path.suffix.removeprefix(".")
+    kind = Path(path).suffix.removeprefix(".")
     if kind not in ("png", "svg"):
         raise FigureError(f"cannot draw '{path}': the file must end in .png or .svg")
     content = io.BytesIO()
@@ -86,11 +85,7 @@ def save(drawn: Figure, path: str | Path) -> Path:
         # The SVG writer adds the date unless told not to.
         metadata = {"Date": None} if kind == "svg" else {"Software": "rti-cosim"}
         drawn.savefig(content, format=kind, dpi=200, metadata=metadata)
-    try:
-        write_atomically(path, content.getvalue())
-    except OSError as error:
-        raise FigureError(f"cannot write '{path}': {error.strerror}") from None
-    return path
+    return write_atomically(path, content.getvalue())
 
 
 def save_set(figures: Iterable[tuple[str, Figure]], folder: Path) -> list[str]:

@@ -54,7 +54,7 @@ def render(
     is the worst violation of a run, or the end.
 
     Raises RecordingError where there is no such file or graphics driver, where a view failed or
-    `timeout` s have passed.
+    `timeout` s have passed, OSError where the PNG cannot be written.
     """
     if at is not None and not isfinite(at):
         raise RecordingError(f"the time of the cursor (--at) must be finite, not {at}")
@@ -62,11 +62,8 @@ def render(
     if at is None:
         at = worst_moment(path)
     deadline = time.monotonic() + timeout
-    try:
-        with replacing(png) as target:
-            target.write_bytes(_drawn(path, at, size, deadline))
-    except OSError as error:
-        raise RecordingError(f"cannot write {png}: {error.strerror}") from None
+    with replacing(png) as target:
+        target.write_bytes(_drawn(path, at, size, deadline))
 
 
 def _drawn(path: Path, at: float | None, size: tuple[int, int], deadline: float) -> bytes:

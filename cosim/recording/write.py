@@ -60,7 +60,7 @@ class RerunRecorder:
     the signals `prediction/<name>`, N+1 or N numbers a sample. A plant that is made with
     `intermediate=recorder.intermediate` has its states within the samples recorded, too.
 
-    Raises RecordingError where the file cannot be written.
+    Raises OSError where the file cannot be begun, RecordingError where it is not written whole.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -289,7 +289,7 @@ def _record(
 
 
 def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str) -> None:
-    """Write a recording of runs of one scenario by name, over each other; raises RecordingError.
+    """Write a recording of runs of one scenario by name, over each other; errors as of a run's.
 
     The signals are `<run>/<signal>` for every signal that all runs have, and, of two runs,
     `difference/<signal>`; bounds are those that the first run knows. `about` is Markdown.
@@ -336,7 +336,7 @@ def record_training(path: str | Path, training: Training) -> None:
 
     `increment/<block>` is the change of a block of θ since the start, (K, size).
 
-    Raises RecordingError where the file cannot be written.
+    Raises OSError where the file cannot be begun, RecordingError where it is not written whole.
     """
     run, blocks, log = training.run, training.parameters.blocks, training.log()
     properties = {
@@ -423,7 +423,7 @@ class Stream:
 
     The file is written beside `path` under a hidden name and renamed by `close`, so that `path`
     never holds half a recording; `rerun rrd optimize` repairs what a killed process leaves. Raises
-    RecordingError where the folder does not exist or cannot be written.
+    OSError where the folder does not exist or cannot be written.
     """
 
     def __init__(
@@ -437,12 +437,7 @@ class Stream:
         self.path = check_target(path)
         name_of_partial = f".{self.path.stem}.{secrets.token_hex(4)}.partial.rrd"
         self._partial = self.path.with_name(name_of_partial)
-        try:
-            self._partial.touch()
-        except OSError as error:
-            raise RecordingError(
-                f"cannot write the recording {self.path}: {error.strerror}"
-            ) from None
+        self._partial.touch()
         # Otherwise a column of the wrong shape is dropped with a warning.
         rr.set_strict_mode(True)
         self.rerun = rr.RecordingStream("rti-cosim")

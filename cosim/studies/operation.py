@@ -13,7 +13,7 @@ from scipy.stats import ttest_1samp
 
 from controllers import compile_functions
 from controllers.factories import nmpc
-from controllers.optimum import Fouling, QuasiStaticPolicy, change_of
+from controllers.optimum import Fouling, QuasiStaticPolicy
 from cosim.plant import FmuPlant
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
@@ -36,8 +36,7 @@ LIFE = [
 
 def plant_at(scenario: Scenario, time: float) -> Scenario:
     """The scenario with its plant frozen at a time in s."""
-    law = change_of(scenario)
-    if isinstance(law, Fouling):
+    if law := Fouling.from_scenario(scenario):
         return scenario.replace(
             {"plant": {"parameters": law.present(time) | {"fouling_rate": 0.0}}}
         )
@@ -56,7 +55,7 @@ class StoppedPolicy(QuasiStaticPolicy):
 
 def optimum_at(scenario: Scenario, sample: int) -> Controller:
     """The optimal policy of the plant frozen at a sample."""
-    if not isinstance(change_of(scenario), Fouling):
+    if Fouling.from_scenario(scenario) is None:
         return build_controller("optimal", plant_at(scenario, sample * scenario.sampling_time))
     moving = QuasiStaticPolicy.from_scenario(scenario)
     found = StoppedPolicy(moving.law, moving.policies, scenario.sampling_time)

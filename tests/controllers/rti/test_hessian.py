@@ -4,7 +4,7 @@ import pytest
 
 from controllers import ThetaBlocks
 from controllers.model import discretise
-from controllers.rti.preparation import Exact, Spectrum, make_hessian, preparation
+from controllers.rti.preparation import HESSIANS, Exact, Spectrum, preparation
 from tests.helpers.sampling import evaporator_problem, random_parameters, random_point
 
 N, n, m = 10, 2, 2
@@ -22,7 +22,7 @@ def prepared(blocks):
 
 
 def filled(name, prepared, blocks, problem, parameters, point):
-    rule = make_hessian(name.removesuffix("-unlifted"), problem, blocks, prepared)
+    rule = HESSIANS[name.removesuffix("-unlifted")](problem, blocks, prepared)
     rule.lifts = not name.endswith("-unlifted")
     rule.set_parameters(parameters)
     constant = rule.fill(*point)

@@ -137,8 +137,7 @@ class Problem:
     x_s (n,), `reference_action` u_s (m,), in the units of the model's quantities; `reference_cost`
     ℓ_s. The penalty of a violation v ≥ 0 is Σ_i linear_i v_i + quadratic_i v_i² with
     `penalty_linear` and `penalty_quadratic` (n,) (paper.tex, Simulations). `substeps` RK4 steps
-    make a sample of the model. Raises ModelError on vectors of a wrong size or not finite, and on a
-    penalty that is not positive; a scenario has checked all else.
+    make a sample of the model. Raises ModelError on sizes or values that do not fit.
     """
 
     model: Model
@@ -160,8 +159,23 @@ class Problem:
         for name in VECTORS:
             size = self.n_actions if "action" in name else self.n_states
             object.__setattr__(self, name, _frozen(name, getattr(self, name), size))
+        for kind in ("state", "action"):
+            if not (getattr(self, f"{kind}_lower") < getattr(self, f"{kind}_upper")).all():
+                raise ModelError(f"problem: {kind}_lower must be below {kind}_upper everywhere")
         if (self.penalty_linear <= 0).any() or (self.penalty_quadratic <= 0).any():
             raise ModelError("problem: penalty_linear and penalty_quadratic must be positive")
+        if self.horizon < 1 or not 0 < self.discount <= 1:
+            raise ModelError(
+                f"problem: horizon {self.horizon} must be at least 1 and discount "
+                f"{self.discount} in (0, 1]"
+            )
+        if not 0 < self.sampling_time < np.inf or self.substeps < 1:
+            raise ModelError(
+                f"problem: sampling_time {self.sampling_time} s must be positive and finite and "
+                f"substeps {self.substeps} at least 1"
+            )
+        if not np.isfinite(self.reference_cost):
+            raise ModelError(f"problem: reference_cost must be finite, not {self.reference_cost}")
 
     @property
     def n_states(self) -> int:

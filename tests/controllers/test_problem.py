@@ -19,7 +19,12 @@ BAD = {
     "short bound": {"state_lower": [25]},
     "bound not finite": {"action_upper": [400, np.inf]},
     "text": {"reference_action": "u_s"},
+    "crossed states": {"state_lower": [25, 80]},
     "no linear penalty": {"penalty_linear": [0, 1]},
+    "no horizon": {"horizon": 0},
+    "discount above one": {"discount": 1.01},
+    "no steps": {"substeps": 0},
+    "no cost": {"reference_cost": np.nan},
 }
 
 

@@ -81,7 +81,9 @@ class ModelBasedConfiguration(Configuration):
     model_parameters: ModelParameters = ALL
     first_update: Count = Field(30, description="samples before the first update of θ")
     longest_interval: Count = Field(
-        1440, description="most samples between updates, which double with the model's data"
+        1440,
+        description="most samples between updates, which double with the model's data, as long as "
+        "these are no more than eight times as many",
     )
     memory: Count = Field(20_000, description="samples that the model remembers")
     exploration_samples: Count = Field(120, description="samples at the start that explore")
@@ -96,11 +98,11 @@ class ModelBasedConfiguration(Configuration):
 class ModelBased(Algorithm):
     """Operates with θ, fits the empirical model, searches on it, and operates on.
 
-    An update is due whenever the model's data have doubled or `longest_interval` has passed, and as
-    soon as samples are dearer than any of the rollout that promised θ's cost. Where the errors
-    since the last update have a mean that the model makes improbable, the plant has changed, and
-    the data from there on count. θ moves only where the model, on new noise, promises less for the
-    new one.
+    An update is due when the model's data have doubled, at the latest after `longest_interval` or
+    an eighth of them; and as soon as samples are dearer than any of the rollout that promised θ's
+    cost. Where the errors since the last update have a mean that the model makes improbable, the
+    plant has changed, and the data from there on count. θ moves only where the model, on new noise,
+    promises less for the new one.
     """
 
     Configuration = ModelBasedConfiguration

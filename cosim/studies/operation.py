@@ -150,31 +150,32 @@ def theta_at(log: str, mark: int) -> tuple[float, ...]:
 class Judged(NamedTuple):
     """Operation on one scenario: by case and samples the greedy costs, and each run's life.
 
-    `greedy[case][samples]` (R, S), `optimum[samples]` (S,); `lives` has a row for each run and
+    `greedy[case][samples]` has a row for each training seed and a column for each seed of the
+    noise, `optimum[samples]` (S,); `lives` has a row for each run and
     mark with `regret` (greedy), `life_regret`, `dearest` as a regret, and `excess` as a share of
     the optimum's cost.
     """
 
-    greedy: dict[str, dict[int, Array]]
+    greedy: dict[str, dict[int, pd.DataFrame]]
     optimum: dict[int, Array]
     lives: pd.DataFrame
 
 
 def judged(lives: pd.DataFrame, greedy: pd.DataFrame, optimum: str) -> Judged:
     """Regrets of the rows of a scenario; without an optimum against the best case at the time."""
-    costs: dict[str, dict[int, Array]] = {}
+    costs: dict[str, dict[int, pd.DataFrame]] = {}
     for (case, samples), rows in greedy.groupby(["case", "samples"], sort=False):
         table = rows.assign(run=rows.training_seed.fillna(-1)).pivot(
             index="run", columns="seed", values="J"
         )
-        costs.setdefault(case, {})[int(samples)] = table.to_numpy(dtype=np.float64)
-    best = {samples: cost[0] for samples, cost in costs.pop(optimum, {}).items()}
+        costs.setdefault(case, {})[int(samples)] = table
+    best = {samples: cost.to_numpy()[0] for samples, cost in costs.pop(optimum, {}).items()}
     where = ["training_seed", "samples"]
     key = ["case", *where]
     own = lives[lives.case == optimum].set_index(where).J
     if not best:
         for mark in lives.samples.unique().tolist():
-            each = (cost[mark].mean(axis=0) for cost in costs.values() if mark in cost)
+            each = (cost[mark].to_numpy().mean(axis=0) for cost in costs.values() if mark in cost)
             best[mark] = min(each, key=np.mean)
         own = lives.groupby(where).J.min()
     found = lives[lives.case != optimum].merge(own.rename("optimal_J"), on=where, how="left")
@@ -254,7 +255,10 @@ def tables(
         if other and all(pairs) and found.optimum:
             line = [f"{case} − {other}"]
             for mark in marks:
-                one, two = np.broadcast_arrays(*(costs[mark] for costs in pairs))
+                one, two = (costs[mark] for costs in pairs)
+                if len(common := one.index.intersection(two.index)):
+                    one, two = one.loc[common], two.loc[common]
+                one, two = np.broadcast_arrays(one, two)  # a controller has one row, for any seed
                 value, ends, p = paired_difference(one, two, found.optimum[mark])
                 line.append(shown(value, ends, 100, 3) + ("" if np.isnan(p) else f", p {p:.2f}"))
             rows.append(line)

@@ -1,7 +1,8 @@
 import numpy as np
+import pandas as pd
 
 from cosim import study
-from cosim.studies.operation import SHIFT, dearer_than
+from cosim.studies.operation import LIFE, SHIFT, dearer_than, judged, tables
 
 
 def test_noise_alone_makes_no_shift_dearer_and_a_dearer_one_is_found(rng):
@@ -25,3 +26,19 @@ def test_a_study_in_operation_without_a_training_has_a_report(tmp_path):
     document = {"schema": 1, "name": "held", "scenarios": ["paper"], "operation": {"hours": [1]}}
     document |= {"case": [{"controller": "naive"}], "evaluation": {"seeds": 2, "steps": 10}}
     assert study(document | {"curves": {"seeds": 2, "steps": 10}}, tmp_path).report().is_file()
+
+
+def test_cases_with_other_training_seeds_are_compared_on_those_that_both_have():
+    runs = {"optimal": [10.0, 10.0, 10.0], "a": [11.0, 11.0, 90.0], "b": [10.5, 10.5]}
+    rows = [
+        {"case": case, "training_seed": seed, "samples": 10, "J": J}
+        for case, costs in runs.items()
+        for seed, J in enumerate(costs)
+    ]
+    greedy = [row | {"seed": noise} for row in rows for noise in (5, 6)]
+    lives = pd.DataFrame([dict.fromkeys(LIFE, 0.0) | row for row in rows])
+    found = judged(lives, pd.DataFrame(greedy), "optimal")
+    about = {"sampling_time": 60.0, "columns": [10]}
+    *_, (_, _, ((pair, difference),)) = tables(found, "paper", about, {"a": "b", "b": None}, {})
+    assert pair == "a − b"
+    assert difference.startswith("5.00")

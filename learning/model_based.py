@@ -15,13 +15,13 @@ from itertools import product
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from controllers.economic import tune
 from controllers.errors import TuningError
 from controllers.problem import Problem
 from controllers.theta import Parameters
+from cosim.protocols import Array
 from cosim.scenario import Penalty
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import ALL, Configuration, Count, ModelParameters
@@ -36,8 +36,6 @@ from learning.empirical_model import (
 )
 from learning.prediction_errors import SortedErrors, expected_penalties
 from learning.step import moved
-
-Array = NDArray[np.float64]
 
 BURN, COARSE, FINE = 300, 1800, 5300
 """Samples of a rollout before it counts, of a short one, and of a long one."""

@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from controllers.export.core import core
 from controllers.functions import c_source, library
@@ -290,7 +290,7 @@ class PlantData:
         mean, design = errors.mean(axis=0), designs.mean(axis=0)
         covariance = model.noise / len(errors) + design @ model.covariance @ design.T
         statistic = mean @ np.linalg.solve(covariance, mean) * (M - K) / (K * (M - 1))
-        if fisher.sf(statistic, K, M - K) >= alarm:
+        if fdtrc(K, M - K, max(statistic, 0.0)) >= alarm:
             return False
         self.era, self._pool = self.count - len(errors), model.residuals[-POOL:]
         return True

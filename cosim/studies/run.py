@@ -36,14 +36,14 @@ from controllers import compile_functions
 from controllers.factories import nmpc
 from controllers.problem import Problem
 from controllers.rti import RtiNmpc
-from controllers.theta import Parameters, ThetaBlocks
+from controllers.theta import Parameters
 from cosim.errors import EvaluationError, StudyError
 from cosim.files import read_json, temporary_folder, write_atomically
 from cosim.plant import FmuPlant
 from cosim.plant.fmi import unpack
 from cosim.plugins import OURS, build_controller, changed, code_hash, import_from
 from cosim.processes import Terminated, follow_parent, without_interrupts
-from cosim.protocols import Controller
+from cosim.protocols import Controller, Vector
 from cosim.scenario import Scenario
 from cosim.simulation import measure, simulate
 
@@ -109,9 +109,6 @@ def to_csv(frame: pd.DataFrame) -> str:
 
 # What a run is
 
-_judged: dict[tuple[str, str, ThetaBlocks], RtiNmpc] = {}
-"""The controller that judged a θ here last: to build one takes as long as 8000 of its samples."""
-
 
 @dataclass(frozen=True)
 class TrainingTask:
@@ -129,20 +126,14 @@ class TrainingTask:
 
         return prepare(self.algorithm, self.scenario, self.samples, self.settings, self.options)
 
-    def controller(self, parameters: str, theta: Sequence[float] = ()) -> Controller:
-        """The greedy controller of the θ that a TOML text holds, or of another θ of its blocks."""
+    def controller(self, parameters: str) -> RtiNmpc:
+        """The greedy controller of the θ that a TOML text holds."""
         problem = Problem.from_scenario(self.scenario)
         with temporary_folder("cosim-theta-") as folder:
             path = folder / "parameters.toml"
             path.write_text(parameters, "utf-8")
             found = Parameters.load(path, problem)
-        found = found.with_theta(np.array(theta)) if theta else found
-        key = (self.scenario.hash, self.options["controller"], found.blocks)
-        if key not in _judged:
-            _judged.clear()
-            _judged[key] = nmpc(self.scenario, found, self.options["controller"])
-        _judged[key].theta = found.theta
-        return _judged[key]
+        return nmpc(self.scenario, found, self.options["controller"])
 
 
 class Noise(NamedTuple):
@@ -345,7 +336,7 @@ def _simulate(item: Item) -> Measured | str:
         scenario = plant_at(scenario, mark * scenario.sampling_time)
     controller: Controller
     if run.training is not None:
-        controller = run.training.controller(item.parameters, item.theta)
+        controller = _judging(run.training, item)
     elif mark:
         controller = optimum_at(run.scenario, mark)
     elif isinstance(factory, str):
@@ -357,6 +348,22 @@ def _simulate(item: Item) -> Measured | str:
         if whole:
             return simulate(plant, controller, steps, seeds[0]).to_csv()
         return {seed: measure(plant, controller, seed, steps, burn_in) for seed in seeds}
+
+
+_judged: dict[str, tuple[RtiNmpc, Vector]] = {}
+"""The run that was judged last here: its controller and final θ."""
+
+
+def _judging(training: TrainingTask, item: Item) -> RtiNmpc:
+    """The controller with an item's θ; to build one takes as long as 8000 of its samples."""
+    key = f"{item.run.key} {item.run.facts} {item.run.noise} {item.parameters}"
+    if key not in _judged:
+        controller = training.controller(item.parameters)
+        _judged.clear()
+        _judged[key] = controller, controller.theta
+    controller, final = _judged[key]
+    controller.theta = np.array(item.theta) if item.theta else final
+    return controller
 
 
 def begin(parent: int) -> None:

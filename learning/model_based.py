@@ -118,7 +118,6 @@ class ModelBased(Algorithm):
         self._carried = problem.model.parameter_indices(labels)
         self._rollout = Rollout(problem, start, self._features)
         self._data = PlantData(self._features, settings.memory)
-        self._costs: ExpectedCosts | None = None
         backed = np.concatenate([start["x_l"] - base["x_l"], base["x_u"] - start["x_u"]])
         self.back_off: Array = np.maximum(backed, 0.0)
         """Back-offs of θ, of lower then upper bounds, (2n,)."""
@@ -149,9 +148,7 @@ class ModelBased(Algorithm):
         if len(model.residuals) < CAUTION:
             return False
         predicted, h, errors, designs = data.errors()
-        if self._costs is None or self._costs.model is not model:
-            self._costs = ExpectedCosts(self._problem, model)
-        costs = self._costs(predicted, h)[0]
+        costs = ExpectedCosts(self._problem, model)(predicted, h)[0]
         for window, limit in zip(WINDOWS, self._limits, strict=True):
             if window > since:
                 break
@@ -248,7 +245,6 @@ class ExpectedCosts:
     """Costs of samples that a model predicts, the penalty by its expectation over all residuals."""
 
     def __init__(self, problem: Problem, model: EmpiricalModel) -> None:
-        self.model = model
         self.penalty = Penalty(
             problem.state_lower,
             problem.state_upper,

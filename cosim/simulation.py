@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from math import nan
 from threading import RLock
 from time import perf_counter
 from typing import Any
@@ -11,29 +12,16 @@ from typing import Any
 import numpy as np
 
 from cosim.errors import CosimError
-from cosim.protocols import (
-    Array,
-    CompiledLoop,
-    Controller,
-    Decision,
-    Plant,
-    Recorder,
-    RunPart,
-    Solution,
-)
+from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, RunPart, Solution
 from cosim.scenario import Scenario
-from cosim.trajectory import (
-    FALLBACK,
-    SIGNALS,
-    Sample,
-    Signal,
-    SignalColumns,
-    Trajectory,
-)
+from cosim.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
 from cosim.validation import known_keywords
 
-NO_SOLUTION = Decision(np.empty(0))
-"""Stands for the solution where there is none: its numbers are NaN."""
+MEASURED = (
+    "states", "actions", "stage_cost", "disturbances", "value", "residual", "failed",
+    "prepare_time", "feedback_time", "plant_time",
+)  # fmt: skip
+"""Signals in a row of the loop's table, in order (`cosim.protocols.CompiledLoop`)."""
 PART = 500
 """Samples of a part; of more than 10⁵ samples it is longer, since a recording indexes each."""
 
@@ -102,9 +90,20 @@ class _Run:
     ) -> None:
         self._plant, self._controller = plant, controller
         self._scenario: Scenario = plant.scenario
-        self._seed, self._steps = seed, steps
+        self._seed, self._steps, self._residuals = seed, steps, residuals
         self._length = min(max(PART, steps // 200), 10 * PART)
-        self._columns = SignalColumns(self._scenario, steps, residuals)
+        widths = {kind.name: len(kind.names(self._scenario)) for kind in SIGNALS}
+        self._ends = np.cumsum([widths[name] for name in MEASURED])
+        # Column-major, so that a signal is a column and not a copy of one. What is never written
+        # takes no memory; a clock is not as precise as a float of 32 bits.
+        self._columns: dict[str, Array] = {
+            kind.name: np.zeros(
+                (steps, widths[kind.name]) if kind.vector else steps,
+                np.float32 if kind.clock else np.float64,
+                order="F",
+            )
+            for kind in SIGNALS
+        }
         self._status: list[str] = []
         self._predicted: list[Array] = []
         self._final_state: Array | None = None
@@ -113,8 +112,7 @@ class _Run:
         self, record: Callable[[RunPart], None] | None, progress: Callable[[int], None]
     ) -> None:
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
-        sampling_time = self._scenario.sampling_time
-        plant, read, solve = self._plant, self._columns.read, self._solve
+        plant, solve, rows = self._plant, self._solve, list[list[float]]()
         s = plant.reset(spawn_seeds(self._seed)[0])
         self._controller.reset()
         applied = self._scenario.reference_action
@@ -130,24 +128,18 @@ class _Run:
             begin = perf_counter()
             step = plant.step(applied)
             plant_time = perf_counter() - begin
-            read(
-                Sample(
-                    k * sampling_time,
-                    s,
-                    applied,
-                    step,
-                    NO_SOLUTION if solution is None else solution,
-                    solution is None,
-                    prepare_time,
-                    feedback_time,
-                    plant_time,
-                )
-            )
+            value, residual = nan if solution is None else solution.value, nan
+            if self._residuals and solution is not None:
+                residual = solution.residual
+            row = [*s.tolist(), *applied.tolist(), step.stage_cost, *step.disturbance.tolist()]
+            row += [value, residual, solution is None, prepare_time, feedback_time, plant_time]
+            rows.append(row)
             s = step.s
             if record is not None and solution is not None:
                 self._keep_prediction(k, solution)
             if (k + 1) % self._length == 0 or k + 1 == self._steps:
-                part = self._part(k // self._length * self._length, k + 1)
+                part = self._part(k // self._length * self._length, np.array(rows))
+                rows.clear()
                 if record is not None:
                     record(part)
                 progress(k + 1)
@@ -155,28 +147,29 @@ class _Run:
 
     def compiled(self, loop: CompiledLoop, progress: Callable[[int], None]) -> None:
         """Run with the controller's loop, to the same columns."""
-        scenario, plant, columns = self._scenario, self._plant, self._columns
-        s = plant.reset(spawn_seeds(self._seed)[0])
-        n, m = s.size, scenario.action_lower.size
-        outputs = 1 + len(scenario.plant.disturbances)
+        self._plant.reset(spawn_seeds(self._seed)[0])
         for first in range(0, self._steps, PART):
             end = min(first + PART, self._steps)
-            table = np.empty((end - first, n + m + outputs + 6))
-            self._final_state = plant.drive(loop, table)  # type: ignore[attr-defined]
-            states, actions, output, rest = np.split(table, [n, n + m, n + m + outputs], axis=1)
-            names = ("value", "residual", "failed", "prepare_time", "feedback_time", "plant_time")
-            found = {
-                "time": np.arange(first, end, dtype=np.float64) * scenario.sampling_time,
-                "states": states,
-                "actions": actions,
-                "disturbances": output[:, 1:],
-                "stage_cost": output[:, 0],
-                "penalty": scenario.state_penalty.along(states),
-                **dict(zip(names, rest.T, strict=True)),
-            }
-            columns.fill(first, found)
-            self._status += [FALLBACK if each else "solved" for each in found["failed"]]
+            table = np.empty((end - first, self._ends[-1]))
+            self._final_state = self._plant.drive(loop, table)  # type: ignore[attr-defined]
+            failed = self._fill(first, table)["failed"]
+            self._status += [FALLBACK if each else "solved" for each in failed]
             progress(end)
+
+    def _fill(self, first: int, table: Array) -> dict[str, Array]:
+        """Store rows of the signals that are `MEASURED`, and those that follow; all by name."""
+        end = first + len(table)
+        stored = {name: column[first:end] for name, column in self._columns.items()}
+        stored["time"][:] = np.arange(first, end) * self._scenario.sampling_time
+        parts = np.split(table, self._ends[:-1], axis=1)
+        for name, part in zip(MEASURED, parts, strict=True):
+            stored[name][:] = part.reshape(stored[name].shape)
+        if not self._residuals:
+            stored["residual"][:] = nan
+        for kind in SIGNALS:
+            if kind.of is not None:
+                stored[kind.name][:] = kind.of(self._scenario, stored)
+        return stored
 
     def _solve(self, s: Array) -> tuple[Solution | None, float, float]:
         """Prepare and feed back, timed apart; None if the controller declares a failure."""
@@ -213,17 +206,16 @@ class _Run:
         except (TypeError, ValueError) as error:
             raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
 
-    def _part(self, first: int, end: int) -> RunPart:
-        states, actions = [kept[: end - first] for kept in self._predicted] or (None, None)
+    def _part(self, first: int, table: Array) -> RunPart:
+        states, actions = [kept[: len(table)] for kept in self._predicted] or (None, None)
         self._predicted = []
-        columns, status = self._columns.store(first), self._status[first:end]
-        return RunPart(first, columns, status, states, actions)
+        return RunPart(first, self._fill(first, table), self._status[first:], states, actions)
 
     def trajectory(self) -> Trajectory:
         scenario = self._scenario
         named, timing = {}, {}
         for kind in SIGNALS:
-            values = self._columns.columns[kind.name].reshape(self._steps, -1)
+            values = self._columns[kind.name].reshape(self._steps, -1)
             if kind.clock:
                 timing[kind.name.removesuffix("_time")] = values[:, 0]
                 continue

@@ -8,8 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from math import ceil, nan
-from operator import attrgetter
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from cosim.errors import TrajectoryError
 from cosim.files import replacing
-from cosim.protocols import Array, Solution, Step
+from cosim.protocols import Array
 from cosim.result import Result
 from cosim.scenario import VIOLATING, Scenario
 
@@ -26,42 +25,22 @@ if TYPE_CHECKING:
 
 Group = Literal["states", "actions", "disturbances", "costs", "step_time", "unseen"]
 COST = "unit of the stage cost"
-RESIDUAL = "solution.residual"
 Derived = Callable[[Scenario, Mapping[str, Array]], Array]
 """K values of a signal, (K,), from a scenario and K values of each signal declared before it."""
 
 
-@dataclass(slots=True)
-class Sample:
-    """A sample of the loop.
-
-    `time` in s, the measured state `s` (n,), the applied `action` (m,), the plant's `step`, the
-    controller's `solution`, whether the controller `failed`, and wall-clock times in s.
-    """
-
-    time: float
-    s: Array
-    action: Array
-    step: Step
-    solution: Solution
-    failed: bool
-    prepare_time: float
-    feedback_time: float
-    plant_time: float
-
-
 @dataclass(frozen=True)
 class SignalKind:
-    """A declared signal: its `name`, its source `of`, its `unit`.
+    """A declared signal: its `name`, the function `of` other signals that it is, its `unit`.
 
-    `of` is an attribute of a `Sample`, a function of other signals, or None for zero. A `vector`
-    has a signal for each variable that the scenario's plant names under `name`, in the variable's
-    unit. `group` is where a recording shows it, None: nowhere; `whole` marks 0 or 1, `clock`
-    wall-clock times, which the trajectory's file leaves out.
+    What the loop measures is no such function. A `vector` has a signal for each variable that the
+    scenario's plant names under `name`, in the variable's unit. `group` is where a recording shows
+    it, None: nowhere; `whole` marks 0 or 1, `clock` wall-clock times, which the trajectory's file
+    leaves out.
     """
 
     name: str
-    of: str | Derived | None
+    of: Derived | None = None
     unit: str = ""
     group: Group | None = "unseen"
     vector: bool = False
@@ -79,89 +58,36 @@ class SignalKind:
         return (known.get(scenario.plant.stage_cost, "") if self.unit == COST else self.unit,)
 
 
+def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
+    return scenario.state_penalty.along(columns["states"])
+
+
 def _violation(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
     total: Array = scenario.state_penalty.violation(columns["states"]).sum(axis=1)
     return total
 
 
 SIGNALS: tuple[SignalKind, ...] = (
-    SignalKind("time", "time", "s"),
-    SignalKind("states", "s", group="states", vector=True),
-    SignalKind("actions", "action", group="actions", vector=True),
-    SignalKind("disturbances", "step.disturbance", group="disturbances", vector=True),
-    SignalKind("stage_cost", "step.stage_cost", COST, "costs"),
-    SignalKind("penalty", "step.penalty", COST, "costs"),
+    SignalKind("time", unit="s"),
+    SignalKind("states", group="states", vector=True),
+    SignalKind("actions", group="actions", vector=True),
+    SignalKind("disturbances", group="disturbances", vector=True),
+    SignalKind("stage_cost", unit=COST, group="costs"),
+    SignalKind("penalty", _penalty, COST, "costs"),
     SignalKind("violation", _violation),
-    SignalKind("value", "solution.value", COST),
-    SignalKind("residual", RESIDUAL),
-    SignalKind("explored", None, whole=True),
-    SignalKind("failed", "failed", whole=True),
-    SignalKind("prepare_time", "prepare_time", "s", "step_time", clock=True),
-    SignalKind("feedback_time", "feedback_time", "s", "step_time", clock=True),
-    SignalKind("plant_time", "plant_time", "s", None, clock=True),
+    SignalKind("value", unit=COST),
+    SignalKind("residual"),
+    SignalKind("explored", whole=True),
+    SignalKind("failed", whole=True),
+    SignalKind("prepare_time", unit="s", group="step_time", clock=True),
+    SignalKind("feedback_time", unit="s", group="step_time", clock=True),
+    SignalKind("plant_time", unit="s", group=None, clock=True),
 )
 
 
 def clocked() -> frozenset[str]:
     """Names of the signals that a clock measured: two equal runs differ in them."""
     return frozenset(kind.name for kind in SIGNALS if kind.clock)
-
-
-class SignalColumns:
-    """Every declared signal of a run, read sample by sample and stored in parts, as `columns`.
-
-    Without `residuals` their column is NaN.
-    """
-
-    def __init__(self, scenario: Scenario, steps: int, residuals: bool) -> None:
-        self._scenario = scenario
-        self._derived = {k.name: k.of for k in SIGNALS if callable(k.of)}
-        read = {k: k.of for k in SIGNALS if isinstance(k.of, str)}
-        read = {kind: of for kind, of in read.items() if residuals or of != RESIDUAL}
-        kinds = sorted(read, key=lambda kind: kind.vector)
-        # One call a sample reads all scalars, one all vectors.
-        self._scalars = attrgetter(*(read[kind] for kind in kinds if not kind.vector))
-        self._vectors = attrgetter(*(read[kind] for kind in kinds if kind.vector))
-        self._rows: list[list[float]] = []
-        widths = {kind: len(kind.names(scenario)) for kind in SIGNALS}
-        self._names = [kind.name for kind in kinds]
-        self._cuts = np.cumsum([widths[kind] for kind in kinds])[:-1]
-        # Column-major, so that a signal is a column and not a copy of one. What is never written
-        # takes no memory; a clock is not as precise as a float of 32 bits.
-        self.columns: dict[str, Array] = {
-            kind.name: np.zeros(
-                (steps, width) if kind.vector else steps,
-                np.float32 if kind.clock else np.float64,
-                order="F",
-            )
-            for kind, width in widths.items()
-        }
-        if not residuals:
-            self.columns["residual"][:] = nan
-
-    def read(self, sample: Sample) -> None:
-        """Copy the values of a sample, which plant and controller may overwrite."""
-        row = list(self._scalars(sample))
-        for values in self._vectors(sample):
-            row += values.tolist()
-        self._rows.append(row)
-
-    def store(self, first: int) -> dict[str, Array]:
-        """Store the samples read, from sample number `first` on, and return them by name."""
-        parts = np.split(np.array(self._rows), self._cuts, axis=1)
-        self._rows.clear()
-        return self.fill(first, dict(zip(self._names, parts, strict=True)))
-
-    def fill(self, first: int, values: Mapping[str, Array]) -> dict[str, Array]:
-        """Store K samples of signals by name, derive the others, and return all by name."""
-        where = slice(first, first + len(values["time"]))
-        stored = {name: column[where] for name, column in self.columns.items()}
-        for name in self._names:
-            if name in values:
-                stored[name][:] = values[name].reshape(stored[name].shape)
-        for name, derive in self._derived.items():
-            stored[name][:] = derive(self._scenario, stored)
-        return stored
 
 
 STATUS = "status"

@@ -934,10 +934,7 @@ def simulate_policy(
         d = list(plant.law.draw(generator, paths).T)
         if k >= burn_in:
             total += cost(x, u, d, plant.parameters)[0]
-            violations = problem.penalty.violation(np.stack(x, axis=1)).T
-            weights = zip(problem.penalty_linear, problem.penalty_quadratic, strict=True)
-            for v, (linear, quadratic) in zip(violations, weights, strict=True):
-                total += (linear + quadratic * v) * v
+            total += problem.penalty.along(np.stack(x, axis=1))
         x = [np.broadcast_to(entry, paths) for entry in step(x, u, d, plant.parameters)]
     means = total / steps
     half_width = 1.96 * means.std(ddof=1) / np.sqrt(paths)

@@ -22,7 +22,6 @@ from controllers.errors import TuningError
 from controllers.problem import Problem
 from controllers.theta import Parameters
 from cosim.protocols import Array
-from cosim.scenario import Penalty
 from learning.algorithm import Algorithm, Transition, Update
 from learning.configuration import ALL, Configuration, Count, ModelParameters
 from learning.empirical_model import (
@@ -245,12 +244,7 @@ class ExpectedCosts:
     """Costs of samples that a model predicts, the penalty by its expectation over all residuals."""
 
     def __init__(self, problem: Problem, model: EmpiricalModel) -> None:
-        self.penalty = Penalty(
-            problem.state_lower,
-            problem.state_upper,
-            problem.penalty_linear,
-            problem.penalty_quadratic,
-        )
+        self.penalty = problem.penalty
         errors = model.residuals[:, : problem.n_states]
         self._errors = SortedErrors(errors)
         self._widened = 1 + TAIL * (TAIL_SAMPLES / len(errors)) ** 0.5

@@ -13,16 +13,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, FormatStrFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from cosim.figures import style
-from cosim.figures.style import BOUND, DASHED, FLOOR, Dots, EndLabel, Look, palette, shown_case
+from cosim.figures.style import BOUND, DASHED, Dots, EndLabel, Look, palette, shown_case
 from cosim.figures.training import parameters_figure
 from cosim.figures.trajectory import overlay_figure, trajectory_figure
 from cosim.plugins import build_controller
 from cosim.protocols import Array, Controller
 from cosim.scenario import VIOLATING, Scenario
-from cosim.statistics import LEVEL, regrets, td_error_mean
+from cosim.statistics import regrets, td_error_mean
 from cosim.studies.operation import Judged
 from cosim.studies.plan import Plan
 from cosim.studies.report import FOLDER
@@ -151,46 +151,6 @@ def _by_start(names: Iterable[str]) -> dict[str, list[str]]:
         start = name.partition("start=")[2].rstrip(")").split(" ")[0]
         panels.setdefault(f"from {start}" if start else "others", []).append(name)
     return panels
-
-
-def profile_figure(strata: Mapping[str, Sequence[Array]], looks: Mapping[str, Look]) -> Figure:
-    """Performance profiles: the share of runs whose regret is at most so much.
-
-    `strata` are a case's regrets in %, an array for each scenario. The 95 % bands are pointwise,
-    a stratified bootstrap over runs; they are drawn where at most six cases are shown.
-    """
-    finite = np.concatenate([runs[np.isfinite(runs)] for each in strata.values() for runs in each])
-    axis = np.geomspace(FLOOR, 1.3 * max(float(finite.max(initial=1.0)), 10 * FLOOR), 200)
-    with style.figure(max(2.6, 0.16 * len(strata) + 0.6)) as drawn:
-        axes: Axes = drawn.subplots()
-        lines = palette(list(strata))
-        for name, runs in strata.items():
-            color, line = looks[name].color, lines[name].line
-            below = [(stratum[:, None] <= axis).astype(float) for stratum in runs]
-            share = np.concatenate(below).mean(axis=0)
-            axes.step(axis, share, where="post", c=color, ls=line, lw=1.3, label=shown_case(name))
-            if len(strata) <= BANDED:
-                low, high = _band(below)
-                axes.fill_between(axis, low, high, step="post", color=color, alpha=0.15, lw=0)
-        axes.set_xscale("log")
-        axes.set_xlim(axis[0], axis[-1])
-        axes.set_ylim(-0.02, 1.02)
-        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-        axes.set_xlabel("regret % at most")
-        axes.set_ylabel("share of runs")
-        drawn.legend(loc="outside right upper", handlelength=2.4)
-    return drawn
-
-
-def _band(below: Sequence[Array]) -> tuple[Array, Array]:
-    """Pointwise bootstrap interval of the mean over runs, resampled within each stratum."""
-    rng = np.random.default_rng(0)
-    draws = np.zeros((2000, below[0].shape[1]))
-    for part in below:
-        draws += rng.multinomial(len(part), np.full(len(part), 1 / len(part)), size=2000) @ part
-    draws /= sum(map(len, below))
-    low, high = np.quantile(draws, (0.5 - LEVEL / 2, 0.5 + LEVEL / 2), axis=0)
-    return low, high
 
 
 def operation_figure(

@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cosim.errors import FailedRunsError, StudyError
-from cosim.figures.style import FLOOR, Dots, Look, palette, save_set
+from cosim.figures.style import Dots, Look, palette, save_set
 from cosim.files import read_json, write_atomically
 from cosim.protocols import Array
 from cosim.result import Shown, TextTable, markdown_table
@@ -429,40 +429,35 @@ class StudyResults(Shown):
         return f"Gains over the baselines: {said}", header, rows
 
     def figure(self, name: str | None = None) -> Figure:
-        """Draw `curves`, `regret`, `profile` or `operation` of a scenario, as `curves-paper`.
+        """Draw `curves`, `regret` or `operation` of a scenario, as `curves-paper`.
 
-        `profile` alone is that of all scenarios; None is the first one's regret. Raises StudyError
-        for another name, and where there is nothing to draw.
+        None is the first scenario's regret. Raises StudyError for another name, and where there is
+        nothing to draw.
         """
         names = [f"{kind}-{scenario}" for scenario in self.scenarios for kind in self._makers]
         name = name or f"regret-{self.scenarios[0]}"
         kind, _, scenario = name.partition("-")
-        drawn = self._makers[kind](scenario) if name in (*names, "profile") else None
+        drawn = self._makers[kind](scenario) if name in names else None
         if drawn is None:
             raise StudyError(f"this study draws no figure '{name}'{instead(name, names)}")
         return drawn
 
     @property
     def _makers(self) -> dict[str, Callable[[str], Figure | None]]:
-        return {
-            "curves": self._curves,
-            "regret": self._regret,
-            "operation": self._operation,
-            "profile": self._profile,
-        }
+        return {"curves": self._curves, "regret": self._regret, "operation": self._operation}
 
     def draw(self, folder: Path) -> dict[str, list[str]]:
-        """Draw all figures into a folder; returns their names by scenario, "" for all."""
+        """Draw all figures into a folder; returns their names by scenario."""
         return {
             scenario: save_set(
                 (
-                    (f"{kind}-{safe(scenario)}" if scenario else kind, drawn)
+                    (f"{kind}-{safe(scenario)}", drawn)
                     for kind, maker in self._makers.items()
-                    if (scenario or kind == "profile") and (drawn := maker(scenario)) is not None
+                    if (drawn := maker(scenario)) is not None
                 ),
                 folder,
             )
-            for scenario in (*self.scenarios, "")
+            for scenario in self.scenarios
         }
 
     @property
@@ -535,18 +530,6 @@ class StudyResults(Shown):
             return None
         return figures.operation_figure(judged, about, self._looks, self.baselines)
 
-    def _profile(self, scenario: str) -> Figure | None:
-        """Profile of one scenario or, for "", of all (several) with known J*; of drawn cases."""
-        scenarios = self.known if not scenario else [s for s in self.known if s == scenario]
-        if not scenarios or (not scenario and len(scenarios) < 2):
-            return None
-        drawn = {n for each in (self.about.get("operation") or {}).values() for n in each["drawn"]}
-        cases = [name for name in self.trained if not drawn or name in drawn]
-        strata = {n: [100 * self.regrets(n, one) for one in scenarios] for n in cases}
-        strata = {n: v for n, v in strata.items() if all(map(len, v)) and sum(map(len, v)) > 1}
-        most = max((float(one.max()) for each in strata.values() for one in each), default=0.0)
-        return figures.profile_figure(strata, self._looks) if most > FLOOR else None
-
     def report(self) -> Path:
         """Write report.html, report.md and figures/ into the study's folder; returns the page."""
         page = self._page(self.draw(self.folder / report.FOLDER))
@@ -571,7 +554,7 @@ class StudyResults(Shown):
         if len(self.aggregate):
             rows = self.aggregate.to_dict("records")
             table = ("", *report.texts(rows, report.AGGREGATE))
-            sections.append({"title": "All scenarios", "tables": [table], "figures": drawn[""]})
+            sections.append({"title": "All scenarios", "tables": [table]})
         for title, header, lines in self.further():
             sections.append({"title": title, "tables": [("", header, lines)]})
         if self.about["pictures"]:
@@ -599,7 +582,7 @@ class StudyResults(Shown):
             return "No run is finished."
         seeds, steps = self.about["curves"][scenario]
         return (
-            f"Table, regret and profile: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
+            f"Table and regret: {own.seed.nunique()} noise seeds × {own.steps.iloc[0]} "
             f"samples. Learning curves: {seeds} other seeds × {steps} samples. Regrets of a case "
             "differ between the two."
         )

@@ -12,7 +12,6 @@ from cosim.studies.figures import (
     density_figure,
     increments,
     learning_curve,
-    profile_figure,
 )
 from tests.helpers.loop import Proportional
 
@@ -51,14 +50,6 @@ def test_a_curve_averages_training_since_the_point_before_and_holds_diverged_run
     assert curve.training.tolist() == [[3.0, 6.0], [7.0, 7.0]]
     assert curve.greedy.tolist() == [[9.0, 8.0], [5.0, 5.0]]
     assert learning_curve(log, 4.0).greedy[0].tolist() == [125.0, 100.0]
-
-
-def test_a_profile_is_the_share_of_runs_at_most_so_bad():
-    values = np.array([0.1, 1.0, 10.0, np.inf])
-    axes = profile_figure({"q": [values]}, palette(["search+q", "q"])).axes[0]
-    assert axes.lines[0].get_linestyle() == "-"
-    regret, share = axes.lines[0].get_data()
-    assert share.tolist() == [np.mean(values <= level) for level in regret]
 
 
 def test_a_dark_ground_hides_no_controller():

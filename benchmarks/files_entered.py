@@ -21,7 +21,7 @@ class Entered:
 
     def __init__(self) -> None:
         self.files: set[str] = set()
-        self._known: dict[object, str | None] = {}
+        self._seen: set[object] = set()
 
     def __enter__(self) -> Entered:
         threading.setprofile(self._see)
@@ -34,21 +34,19 @@ class Entered:
 
     def _see(self, frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
-        if event != "call" or self._known.get(code, "") is None:
+        if event != "call" or code in self._seen:
             return
         path = Path(code.co_filename)
         inside = path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in OURS
-        if not inside:
-            self._known[code] = None
-            return
         above: FrameType | None = frame
-        while above is not None:
+        while inside and above is not None:
             name = above.f_globals.get("__name__", "")
             if above.f_code.co_name == "<module>" and name.partition(".")[0] in OURS:
                 return
             above = above.f_back
-        self.files.add(path.relative_to(ROOT).as_posix())
-        self._known[code] = None
+        self._seen.add(code)
+        if inside:
+            self.files.add(path.relative_to(ROOT).as_posix())
 
 
 def step() -> Entered:

@@ -322,16 +322,17 @@ class Instance(ABC):
         self.drivable = all(map(self._all_real, self._places))
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
-        self.inputs, _, self._set_inputs = self._exchange(wiring.inputs, "Set")
-        self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs, "Get")
-        self.states, self.states_view, self._get_states = self._exchange(wiring.states, "Get")
+        self.inputs, self._set_inputs = self._exchange(wiring.inputs, "Set")
+        self.outputs, self._get_outputs = self._exchange(wiring.outputs, "Get")
+        self.states, self._get_states = self._exchange(wiring.states, "Get")
+        self.outputs_view: NDArray[np.float64] = np.frombuffer(memoryview(self.outputs))
+        self.states_view: NDArray[np.float64] = np.frombuffer(memoryview(self.states))
         self._do_step = self._function("DoStep")
         places = [place for place, _ in wiring.starts]
+        self._starts, self._set_starts = self._exchange(places, "Set")
+        self._starts[:] = [value for _, value in wiring.starts]
         # FMI 2 counts value references anew for each type.
-        keys = (place[:3] for place in places)
-        self._starts = dict(zip(keys, self._parts(places), strict=True))
-        for place, value in wiring.starts:
-            self.change_start(place, value)
+        self._start_of = {place[:3]: i for i, place in enumerate(places)}
 
     @abstractmethod
     def _instantiate(self, **where: Any) -> Any:
@@ -383,8 +384,8 @@ class Instance(ABC):
         """Reset (if started before), write the start values, initialise and read the states."""
         if started:
             self._call("Reset", self._component)
-        for suffix, arguments, *_ in self._starts.values():
-            self._call(f"Set{suffix}", *arguments)
+        if self._starts:
+            self._set_starts()
         for name, arguments in self._begin:
             self._call(name, self._component, *arguments)
         self._get_states()
@@ -398,13 +399,10 @@ class Instance(ABC):
             self.fail("DoStep", status)
         self._get_states()
 
-    def _exchange(
-        self, places: Sequence[Place], verb: str
-    ) -> tuple[Any, NDArray[np.float64], Callable[[], None]]:
-        """A buffer for numbers, NumPy's view of it, and a function that sets or gets them all."""
-        buffer = (ctypes.c_double * len(places))()
-        view: NDArray[np.float64] = np.frombuffer(memoryview(buffer), dtype=np.float64)
+    def _exchange(self, places: Sequence[Place], verb: str) -> tuple[Any, Callable[[], None]]:
+        """A buffer for a number of each place, and a function that sets or gets them all."""
         if self._all_real(places):
+            buffer = (ctypes.c_double * len(places))()
             name = f"{verb}{self.real}"
             function = self._function(name)
             arguments = self._arguments([place.reference for place in places], buffer)
@@ -413,40 +411,36 @@ class Instance(ABC):
                 if (status := function(*arguments)) not in ACCEPTED:
                     self.fail(name, status)
 
-            return buffer, view, exchange
-        parts = self._parts(places)
+            return buffer, exchange
+        # Not every integer of 64 bits is a double: what is set is a list.
+        numbers: Any = [0.0] * len(places)
+        numbers = numbers if verb == "Set" else (ctypes.c_double * len(places))(*numbers)
+        variables: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
+        for place in places:
+            suffix, ctype = self.setters[place.type]
+            values = (ctype * len(place.starts))()
+            values[:] = [_as(values, start) for start in place.starts]
+            call = f"{verb}{suffix}", self._arguments([place.reference], values), values
+            variables.setdefault(place[:2], call)
+        calls = [(*variables[place[:2]], place.element) for place in places]
 
         def convert() -> None:
-            for i, (suffix, arguments, typed, k) in enumerate(parts):
+            for i, (name, arguments, values, k) in enumerate(calls):
                 if verb == "Set":
-                    typed[k] = _as(typed, buffer[i])
-                self._call(f"{verb}{suffix}", *arguments)
+                    values[k] = _as(values, numbers[i])
+                self._call(name, *arguments)
                 if verb == "Get":
-                    buffer[i] = typed[k]
+                    numbers[i] = values[k]
 
-        return buffer, view, convert
-
-    def _parts(self, places: Sequence[Place]) -> list[tuple[str, tuple[Any, ...], Any, int]]:
-        """For each place the end of a call's name, its arguments, their buffer and the index in it;
-        elements of one array share them.
-        """
-        made: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
-        for place in places:
-            if place[:2] not in made:
-                suffix, ctype = self.setters[place.type]
-                buffer = (ctype * len(place.starts))()
-                buffer[:] = [_as(buffer, value) for value in place.starts]
-                made[place[:2]] = suffix, self._arguments([place.reference], buffer), buffer
-        return [(*made[place[:2]], place.element) for place in places]
+        return numbers, convert
 
     def change_start(self, place: Place, value: float) -> None:
         """Replace the start value of a place of the wiring's for the next reset."""
-        *_, buffer, index = self._starts[place[:3]]
-        buffer[index] = _as(buffer, value)
+        self._starts[self._start_of[place[:3]]] = value
 
     def writer(self, places: Sequence[Place], values: Sequence[float]) -> Callable[[], None]:
         """A function that writes values between two steps."""
-        buffer, _, write = self._exchange(places, "Set")
+        buffer, write = self._exchange(places, "Set")
         buffer[:] = values
         return write
 

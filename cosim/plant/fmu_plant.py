@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import operator
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite, prod
 from pathlib import Path
@@ -96,7 +96,7 @@ class Wirer:
         plant = self._scenario.plant
         outputs = (plant.stage_cost, *plant.disturbances)
         return Wiring(
-            inputs=[self._written(name, "plant.actions") for name in plant.actions],
+            inputs=[self._place(name, "plant.actions", _not_written) for name in plant.actions],
             outputs=self.numbers(outputs, "plant"),
             states=self.numbers(plant.states, "plant.states"),
             starts=self._starts(),
@@ -109,26 +109,21 @@ class Wirer:
         for change in scenario.plant.changes or ():
             places, values = found.setdefault(ceil(change.time / scenario.sampling_time), ([], []))
             for name, value in change.parameters.items():
-                places.append(self._written(name, "plant.changes"))
+                places.append(self._place(name, "plant.changes", _not_written))
                 values.append(value)
         return found
 
     def seeds(self) -> list[Place]:
         """Places of the variables that take the seed, low word first."""
-        words = []
+        words: list[Place] = []
         for name in self._scenario.plant.mapping.seed:
-            variable = self._find(name, "plant.mapping.seed")
-            if variable.type not in (*_WIDE, "Integer", "Int32", "UInt32"):
-                what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
-                raise self._misfit(name, "plant.mapping.seed", what)
-            words.append(self._place(name, "plant.mapping.seed"))
-            if variable.type in _WIDE:
-                break
+            if not (words and words[-1].type in _WIDE):
+                words.append(self._place(name, "plant.mapping.seed", _no_word))
         return words
 
     def numbers(self, names: Sequence[str], table: str) -> list[Place]:
         """Places of variables that are numbers."""
-        return [self._number(name, table) for name in names]
+        return [self._place(name, table, _no_number) for name in names]
 
     def _starts(self) -> list[tuple[Place, float]]:
         scenario, mapping = self._scenario, self._scenario.plant.mapping
@@ -152,57 +147,56 @@ class Wirer:
         return starts + [(place, 0.0) for place in self.seeds()]
 
     def _start_value(self, name: str, value: float, table: str) -> tuple[Place, float]:
-        variable = self._find(name, table)
-        if variable.type not in self._interface.setters:
-            raise self._misfit(name, table, f"is {_a(variable.type)}, which cannot be set here")
-        if variable.type not in REALS and value != int(value):
-            raise self._misfit(name, table, f"is {_a(variable.type)} and cannot take {value}")
-        if not has_start(variable):
-            raise self._misfit(name, table, f"is {_a(variable.causality)} without a start to set")
-        return self._place(name, table), value
+        def misfit(variable: Any) -> str:
+            if variable.type not in self._interface.setters:
+                return f"is {_a(variable.type)}, which cannot be set here"
+            if variable.type not in REALS and value != int(value):
+                return f"is {_a(variable.type)} and cannot take {value}"
+            return (
+                "" if has_start(variable) else f"is {_a(variable.causality)} without a start to set"
+            )
 
-    def _written(self, name: str, table: str) -> Place:
-        variable = self._find(name, table)
-        if variable.causality != "input" and variable.variability != "tunable":
-            what = f"is {_a(variable.causality)}, not an input, and is not tunable"
-            raise self._misfit(name, table, what)
-        return self._number(name, table)
+        return self._place(name, table, misfit), value
 
-    def _number(self, name: str, table: str) -> Place:
-        if (variable := self._find(name, table)).type in _NO_NUMBERS:
-            raise self._misfit(name, table, f"is {_a(variable.type)}, not a number")
-        return self._place(name, table)
+    def _place(self, name: str, table: str, misfit: Callable[[Any], str]) -> Place:
+        """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is.
 
-    def _place(self, name: str, table: str) -> Place:
-        """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is."""
-        variable = self._find(name, table)
-        shape, index = tuple(variable.shape or ()), 0
-        if shape:
+        `misfit` says what is wrong with a variable, if anything.
+        """
+        fmu, asked = self._fmu, f"{table} of scenario '{self._scenario.name}' names"
+        if (variable := fmu.variable(name)) is None:
+            raise PlantError(
+                f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}, "
+                f"which {asked}"
+            )
+        what, shape, index = misfit(variable), tuple(variable.shape or ()), 0
+        if shape and not what:
             try:
                 indices = name.removeprefix(variable.name).removeprefix("[").removesuffix("]")
                 index = int(np.ravel_multi_index([int(i) for i in indices.split(",")], shape))
             except ValueError:
                 last = ",".join(str(n - 1) for n in shape)
                 what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
-                raise self._misfit(name, table, what) from None
+        if what:
+            raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
         stated = ["0"] if variable.type in _NO_NUMBERS else str(variable.start or 0).split()
         starts = tuple(map(float, stated)) * (prod(shape) // len(stated))
         return Place(int(variable.valueReference), str(variable.type), index, starts)
 
-    def _find(self, name: str, table: str) -> Any:
-        if (variable := self._fmu.variable(name)) is None:
-            raise PlantError(
-                f"FMU '{self._fmu.path.name}' has no variable '{name}'"
-                f"{suggestion(name, self._fmu.variables)}, which {table} of scenario "
-                f"'{self._scenario.name}' names"
-            )
-        return variable
 
-    def _misfit(self, name: str, table: str, what: str) -> PlantError:
-        return PlantError(
-            f"variable '{name}' of FMU '{self._fmu.path.name}' {what}; {table} of scenario "
-            f"'{self._scenario.name}' names it"
-        )
+def _no_number(variable: Any) -> str:
+    return f"is {_a(variable.type)}, not a number" if variable.type in _NO_NUMBERS else ""
+
+
+def _not_written(variable: Any) -> str:
+    if variable.causality != "input" and variable.variability != "tunable":
+        return f"is {_a(variable.causality)}, not an input, and is not tunable"
+    return _no_number(variable)
+
+
+def _no_word(variable: Any) -> str:
+    known = variable.type in (*_WIDE, "Integer", "Int32", "UInt32")
+    return "" if known else f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
 
 
 def _a(noun: str) -> str:

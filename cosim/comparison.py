@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
@@ -56,7 +57,10 @@ def load_run(path: str | Path) -> RunSignals:
     if not path.is_file():
         raise ComparisonError(f"there is no run at '{path}'; give a run's folder, CSV or .rrd")
     if path.suffix != ".rrd":
-        return RunSignals(str(path), *read_signals(path), _bounds(path.parent / "scenario.toml"))
+        bounds: Mapping[str, tuple[float, float]] = {}
+        with suppress(ScenarioError):
+            bounds = Scenario.load(path.parent / "scenario.toml").limits
+        return RunSignals(str(path), *read_signals(path), bounds)
     from cosim.recording.read import read_recording  # noqa: PLC0415 - half a second, for .rrd only
 
     recording = read_recording(path)
@@ -66,14 +70,6 @@ def load_run(path: str | Path) -> RunSignals:
         if values.ndim == 1 and name not in clocked()
     }
     return RunSignals(str(path), signals, recording.status, ordered=False)
-
-
-def _bounds(path: Path) -> dict[str, tuple[float, float]]:
-    """Bounds of states and actions by name; empty without a readable scenario."""
-    try:
-        return Scenario.load(path).limits if path.is_file() else {}
-    except ScenarioError:
-        return {}
 
 
 @dataclass(frozen=True)
@@ -96,14 +92,12 @@ class Difference:
 
     def text(self) -> str:
         """Largest difference and tolerance, with units and both values."""
-        beyond = "" if self.tolerance is None else f", tolerance {self._shown(self.tolerance)}"
+        unit = "" if self.unit in ("", "1") else f" {self.unit}"
+        beyond = "" if self.tolerance is None else f", tolerance {self.tolerance:.6g}{unit}"
         return (
-            f"{self.name} differs by up to {self._shown(self.maximum)} "
+            f"{self.name} differs by up to {self.maximum:.6g}{unit} "
             f"(sample {self.at}: {self.a!r} against {self.b!r}){beyond}"
         )
-
-    def _shown(self, value: float) -> str:
-        return f"{value:.6g} {self.unit}".rstrip() if self.unit != "1" else f"{value:.6g}"
 
 
 @dataclass(frozen=True)

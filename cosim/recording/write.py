@@ -28,6 +28,7 @@ from cosim.errors import RecordingError
 from cosim.files import check_target, publish
 from cosim.protocols import Array, Controller, RunPart
 from cosim.recording.read import SAMPLE, SIGNAL, TIME
+from cosim.result import markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import controller_name
 from cosim.trajectory import SIGNALS, SignalKind
@@ -94,7 +95,6 @@ class RerunRecorder:
         ]
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
         self._status: str | None = None
-        self._samples = 0
         properties = {
             "scenario": scenario.name,
             "scenario_hash": scenario.hash,
@@ -115,7 +115,7 @@ class RerunRecorder:
     def record(self, part: RunPart) -> None:
         """Append K samples: one column of K rows for each signal."""
         stream = self._stream
-        if stream is None or not len(part):
+        if stream is None:
             return
         samples, time = np.arange(part.first, part.first + len(part)), part["time"]
         rows, ends = times(samples, time), times(samples[[0, -1]], time[[0, -1]])
@@ -131,15 +131,24 @@ class RerunRecorder:
             residual = np.log10(part["residual"])
         stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
         self._residual.see(residual)
-        self._changes_of_status(stream, samples, part)
+        before, self._status = [self._status, *part.status[:-1]], part.status[-1]
+        changes = [i for i, status in enumerate(part.status) if status != before[i]]
+        if changes:
+            states = rr.StateChange.columns(state=[drawable(part.status[i]) for i in changes])
+            stream.rerun.send_columns(_STATUS, times(samples[changes], time[changes]), states)
         predictions = {"states": part.predicted_states, "actions": part.predicted_actions}
         for group, stages in predictions.items():
             if stages is not None:
                 for i, channel in enumerate(self._predicted[group]):
                     channel.labels = [f"+{stage}" for stage in range(stages.shape[1])]
                     stream.send([channel], rows, stages[:, :, i])
-        self._intermediate(stream, samples, time)
-        self._samples += len(part)
+        if self._within:
+            moments, *within = np.array(self._within).T
+            self._within.clear()
+            # A state at the end of a sample counts to that sample.
+            rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
+            for channel, values in zip(self._fine, within, strict=True):
+                stream.send([channel], rows, values)
 
     def intermediate(self, time: float, states: Array) -> None:
         """Take the states (n,) at a time [s] within a sample."""
@@ -148,30 +157,12 @@ class RerunRecorder:
     def close(self) -> None:
         """Finish the file with the ranges that the run has filled; no sample, no file."""
         if self._stream is not None:
-            if self._samples:
+            if self._status is not None:
                 self._stream.layout = self._layout()
                 self._stream.close()
             else:
                 self._stream.discard()
             self._stream = None
-
-    def _changes_of_status(self, stream: Stream, samples: np.ndarray, part: RunPart) -> None:
-        before = [self._status, *part.status[:-1]]
-        rows = [i for i, status in enumerate(part.status) if status != before[i]]
-        self._status = part.status[-1]
-        if rows:
-            states = rr.StateChange.columns(state=[drawable(part.status[i]) for i in rows])
-            stream.rerun.send_columns(_STATUS, times(samples[rows], part["time"][rows]), states)
-
-    def _intermediate(self, stream: Stream, samples: np.ndarray, time: Array) -> None:
-        if not self._within:
-            return
-        moments, *states = np.array(self._within).T
-        self._within.clear()
-        # A state at the end of a sample counts to that sample.
-        rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
-        for channel, values in zip(self._fine, states, strict=True):
-            stream.send([channel], rows, values)
 
     def _group(self, *groups: str) -> list[Channel]:
         return [
@@ -231,7 +222,7 @@ def _about(scenario: Scenario, properties: Mapping[str, object]) -> str:
 
 {scenario.description}
 
-{table("run", properties)}
+{_table("run", properties)}
 
 **Time** is the plant's. Sample k of a state is what the controller measured; the input,
 disturbance and cost of sample k hold until sample k+1. The cost per sample is economic cost +
@@ -330,7 +321,7 @@ def record_training(path: str | Path, training: Training) -> None:
     rows, theta, course = times(samples), [], []
     along = axis(AT(seq=0), AT(seq=int(samples[-1]) if len(samples) else 0))
     title = f"{run.algorithm} on {run.scenario.name}"
-    about = f"# {title}\n\n{table('training', properties)}\n"
+    about = f"# {title}\n\n{_table('training', properties)}"
     with Stream(path, title, about, properties) as stream:
         for name, values in training.theta().items():
             labels = list(blocks.labels[blocks.slices[name]])
@@ -589,7 +580,6 @@ def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
     )
 
 
-def table(title: str, values: Mapping[str, object]) -> str:
-    """Markdown table of names and values."""
-    rows = [f"| {key.replace('_', ' ')} | {value} |" for key, value in values.items()]
-    return "\n".join([f"| {title} | |", "|---|---|", *rows])
+def _table(title: str, values: Mapping[str, object]) -> str:
+    rows = [(key.replace("_", " "), str(value)) for key, value in values.items()]
+    return markdown_table((title, ""), rows)

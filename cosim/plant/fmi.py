@@ -473,7 +473,8 @@ class Instance(ABC):
         names = (f"Set{self.real}", f"Get{self.real}", "DoStep", "DoStep")
         if fault == len(names):
             self.messages.append("the FMU ended the step early")
-        self.fail(names[fault - 1], DISCARD if fault == len(names) else status)
+            status = DISCARD
+        self.fail(names[fault - 1], status)
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""

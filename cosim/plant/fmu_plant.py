@@ -152,9 +152,9 @@ class Wirer:
                 return f"is {_a(variable.type)}, which cannot be set here"
             if variable.type not in REALS and value != int(value):
                 return f"is {_a(variable.type)} and cannot take {value}"
-            return (
-                "" if has_start(variable) else f"is {_a(variable.causality)} without a start to set"
-            )
+            if not has_start(variable):
+                return f"is {_a(variable.causality)} without a start to set"
+            return ""
 
         return self._place(name, table, misfit), value
 
@@ -370,7 +370,7 @@ class FmuPlant:
             names = ", ".join(self.scenario.plant.actions)
             raise PlantError(f"action must be {self._m} finite numbers ({names}), not {a}")
         if self._k < 0:
-            self._refuse_unstarted()
+            self._running()
         self._inputs[:] = values
         penalty, k = self._penalty_now, self._k
         self._k = _NOT_STARTED
@@ -398,9 +398,7 @@ class FmuPlant:
 
         As many calls of `step` give the same. Raises PlantError, then needs a reset.
         """
-        fmi = self._instance
-        if self._k < 0:
-            self._refuse_unstarted()
+        fmi = self._running()
         k, first, end = self._k, self._k, self._k + len(table)
         self._k = _NOT_STARTED
         while k < end:
@@ -419,10 +417,7 @@ class FmuPlant:
 
     def snapshot(self) -> Snapshot:
         """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""
-        fmi = self._instance
-        if self._k < 0:
-            self._refuse_unstarted()
-        handle = self._handle()
+        fmi, handle = self._running(), self._handle()
         fmi.save(handle)
         return Snapshot(self, handle, self._k)
 
@@ -494,6 +489,12 @@ class FmuPlant:
             raise PlantError("the FMU ended in a fatal error; close this plant and make a new one")
         return self._fmi
 
+    def _running(self) -> Instance:
+        fmi = self._instance
+        if self._k < 0:
+            raise PlantError("call reset first: no episode has begun, or an error ended it")
+        return fmi
+
     def _start_from(self, fmi: Instance, state: Sequence[float] | Array | None) -> None:
         """Replace the start values of the states, or put the scenario's back."""
         table = self.scenario.plant
@@ -511,11 +512,6 @@ class FmuPlant:
         for place, value in zip(self._initial, values.tolist(), strict=True):
             fmi.change_start(place, value)
         self._elsewhere = state is not None
-
-    def _refuse_unstarted(self) -> NoReturn:
-        if self._fmi is None:
-            raise PlantError("the plant is closed")
-        raise PlantError("call reset first: no episode has begun, or an error ended it")
 
     def _refuse_output(self, k: int) -> NoReturn:
         table = self.scenario.plant

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
 from xml.etree import ElementTree
 
@@ -32,6 +32,9 @@ import fmus
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
+
+if TYPE_CHECKING:
+    from cosim.plant.fmu_plant import Wiring
 
 SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
 DESCRIPTION = "modelDescription.xml"
@@ -254,16 +257,6 @@ Intermediate = Callable[[float, NDArray[np.float64]], None]
 """Called with the time [s] and the states (n,) at each internal step of an FMU."""
 
 
-class Wiring(NamedTuple):
-    """Places of the variables that a plant exchanges with its FMU; `starts` with their values."""
-
-    inputs: Sequence[Place]
-    outputs: Sequence[Place]
-    states: Sequence[Place]
-    starts: Sequence[tuple[Place, float]]
-    intermediate: Intermediate | None = None
-
-
 def _as(buffer: Any, value: float) -> float:
     """A number as a buffer of a C type takes it: an integer is the nearest one."""
     return value if buffer._type_ in (ctypes.c_double, ctypes.c_float) else round(value)
@@ -304,12 +297,15 @@ class Instance(ABC):
     _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
     """The calls that initialise, with their arguments after the instance."""
 
-    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
+    def __init__(
+        self, fmu: UnpackedFmu, wiring: Wiring, step_size: float, intermediate: Intermediate | None
+    ) -> None:
         self.fmu = fmu
         self.messages: deque[str] = deque(maxlen=8)
         self.fatal = False
         self._interface = fmu.description.coSimulation
-        self._wiring = wiring
+        self._intermediate = intermediate
+        self._places = (wiring.inputs, wiring.outputs, wiring.states)
         if self._interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
             raise CapabilityError(
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
@@ -318,7 +314,6 @@ class Instance(ABC):
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._functions: dict[str, Any] = {}
-        self._places = (wiring.inputs, wiring.outputs, wiring.states)
         self.drivable = all(map(self._all_real, self._places))
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
@@ -642,7 +637,7 @@ class Fmi3Instance(Instance):
 
     def _intermediate_update(self) -> dict[str, Any]:
         """Arguments that ask for the states at each internal step; {} if the FMU has none."""
-        if self._wiring.intermediate is None or not self._interface.providesIntermediateUpdate:
+        if self._intermediate is None or not self._interface.providesIntermediateUpdate:
             return {}
         # fmpy does not read the attribute, an xs:boolean.
         elements = ElementTree.parse(self.fmu.folder / DESCRIPTION).iter()
@@ -651,17 +646,17 @@ class Fmi3Instance(Instance):
             for e in elements
             if e.get("intermediateUpdate") in ("true", "1")
         }
-        states = {place.reference for place in self._wiring.states}
+        states = {place.reference for place in self._places[2]}
         told = {str(state) for state in states} <= offered
         update = {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}
         return update if told else {}
 
     def _update(self, _: Any, time: float, __: bool, readable: bool, *___: Any) -> None:
         """Tell of the states; the FMU calls it in a step."""
-        if readable and self._raised is None and self._wiring.intermediate is not None:
+        if readable and self._raised is None and self._intermediate is not None:
             try:
                 self._get_states()
-                self._wiring.intermediate(time, self.states_view.copy())
+                self._intermediate(time, self.states_view.copy())
             except BaseException as error:
                 self._raised = error  # ctypes would print and drop it
 

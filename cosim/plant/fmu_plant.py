@@ -22,7 +22,6 @@ from cosim.plant.fmi import (
     Intermediate,
     Place,
     UnpackedFmu,
-    Wiring,
     library_path,
     unpack,
 )
@@ -83,24 +82,25 @@ def has_start(variable: Any) -> bool:
     return variable.causality not in ("calculatedParameter", "independent")
 
 
-class Wirer:
-    """Looks up the variables of one FMU for one scenario; raises PlantError on any misfit."""
+class Wiring:
+    """Places in an FMU of the variables that a scenario names; raises PlantError on any misfit.
 
-    def __init__(self, scenario: Scenario, fmu: UnpackedFmu, interface: type[Instance]) -> None:
-        self._scenario = scenario
-        self._fmu = fmu
-        self._interface = interface
+    They are `inputs`, `outputs` (stage cost first), `states`, the `seeds`, low word first, the
+    parameters for the `initial` state, and all `starts` with their values.
+    """
 
-    def wiring(self) -> Wiring:
-        """Value references of inputs, outputs (stage cost first), states and start values."""
-        plant = self._scenario.plant
-        outputs = (plant.stage_cost, *plant.disturbances)
-        return Wiring(
-            inputs=[self._place(name, "plant.actions", _not_written) for name in plant.actions],
-            outputs=self.numbers(outputs, "plant"),
-            states=self.numbers(plant.states, "plant.states"),
-            starts=self._starts(),
-        )
+    def __init__(self, scenario: Scenario, fmu: UnpackedFmu) -> None:
+        self._scenario, self._fmu, plant = scenario, fmu, scenario.plant
+        self.interface = Fmi2Instance if fmu.description.fmiVersion[0] == "2" else Fmi3Instance
+        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
+        self.outputs = self._numbers((plant.stage_cost, *plant.disturbances), "plant")
+        self.states = self._numbers(plant.states, "plant.states")
+        self.initial = self._numbers(plant.mapping.initial_state, "plant.mapping.initial_state")
+        self.seeds: list[Place] = []
+        for name in plant.mapping.seed:
+            if not (self.seeds and self.seeds[-1].type in _WIDE):
+                self.seeds.append(self._place(name, "plant.mapping.seed", _no_word))
+        self.starts = self._starts()
 
     def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
         """By the number of a sample the places to write at its start, and the values."""
@@ -113,16 +113,7 @@ class Wirer:
                 values.append(value)
         return found
 
-    def seeds(self) -> list[Place]:
-        """Places of the variables that take the seed, low word first."""
-        words: list[Place] = []
-        for name in self._scenario.plant.mapping.seed:
-            if not (words and words[-1].type in _WIDE):
-                words.append(self._place(name, "plant.mapping.seed", _no_word))
-        return words
-
-    def numbers(self, names: Sequence[str], table: str) -> list[Place]:
-        """Places of variables that are numbers."""
+    def _numbers(self, names: Sequence[str], table: str) -> list[Place]:
         return [self._place(name, table, _no_number) for name in names]
 
     def _starts(self) -> list[tuple[Place, float]]:
@@ -144,11 +135,11 @@ class Wirer:
                 starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
         for name, value in scenario.plant.parameters.items():
             starts.append(self._start_value(name, float(value), "plant.parameters"))
-        return starts + [(place, 0.0) for place in self.seeds()]
+        return starts + [(place, 0.0) for place in self.seeds]
 
     def _start_value(self, name: str, value: float, table: str) -> tuple[Place, float]:
         def misfit(variable: Any) -> str:
-            if variable.type not in self._interface.setters:
+            if variable.type not in self.interface.setters:
                 return f"is {_a(variable.type)}, which cannot be set here"
             if variable.type not in REALS and value != int(value):
                 return f"is {_a(variable.type)} and cannot take {value}"
@@ -204,7 +195,7 @@ def _a(noun: str) -> str:
 
 
 def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
-    """A seed's words for the `places` of `Wirer.seeds`, each with its own.
+    """A seed's words for the `places` of `Wiring.seeds`, each with its own.
 
     Raises PlantError for anything but an integer in [0, 2⁶⁴).
     """
@@ -230,17 +221,13 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
     scenario's FMU does not fit it.
     """
     fmu = unpack(scenario.plant.fmu)
-    wirer = Wirer(scenario, fmu, _interface(fmu))
+    wiring = Wiring(scenario, fmu)
     names = {(int(v.valueReference), v.type): name for name, v in fmu.variables.items()}
-    found = {names[place[:2]]: (place.type, value) for place, value in wirer.wiring().starts}
-    for place, value in seed_words(plant_seed, wirer.seeds()):
+    found = {names[place[:2]]: (place.type, value) for place, value in wiring.starts}
+    for place, value in seed_words(plant_seed, wiring.seeds):
         signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
         found[names[place[:2]]] = (place.type, signed)
     return found
-
-
-def _interface(fmu: UnpackedFmu) -> type[Instance]:
-    return Fmi2Instance if str(fmu.description.fmiVersion)[0] == "2" else Fmi3Instance
 
 
 _NOT_STARTED = -1
@@ -293,13 +280,11 @@ class FmuPlant:
         step = self.scenario.plant.communication_step or self._h
         for refusal in refusals(archive, step):
             raise PlantError(refusal)
-        interface = _interface(archive)
-        wirer = Wirer(self.scenario, archive, interface)
+        wiring = Wiring(self.scenario, archive)
         self.unpacked = archive
         self.fmi_version = str(archive.description.fmiVersion)
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
-        wiring = wirer.wiring()._replace(intermediate=intermediate)
         plant = self.scenario.plant
         names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
         self.units = {name: archive.unit(name) for name in names}
@@ -308,18 +293,16 @@ class FmuPlant:
         upper = np.array([inf if v.max is None else float(v.max) for v in states])
         self.state_range = lower, upper
         self.penalty = self.scenario.state_penalty
-        self._seeds = wirer.seeds()
-        initial = plant.mapping.initial_state
-        self._initial = wirer.numbers(initial, "plant.mapping.initial_state")
+        self._seeds, self._initial = wiring.seeds, wiring.initial
         self._elsewhere = False
         self._m = len(plant.actions)
         self._k = _NOT_STARTED
         self._started = False
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
-        self._fmi = interface(archive, wiring, self._h / self._steps)
+        self._fmi = wiring.interface(archive, wiring, self._h / self._steps, intermediate)
         self.drivable = self._fmi.drivable and self._steps == 1 and intermediate is None
-        self._changes = {k: self._fmi.writer(*change) for k, change in wirer.changes().items()}
+        self._changes = {k: self._fmi.writer(*change) for k, change in wiring.changes().items()}
         self._advance = self._fmi.advance if self._steps == 1 else self._advance_in_steps
         self._inputs = self._fmi.inputs
         self._outputs = self._fmi.outputs

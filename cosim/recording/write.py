@@ -15,7 +15,7 @@ from itertools import chain, cycle
 from math import inf, isfinite
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
 import pyarrow
@@ -26,7 +26,7 @@ from rerun import escape_entity_path_part as escaped
 from cosim.comparison import RunSignals
 from cosim.errors import RecordingError
 from cosim.files import check_target, publish
-from cosim.protocols import Array, Controller, RunPart
+from cosim.protocols import Array, Controller
 from cosim.recording.read import SAMPLE, SIGNAL, TIME
 from cosim.result import markdown_table
 from cosim.scenario import Scenario
@@ -83,7 +83,7 @@ class RerunRecorder:
         recorded = [kind for kind in SIGNALS if kind.group is not None]
         self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
         self._predicted = {
-            group: [
+            f"predicted_{group}": [
                 Channel(f"prediction/{escaped(c.name)}", f"prediction/{c.name}", c.unit)
                 for c in self._group(group)
             ]
@@ -112,36 +112,34 @@ class RerunRecorder:
         good = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
         stream.rerun.log(_STATUS, good, static=True)
 
-    def record(self, part: RunPart) -> None:
+    def record(self, first: int, columns: Mapping[str, Array], status: Sequence[str]) -> None:
         """Append K samples: one column of K rows for each signal."""
         stream = self._stream
         if stream is None:
             return
-        samples, time = np.arange(part.first, part.first + len(part)), part["time"]
+        samples, time = np.arange(first, first + len(status)), columns["time"]
         rows, ends = times(samples, time), times(samples[[0, -1]], time[[0, -1]])
         bundles: dict[str, list[tuple[Channel, Array]]] = {}
         for kind, channels in self._kinds.items():
-            columns = part[kind.name].reshape(len(part), -1).T
-            for channel, values in zip(channels, columns, strict=True):
+            own = columns[kind.name].reshape(len(status), -1).T
+            for channel, values in zip(channels, own, strict=True):
                 bundles.setdefault(channel.entity, []).append((channel, values))
         for bundle in bundles.values():
-            members = [channel for channel, _ in bundle]
-            stream.send(members, rows, np.column_stack([values for _, values in bundle]), ends)
+            members, parts = zip(*bundle, strict=True)
+            stream.send(members, rows, np.column_stack(parts), ends)
         with np.errstate(divide="ignore", invalid="ignore"):
-            residual = np.log10(part["residual"])
+            residual = np.log10(columns["residual"])
         stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
         self._residual.see(residual)
-        before, self._status = [self._status, *part.status[:-1]], part.status[-1]
-        changes = [i for i, status in enumerate(part.status) if status != before[i]]
-        if changes:
-            states = rr.StateChange.columns(state=[drawable(part.status[i]) for i in changes])
+        before, self._status = [self._status, *status[:-1]], status[-1]
+        if changes := [i for i, word in enumerate(status) if word != before[i]]:
+            states = rr.StateChange.columns(state=[drawable(status[i]) for i in changes])
             stream.rerun.send_columns(_STATUS, times(samples[changes], time[changes]), states)
-        predictions = {"states": part.predicted_states, "actions": part.predicted_actions}
-        for group, stages in predictions.items():
-            if stages is not None:
-                for i, channel in enumerate(self._predicted[group]):
-                    channel.labels = [f"+{stage}" for stage in range(stages.shape[1])]
-                    stream.send([channel], rows, stages[:, :, i])
+        for name, channels in self._predicted.items():
+            stages: Any = np.moveaxis(columns[name], 2, 0) if name in columns else []
+            for channel, values in zip(channels, stages, strict=False):
+                channel.labels = [f"+{stage}" for stage in range(values.shape[1])]
+                stream.send([channel], rows, values)
         if self._within:
             moments, *within = np.array(self._within).T
             self._within.clear()

@@ -219,7 +219,7 @@ class _Run:
                 timing[kind.name.removesuffix("_time")] = values[:, 0]
                 continue
             units = kind.units(scenario, self._plant.units)
-            for name, unit, column in zip(kind.names(scenario), units, values.T, strict=True):
+            for (name, unit), column in zip(units.items(), values.T, strict=True):
                 named[name] = Signal(name, unit, np.ascontiguousarray(column))
         return Trajectory(
             scenario=scenario,

@@ -50,11 +50,12 @@ class SignalKind:
         """Names of the signals, one but for a vector."""
         return getattr(scenario.plant, self.name) if self.vector else (self.name,)
 
-    def units(self, scenario: Scenario, known: Mapping[str, str]) -> tuple[str, ...]:
-        """Unit of each; `known` maps FMU variables to theirs, and one not known is left empty."""
+    def units(self, scenario: Scenario, known: Mapping[str, str]) -> dict[str, str]:
+        """Unit of each by name; `known` maps FMU variables to theirs, one not known has none."""
         if self.vector:
-            return tuple(known.get(name, "") for name in self.names(scenario))
-        return (known.get(scenario.plant.stage_cost, "") if self.unit == COST else self.unit,)
+            return {name: known.get(name, "") for name in self.names(scenario)}
+        cost = known.get(scenario.plant.stage_cost, "")
+        return {self.name: cost if self.unit == COST else self.unit}
 
 
 def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:

@@ -211,7 +211,7 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
             step=kind.name in HELD,
             tail=0.05 if kind.clock else 0.0,
         )
-        for name, unit in zip(kind.names(scenario), kind.units(scenario, units), strict=True)
+        for name, unit in kind.units(scenario, units).items()
     ]
 
 

@@ -302,11 +302,10 @@ class Scenario(Shown, Table):
                     f"{field}: must have one entry per {of} (plant.{of}s has {sizes[of]}), "
                     f"not {entries}"
                 )
-        for kind in ("state", "action"):
-            lower = getattr(self.bounds, f"{kind}_lower")
-            upper = getattr(self.bounds, f"{kind}_upper")
-            if not all(low < high for low, high in zip(lower, upper, strict=True)):
-                raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper in every entry")
+        for name, (lower, upper) in self.limits.items():
+            if not lower < upper:
+                kind = "state" if name in plant.states else "action"
+                raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper for '{name}'")
         steps = self.sampling_time / (plant.communication_step or self.sampling_time)
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
             raise ValueError("plant.communication_step: must be a divisor of sampling_time")

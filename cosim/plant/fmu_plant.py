@@ -70,6 +70,7 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
 
 
 _WIDE = ("Int64", "UInt64")
+INTEGERS = ("Integer", "Int32", "UInt32", *_WIDE)
 _NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
 
 
@@ -186,8 +187,8 @@ def _not_written(variable: Any) -> str:
 
 
 def _no_word(variable: Any) -> str:
-    known = variable.type in (*_WIDE, "Integer", "Int32", "UInt32")
-    return "" if known else f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
+    what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
+    return "" if variable.type in INTEGERS else what
 
 
 def _a(noun: str) -> str:

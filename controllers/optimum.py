@@ -33,7 +33,7 @@ from controllers.model import Model
 from controllers.problem import VECTORS, PlantProblem, load_model
 from cosim.files import cache_folder, read_arrays, write_atomically
 from cosim.protocols import Decision, Vector
-from cosim.scenario import Scenario
+from cosim.scenario import Scenario, is_file
 
 VERSION = 2
 """Part of every key; to be raised when the solver's results change."""
@@ -434,7 +434,7 @@ def stored_optimum(scenario: Scenario) -> str | None:
     A foreign FMU may be another plant than the controller's model, whose optimum it is, unless the
     scenario names the plant's own model.
     """
-    if scenario.plant.foreign and scenario.plant.model is None:
+    if is_file(scenario.plant.fmu) and scenario.plant.model is None:
         return None
     law = change_of(scenario)
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from math import nan
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -118,29 +117,6 @@ what failed there (0: nothing), and FMI's status.
 """
 
 
-@dataclass(frozen=True)
-class RunPart:
-    """K consecutive samples of a run, as columns; arrays are views that the loop overwrites later.
-
-    `first` is the number of the first sample. `columns` maps each name in `trajectory.SIGNALS`
-    to its values, (K,) or for a vector (K, n), which `part[name]` gives; `status` are K words;
-    `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m) are NaN where the controller
-    gave none, or None if it never did in this part.
-    """
-
-    first: int
-    columns: Mapping[str, Array]
-    status: Sequence[str]
-    predicted_states: Array | None = None
-    predicted_actions: Array | None = None
-
-    def __len__(self) -> int:
-        return len(self.status)
-
-    def __getitem__(self, name: str) -> Array:
-        return self.columns[name]
-
-
 class Recorder(Protocol):
     """Takes a run part by part; the loop calls start, record…, close in this order."""
 
@@ -154,8 +130,13 @@ class Recorder(Protocol):
     ) -> None:
         """Open the record; `units` maps each FMU variable's name to its unit."""
 
-    def record(self, part: RunPart) -> None:
-        """Append a part; copy what must outlive the call."""
+    def record(self, first: int, columns: Mapping[str, Array], status: Sequence[str]) -> None:
+        """Append K samples from number `first` on; the loop overwrites the arrays later.
+
+        `columns` maps each name in `trajectory.SIGNALS` to its values, (K,) or for a vector (K, n);
+        `predicted_states` (K, N+1, n) and `predicted_actions` (K, N, m), NaN where the controller
+        gave none, are there unless it never did. `status` are K words.
+        """
 
     def close(self) -> None:
         """Finish the record; also called when the run fails."""

@@ -108,11 +108,6 @@ class PlantTable(Table):
     mapping: MappingTable = MappingTable()
     """Table `[plant.mapping]`."""
 
-    @property
-    def foreign(self) -> bool:
-        """Whether the FMU is a file, and not one of the shipped."""
-        return is_file(self.fmu)
-
 
 class DisturbanceTable(Table):
     """Law of the disturbances, drawn anew each sample and held."""
@@ -218,9 +213,8 @@ class Penalty:
         self.upper = np.asarray(upper, dtype=float)
         self.linear = np.asarray(linear, dtype=float)
         self.quadratic = np.asarray(quadratic, dtype=float)
-        columns = (self.lower, self.upper, self.linear, self.quadratic)
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        self._rows = tuple((i, *row) for i, row in enumerate(rows))
+        columns = np.array([self.lower, self.upper, self.linear, self.quadratic])
+        self._rows = [(i, *row) for i, row in enumerate(columns.T.tolist())]
 
     def __call__(self, state: Sequence[float] | NDArray[np.float64]) -> float:
         """Penalty of one state (n,), fastest for a list; a NaN state gives NaN."""
@@ -308,11 +302,10 @@ class Scenario(Shown, Table):
                     f"{field}: must have one entry per {of} (plant.{of}s has {sizes[of]}), "
                     f"not {entries}"
                 )
-        for kind in ("state", "action"):
-            lower = getattr(self.bounds, f"{kind}_lower")
-            upper = getattr(self.bounds, f"{kind}_upper")
-            if not all(low < high for low, high in zip(lower, upper, strict=True)):
-                raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper in every entry")
+        for name, (lower, upper) in self.limits.items():
+            if not lower < upper:
+                kind = "state" if name in plant.states else "action"
+                raise ValueError(f"bounds.{kind}_lower: must be below {kind}_upper for '{name}'")
         steps = self.sampling_time / (plant.communication_step or self.sampling_time)
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
             raise ValueError("plant.communication_step: must be a divisor of sampling_time")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cosim.errors import CosimError
-from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, RunPart, Solution
+from cosim.protocols import Array, CompiledLoop, Controller, Plant, Recorder, Solution
 from cosim.scenario import Scenario
 from cosim.trajectory import FALLBACK, SIGNALS, Signal, Trajectory
 from cosim.validation import known_keywords
@@ -22,6 +22,7 @@ MEASURED = (
     "prepare_time", "feedback_time", "plant_time",
 )  # fmt: skip
 """Signals in a row of the loop's table, in order (`cosim.protocols.CompiledLoop`)."""
+PREDICTED = ("predicted_states", "predicted_actions")
 PART = 500
 """Samples of a part; of more than 10⁵ samples it is longer, since a recording indexes each."""
 
@@ -105,11 +106,11 @@ class _Run:
             for kind in SIGNALS
         }
         self._status: list[str] = []
-        self._predicted: list[Array] = []
+        self._predicted: dict[str, Array] = {}
         self._final_state: Array | None = None
 
     def interpreted(
-        self, record: Callable[[RunPart], None] | None, progress: Callable[[int], None]
+        self, record: Callable[..., None] | None, progress: Callable[[int], None]
     ) -> None:
         shape, saturate = self._scenario.action_lower.shape, self._scenario.saturate
         plant, solve, rows = self._plant, self._solve, list[list[float]]()
@@ -138,10 +139,13 @@ class _Run:
             if record is not None and solution is not None:
                 self._keep_prediction(k, solution)
             if (k + 1) % self._length == 0 or k + 1 == self._steps:
-                part = self._part(k // self._length * self._length, np.array(rows))
+                first = k // self._length * self._length
+                columns = self._fill(first, np.array(rows))
                 rows.clear()
                 if record is not None:
-                    record(part)
+                    predicted = {name: a[: k + 1 - first] for name, a in self._predicted.items()}
+                    record(first, columns | predicted, self._status[first:])
+                    self._predicted = {}
                 progress(k + 1)
         self._final_state = s
 
@@ -194,22 +198,17 @@ class _Run:
         return CosimError(f"{controller_name(self._controller)} gave {given}{at}")
 
     def _keep_prediction(self, k: int, solution: Solution) -> None:
-        given: list[Any] = [solution.predicted_states, solution.predicted_actions]
-        if any(values is None for values in given):
+        given: Any = {name: getattr(solution, name) for name in PREDICTED}
+        if any(values is None for values in given.values()):
             return
         if not self._predicted:
-            shapes = [(self._length, *np.shape(values)) for values in given]
-            self._predicted = [np.full(shape, np.nan) for shape in shapes]
+            shapes = {name: (self._length, *np.shape(values)) for name, values in given.items()}
+            self._predicted = {name: np.full(shape, nan) for name, shape in shapes.items()}
         try:
-            for kept, values in zip(self._predicted, given, strict=True):
-                kept[k % self._length] = values
+            for name, values in given.items():
+                self._predicted[name][k % self._length] = values
         except (TypeError, ValueError) as error:
             raise self._wrong(f"a prediction of another shape or kind ({error})", k) from None
-
-    def _part(self, first: int, table: Array) -> RunPart:
-        states, actions = [kept[: len(table)] for kept in self._predicted] or (None, None)
-        self._predicted = []
-        return RunPart(first, self._fill(first, table), self._status[first:], states, actions)
 
     def trajectory(self) -> Trajectory:
         scenario = self._scenario
@@ -220,7 +219,7 @@ class _Run:
                 timing[kind.name.removesuffix("_time")] = values[:, 0]
                 continue
             units = kind.units(scenario, self._plant.units)
-            for name, unit, column in zip(kind.names(scenario), units, values.T, strict=True):
+            for (name, unit), column in zip(units.items(), values.T, strict=True):
                 named[name] = Signal(name, unit, np.ascontiguousarray(column))
         return Trajectory(
             scenario=scenario,

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TextIO
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from cosim.errors import TrajectoryError
 from cosim.files import replacing
 from cosim.protocols import Array
-from cosim.result import Result
+from cosim.result import Result, csv_text
 from cosim.scenario import VIOLATING, Scenario
 
 if TYPE_CHECKING:
@@ -51,11 +50,12 @@ class SignalKind:
         """Names of the signals, one but for a vector."""
         return getattr(scenario.plant, self.name) if self.vector else (self.name,)
 
-    def units(self, scenario: Scenario, known: Mapping[str, str]) -> tuple[str, ...]:
-        """Unit of each; `known` maps FMU variables to theirs, and one not known is left empty."""
+    def units(self, scenario: Scenario, known: Mapping[str, str]) -> dict[str, str]:
+        """Unit of each by name; `known` maps FMU variables to theirs, one not known has none."""
         if self.vector:
-            return tuple(known.get(name, "") for name in self.names(scenario))
-        return (known.get(scenario.plant.stage_cost, "") if self.unit == COST else self.unit,)
+            return {name: known.get(name, "") for name in self.names(scenario)}
+        cost = known.get(scenario.plant.stage_cost, "")
+        return {self.name: cost if self.unit == COST else self.unit}
 
 
 def _penalty(scenario: Scenario, columns: Mapping[str, Array]) -> Array:
@@ -226,34 +226,35 @@ class Trajectory(Result):
 
     def to_csv(self) -> str:
         """Return the signals and the status as CSV text; floats read back to the same bits."""
-        stream = io.StringIO()
-        self._write(stream)
-        return stream.getvalue()
+        return csv_text(*self._table())
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `to_csv` to a file, whole or not at all."""
-        with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
-            self._write(stream)
-        return Path(path)
+        return _write(path, *self._table())
 
     def write_timing_csv(self, path: str | Path) -> Path:
         """Write the wall-clock times in µs to a file of their own, one row per sample."""
         header = [f"{name} [us]" for name in self.timing]
         rows = ([f"{1e6 * v:.3f}" for v in row] for row in _rows(list(self.timing.values())))
-        with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
-            csv.writer(stream, lineterminator="\n").writerows(chain([header], rows))
-        return Path(path)
+        return _write(path, header, rows)
 
-    def _write(self, stream: TextIO) -> None:
+    def _table(self) -> tuple[list[str], Iterator[list[str]]]:
+        """Header and rows of the CSV."""
         signals = list(self.signals.values())
         counted = {kind.name for kind in SIGNALS if kind.whole}
         text = [(lambda v: repr(int(v))) if s.name in counted else repr for s in signals]
-        writer = csv.writer(stream, lineterminator="\n")
-        titles = (f"{s.name} [{s.unit}]" if s.unit else s.name for s in signals)
-        writer.writerow([*titles, STATUS])
         numbers = _rows([signal.values for signal in signals])
-        for row, status in zip(numbers, self.status, strict=True):
-            writer.writerow([*(write(v) for write, v in zip(text, row, strict=True)), status])
+        titles = [f"{s.name} [{s.unit}]" if s.unit else s.name for s in signals]
+        return [*titles, STATUS], (
+            [*(write(v) for write, v in zip(text, row, strict=True)), status]
+            for row, status in zip(numbers, self.status, strict=True)
+        )
+
+
+def _write(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[str]]) -> Path:
+    with replacing(path) as partial, partial.open("w", encoding="utf-8", newline="") as stream:
+        csv.writer(stream, lineterminator="\n").writerows(chain([header], rows))
+    return Path(path)
 
 
 def _quantiles(seconds: Array) -> dict[str, float]:

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from cosim.errors import PlantError
 from cosim.plant.fmi import SHIPPED, UnpackedFmu, unpack
-from cosim.plant.fmu_plant import REALS, FmuPlant, has_start, refusals
+from cosim.plant.fmu_plant import INTEGERS, REALS, FmuPlant, has_start, refusals
 from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.validation import suggestion
@@ -27,7 +27,6 @@ NO_NOISE = (
 HEAD = """\
 # Drafted by `cosim scenario init` from the FMU's model description.
 # Lines with CHECK are guesses that only you can confirm."""
-INTEGERS = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
 COSTS = ("cost", "loss", "objective")
 
 

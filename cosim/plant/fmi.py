@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 from weakref import WeakValueDictionary
 from xml.etree import ElementTree
 
@@ -32,6 +32,9 @@ import fmus
 from cosim.errors import CapabilityError, PlantError
 from cosim.files import cache_folder, lock, temporary_folder
 from fmus import platforms_of, present
+
+if TYPE_CHECKING:
+    from cosim.plant.fmu_plant import Wiring
 
 SHIPPED = (*fmus.NAMES, *fmus.PLANTS)
 DESCRIPTION = "modelDescription.xml"
@@ -254,16 +257,6 @@ Intermediate = Callable[[float, NDArray[np.float64]], None]
 """Called with the time [s] and the states (n,) at each internal step of an FMU."""
 
 
-class Wiring(NamedTuple):
-    """Places of the variables that a plant exchanges with its FMU; `starts` with their values."""
-
-    inputs: Sequence[Place]
-    outputs: Sequence[Place]
-    states: Sequence[Place]
-    starts: Sequence[tuple[Place, float]]
-    intermediate: Intermediate | None = None
-
-
 def _as(buffer: Any, value: float) -> float:
     """A number as a buffer of a C type takes it: an integer is the nearest one."""
     return value if buffer._type_ in (ctypes.c_double, ctypes.c_float) else round(value)
@@ -304,12 +297,15 @@ class Instance(ABC):
     _begin: ClassVar[tuple[tuple[str, tuple[Any, ...]], ...]]
     """The calls that initialise, with their arguments after the instance."""
 
-    def __init__(self, fmu: UnpackedFmu, wiring: Wiring, step_size: float) -> None:
+    def __init__(
+        self, fmu: UnpackedFmu, wiring: Wiring, step_size: float, intermediate: Intermediate | None
+    ) -> None:
         self.fmu = fmu
         self.messages: deque[str] = deque(maxlen=8)
         self.fatal = False
         self._interface = fmu.description.coSimulation
-        self._wiring = wiring
+        self._intermediate = intermediate
+        self._places = (wiring.inputs, wiring.outputs, wiring.states)
         if self._interface.canBeInstantiatedOnlyOncePerProcess and _alive[fmu.sha256]:
             raise CapabilityError(
                 f"FMU '{fmu.path}' can be instantiated only once per process; close the other plant"
@@ -318,20 +314,20 @@ class Instance(ABC):
         _alive[fmu.sha256] += 1
         self._component = ctypes.c_void_p(self._slave.component)
         self._functions: dict[str, Any] = {}
-        self._places = (wiring.inputs, wiring.outputs, wiring.states)
         self.drivable = all(map(self._all_real, self._places))
         self._step_size = ctypes.c_double(step_size)
         self._time = ctypes.c_double(0.0)
-        self.inputs, _, self._set_inputs = self._exchange(wiring.inputs, "Set")
-        self.outputs, self.outputs_view, self._get_outputs = self._exchange(wiring.outputs, "Get")
-        self.states, self.states_view, self._get_states = self._exchange(wiring.states, "Get")
+        self.inputs, self._set_inputs = self._exchange(wiring.inputs, "Set")
+        self.outputs, self._get_outputs = self._exchange(wiring.outputs, "Get")
+        self.states, self._get_states = self._exchange(wiring.states, "Get")
+        self.outputs_view: NDArray[np.float64] = np.frombuffer(memoryview(self.outputs))
+        self.states_view: NDArray[np.float64] = np.frombuffer(memoryview(self.states))
         self._do_step = self._function("DoStep")
         places = [place for place, _ in wiring.starts]
+        self._starts, self._set_starts = self._exchange(places, "Set")
+        self._starts[:] = [value for _, value in wiring.starts]
         # FMI 2 counts value references anew for each type.
-        keys = (place[:3] for place in places)
-        self._starts = dict(zip(keys, self._parts(places), strict=True))
-        for place, value in wiring.starts:
-            self.change_start(place, value)
+        self._start_of = {place[:3]: i for i, place in enumerate(places)}
 
     @abstractmethod
     def _instantiate(self, **where: Any) -> Any:
@@ -383,8 +379,8 @@ class Instance(ABC):
         """Reset (if started before), write the start values, initialise and read the states."""
         if started:
             self._call("Reset", self._component)
-        for suffix, arguments, *_ in self._starts.values():
-            self._call(f"Set{suffix}", *arguments)
+        if self._starts:
+            self._set_starts()
         for name, arguments in self._begin:
             self._call(name, self._component, *arguments)
         self._get_states()
@@ -398,13 +394,10 @@ class Instance(ABC):
             self.fail("DoStep", status)
         self._get_states()
 
-    def _exchange(
-        self, places: Sequence[Place], verb: str
-    ) -> tuple[Any, NDArray[np.float64], Callable[[], None]]:
-        """A buffer for numbers, NumPy's view of it, and a function that sets or gets them all."""
-        buffer = (ctypes.c_double * len(places))()
-        view: NDArray[np.float64] = np.frombuffer(memoryview(buffer), dtype=np.float64)
+    def _exchange(self, places: Sequence[Place], verb: str) -> tuple[Any, Callable[[], None]]:
+        """A buffer for a number of each place, and a function that sets or gets them all."""
         if self._all_real(places):
+            buffer = (ctypes.c_double * len(places))()
             name = f"{verb}{self.real}"
             function = self._function(name)
             arguments = self._arguments([place.reference for place in places], buffer)
@@ -413,40 +406,36 @@ class Instance(ABC):
                 if (status := function(*arguments)) not in ACCEPTED:
                     self.fail(name, status)
 
-            return buffer, view, exchange
-        parts = self._parts(places)
+            return buffer, exchange
+        # Not every integer of 64 bits is a double: what is set is a list.
+        numbers: Any = [0.0] * len(places)
+        numbers = numbers if verb == "Set" else (ctypes.c_double * len(places))(*numbers)
+        variables: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
+        for place in places:
+            suffix, ctype = self.setters[place.type]
+            values = (ctype * len(place.starts))()
+            values[:] = [_as(values, start) for start in place.starts]
+            call = f"{verb}{suffix}", self._arguments([place.reference], values), values
+            variables.setdefault(place[:2], call)
+        calls = [(*variables[place[:2]], place.element) for place in places]
 
         def convert() -> None:
-            for i, (suffix, arguments, typed, k) in enumerate(parts):
+            for i, (name, arguments, values, k) in enumerate(calls):
                 if verb == "Set":
-                    typed[k] = _as(typed, buffer[i])
-                self._call(f"{verb}{suffix}", *arguments)
+                    values[k] = _as(values, numbers[i])
+                self._call(name, *arguments)
                 if verb == "Get":
-                    buffer[i] = typed[k]
+                    numbers[i] = values[k]
 
-        return buffer, view, convert
-
-    def _parts(self, places: Sequence[Place]) -> list[tuple[str, tuple[Any, ...], Any, int]]:
-        """For each place the end of a call's name, its arguments, their buffer and the index in it;
-        elements of one array share them.
-        """
-        made: dict[tuple[int, str], tuple[str, tuple[Any, ...], Any]] = {}
-        for place in places:
-            if place[:2] not in made:
-                suffix, ctype = self.setters[place.type]
-                buffer = (ctype * len(place.starts))()
-                buffer[:] = [_as(buffer, value) for value in place.starts]
-                made[place[:2]] = suffix, self._arguments([place.reference], buffer), buffer
-        return [(*made[place[:2]], place.element) for place in places]
+        return numbers, convert
 
     def change_start(self, place: Place, value: float) -> None:
         """Replace the start value of a place of the wiring's for the next reset."""
-        *_, buffer, index = self._starts[place[:3]]
-        buffer[index] = _as(buffer, value)
+        self._starts[self._start_of[place[:3]]] = value
 
     def writer(self, places: Sequence[Place], values: Sequence[float]) -> Callable[[], None]:
         """A function that writes values between two steps."""
-        buffer, _, write = self._exchange(places, "Set")
+        buffer, write = self._exchange(places, "Set")
         buffer[:] = values
         return write
 
@@ -479,7 +468,8 @@ class Instance(ABC):
         names = (f"Set{self.real}", f"Get{self.real}", "DoStep", "DoStep")
         if fault == len(names):
             self.messages.append("the FMU ended the step early")
-        self.fail(names[fault - 1], DISCARD if fault == len(names) else status)
+            status = DISCARD
+        self.fail(names[fault - 1], status)
 
     def save(self, handle: ctypes.c_void_p) -> None:
         """Copy the FMU's state into a handle; a non-empty handle's memory is used again."""
@@ -647,7 +637,7 @@ class Fmi3Instance(Instance):
 
     def _intermediate_update(self) -> dict[str, Any]:
         """Arguments that ask for the states at each internal step; {} if the FMU has none."""
-        if self._wiring.intermediate is None or not self._interface.providesIntermediateUpdate:
+        if self._intermediate is None or not self._interface.providesIntermediateUpdate:
             return {}
         # fmpy does not read the attribute, an xs:boolean.
         elements = ElementTree.parse(self.fmu.folder / DESCRIPTION).iter()
@@ -656,17 +646,17 @@ class Fmi3Instance(Instance):
             for e in elements
             if e.get("intermediateUpdate") in ("true", "1")
         }
-        states = {place.reference for place in self._wiring.states}
+        states = {place.reference for place in self._places[2]}
         told = {str(state) for state in states} <= offered
         update = {"intermediateUpdate": self._update, "requiredIntermediateVariables": [*states]}
         return update if told else {}
 
     def _update(self, _: Any, time: float, __: bool, readable: bool, *___: Any) -> None:
         """Tell of the states; the FMU calls it in a step."""
-        if readable and self._raised is None and self._wiring.intermediate is not None:
+        if readable and self._raised is None and self._intermediate is not None:
             try:
                 self._get_states()
-                self._wiring.intermediate(time, self.states_view.copy())
+                self._intermediate(time, self.states_view.copy())
             except BaseException as error:
                 self._raised = error  # ctypes would print and drop it
 

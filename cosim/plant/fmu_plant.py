@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import operator
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite, prod
 from pathlib import Path
@@ -22,7 +22,6 @@ from cosim.plant.fmi import (
     Intermediate,
     Place,
     UnpackedFmu,
-    Wiring,
     library_path,
     unpack,
 )
@@ -71,6 +70,7 @@ def refusals(fmu: UnpackedFmu, step: float | None = None) -> Iterator[str]:
 
 
 _WIDE = ("Int64", "UInt64")
+INTEGERS = ("Integer", "Int32", "UInt32", *_WIDE)
 _NO_NUMBERS = ("Boolean", "Enumeration", "String", "Binary", "Clock")
 
 
@@ -83,24 +83,25 @@ def has_start(variable: Any) -> bool:
     return variable.causality not in ("calculatedParameter", "independent")
 
 
-class Wirer:
-    """Looks up the variables of one FMU for one scenario; raises PlantError on any misfit."""
+class Wiring:
+    """Places in an FMU of the variables that a scenario names; raises PlantError on any misfit.
 
-    def __init__(self, scenario: Scenario, fmu: UnpackedFmu, interface: type[Instance]) -> None:
-        self._scenario = scenario
-        self._fmu = fmu
-        self._interface = interface
+    They are `inputs`, `outputs` (stage cost first), `states`, the `seeds`, low word first, the
+    parameters for the `initial` state, and all `starts` with their values.
+    """
 
-    def wiring(self) -> Wiring:
-        """Value references of inputs, outputs (stage cost first), states and start values."""
-        plant = self._scenario.plant
-        outputs = (plant.stage_cost, *plant.disturbances)
-        return Wiring(
-            inputs=[self._written(name, "plant.actions") for name in plant.actions],
-            outputs=self.numbers(outputs, "plant"),
-            states=self.numbers(plant.states, "plant.states"),
-            starts=self._starts(),
-        )
+    def __init__(self, scenario: Scenario, fmu: UnpackedFmu) -> None:
+        self._scenario, self._fmu, plant = scenario, fmu, scenario.plant
+        self.interface = Fmi2Instance if fmu.description.fmiVersion[0] == "2" else Fmi3Instance
+        self.inputs = [self._place(name, "plant.actions", _not_written) for name in plant.actions]
+        self.outputs = self._numbers((plant.stage_cost, *plant.disturbances), "plant")
+        self.states = self._numbers(plant.states, "plant.states")
+        self.initial = self._numbers(plant.mapping.initial_state, "plant.mapping.initial_state")
+        self.seeds: list[Place] = []
+        for name in plant.mapping.seed:
+            if not (self.seeds and self.seeds[-1].type in _WIDE):
+                self.seeds.append(self._place(name, "plant.mapping.seed", _no_word))
+        self.starts = self._starts()
 
     def changes(self) -> dict[int, tuple[list[Place], list[float]]]:
         """By the number of a sample the places to write at its start, and the values."""
@@ -109,26 +110,12 @@ class Wirer:
         for change in scenario.plant.changes or ():
             places, values = found.setdefault(ceil(change.time / scenario.sampling_time), ([], []))
             for name, value in change.parameters.items():
-                places.append(self._written(name, "plant.changes"))
+                places.append(self._place(name, "plant.changes", _not_written))
                 values.append(value)
         return found
 
-    def seeds(self) -> list[Place]:
-        """Places of the variables that take the seed, low word first."""
-        words = []
-        for name in self._scenario.plant.mapping.seed:
-            variable = self._find(name, "plant.mapping.seed")
-            if variable.type not in (*_WIDE, "Integer", "Int32", "UInt32"):
-                what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
-                raise self._misfit(name, "plant.mapping.seed", what)
-            words.append(self._place(name, "plant.mapping.seed"))
-            if variable.type in _WIDE:
-                break
-        return words
-
-    def numbers(self, names: Sequence[str], table: str) -> list[Place]:
-        """Places of variables that are numbers."""
-        return [self._number(name, table) for name in names]
+    def _numbers(self, names: Sequence[str], table: str) -> list[Place]:
+        return [self._place(name, table, _no_number) for name in names]
 
     def _starts(self) -> list[tuple[Place, float]]:
         scenario, mapping = self._scenario, self._scenario.plant.mapping
@@ -149,60 +136,59 @@ class Wirer:
                 starts.append(self._start_value(name, float(value), f"plant.mapping.{field}"))
         for name, value in scenario.plant.parameters.items():
             starts.append(self._start_value(name, float(value), "plant.parameters"))
-        return starts + [(place, 0.0) for place in self.seeds()]
+        return starts + [(place, 0.0) for place in self.seeds]
 
     def _start_value(self, name: str, value: float, table: str) -> tuple[Place, float]:
-        variable = self._find(name, table)
-        if variable.type not in self._interface.setters:
-            raise self._misfit(name, table, f"is {_a(variable.type)}, which cannot be set here")
-        if variable.type not in REALS and value != int(value):
-            raise self._misfit(name, table, f"is {_a(variable.type)} and cannot take {value}")
-        if not has_start(variable):
-            raise self._misfit(name, table, f"is {_a(variable.causality)} without a start to set")
-        return self._place(name, table), value
+        def misfit(variable: Any) -> str:
+            if variable.type not in self.interface.setters:
+                return f"is {_a(variable.type)}, which cannot be set here"
+            if variable.type not in REALS and value != int(value):
+                return f"is {_a(variable.type)} and cannot take {value}"
+            if not has_start(variable):
+                return f"is {_a(variable.causality)} without a start to set"
+            return ""
 
-    def _written(self, name: str, table: str) -> Place:
-        variable = self._find(name, table)
-        if variable.causality != "input" and variable.variability != "tunable":
-            what = f"is {_a(variable.causality)}, not an input, and is not tunable"
-            raise self._misfit(name, table, what)
-        return self._number(name, table)
+        return self._place(name, table, misfit), value
 
-    def _number(self, name: str, table: str) -> Place:
-        if (variable := self._find(name, table)).type in _NO_NUMBERS:
-            raise self._misfit(name, table, f"is {_a(variable.type)}, not a number")
-        return self._place(name, table)
+    def _place(self, name: str, table: str, misfit: Callable[[Any], str]) -> Place:
+        """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is.
 
-    def _place(self, name: str, table: str) -> Place:
-        """Where variable `name`, or element ``NAME[i]``, ``NAME[i,j]`` of an array, is."""
-        variable = self._find(name, table)
-        shape, index = tuple(variable.shape or ()), 0
-        if shape:
+        `misfit` says what is wrong with a variable, if anything.
+        """
+        fmu, asked = self._fmu, f"{table} of scenario '{self._scenario.name}' names"
+        if (variable := fmu.variable(name)) is None:
+            raise PlantError(
+                f"FMU '{fmu.path.name}' has no variable '{name}'{suggestion(name, fmu.variables)}, "
+                f"which {asked}"
+            )
+        what, shape, index = misfit(variable), tuple(variable.shape or ()), 0
+        if shape and not what:
             try:
                 indices = name.removeprefix(variable.name).removeprefix("[").removesuffix("]")
                 index = int(np.ravel_multi_index([int(i) for i in indices.split(",")], shape))
             except ValueError:
                 last = ",".join(str(n - 1) for n in shape)
                 what = f"is of an array of {shape}: name an element, up to {variable.name}[{last}]"
-                raise self._misfit(name, table, what) from None
+        if what:
+            raise PlantError(f"variable '{name}' of FMU '{fmu.path.name}' {what}; {asked} it")
         stated = ["0"] if variable.type in _NO_NUMBERS else str(variable.start or 0).split()
         starts = tuple(map(float, stated)) * (prod(shape) // len(stated))
         return Place(int(variable.valueReference), str(variable.type), index, starts)
 
-    def _find(self, name: str, table: str) -> Any:
-        if (variable := self._fmu.variable(name)) is None:
-            raise PlantError(
-                f"FMU '{self._fmu.path.name}' has no variable '{name}'"
-                f"{suggestion(name, self._fmu.variables)}, which {table} of scenario "
-                f"'{self._scenario.name}' names"
-            )
-        return variable
 
-    def _misfit(self, name: str, table: str, what: str) -> PlantError:
-        return PlantError(
-            f"variable '{name}' of FMU '{self._fmu.path.name}' {what}; {table} of scenario "
-            f"'{self._scenario.name}' names it"
-        )
+def _no_number(variable: Any) -> str:
+    return f"is {_a(variable.type)}, not a number" if variable.type in _NO_NUMBERS else ""
+
+
+def _not_written(variable: Any) -> str:
+    if variable.causality != "input" and variable.variability != "tunable":
+        return f"is {_a(variable.causality)}, not an input, and is not tunable"
+    return _no_number(variable)
+
+
+def _no_word(variable: Any) -> str:
+    what = f"is {_a(variable.type)}, not an integer of 32 or 64 bits"
+    return "" if variable.type in INTEGERS else what
 
 
 def _a(noun: str) -> str:
@@ -210,7 +196,7 @@ def _a(noun: str) -> str:
 
 
 def seed_words(seed: int, places: Sequence[Place]) -> list[tuple[Place, int]]:
-    """A seed's words for the `places` of `Wirer.seeds`, each with its own.
+    """A seed's words for the `places` of `Wiring.seeds`, each with its own.
 
     Raises PlantError for anything but an integer in [0, 2⁶⁴).
     """
@@ -236,17 +222,13 @@ def start_values(scenario: Scenario, plant_seed: int) -> dict[str, tuple[str, fl
     scenario's FMU does not fit it.
     """
     fmu = unpack(scenario.plant.fmu)
-    wirer = Wirer(scenario, fmu, _interface(fmu))
+    wiring = Wiring(scenario, fmu)
     names = {(int(v.valueReference), v.type): name for name, v in fmu.variables.items()}
-    found = {names[place[:2]]: (place.type, value) for place, value in wirer.wiring().starts}
-    for place, value in seed_words(plant_seed, wirer.seeds()):
+    found = {names[place[:2]]: (place.type, value) for place, value in wiring.starts}
+    for place, value in seed_words(plant_seed, wiring.seeds):
         signed = value - (1 << 32) if value >= 1 << 31 and place.type == "Integer" else value
         found[names[place[:2]]] = (place.type, signed)
     return found
-
-
-def _interface(fmu: UnpackedFmu) -> type[Instance]:
-    return Fmi2Instance if str(fmu.description.fmiVersion)[0] == "2" else Fmi3Instance
 
 
 _NOT_STARTED = -1
@@ -299,13 +281,11 @@ class FmuPlant:
         step = self.scenario.plant.communication_step or self._h
         for refusal in refusals(archive, step):
             raise PlantError(refusal)
-        interface = _interface(archive)
-        wirer = Wirer(self.scenario, archive, interface)
+        wiring = Wiring(self.scenario, archive)
         self.unpacked = archive
         self.fmi_version = str(archive.description.fmiVersion)
         self.fmu_path = archive.path
         self.fmu_sha256 = archive.sha256
-        wiring = wirer.wiring()._replace(intermediate=intermediate)
         plant = self.scenario.plant
         names = (*plant.states, *plant.actions, *plant.disturbances, plant.stage_cost)
         self.units = {name: archive.unit(name) for name in names}
@@ -314,18 +294,16 @@ class FmuPlant:
         upper = np.array([inf if v.max is None else float(v.max) for v in states])
         self.state_range = lower, upper
         self.penalty = self.scenario.state_penalty
-        self._seeds = wirer.seeds()
-        initial = plant.mapping.initial_state
-        self._initial = wirer.numbers(initial, "plant.mapping.initial_state")
+        self._seeds, self._initial = wiring.seeds, wiring.initial
         self._elsewhere = False
         self._m = len(plant.actions)
         self._k = _NOT_STARTED
         self._started = False
         self._penalty_now = 0.0
         self._steps = round(self._h / step)
-        self._fmi = interface(archive, wiring, self._h / self._steps)
+        self._fmi = wiring.interface(archive, wiring, self._h / self._steps, intermediate)
         self.drivable = self._fmi.drivable and self._steps == 1 and intermediate is None
-        self._changes = {k: self._fmi.writer(*change) for k, change in wirer.changes().items()}
+        self._changes = {k: self._fmi.writer(*change) for k, change in wiring.changes().items()}
         self._advance = self._fmi.advance if self._steps == 1 else self._advance_in_steps
         self._inputs = self._fmi.inputs
         self._outputs = self._fmi.outputs
@@ -376,7 +354,7 @@ class FmuPlant:
             names = ", ".join(self.scenario.plant.actions)
             raise PlantError(f"action must be {self._m} finite numbers ({names}), not {a}")
         if self._k < 0:
-            self._refuse_unstarted()
+            self._running()
         self._inputs[:] = values
         penalty, k = self._penalty_now, self._k
         self._k = _NOT_STARTED
@@ -404,9 +382,7 @@ class FmuPlant:
 
         As many calls of `step` give the same. Raises PlantError, then needs a reset.
         """
-        fmi = self._instance
-        if self._k < 0:
-            self._refuse_unstarted()
+        fmi = self._running()
         k, first, end = self._k, self._k, self._k + len(table)
         self._k = _NOT_STARTED
         while k < end:
@@ -425,10 +401,7 @@ class FmuPlant:
 
     def snapshot(self) -> Snapshot:
         """Save the state of plant and disturbances; raises CapabilityError if the FMU cannot."""
-        fmi = self._instance
-        if self._k < 0:
-            self._refuse_unstarted()
-        handle = self._handle()
+        fmi, handle = self._running(), self._handle()
         fmi.save(handle)
         return Snapshot(self, handle, self._k)
 
@@ -500,6 +473,12 @@ class FmuPlant:
             raise PlantError("the FMU ended in a fatal error; close this plant and make a new one")
         return self._fmi
 
+    def _running(self) -> Instance:
+        fmi = self._instance
+        if self._k < 0:
+            raise PlantError("call reset first: no episode has begun, or an error ended it")
+        return fmi
+
     def _start_from(self, fmi: Instance, state: Sequence[float] | Array | None) -> None:
         """Replace the start values of the states, or put the scenario's back."""
         table = self.scenario.plant
@@ -517,11 +496,6 @@ class FmuPlant:
         for place, value in zip(self._initial, values.tolist(), strict=True):
             fmi.change_start(place, value)
         self._elsewhere = state is not None
-
-    def _refuse_unstarted(self) -> NoReturn:
-        if self._fmi is None:
-            raise PlantError("the plant is closed")
-        raise PlantError("call reset first: no episode has begun, or an error ended it")
 
     def _refuse_output(self, k: int) -> NoReturn:
         table = self.scenario.plant

@@ -15,7 +15,7 @@ from itertools import chain, cycle
 from math import inf, isfinite
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 import numpy as np
 import pyarrow
@@ -26,8 +26,9 @@ from rerun import escape_entity_path_part as escaped
 from cosim.comparison import RunSignals
 from cosim.errors import RecordingError
 from cosim.files import check_target, publish
-from cosim.protocols import Array, Controller, RunPart
+from cosim.protocols import Array, Controller
 from cosim.recording.read import SAMPLE, SIGNAL, TIME
+from cosim.result import markdown_table
 from cosim.scenario import Scenario
 from cosim.simulation import controller_name
 from cosim.trajectory import SIGNALS, SignalKind
@@ -81,14 +82,19 @@ class RerunRecorder:
         self._seconds = steps * scenario.sampling_time
         recorded = [kind for kind in SIGNALS if kind.group is not None]
         self._kinds = {kind: _channels(kind, scenario, units) for kind in recorded}
-        self._predicted: dict[str, Channel] = {}
+        self._predicted = {
+            f"predicted_{group}": [
+                Channel(f"prediction/{escaped(c.name)}", f"prediction/{c.name}", c.unit)
+                for c in self._group(group)
+            ]
+            for group in ("states", "actions")
+        }
         self._fine = [
             replace(c, entity=f"intermediate/{escaped(c.name)}", color=color, labels=["within"])
             for c, color in zip(self._group("states"), cycle(SERIES[2:]), strict=False)
         ]
         self._residual = Channel(_RESIDUAL, "log10 of the KKT residual", color=SERIES[2])
         self._status: str | None = None
-        self._samples = 0
         properties = {
             "scenario": scenario.name,
             "scenario_hash": scenario.hash,
@@ -102,35 +108,45 @@ class RerunRecorder:
         }
         title = f"{name} on {scenario.name}, seed {seed}"
         about = _about(scenario, properties)
-        stream = self._stream = Stream(self.path, title, self._layout(), about, properties)
+        stream = self._stream = Stream(self.path, title, about, properties, self._layout())
         good = rr.StateConfiguration(values=["solved"], colors=[packed_color(_GOOD)])
         stream.rerun.log(_STATUS, good, static=True)
 
-    def record(self, part: RunPart) -> None:
+    def record(self, first: int, columns: Mapping[str, Array], status: Sequence[str]) -> None:
         """Append K samples: one column of K rows for each signal."""
         stream = self._stream
-        if stream is None or not len(part):
+        if stream is None:
             return
-        samples, time = np.arange(part.first, part.first + len(part)), part["time"]
+        samples, time = np.arange(first, first + len(status)), columns["time"]
         rows, ends = times(samples, time), times(samples[[0, -1]], time[[0, -1]])
         bundles: dict[str, list[tuple[Channel, Array]]] = {}
         for kind, channels in self._kinds.items():
-            columns = part[kind.name].reshape(len(part), -1).T
-            for channel, values in zip(channels, columns, strict=True):
-                channel.see(values, tail=0.05 if kind.clock else 0.0)
+            own = columns[kind.name].reshape(len(status), -1).T
+            for channel, values in zip(channels, own, strict=True):
                 bundles.setdefault(channel.entity, []).append((channel, values))
-            stream.bounds(channels, ends)
         for bundle in bundles.values():
-            members = [channel for channel, _ in bundle]
-            stream.send(members, rows, np.column_stack([values for _, values in bundle]))
+            members, parts = zip(*bundle, strict=True)
+            stream.send(members, rows, np.column_stack(parts), ends)
         with np.errstate(divide="ignore", invalid="ignore"):
-            residual = np.log10(part["residual"])
+            residual = np.log10(columns["residual"])
         stream.rerun.send_columns(_RESIDUAL, rows, rr.Scalars.columns(scalars=residual))
         self._residual.see(residual)
-        self._changes_of_status(stream, samples, part)
-        self._predictions(stream, rows, part)
-        self._intermediate(stream, samples, time)
-        self._samples += len(part)
+        before, self._status = [self._status, *status[:-1]], status[-1]
+        if changes := [i for i, word in enumerate(status) if word != before[i]]:
+            states = rr.StateChange.columns(state=[drawable(status[i]) for i in changes])
+            stream.rerun.send_columns(_STATUS, times(samples[changes], time[changes]), states)
+        for name, channels in self._predicted.items():
+            stages: Any = np.moveaxis(columns[name], 2, 0) if name in columns else []
+            for channel, values in zip(channels, stages, strict=False):
+                channel.labels = [f"+{stage}" for stage in range(values.shape[1])]
+                stream.send([channel], rows, values)
+        if self._within:
+            moments, *within = np.array(self._within).T
+            self._within.clear()
+            # A state at the end of a sample counts to that sample.
+            rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
+            for channel, values in zip(self._fine, within, strict=True):
+                stream.send([channel], rows, values)
 
     def intermediate(self, time: float, states: Array) -> None:
         """Take the states (n,) at a time [s] within a sample."""
@@ -139,41 +155,12 @@ class RerunRecorder:
     def close(self) -> None:
         """Finish the file with the ranges that the run has filled; no sample, no file."""
         if self._stream is not None:
-            if self._samples:
-                self._stream.close(self._layout())
+            if self._status is not None:
+                self._stream.layout = self._layout()
+                self._stream.close()
             else:
                 self._stream.discard()
             self._stream = None
-
-    def _changes_of_status(self, stream: Stream, samples: np.ndarray, part: RunPart) -> None:
-        before = [self._status, *part.status[:-1]]
-        rows = [i for i, status in enumerate(part.status) if status != before[i]]
-        self._status = part.status[-1]
-        if rows:
-            states = rr.StateChange.columns(state=[drawable(part.status[i]) for i in rows])
-            stream.rerun.send_columns(_STATUS, times(samples[rows], part["time"][rows]), states)
-
-    def _predictions(self, stream: Stream, rows: list[rr.TimeColumn], part: RunPart) -> None:
-        predictions = {"states": part.predicted_states, "actions": part.predicted_actions}
-        for group, values in predictions.items():
-            if values is None:
-                continue
-            for i, channel in enumerate(self._group(group)):
-                stages, name = values[:, :, i], f"prediction/{escaped(channel.name)}"
-                labels = [f"+{stage}" for stage in range(stages.shape[1])]
-                own = Channel(name, f"prediction/{channel.name}", channel.unit, labels=labels)
-                own = self._predicted.setdefault(channel.name, own)
-                stream.send([own.see(stages)], rows, stages)
-
-    def _intermediate(self, stream: Stream, samples: np.ndarray, time: Array) -> None:
-        if not self._within:
-            return
-        moments, *states = np.array(self._within).T
-        self._within.clear()
-        # A state at the end of a sample counts to that sample.
-        rows = times(samples[np.maximum(np.searchsorted(time, moments) - 1, 0)], moments)
-        for channel, values in zip(self._fine, states, strict=True):
-            stream.send([channel.see(values)], rows, values)
 
     def _group(self, *groups: str) -> list[Channel]:
         return [
@@ -195,7 +182,11 @@ class RerunRecorder:
             rrb.StateTimelineView(name="QP status", contents=[f"/{_STATUS}"], time_view=along),
         ]
         about = rrb.TextDocumentView(name="about this run", origin="/about")
-        predicted = [view(c.title, [c], along, legend=False) for c in self._predicted.values()]
+        predicted = [
+            view(c.title, [c], along, legend=False)
+            for c in chain(*self._predicted.values())
+            if c.window()
+        ]
         right = rrb.Tabs(rrb.Vertical(*predicted, name="predictions"), about)
         return layout(
             rrb.Horizontal(
@@ -218,8 +209,9 @@ def _channels(kind: SignalKind, scenario: Scenario, units: Mapping[str, str]) ->
             SERIES[1] if name in ("penalty", "feedback_time") else next(colors),
             scenario.limits.get(name, FREE) if kind.vector else FREE,
             step=kind.name in HELD,
+            tail=0.05 if kind.clock else 0.0,
         )
-        for name, unit in zip(kind.names(scenario), kind.units(scenario, units), strict=True)
+        for name, unit in kind.units(scenario, units).items()
     ]
 
 
@@ -228,7 +220,7 @@ def _about(scenario: Scenario, properties: Mapping[str, object]) -> str:
 
 {scenario.description}
 
-{table("run", properties)}
+{_table("run", properties)}
 
 **Time** is the plant's. Sample k of a state is what the controller measured; the input,
 disturbance and cost of sample k hold until sample k+1. The cost per sample is economic cost +
@@ -256,38 +248,6 @@ def spare_pandas() -> None:
         sys.meta_path.remove(Missing)
 
 
-class Plot(NamedTuple):
-    """A view of an ended run: its title, and each signal's channel, rows and values."""
-
-    title: str
-    signals: Sequence[tuple[Channel, list[rr.TimeColumn], Array]]
-
-
-def _record(
-    path: str | Path,
-    title: str,
-    tabs: Mapping[str, Sequence[Plot]],
-    along: rrb.TimeAxis,
-    about: str,
-    *,
-    timeline: str = TIME,
-    ends: list[rr.TimeColumn] | None = None,
-    properties: Mapping[str, object] = MappingProxyType({}),
-) -> None:
-    """Write a recording of plots in tabs; bounds are drawn between the two times `ends`."""
-    grids = []
-    for name, plots in tabs.items():
-        views = (view(p.title, [channel for channel, _, _ in p.signals], along) for p in plots)
-        grids += [rrb.Grid(*views, grid_columns=3, name=name)] * bool(plots)
-    page = rrb.TextDocumentView(name="about", origin="/about")
-    shown = layout(rrb.Tabs(*grids, page), timeline)
-    with Stream(path, title, shown, about, properties) as stream:
-        for plot in chain(*tabs.values()):
-            for channel, rows, values in plot.signals:
-                stream.bounds([channel], ends or [])
-                stream.send([channel], rows, values)
-
-
 def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str) -> None:
     """Write a recording of runs of one scenario by name, over each other; errors as of a run's.
 
@@ -303,32 +263,40 @@ def record_overlay(path: str | Path, runs: Mapping[str, RunSignals], about: str)
     }
     rows = {name: times(np.arange(len(time)), time) for name, time in times_of.items()}
     colors = {name: lit(look.color) for name, look in palette(list(runs)).items()}
-    overlaid, differences = [], []
-    for signal, own in first.signals.items():
-        if signal == "time" or not all(signal in run.signals for run in others):
-            continue
-        lines = []
-        for name, run in runs.items():
-            entity, values = f"{escaped(name)}/{escaped(signal)}", run.signals[signal].values
-            bounds = first.bounds.get(signal, FREE) if run is first else FREE
-            line = Channel(
-                entity, f"{name}/{signal}", own.unit, colors[name], bounds, labels=[name]
-            )
-            lines.append((line.see(values), rows[name], values))
-        overlaid.append(Plot(replace(lines[0][0], name=signal).title, lines))
-        if len(runs) == 2:
-            common = min(len(values) for _, _, values in lines)
-            with np.errstate(invalid="ignore"):
-                values = lines[0][2][:common] - lines[1][2][:common]
-            entity, name = f"difference/{escaped(signal)}", f"difference/{signal}"
-            line = Channel(entity, name, own.unit, SERIES[3]).see(values)
-            time = next(iter(times_of.values()))[:common]
-            differences.append(Plot(line.title, [(line, times(np.arange(common), time), values)]))
     seconds = max((float(time[-1]) for time in times_of.values() if len(time)), default=0.0)
-    title, last = " / ".join(runs), max(map(len, runs.values())) - 1
-    tabs = {title: overlaid, "difference": differences}
-    ends = times([0, last], np.array([0.0, seconds]))
-    _record(path, title, tabs, axis(AT(seconds=0.0), AT(seconds=seconds)), about, ends=ends)
+    along = axis(AT(seconds=0.0), AT(seconds=seconds))
+    ends = times([0, max(map(len, runs.values())) - 1], np.array([0.0, seconds]))
+    title, overlaid, differences = " / ".join(runs), [], []
+    with Stream(path, title, about) as stream:
+        for signal, own in first.signals.items():
+            if signal == "time" or not all(signal in run.signals for run in others):
+                continue
+            lines = []
+            for name, run in runs.items():
+                entity, bounds = f"{escaped(name)}/{escaped(signal)}", FREE
+                if run is first:
+                    bounds = first.bounds.get(signal, FREE)
+                line = Channel(entity, f"{name}/{signal}", own.unit, colors[name], bounds, [name])
+                stream.send([line], rows[name], run.signals[signal].values, ends)
+                lines.append(line)
+            overlaid.append(view(replace(lines[0], name=signal).title, lines, along))
+            if len(runs) == 2:
+                a, b = (run.signals[signal].values for run in runs.values())
+                common = min(len(a), len(b))
+                with np.errstate(invalid="ignore"):
+                    values = a[:common] - b[:common]
+                entity, name = f"difference/{escaped(signal)}", f"difference/{signal}"
+                line = Channel(entity, name, own.unit, SERIES[3])
+                time = next(iter(times_of.values()))[:common]
+                stream.send([line], times(np.arange(common), time), values)
+                differences.append(view(line.title, [line], along))
+        stream.layout = _tabs({title: overlaid, "difference": differences})
+
+
+def _tabs(tabs: Mapping[str, Sequence[rrb.View]], timeline: str = TIME) -> rrb.Blueprint:
+    grids = [rrb.Grid(*views, grid_columns=3, name=name) for name, views in tabs.items() if views]
+    page = rrb.TextDocumentView(name="about", origin="/about")
+    return layout(rrb.Tabs(*grids, page), timeline)
 
 
 def record_training(path: str | Path, training: Training) -> None:
@@ -349,20 +317,21 @@ def record_training(path: str | Path, training: Training) -> None:
     }
     samples = log["samples"].astype(np.int64)
     rows, theta, course = times(samples), [], []
-    for name, values in training.theta().items():
-        labels = list(blocks.labels[blocks.slices[name]])
-        entity = f"increment/{escaped(name)}"
-        block = Channel(entity, f"increment/{name}", labels=labels).see(values)
-        theta.append(Plot(f"change of {name}", [(block, rows, values)]))
-    for (name, values), color in zip(log.items(), cycle(SERIES), strict=False):
-        rare = bool(np.isnan(values).any())
-        column = Channel(f"log/{escaped(name)}", name, color=color, points=rare).see(values)
-        course.append(Plot(name, [(column, rows, values)]))
     along = axis(AT(seq=0), AT(seq=int(samples[-1]) if len(samples) else 0))
     title = f"{run.algorithm} on {run.scenario.name}"
-    about = f"# {title}\n\n{table('training', properties)}\n"
-    tabs = {"θ": theta, "log": course}
-    _record(path, title, tabs, along, about, timeline=SAMPLE, properties=properties)
+    about = f"# {title}\n\n{_table('training', properties)}"
+    with Stream(path, title, about, properties) as stream:
+        for name, values in training.theta().items():
+            labels = list(blocks.labels[blocks.slices[name]])
+            block = Channel(f"increment/{escaped(name)}", f"increment/{name}", labels=labels)
+            stream.send([block], rows, values)
+            theta.append(view(f"change of {name}", [block], along))
+        for (name, values), color in zip(log.items(), cycle(SERIES), strict=False):
+            rare = bool(np.isnan(values).any())
+            column = Channel(f"log/{escaped(name)}", name, color=color, points=rare)
+            stream.send([column], rows, values)
+            course.append(view(name, [column], along))
+        stream.layout = _tabs({"θ": theta, "log": course}, SAMPLE)
 
 
 # The file, its signals and its layout
@@ -373,7 +342,8 @@ class Channel:
     """A signal in a recording: its entity, how it is drawn, and the range `seen` of its values.
 
     `labels` name the lines of a signal with several numbers a row. `step` holds a value until the
-    next one, `points` draws dots; `bounds` may be infinite.
+    next one, `points` draws dots; `bounds` may be infinite; the range leaves out the share `tail`
+    of the largest values.
     """
 
     entity: str
@@ -384,6 +354,7 @@ class Channel:
     labels: Sequence[str] = ()
     step: bool = False
     points: bool = False
+    tail: float = 0.0
     seen: Range = (inf, -inf)
 
     @property
@@ -393,14 +364,13 @@ class Channel:
         sides = zip(("at least", "at most"), self.bounds, strict=True)
         return ", ".join([label, *(f"{side} {b:g}" for side, b in sides if isfinite(b))])
 
-    def see(self, values: Array, *, tail: float = 0.0) -> Self:
-        """Widen the range seen by values of any shape, without the share `tail` of the largest."""
+    def see(self, values: Array) -> None:
+        """Widen the range seen by values of any shape."""
         values = values[np.isfinite(values)]
         if values.size:
             low, high = self.seen
-            top = np.quantile(values, 1.0 - tail) if tail else values.max()
+            top = np.quantile(values, 1.0 - self.tail) if self.tail else values.max()
             self.seen = (min(low, float(values.min())), max(high, float(top)))
-        return self
 
     def window(self) -> Range | None:
         """Range of view: the values seen and each bound within their span; None before any."""
@@ -419,7 +389,7 @@ class Stream:
     """An open recording: `send`, then `close`; an exception in its context discards it.
 
     `about` is the Markdown of the view `/about`; `properties` describe the run as a whole, shown in
-    the viewer when the recording is selected.
+    the viewer when the recording is selected. `layout` may be replaced before `close`.
 
     The file is written beside `path` under a hidden name and renamed by `close`, so that `path`
     never holds half a recording; `rerun rrd optimize` repairs what a killed process leaves. Raises
@@ -430,11 +400,11 @@ class Stream:
         self,
         path: str | Path,
         name: str,
-        layout: rrb.Blueprint,
         about: str,
-        properties: Mapping[str, object],
+        properties: Mapping[str, object] = MappingProxyType({}),
+        layout: rrb.Blueprint | None = None,
     ) -> None:
-        self.path = check_target(path)
+        self.path, self.layout = check_target(path), layout
         name_of_partial = f".{self.path.stem}.{secrets.token_hex(4)}.partial.rrd"
         self._partial = self.path.with_name(name_of_partial)
         self._partial.touch()
@@ -461,9 +431,28 @@ class Stream:
         else:
             self.discard()
 
-    def send(self, channels: Sequence[Channel], times: list[rr.TimeColumn], values: Array) -> None:
-        """Send K rows of the signals of one entity: (K,), (K, m), or (K, labels)."""
+    def send(
+        self,
+        channels: Sequence[Channel],
+        times: list[rr.TimeColumn],
+        values: Array,
+        ends: list[rr.TimeColumn] | None = None,
+    ) -> None:
+        """Send K rows of the signals of one entity: (K,), (K, m), or (K, labels).
+
+        Finite bounds are drawn between two times `ends`.
+        """
         entity = channels[0].entity
+        for channel, column in zip(
+            channels, values.T if len(channels) > 1 else [values], strict=True
+        ):
+            channel.see(column)
+            for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
+                if ends and isfinite(bound):
+                    line = Channel(f"bounds/{channel.entity}/{side}", f"{side} bound", color=BOUND)
+                    self.rerun.log(line.entity, _style([line]), static=True)
+                    drawn = rr.Scalars.columns(scalars=[bound, bound])
+                    self.rerun.send_columns(line.entity, ends, drawn)
         if entity not in self._declared:
             self._declared.add(entity)
             names, units = [c.name for c in channels], [c.unit for c in channels]
@@ -471,27 +460,15 @@ class Stream:
             self.rerun.log(entity, mark, _style(channels), static=True)
         self.rerun.send_columns(entity, times, rr.Scalars.columns(scalars=np.array(values)))
 
-    def bounds(self, channels: Sequence[Channel], ends: list[rr.TimeColumn]) -> None:
-        """Draw the finite bounds of signals between two times."""
-        for channel in channels:
-            for side, bound in zip(("lower", "upper"), channel.bounds, strict=True):
-                if isfinite(bound):
-                    entity = f"bounds/{channel.entity}/{side}"
-                    line = Channel(entity, f"{side} bound", color=BOUND)
-                    self.rerun.log(entity, _style([line]), static=True)
-                    self.rerun.send_columns(
-                        entity, ends, rr.Scalars.columns(scalars=[bound, bound])
-                    )
-
-    def close(self, layout: rrb.Blueprint | None = None) -> None:
-        """Finish the file, with a layout in place of the first, and give it its name.
+    def close(self) -> None:
+        """Finish the file, with the layout, and give it its name.
 
         Raises RecordingError where not all of it could be written.
         """
         if self.rerun in _ABANDONED:
             return
-        if layout is not None:
-            self.rerun.send_blueprint(layout)
+        if self.layout is not None:
+            self.rerun.send_blueprint(self.layout)
         self._bounded(self.rerun.disconnect)
         with self._partial.open("rb") as written:
             written.seek(-min(len(_FOOTER) + 32, self._partial.stat().st_size), os.SEEK_END)
@@ -601,7 +578,6 @@ def layout(root: rrb.Container, timeline: str = TIME) -> rrb.Blueprint:
     )
 
 
-def table(title: str, values: Mapping[str, object]) -> str:
-    """Markdown table of names and values."""
-    rows = [f"| {key.replace('_', ' ')} | {value} |" for key, value in values.items()]
-    return "\n".join([f"| {title} | |", "|---|---|", *rows])
+def _table(title: str, values: Mapping[str, object]) -> str:
+    rows = [(key.replace("_", " "), str(value)) for key, value in values.items()]
+    return markdown_table((title, ""), rows)

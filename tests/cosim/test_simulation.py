@@ -82,10 +82,10 @@ class Recorder:
     def start(self, scenario, controller, seed, steps, units):
         self.calls.append(("start", scenario.name, controller.name, seed, steps, units["P2"]))
 
-    def record(self, block):
-        if block.first == self._fail_at:
+    def record(self, first, columns, status):
+        if first == self._fail_at:
             raise OSError("disk full")
-        self.blocks.append((block.first, block["states"].copy(), list(block.status), block))
+        self.blocks.append((first, columns["states"].copy(), list(status), columns))
 
     def close(self):
         self.calls.append(("close",))
@@ -113,11 +113,11 @@ def test_a_recorder_gets_the_whole_run_in_parts(evaporator, paper):
     states = np.concatenate([states for _, states, *_ in recorder.blocks])
     np.testing.assert_array_equal(states, trajectory.states)
     for _, states, status, block in recorder.blocks:
-        assert len(status) == len(states) == len(block.predicted_states)
-        predicted = states[:, 0] > 25.0
-        np.testing.assert_array_equal(block.predicted_states[predicted][:, 3], states[predicted])
-        assert np.isnan(block.predicted_states[~predicted]).all()
-        assert block.predicted_actions.shape[1:] == (3, 2)
+        assert len(status) == len(states) == len(block["predicted_states"])
+        predicted, stages = states[:, 0] > 25.0, block["predicted_states"]
+        np.testing.assert_array_equal(stages[predicted][:, 3], states[predicted])
+        assert np.isnan(stages[~predicted]).all()
+        assert block["predicted_actions"].shape[1:] == (3, 2)
 
 
 def test_recording_does_not_change_the_run_nor_do_longer_parts(evaporator, paper, monkeypatch):

@@ -47,7 +47,7 @@ class Plugin:
 
 
 # A recorder, so that predictions are looked at.
-KEEP = SimpleNamespace(start=lambda *_: None, record=lambda block: None, close=lambda: None)
+KEEP = SimpleNamespace(start=lambda *_: None, record=lambda *_: None, close=lambda: None)
 
 
 def one_line(error):

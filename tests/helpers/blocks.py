@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from cosim.protocols import RunPart
 from cosim.trajectory import SIGNALS
 
 
@@ -15,10 +14,6 @@ def random_block(scenario, rng, first=0, samples=10):
     columns["time"] = np.arange(first, first + samples) * scenario.sampling_time
     columns["residual"] = np.full(samples, np.nan)
     n, m = len(scenario.plant.states), len(scenario.plant.actions)
-    return RunPart(
-        first=first,
-        columns=columns,
-        status=["solved"] * samples,
-        predicted_states=rng.normal(size=(samples, 4, n)),
-        predicted_actions=rng.normal(size=(samples, 3, m)),
-    )
+    columns["predicted_states"] = rng.normal(size=(samples, 4, n))
+    columns["predicted_actions"] = rng.normal(size=(samples, 3, m))
+    return first, columns, ["solved"] * samples

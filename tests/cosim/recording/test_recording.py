@@ -34,7 +34,7 @@ def recorded(path, scenario, blocks, units=None, steps=100):
     recorder = RerunRecorder(path)
     recorder.start(scenario, CONTROLLER, 5, steps, units or {})
     for block in blocks:
-        recorder.record(block)
+        recorder.record(*block)
     recorder.close()
     return read_recording(path)
 
@@ -55,18 +55,17 @@ def test_signals_equal_the_csv_bit_for_bit(tmp_path, paper):
 
 def test_a_block_that_the_loop_overwrites_is_recorded_as_it_was(tmp_path, paper, rng):
     block = random_block(paper, rng)
-    before = {name: np.array(values) for name, values in block.columns.items()}
-    predicted = block.predicted_states.copy()
+    before = {name: np.array(values) for name, values in block[1].items()}
     recorder = RerunRecorder(tmp_path / "run.rrd")
     recorder.start(paper, CONTROLLER, 0, 10, {})
-    recorder.record(block)
-    for values in (*block.columns.values(), block.predicted_states):
+    recorder.record(*block)
+    for values in block[1].values():
         values[:] = 0.0
     recorder.close()
     recording = read_recording(tmp_path / "run.rrd")
     assert np.array_equal(recording.signals["X2"], before["states"][:, 0])
     assert np.array_equal(recording.signals["violation"], before["violation"])
-    assert np.array_equal(recording.signals["prediction/X2"], predicted[:, :, 0])
+    assert np.array_equal(recording.signals["prediction/X2"], before["predicted_states"][:, :, 0])
 
 
 def test_a_run_that_breaks_off_leaves_the_samples_it_made(tmp_path, paper):
@@ -85,8 +84,8 @@ def test_names_and_units_of_any_spelling_come_back(tmp_path, foreign, rng):
     block = random_block(foreign, rng)
     units = {"tank[1].level": "m³", "der(x)/dt": "∇"}
     recording = recorded(tmp_path / "run.rrd", foreign, [block], units)
-    assert np.array_equal(recording.signals["tank[1].level"], block["states"][:, 0])
-    assert np.array_equal(recording.signals["der(x)/dt"], block["actions"][:, 0])
+    assert np.array_equal(recording.signals["tank[1].level"], block[1]["states"][:, 0])
+    assert np.array_equal(recording.signals["der(x)/dt"], block[1]["actions"][:, 0])
     assert recording.units["tank[1].level"] == "m³"
     assert recording.units["der(x)/dt"] == "∇"
     assert drawable("X2 [kg/min] θ µ °C\n∇水") == "X2 [kg/min] θ µ °C\n??"
@@ -96,7 +95,7 @@ def test_the_file_is_whole_or_not_there(tmp_path, paper, rng):
     path = tmp_path / "run.rrd"
     recorder = RerunRecorder(path)
     recorder.start(paper, CONTROLLER, 0, 10, {})
-    recorder.record(random_block(paper, rng))
+    recorder.record(*random_block(paper, rng))
     assert not path.exists()
     recorder.close()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.rrd"]
@@ -146,8 +145,8 @@ def test_the_summary_has_units_and_ranges(tmp_path, paper, rng, units):
     assert summary["statuses"] == {"solved": 10}
     assert summary["signals"]["X2"] == {
         "unit": "%",
-        "minimum": block["states"][:, 0].min(),
-        "maximum": block["states"][:, 0].max(),
+        "minimum": block[1]["states"][:, 0].min(),
+        "maximum": block[1]["states"][:, 0].max(),
     }
     assert summary["signals"]["residual"]["minimum"] is None
 

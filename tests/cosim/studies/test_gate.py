@@ -13,7 +13,7 @@ from controllers import evaporator
 from controllers.problem import Problem
 from controllers.rti.nmpc import RtiSolution
 from cosim.cli.main import app
-from cosim.plant.fmu_plant import Wirer
+from cosim.plant.fmu_plant import Wiring
 from learning.baselines import BackOffSearch
 
 pytestmark = pytest.mark.campaign
@@ -22,13 +22,13 @@ STORED = Path(__file__).parents[3] / "results"
 
 def plant(patch):
     """The plant's heat transfer."""
-    start_value = Wirer._start_value
+    start_value = Wiring._start_value
 
     def changed(self, name, value, table):
         factor = 1.01 if (name, table) == ("UA2", "plant.parameters") else 1.0
         return start_value(self, name, factor * value, table)
 
-    patch.setattr(Wirer, "_start_value", changed)
+    patch.setattr(Wiring, "_start_value", changed)
 
 
 def model(patch):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cosim.errors import ComparisonError, ScenarioError
+from cosim.protocols import Array
 from cosim.scenario import Scenario
 from cosim.trajectory import Signal, clocked, read_signals
 from cosim.validation import instead
@@ -101,34 +102,59 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The `differences` of two runs by signal, and all `words` there are to say, none if equal.
+    """The `differences` of two runs by signal, and all others.
 
-    `samples` are the two lengths; `first` is the first sample at which any signal or the status
-    differs.
+    `samples` are the two lengths; `only_first` and `only_second` signals of one run; `units`
+    different units by signal; `order` the first position at which the order of the signals differs;
+    `status` the first sample whose status differs; `times` (K,) in s are those of A.
     """
 
     samples: tuple[int, int]
     differences: Sequence[Difference]
-    first: int | None
-    words: Sequence[str]
+    only_first: Sequence[str] = ()
+    only_second: Sequence[str] = ()
+    units: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    order: int | None = None
+    status: int | None = None
+    times: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def equal(self) -> bool:
         """Whether the runs have the same samples, signals and status, all within tolerance."""
-        return not self.words
+        return not self.lines()
+
+    @property
+    def first(self) -> int | None:
+        """First sample at which any signal or the status differs."""
+        steps = [d.first for d in self.differences if d.first is not None]
+        return min((*steps, *([] if self.status is None else [self.status])), default=None)
 
     def lines(self) -> list[str]:
-        """The differences in words: the first one, then samples, names, units and order."""
-        return list(self.words)
+        """The differences in words: the first one, then names, units and order."""
+        text = []
+        if (step := self.first) is not None:
+            at = f" (time {self.times[step]:g} s)" if len(self.times) > step else ""
+            found = [d.text() for d in self.differences if d.first == step]
+            found += ["status"] if self.status == step else []
+            text += [f"first difference at sample {step}{at}:", *(f"  {one}" for one in found)]
+        if len(set(self.samples)) > 1:
+            text.append(f"{self.samples[0]} samples against {self.samples[1]}")
+        for missing, side in ((self.only_first, "first"), (self.only_second, "second")):
+            if missing:
+                text.append(f"only the {side} has {', '.join(missing)}")
+        text += [f"{name} is in '{a}' against '{b}'" for name, (a, b) in self.units.items()]
+        if self.order is not None:
+            text.append(f"the columns stand in another order from column {self.order + 1} on")
+        return text
 
     def document(self) -> dict[str, Any]:
         """The comparison as plain values, ready for JSON."""
+        names = ("samples", "only_first", "only_second", "units", "order")
         shown = ("unit", "tolerance", "maximum", "at", "first")
         return {
             "equal": self.equal,
             "first_difference": self.first,
-            "samples": self.samples,
-            "lines": self.lines(),
+            **{name: getattr(self, name) for name in names},
             "signals": {d.name: {key: getattr(d, key) for key in shown} for d in self.differences},
         }
 
@@ -168,34 +194,22 @@ def compare(
             largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
             tolerance = inf if name == _ERROR else float(relative * largest)
         differences.append(_difference(a.signals[name], b.signals[name], tolerance))
-    status = _first([x != y for x, y in zip(a.status, b.status, strict=False)])
-    steps = [step for step in (status, *(d.first for d in differences)) if step is not None]
-    words = []
-    if (first := min(steps, default=None)) is not None:
-        times = a.signals["time"].values if "time" in a.signals else ()
-        at = f" (time {times[first]:g} s)" if len(times) > first else ""
-        words = [f"first difference at sample {first}{at}:"]
-        words += [f"  {d.text()}" for d in differences if d.first == first]
-        words += ["  status"] * (status == first)
-    return Comparison((len(a), len(b)), differences, first, words + _others(a, b, both))
-
-
-def _others(a: RunSignals, b: RunSignals, both: Sequence[str]) -> list[str]:
-    """Differences of length, names, units and order in words."""
-    words = []
-    if len(a) != len(b):
-        words.append(f"{len(a)} samples against {len(b)}")
-    for side, one, other in (("first", a, b), ("second", b, a)):
-        if missing := [name for name in one.signals if name not in other.signals]:
-            words.append(f"only the {side} has {', '.join(missing)}")
-    for name in both:
-        units = a.signals[name].unit, b.signals[name].unit
-        words += [f"{name} is in '{units[0]}' against '{units[1]}'"] * (units[0] != units[1])
-    if a.ordered and b.ordered:
-        order = [name for name in b.signals if name in a.signals]
-        if (at_column := _first([x != y for x, y in zip(both, order, strict=True)])) is not None:
-            words.append(f"the columns stand in another order from column {at_column + 1} on")
-    return words
+    time = a.signals.get("time")
+    order = [name for name in b.signals if name in a.signals] if a.ordered and b.ordered else both
+    return Comparison(
+        samples=(len(a), len(b)),
+        differences=differences,
+        only_first=[name for name in a.signals if name not in b.signals],
+        only_second=[name for name in b.signals if name not in a.signals],
+        units={
+            name: units
+            for name in both
+            if len(set(units := (a.signals[name].unit, b.signals[name].unit))) > 1
+        },
+        order=_first([x != y for x, y in zip(both, order, strict=True)]),
+        status=_first([x != y for x, y in zip(a.status, b.status, strict=False)]),
+        times=np.empty(0) if time is None else time.values,
+    )
 
 
 def _difference(a: Signal, b: Signal, tolerance: float | None) -> Difference:
